@@ -1,0 +1,797 @@
+//! The syntax tree: what was written, with the place of every part.
+//!
+//! Nothing here is checked beyond the concrete syntax, with one exception: inside a model the declared
+//! names decide whether `dz/dt` is a derivative or a division (docs/language.md), so the tree holds the answer.
+
+use crate::span::Span;
+
+/// A whole text.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct File {
+    /// The items in the order of the text. Items that could not be read are left out; they have been reported.
+    pub items: Vec<Item>,
+}
+
+/// A word that names something.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Name {
+    /// The word.
+    pub text: String,
+    /// Its place.
+    pub span: Span,
+}
+
+/// A unit as written, without the brackets of a declaration: `N·s/m`, `1`, `%`.
+#[derive(Clone, PartialEq, Debug)]
+pub struct UnitText {
+    /// The characters.
+    pub text: String,
+    /// Their place.
+    pub span: Span,
+}
+
+/// A string between double quotes, without them.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Text {
+    /// The characters.
+    pub text: String,
+    /// Their place, with the quotes.
+    pub span: Span,
+}
+
+/// One item at the top of a file.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum Item {
+    Import(Import),
+    Const(Const),
+    Function(Function),
+    Table(Table),
+    Interface(Interface),
+    Model(Model),
+    Experiment(Experiment),
+    Fit(Fit),
+    Device(Device),
+    Rig(Rig),
+}
+
+/// `import std.friction` or `import "file.fric"`.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Import {
+    /// What is imported.
+    pub source: ImportSource,
+    /// The whole item.
+    pub span: Span,
+}
+
+/// Where an import comes from.
+#[derive(Clone, PartialEq, Debug)]
+pub enum ImportSource {
+    /// A module of the library, dotted: `std.friction`.
+    Library(Name),
+    /// A file, relative to the importing one.
+    File(Text),
+}
+
+/// `const g_n [m/s^2] = 9.81 m/s^2`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Const {
+    pub name: Name,
+    pub unit: Option<UnitText>,
+    pub value: Expr,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// `fn slip(v [m/s], vt [m/s]) = tanh(v / vt)`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Function {
+    pub name: Name,
+    pub args: Vec<Argument>,
+    pub unit: Option<UnitText>,
+    pub body: Expr,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// An argument of a function or table; without a unit it is a pure number.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Argument {
+    pub name: Name,
+    pub unit: Option<UnitText>,
+}
+
+/// `table F(v [m/s]) [N] = linear { 0 mm/s: 1.5 N, 1 mm/s: 1.2 N }`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Table {
+    pub name: Name,
+    pub arg: Argument,
+    pub unit: Option<UnitText>,
+    pub shape: TableShape,
+    pub points: TablePoints,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// How a table goes from point to point.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum TableShape {
+    /// Straight lines.
+    Linear,
+    /// Monotone cubics.
+    Smooth,
+}
+
+/// The points of a table.
+#[derive(Clone, PartialEq, Debug)]
+pub enum TablePoints {
+    /// Written out: (argument, value).
+    Listed(Vec<(Expr, Expr)>),
+    /// In a file of two columns.
+    File(Text),
+}
+
+/// `interface Friction { input v [m/s]  output F [N] }`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Interface {
+    pub name: Name,
+    /// Declarations of kind `Input` or `Output`; one with a value is optional.
+    pub ports: Vec<Declaration>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// `model LuGre { … }`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Model {
+    pub name: Name,
+    pub body: Vec<Statement>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// One statement of a model.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum Statement {
+    Declaration(Declaration),
+    Equation(Equation),
+    Part(Part),
+    Every(Every),
+    Mode(Mode),
+    When(When),
+    Require(Require),
+    Storage(Storage),
+    Allow(Allow),
+}
+
+/// `param Fs [N] = 1.5 N in > 0  /// stiction`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Declaration {
+    pub kind: DeclarationKind,
+    pub name: Name,
+    pub unit: Option<UnitText>,
+    pub value: Option<Expr>,
+    pub range: Option<Range>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// What a declaration declares.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+#[allow(missing_docs)]
+pub enum DeclarationKind {
+    Param,
+    Input,
+    Output,
+    State,
+    Let,
+}
+
+impl DeclarationKind {
+    /// The keyword.
+    pub fn word(self) -> &'static str {
+        match self {
+            DeclarationKind::Param => "param",
+            DeclarationKind::Input => "input",
+            DeclarationKind::Output => "output",
+            DeclarationKind::State => "state",
+            DeclarationKind::Let => "let",
+        }
+    }
+}
+
+/// What stands behind `in`.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Range {
+    /// `a .. b`, both ends included.
+    Between(Expr, Expr),
+    /// `> a`, `>= a`, `< a`, `<= a`: the operator is one of those four.
+    Bound(BinaryOp, Expr),
+}
+
+/// `F = …`, `dz/dt = …`, `dx/ds = …` or `next(x) = …`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Equation {
+    pub target: Target,
+    pub value: Expr,
+    pub span: Span,
+}
+
+/// The left side of an equation.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Target {
+    /// `F`
+    Name(Name),
+    /// `dz/dt`, `dx/ds`; `span` covers both words. The names are without the `d`.
+    Derivative {
+        /// What changes.
+        of: Name,
+        /// Along what: `t` or a state.
+        along: Name,
+        /// Both words.
+        span: Span,
+    },
+    /// `next(x)`; `span` covers all of it.
+    Next {
+        /// The sampled state.
+        name: Name,
+        /// All of `next(x)`.
+        span: Span,
+    },
+}
+
+impl Target {
+    /// The quantity it gives a value to.
+    pub fn name(&self) -> &Name {
+        match self {
+            Target::Name(name) | Target::Derivative { of: name, .. } | Target::Next { name, .. } => name,
+        }
+    }
+
+    /// The place of the whole left side.
+    pub fn span(&self) -> Span {
+        match self {
+            Target::Name(name) => name.span,
+            Target::Derivative { span, .. } | Target::Next { span, .. } => *span,
+        }
+    }
+}
+
+/// `part fr : Friction = LuGre(v = body.v)`, `part el[i in 1 .. 4] = Maxwell(v = v)`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Part {
+    pub name: Name,
+    pub repeat: Option<Repeat>,
+    pub slot: Option<SlotType>,
+    pub instance: Instance,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// `[i in 1 .. 4]`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Repeat {
+    pub index: Name,
+    pub first: Expr,
+    pub last: Expr,
+    pub span: Span,
+}
+
+/// `: Friction` or `: rotary Friction`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct SlotType {
+    pub rotary: bool,
+    pub interface: Name,
+}
+
+/// `LuGre(v = body.v, Fc = 2 N)`, perhaps with `rotary` before it.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Instance {
+    pub rotary: bool,
+    pub model: Name,
+    pub args: Vec<Bind>,
+    pub span: Span,
+}
+
+/// One argument of an instance: `v = body.v`, `fr = LuGre()`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Bind {
+    pub name: Name,
+    pub value: BindValue,
+    pub span: Span,
+}
+
+/// What an argument is bound to.
+#[derive(Clone, PartialEq, Debug)]
+pub enum BindValue {
+    /// A value.
+    Expr(Expr),
+    /// A model for a slot.
+    Instance(Instance),
+}
+
+/// `every Ts { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Every {
+    pub period: Expr,
+    pub body: Vec<EveryStatement>,
+    pub span: Span,
+}
+
+/// A statement inside `every`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum EveryStatement {
+    Declaration(Declaration),
+    Equation(Equation),
+}
+
+/// `mode stick initial { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Mode {
+    pub name: Name,
+    /// The word `initial`, if it stands there.
+    pub initial: Option<Span>,
+    pub equations: Vec<Equation>,
+    pub transitions: Vec<Go>,
+    /// From the keyword to the closing brace.
+    pub span: Span,
+    /// `mode NAME`, for labels.
+    pub head: Span,
+}
+
+/// `go slip when abs(F) > Fs { reset(z) = 0 }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Go {
+    pub target: Name,
+    pub condition: Expr,
+    pub resets: Vec<Reset>,
+    pub span: Span,
+}
+
+/// `when x rises x_max { reset(v) = -e * v }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct When {
+    pub condition: Expr,
+    pub resets: Vec<Reset>,
+    pub span: Span,
+}
+
+/// `reset(v) = -e * v`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Reset {
+    pub name: Name,
+    pub value: Expr,
+    pub span: Span,
+}
+
+/// `require Fs >= Fc, "message"`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Require {
+    pub condition: Expr,
+    pub message: Option<Text>,
+    pub span: Span,
+}
+
+/// `storage 0.5 * sigma0 * z^2`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Storage {
+    pub energy: Expr,
+    pub span: Span,
+}
+
+/// `allow not-dissipative "as published"`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Allow {
+    pub lint: Name,
+    pub reason: Text,
+    pub span: Span,
+}
+
+/// `experiment stick_slip { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Experiment {
+    pub name: Name,
+    pub body: Vec<ExperimentStatement>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// One statement of an experiment.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum ExperimentStatement {
+    Run(Run),
+    Solver(Solver),
+    Sweep(Sweep),
+    Data(Data),
+    Plot(Plot),
+    Expect(Expect),
+    Allow(Allow),
+}
+
+/// `run Servo(r = 1 m) for 100 s`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Run {
+    /// A model, or a rig when the name begins with a small letter.
+    pub instance: Instance,
+    pub duration: Option<Expr>,
+    pub span: Span,
+}
+
+/// `solver expo step 1 ms`, `solver adaptive tol 1e-8`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Solver {
+    pub method: Name,
+    pub step: Option<Expr>,
+    pub tol: Option<Expr>,
+    pub span: Span,
+}
+
+/// `sweep fr = LuGre(), KFM()`, `sweep fr.Fs = 1 N .. 2 N by 0.25 N`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Sweep {
+    pub path: Path,
+    pub over: SweepOver,
+    pub span: Span,
+}
+
+/// What a sweep goes through.
+#[derive(Clone, PartialEq, Debug)]
+pub enum SweepOver {
+    /// Models for a slot.
+    Instances(Vec<Instance>),
+    /// Values, listed.
+    Values(Vec<Expr>),
+    /// Values `first .. last by step`.
+    Grid {
+        /// First value.
+        first: Expr,
+        /// Last value, included when the steps meet it.
+        last: Expr,
+        /// Distance.
+        step: Expr,
+    },
+}
+
+/// `data "pull.csv" (t [s], x [mm])`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Data {
+    pub file: Text,
+    /// A column called `_` is skipped.
+    pub columns: Vec<Argument>,
+    pub span: Span,
+}
+
+/// `plot x [m], r [m] against t [s]`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Plot {
+    pub shows: Vec<Show>,
+    pub against: Option<Show>,
+    pub span: Span,
+}
+
+/// An expression with the unit it is shown in.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Show {
+    pub value: Expr,
+    pub unit: Option<UnitText>,
+    pub span: Span,
+}
+
+/// `expect final(x) ~= 3.3 m +- 1 % after 5 s before 10 s`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Expect {
+    /// The condition, or the left side of `~=`.
+    pub value: Expr,
+    /// `~= target +- tolerance`
+    pub near: Option<(Expr, Expr)>,
+    pub after: Option<Expr>,
+    pub before: Option<Expr>,
+    pub span: Span,
+}
+
+/// `fit tustin { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Fit {
+    pub name: Name,
+    pub body: Vec<FitStatement>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// One statement of a fit.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum FitStatement {
+    Experiment(ExperimentStatement),
+    /// `vary Fs in 1 N .. 2 N, vs`
+    Vary(Vec<(Path, Option<Range>)>, Span),
+    /// `minimise rms(F - data.F)`
+    Minimise(Expr, Span),
+}
+
+/// `device Panel { … }` or `device Transducer from "shaft.dbc" message ShaftTorque`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Device {
+    pub name: Name,
+    pub body: DeviceBody,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// How a device is described.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum DeviceBody {
+    Dbc { file: Text, messages: Vec<Name> },
+    Frames { params: Vec<Declaration>, frames: Vec<FrameSignal> },
+}
+
+/// `send torque [N·m] = 0 at 0x200 + node byte 0 as i16 scale T_rated / 1000`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct FrameSignal {
+    /// `send` rather than `read`.
+    pub send: bool,
+    pub name: Name,
+    pub unit: Option<UnitText>,
+    pub start: Option<Expr>,
+    pub identifier: Expr,
+    pub byte: Expr,
+    pub format: Name,
+    pub scale: Option<Expr>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// `rig rtfs { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Rig {
+    pub name: Name,
+    pub body: Vec<RigStatement>,
+    pub doc: Option<String>,
+    pub span: Span,
+}
+
+/// One statement of a rig.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum RigStatement {
+    Run(Run),
+    Rate(Expr, Span),
+    Solver(Solver),
+    Bus(BusDecl),
+    Drive(DriveDecl),
+    Part(Part),
+    Hardware(Hardware),
+    Wire(Wire),
+    Watchdog(Expr, Span),
+    /// `overrun stop` is `None`, `overrun hold N` is `Some(N)`.
+    Overrun(Option<Expr>, Span),
+    Predict(Name, Span),
+    Safe(Vec<(Path, Expr)>, Span),
+    Stop { condition: Expr, why: Text, span: Span },
+    Record(Vec<Show>, Span),
+    Allow(Allow),
+}
+
+/// `bus can0 = can("can0", 1 Mbit/s)`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct BusDecl {
+    pub name: Name,
+    pub kind: Name,
+    pub args: Vec<BusArg>,
+    pub span: Span,
+}
+
+/// An argument of a bus.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum BusArg {
+    Text(Text),
+    Expr(Expr),
+}
+
+/// `drive load = cia402(can0, node = 3)` or `device shaft = Transducer(can0)`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct DriveDecl {
+    /// `drive` rather than `device`.
+    pub moves: bool,
+    pub name: Name,
+    pub kind: Name,
+    pub bus: Name,
+    pub args: Vec<(Name, DriveArg)>,
+    pub span: Span,
+}
+
+/// An argument of a drive: a value, or a range as in `travel = -1 rad .. 1 rad`.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum DriveArg {
+    Expr(Expr),
+    Range(Expr, Expr),
+}
+
+/// `hardware body { … }`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Hardware {
+    pub part: Name,
+    pub wires: Vec<Wire>,
+    pub span: Span,
+}
+
+/// `load.torque = -F_load limit -1 N·m .. 1 N·m slew 200 N·m/s`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Wire {
+    pub path: Path,
+    pub value: Expr,
+    pub limit: Option<(Expr, Expr)>,
+    pub slew: Option<Expr>,
+    pub span: Span,
+}
+
+/// `body.x`, `el[2].f`, `Fs`: one or more names.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Path {
+    /// At least one.
+    pub segments: Vec<Segment>,
+    /// From the first to the last.
+    pub span: Span,
+}
+
+/// One name of a path, with the index that follows it.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Segment {
+    pub name: Name,
+    pub index: Option<u32>,
+}
+
+impl Path {
+    /// The name, if the path is a single one without index.
+    pub fn single(&self) -> Option<&Name> {
+        match self.segments.as_slice() {
+            [Segment { name, index: None }] => Some(name),
+            _ => None,
+        }
+    }
+}
+
+/// An expression and its place.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Expr {
+    /// What it is.
+    pub kind: ExprKind,
+    /// Where it stands; parentheses around it are not part of it.
+    pub span: Span,
+}
+
+/// The kinds of expression.
+#[derive(Clone, PartialEq, Debug)]
+pub enum ExprKind {
+    /// `10 mm`: the number as written times the unit as written.
+    Number {
+        /// Before the unit is applied.
+        value: f64,
+        /// Directly behind the number.
+        unit: Option<UnitText>,
+    },
+    /// A name or path; also `t`, `pi`, `inf`, `true`, `false`.
+    Path(Path),
+    /// `dz/dt`, `dx/ds`, names without the `d`.
+    Derivative {
+        /// What changes.
+        of: Name,
+        /// Along what: `t` or a state.
+        along: Name,
+    },
+    /// `max(a, b)`
+    Call {
+        /// The function, table, signal, operator (`delay`) or measure.
+        function: Name,
+        /// At least one.
+        args: Vec<Expr>,
+    },
+    /// `-a`, `not a`
+    Unary(UnaryOp, Box<Expr>),
+    /// `a + b`; the span is that of the operator.
+    Binary(BinaryOp, Span, Box<Expr>, Box<Expr>),
+    /// `if c then a else b`
+    If(Box<Expr>, Box<Expr>, Box<Expr>),
+    /// `?`
+    Hole,
+    /// Something that could not be read and has been reported.
+    Error,
+}
+
+/// Operators before one operand.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+#[allow(missing_docs)]
+pub enum UnaryOp {
+    Negate,
+    Not,
+}
+
+/// Operators between two operands.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+#[allow(missing_docs)]
+pub enum BinaryOp {
+    Add,
+    Subtract,
+    Multiply,
+    Divide,
+    Power,
+    Less,
+    LessEqual,
+    Greater,
+    GreaterEqual,
+    Equal,
+    NotEqual,
+    And,
+    Or,
+    Crosses,
+    Rises,
+    Falls,
+}
+
+impl BinaryOp {
+    /// As written.
+    pub fn text(self) -> &'static str {
+        match self {
+            BinaryOp::Add => "+",
+            BinaryOp::Subtract => "-",
+            BinaryOp::Multiply => "*",
+            BinaryOp::Divide => "/",
+            BinaryOp::Power => "^",
+            BinaryOp::Less => "<",
+            BinaryOp::LessEqual => "<=",
+            BinaryOp::Greater => ">",
+            BinaryOp::GreaterEqual => ">=",
+            BinaryOp::Equal => "==",
+            BinaryOp::NotEqual => "!=",
+            BinaryOp::And => "and",
+            BinaryOp::Or => "or",
+            BinaryOp::Crosses => "crosses",
+            BinaryOp::Rises => "rises",
+            BinaryOp::Falls => "falls",
+        }
+    }
+}
