@@ -1,1 +1,14 @@
-//! abi
+//! What a compiled model *is*: the one contract between whoever makes code and whoever runs it.
+//!
+//! A model's numbers live in one flat block of `f64`, addressed by [`Slot`]s; every function of the model reads
+//! and writes that block and nothing else. Knows neither the language nor any solver.
+
+pub mod description;
+pub mod instance;
+pub mod plan;
+pub mod table;
+pub mod unit;
+
+pub use description::{Description, Layout, Slot};
+pub use instance::Instance;
+pub use table::{Code, Function};

@@ -1,0 +1,214 @@
+//! What a compiled model says of itself: its quantities, and where in the block their values lie.
+
+use crate::unit::Unit;
+
+/// A place in the block.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
+pub struct Slot(pub u32);
+
+impl Slot {
+    /// Time `t`, in s.
+    pub const TIME: Slot = Slot(0);
+    /// Fixed step `h`, in s.
+    pub const STEP: Slot = Slot(1);
+    /// Number of fixed steps done since the start: a whole number. `t = COUNT · STEP`, never a running sum.
+    pub const COUNT: Slot = Slot(2);
+    /// Number of slots before the first segment.
+    pub const FIXED: u32 = 3;
+
+    /// As an index of the block.
+    pub fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Consecutive slots of one purpose.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Segment {
+    /// First slot.
+    pub start: u32,
+    /// Number of slots.
+    pub len: u32,
+}
+
+impl Segment {
+    /// The slot of the `i`-th entry.
+    pub fn slot(self, i: usize) -> Slot {
+        assert!(i < self.len as usize, "entry {i} of a segment of {}", self.len);
+        Slot(self.start + i as u32)
+    }
+
+    /// Whether the slot lies in this segment.
+    pub fn contains(self, slot: Slot) -> bool {
+        (self.start..self.start + self.len).contains(&slot.0)
+    }
+
+    /// As a range of block indices.
+    pub fn range(self) -> std::ops::Range<usize> {
+        self.start as usize..(self.start + self.len) as usize
+    }
+}
+
+/// The segments of a block, in this order, behind the fixed slots.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Layout {
+    /// Parameters: constant during a step.
+    pub params: Segment,
+    /// Inputs that come from outside: held during a step.
+    pub inputs: Segment,
+    /// Continuous states x.
+    pub states: Segment,
+    /// Sampled states, held outputs, tick counters, delay buffers, crossing memory.
+    pub memory: Segment,
+    /// Active regime of each automaton: a whole number.
+    pub regimes: Segment,
+    /// Outputs and observed quantities, written by `Outputs` and `Step`.
+    pub outputs: Segment,
+    /// dx/dt, written by `Derivatives`.
+    pub derivatives: Segment,
+    /// Switching surfaces, written by `Roots`.
+    pub roots: Segment,
+    /// ∂f/∂x, row-major n × n, written by `Jacobian`; then ∂f/∂t, n entries.
+    pub jacobian: Segment,
+    /// For each sampled block: is it due (1) or not (0), read by `Tick`.
+    pub due: Segment,
+}
+
+impl Layout {
+    /// Number of slots of the block.
+    pub fn size(&self) -> usize {
+        let last = self.due;
+        (last.start + last.len).max(Slot::FIXED) as usize
+    }
+
+    /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
+    pub fn new(lens: [u32; 10]) -> Layout {
+        let mut next = Slot::FIXED;
+        let mut take = |len: u32| {
+            let segment = Segment { start: next, len };
+            next += len;
+            segment
+        };
+        let [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due] = lens;
+        Layout {
+            params: take(params),
+            inputs: take(inputs),
+            states: take(states),
+            memory: take(memory),
+            regimes: take(regimes),
+            outputs: take(outputs),
+            derivatives: take(derivatives),
+            roots: take(roots),
+            jacobian: take(jacobian),
+            due: take(due),
+        }
+    }
+}
+
+/// What a quantity is to its model.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Kind {
+    /// Constant during a step.
+    Param,
+    /// From outside.
+    Input,
+    /// Continuous state.
+    State,
+    /// State that changes at ticks only.
+    SampledState,
+    /// Computed, visible from outside.
+    Output,
+    /// Computed, private.
+    Let,
+    /// True while this regime is active.
+    Regime,
+    /// An expression that an experiment or a rig asked for.
+    Observed,
+}
+
+/// A named quantity.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Quantity {
+    /// Dotted path as the user writes it: `fr.F`, `el[2].f`. For `Observed`: the expression as written.
+    pub path: String,
+    /// What it is.
+    pub kind: Kind,
+    /// The unit it is declared and shown in. Values in the block are SI.
+    pub unit: Unit,
+    /// Whether it is true (1) or false (0) rather than a quantity.
+    pub boolean: bool,
+    /// Where its value lies. Of outputs and lets, after `Outputs` or `Step`.
+    pub slot: Slot,
+    /// Declared range in SI, infinite where open.
+    pub range: (f64, f64),
+    /// The doc comment.
+    pub doc: Option<String>,
+}
+
+/// A block of sampled code.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Tick {
+    /// Slot of its period in s, written by `Start`.
+    pub period: Slot,
+    /// Slot that says whether it is due, in the segment `due`.
+    pub due: Slot,
+}
+
+/// One automaton: its regimes in the order of the text.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Automaton {
+    /// Path of the part that it belongs to; empty for the whole.
+    pub path: String,
+    /// Names of the regimes.
+    pub regimes: Vec<String>,
+    /// Slot of the number of the active one, in the segment `regimes`.
+    pub slot: Slot,
+}
+
+/// A range that is watched while running. A step that leaves it returns the number of the guard, counted from 1.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Guard {
+    /// Path of the quantity.
+    pub path: String,
+    /// Where its value lies.
+    pub slot: Slot,
+    /// Smallest and largest value in SI, as declared.
+    pub range: (f64, f64),
+    /// For messages.
+    pub unit: Unit,
+}
+
+/// A switching surface of an adaptive run.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Root {
+    /// The condition as written, with its part: `fr: v < -v_hold`.
+    pub text: String,
+}
+
+/// All that is known of a compiled model besides its code.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Description {
+    /// The instance as written: `Servo(r = 1 m)`.
+    pub name: String,
+    /// Where the values lie.
+    pub layout: Layout,
+    /// Every quantity, parts after their owner, in the order of the text.
+    pub quantities: Vec<Quantity>,
+    /// Sampled blocks, in the order in which they run when due together.
+    pub ticks: Vec<Tick>,
+    /// Automata.
+    pub automata: Vec<Automaton>,
+    /// Watched ranges; `status = k + 1` names guard k.
+    pub guards: Vec<Guard>,
+    /// Switching surfaces.
+    pub roots: Vec<Root>,
+    /// Constants that generated code reads by index: tables.
+    pub pool: std::sync::Arc<[f64]>,
+}
+
+impl Description {
+    /// The quantity of this path.
+    pub fn quantity(&self, path: &str) -> Option<&Quantity> {
+        self.quantities.iter().find(|quantity| quantity.path == path)
+    }
+}

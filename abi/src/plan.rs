@@ -1,0 +1,176 @@
+//! What to run, as plain data. Every expression in it is a quantity of the program already: a plan holds slots.
+
+use crate::description::Slot;
+use crate::unit::Unit;
+
+/// How time is stepped.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+#[allow(missing_docs)]
+pub enum Method {
+    Euler,
+    Rk4,
+    Expo,
+    Implicit,
+    Adaptive,
+}
+
+impl Method {
+    /// All of them.
+    pub const ALL: [Method; 5] = [Method::Adaptive, Method::Expo, Method::Implicit, Method::Rk4, Method::Euler];
+
+    /// As written behind `solver`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Method::Euler => "euler",
+            Method::Rk4 => "rk4",
+            Method::Expo => "expo",
+            Method::Implicit => "implicit",
+            Method::Adaptive => "adaptive",
+        }
+    }
+
+    /// The method of this name.
+    pub fn named(name: &str) -> Option<Method> {
+        Method::ALL.into_iter().find(|method| method.name() == name)
+    }
+}
+
+/// The solver of an experiment.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Solver {
+    /// The method.
+    pub method: Method,
+    /// Fixed step in s; of an adaptive run 0.
+    pub step: f64,
+    /// Relative tolerance of an adaptive run.
+    pub tol: f64,
+}
+
+/// One experiment on one instance.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Experiment {
+    /// Its name.
+    pub name: String,
+    /// Simulated time in s.
+    pub duration: f64,
+    /// How.
+    pub solver: Solver,
+    /// What is drawn and written.
+    pub plots: Vec<Plot>,
+    /// What must hold.
+    pub expects: Vec<Expect>,
+    /// Instants in s, ascending, at which a signal or a recording has a corner.
+    pub corners: Vec<f64>,
+}
+
+/// A drawn quantity.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Series {
+    /// As written: `body.v`.
+    pub label: String,
+    /// Where its value lies after a step, in SI.
+    pub slot: Slot,
+    /// The unit it is shown in.
+    pub unit: Unit,
+    /// True or false rather than a quantity.
+    pub boolean: bool,
+}
+
+/// One plot.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Plot {
+    /// Drawn upwards.
+    pub series: Vec<Series>,
+    /// Drawn to the right; time where none.
+    pub against: Option<Series>,
+}
+
+/// One expectation.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Expect {
+    /// As written, without the word `expect`.
+    pub text: String,
+    /// What the condition needs.
+    pub measures: Vec<Measure>,
+    /// What must hold at the end.
+    pub condition: Formula,
+    /// The window in s: points with `after <= t <= before` count.
+    pub after: f64,
+    /// End of the window.
+    pub before: f64,
+}
+
+/// A number taken from the course of a quantity.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Measure {
+    /// As written: `peak_to_peak(x)`.
+    pub text: String,
+    /// Which number.
+    pub kind: MeasureKind,
+    /// The quantity, after each step, in SI.
+    pub slot: Slot,
+    /// The unit in which the result is shown.
+    pub unit: Unit,
+}
+
+/// What a measure measures. Booleans count as 0 and 1.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum MeasureKind {
+    /// Least value.
+    Min,
+    /// Greatest value.
+    Max,
+    /// Mean over time, trapezoidal.
+    Mean,
+    /// Root of the mean square over time.
+    Rms,
+    /// Integral over time.
+    Integral,
+    /// Value at the end of the window.
+    Final,
+    /// Value at this time in s, linear between points.
+    At(f64),
+    /// Greatest minus least.
+    PeakToPeak,
+    /// Number of changes of sign.
+    Crossings,
+    /// Mean distance of upward crossings through the mean; needs three.
+    Period,
+    /// Earliest time after which the value stays within this band of its final value.
+    Settling(f64),
+    /// First time the condition holds; inf if never.
+    First,
+}
+
+/// Arithmetic over measures.
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub enum Formula {
+    Number(f64),
+    /// Index into [`Expect::measures`].
+    Measure(usize),
+    Negate(Box<Formula>),
+    Abs(Box<Formula>),
+    Sqrt(Box<Formula>),
+    Add(Box<Formula>, Box<Formula>),
+    Subtract(Box<Formula>, Box<Formula>),
+    Multiply(Box<Formula>, Box<Formula>),
+    Divide(Box<Formula>, Box<Formula>),
+    Min(Box<Formula>, Box<Formula>),
+    Max(Box<Formula>, Box<Formula>),
+    /// Comparisons and connectives give 1 or 0.
+    Less(Box<Formula>, Box<Formula>),
+    LessEqual(Box<Formula>, Box<Formula>),
+    Greater(Box<Formula>, Box<Formula>),
+    GreaterEqual(Box<Formula>, Box<Formula>),
+    And(Box<Formula>, Box<Formula>),
+    Or(Box<Formula>, Box<Formula>),
+    Not(Box<Formula>),
+    /// `value ~= target +- tolerance`; a relative tolerance is a fraction of the target.
+    Near {
+        value: Box<Formula>,
+        target: Box<Formula>,
+        tolerance: Box<Formula>,
+        relative: bool,
+    },
+}

@@ -1,0 +1,127 @@
+//! The functions of a compiled model, behind one door, whatever made them.
+
+use std::any::Any;
+use std::sync::Arc;
+
+/// The functions of a model. Each reads and writes the block only, and neither allocates nor calls anything.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
+pub enum Function {
+    /// Parameters and inputs → states, memory, regimes at t = 0, sampled blocks that are due at 0 included.
+    Start,
+    /// → outputs.
+    Outputs,
+    /// → derivatives.
+    Derivatives,
+    /// → jacobian.
+    Jacobian,
+    /// → roots.
+    Roots,
+    /// Runs the sampled blocks that are `due`.
+    Tick,
+    /// One transition per automaton, events and their resets; remembers for crossings.
+    Transitions,
+    /// One fixed step with all that belongs to it: states, count, time, ticks, transitions, outputs, guards.
+    Step,
+}
+
+impl Function {
+    /// All of them, in order.
+    pub const ALL: [Function; 8] = [
+        Function::Start,
+        Function::Outputs,
+        Function::Derivatives,
+        Function::Jacobian,
+        Function::Roots,
+        Function::Tick,
+        Function::Transitions,
+        Function::Step,
+    ];
+
+    /// Its name in listings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Function::Start => "start",
+            Function::Outputs => "outputs",
+            Function::Derivatives => "derivatives",
+            Function::Jacobian => "jacobian",
+            Function::Roots => "roots",
+            Function::Tick => "tick",
+            Function::Transitions => "transitions",
+            Function::Step => "step",
+        }
+    }
+}
+
+/// Machine code of one function: runs it up to `count` times on the block and stops early at the first non-zero
+/// status, which it returns (0: none). `pool` is the description's pool of constants.
+pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
+
+/// Code that is interpreted, or written by hand in tests.
+pub trait Interpret: Send + Sync {
+    /// As [`Entry`], on a block of the description's size.
+    fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64;
+    /// Whether the function is there.
+    fn has(&self, function: Function) -> bool;
+}
+
+/// The code of a model.
+#[derive(Clone)]
+pub enum Code {
+    /// Machine code.
+    Machine(Machine),
+    /// Anything else.
+    Interpreted(Arc<dyn Interpret>),
+}
+
+/// Entries of machine code, and whatever keeps their memory alive.
+#[derive(Clone)]
+pub struct Machine {
+    entries: [Option<Entry>; Function::ALL.len()],
+    size: usize,
+    pool_len: usize,
+    _memory: Arc<dyn Any + Send + Sync>,
+}
+
+impl Machine {
+    /// Entries in the order of [`Function::ALL`] that work on blocks of `size` slots with a pool of `pool_len` numbers.
+    ///
+    /// # Safety
+    /// Each entry must be valid as long as `memory` lives, must access only `block[..size]` and `pool[..pool_len]`
+    /// and must not unwind.
+    pub unsafe fn new(
+        entries: [Option<Entry>; Function::ALL.len()],
+        size: usize,
+        pool_len: usize,
+        memory: Arc<dyn Any + Send + Sync>,
+    ) -> Machine {
+        Machine { entries, size, pool_len, _memory: memory }
+    }
+}
+
+impl Code {
+    /// Whether the function is there.
+    pub fn has(&self, function: Function) -> bool {
+        match self {
+            Code::Machine(machine) => machine.entries[function as usize].is_some(),
+            Code::Interpreted(code) => code.has(function),
+        }
+    }
+
+    /// Runs a function up to `count` times; see [`Entry`].
+    ///
+    /// # Panics
+    /// If the function is not there, or block or pool are shorter than the code needs: mistakes of the caller.
+    pub fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+        match self {
+            Code::Machine(machine) => {
+                assert!(block.len() >= machine.size, "block of {} slots, {} needed", block.len(), machine.size);
+                assert!(pool.len() >= machine.pool_len, "pool of {} numbers, {} needed", pool.len(), machine.pool_len);
+                let entry = machine.entries[function as usize]
+                    .unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
+                // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
+                unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), count) }
+            }
+            Code::Interpreted(code) => code.call(function, block, pool, count),
+        }
+    }
+}
