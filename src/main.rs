@@ -1,1 +1,6 @@
+//! The `fric` command: joins the crates and talks to people.
+
+mod compile;
+mod report;
+
 fn main() {}
