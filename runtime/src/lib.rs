@@ -9,6 +9,7 @@ pub mod measure;
 pub mod record;
 
 pub mod engine;
+pub mod sweep;
 
 #[cfg(test)]
 #[expect(dead_code, reason = "some helpers wait for the adaptive solver")]
