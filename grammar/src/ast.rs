@@ -604,7 +604,11 @@ pub enum RigStatement {
     Overrun(Option<Expr>, Span),
     Predict(Name, Span),
     Safe(Vec<(Path, Expr)>, Span),
-    Stop { condition: Expr, why: Text, span: Span },
+    Stop {
+        condition: Expr,
+        why: Text,
+        span: Span,
+    },
     Record(Vec<Show>, Span),
     Allow(Allow),
 }
