@@ -64,11 +64,11 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
 
     let mut out = format!("{:left$}{}{}\n", "", panel.y.title(), noted(&y_axis.note));
     let row_of = |value: f64| ((1.0 - y_axis.position(value)) * (dots_y - 1.0) / 4.0) as usize;
-    for row in 0..rows {
+    for (row, beside) in beside.iter().enumerate() {
         let tick = y_axis.ticks.iter().find(|tick| row_of(tick.at) == row);
         let (label, edge) = tick.map_or(("", '│'), |tick| (tick.label.as_str(), '┤'));
         out += &format!("{label:>width$} {edge}{}", canvas.row(row, colour), width = left - 1);
-        if let Some(i) = beside[row] {
+        if let Some(i) = *beside {
             let name = cut(&panel.curves[i].name);
             out += &if colour {
                 format!(" \x1b[{}m{name}\x1b[0m", COLOURS[i % COLOURS.len()])
