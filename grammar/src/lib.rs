@@ -5,4 +5,8 @@
 
 pub mod ast;
 pub mod diagnostic;
+pub mod parse;
+mod slips;
 pub mod span;
+mod split;
+pub mod tokens;
