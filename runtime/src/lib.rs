@@ -1,1 +1,16 @@
-//! runtime
+//! Instances and time to results: experiments, their measures and recordings, sweeps.
+//!
+//! In: an [`abi::Instance`] and the plan of an experiment. Out: verdicts, recordings, final values, or the reason
+//! why the run stopped. Knows neither the language nor the compiler: a model is whatever fills the contract of `abi`.
+
+pub mod show;
+
+pub mod measure;
+pub mod record;
+
+pub mod engine;
+pub mod sweep;
+
+#[cfg(test)]
+#[expect(dead_code, reason = "some helpers wait for the adaptive solver")]
+mod models;

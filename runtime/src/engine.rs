@@ -1,0 +1,462 @@
+//! Runs one experiment: steps the model, shows each point to measures and recording, and tells how it ended.
+//!
+//! In: an [`Instance`] and an [`Experiment`]. Out: an [`Outcome`], or a [`Failure`] that names quantity, value and
+//! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
+//! writes no file: whoever calls may look at the fraction done and stop the run.
+
+use crate::measure::{Expectations, Verdict};
+use crate::record::{Recorder, Recording};
+use crate::show;
+use abi::description::{Guard, Kind};
+use abi::plan::{Experiment, Method};
+use abi::unit::Unit;
+use abi::{Instance, Slot};
+use std::fmt;
+use std::ops::ControlFlow;
+
+/// Whether to go on.
+pub type Continue = ControlFlow<()>;
+
+/// Fixed steps between two looks at the caller and at the whole block.
+const BATCH: u64 = 4096;
+
+/// How an experiment ended that ran to its end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Outcome {
+    /// One for each expectation, in order.
+    pub verdicts: Vec<Verdict>,
+    /// What is drawn and written.
+    pub recording: Recording,
+    /// Outputs at the end, in the order of the description.
+    pub finals: Vec<Final>,
+    /// Time at the end in s.
+    pub time: f64,
+    /// What it took.
+    pub work: Work,
+    /// What the reader should know besides: in words, a sentence each.
+    pub notes: Vec<String>,
+}
+
+impl Outcome {
+    /// Whether every expectation held.
+    pub fn passed(&self) -> bool {
+        self.verdicts.iter().all(|verdict| verdict.holds)
+    }
+}
+
+/// The value of an output at the end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Final {
+    /// Dotted path.
+    pub path: String,
+    /// In SI.
+    pub value: f64,
+    /// The unit it is shown in.
+    pub unit: Unit,
+    /// True (1) or false (0) rather than a quantity.
+    pub boolean: bool,
+}
+
+/// What a run took.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Work {
+    /// Steps that count, of any kind.
+    pub steps: u64,
+}
+
+/// Why a run stopped before its end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Failure {
+    /// The reason.
+    pub cause: Cause,
+    /// When, in s.
+    pub time: f64,
+    /// The run up to there.
+    pub recording: Recording,
+}
+
+/// The reason of a [`Failure`].
+#[derive(Clone, PartialEq, Debug)]
+pub enum Cause {
+    /// A watched quantity left its range.
+    Guard {
+        /// The quantity and its range.
+        guard: Box<Guard>,
+        /// Its value in SI.
+        value: f64,
+    },
+    /// A quantity became infinite or not a number.
+    NotFinite {
+        /// Dotted path, or the expression as written.
+        path: String,
+        /// Its value.
+        value: f64,
+    },
+    /// The solver is not there yet.
+    Unavailable,
+    /// The caller said to stop.
+    Stopped,
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let time = show::time(self.time);
+        match &self.cause {
+            Cause::Guard { guard, value } => {
+                let Guard { path, range, unit, .. } = &**guard;
+                let value = show::quantity(*value, unit);
+                let (low, high) = (show::plain(unit.from_si(range.0)), show::quantity(range.1, unit));
+                write!(f, "`{path}` left its range {low} .. {high}: it is {value} at {time}")
+            }
+            Cause::NotFinite { path, value } if value.is_nan() => {
+                write!(f, "`{path}` is not a number at {time}")
+            }
+            Cause::NotFinite { path, .. } => write!(f, "`{path}` is infinite at {time}"),
+            Cause::Unavailable => write!(f, "adaptive runs are not available yet: give a `solver` with a step"),
+            Cause::Stopped => write!(f, "stopped at {time}"),
+        }
+    }
+}
+
+impl std::error::Error for Failure {}
+
+/// Runs an experiment on an instance whose parameters and inputs are set.
+///
+/// `watch` sees the fraction done, from 0 to 1, every few thousand steps and may end the run.
+///
+/// # Errors
+/// A guard that fired, a quantity that is not finite, or the caller's wish to stop; each with the recording so far.
+///
+/// # Panics
+/// If a fixed step or the duration is not a positive number, or a slot of the plan lies outside the block: such a
+/// plan is the mistake of whoever made it.
+pub fn run(
+    instance: Instance,
+    experiment: &Experiment,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Result<Outcome, Failure> {
+    let duration = experiment.duration;
+    assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
+    let mut run = Run::new(instance, experiment);
+    let result = match experiment.solver.method {
+        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => run.fixed(watch),
+        Method::Adaptive => Err(Stop { cause: Cause::Unavailable, time: 0.0 }),
+    };
+    match result {
+        Ok(()) => Ok(run.outcome()),
+        Err(stop) => Err(Failure { cause: stop.cause, time: stop.time, recording: run.observer.recorder.recording() }),
+    }
+}
+
+/// A reason to stop, and when.
+pub(crate) struct Stop {
+    pub(crate) cause: Cause,
+    pub(crate) time: f64,
+}
+
+/// A run under way.
+struct Run<'a> {
+    instance: Instance,
+    experiment: &'a Experiment,
+    observer: Observer,
+    work: Work,
+    notes: Vec<String>,
+}
+
+/// Everything that looks at the points of a run.
+pub(crate) struct Observer {
+    expectations: Expectations,
+    recorder: Recorder,
+    /// Slots that are read; each must be finite.
+    slots: Vec<Slot>,
+}
+
+impl Observer {
+    fn new(experiment: &Experiment) -> Observer {
+        let expectations = Expectations::new(&experiment.expects);
+        let recorder = Recorder::new(&experiment.plots);
+        let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
+        slots.sort();
+        slots.dedup();
+        Observer { expectations, recorder, slots }
+    }
+
+    /// Whether only the last point of a run matters.
+    pub(crate) fn only_last(&self) -> bool {
+        self.recorder.is_empty() && self.expectations.only_last()
+    }
+
+    /// One point of the run: the block after a step, or on one side of an event.
+    pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
+        let block = instance.block();
+        // Zero times a value is zero unless it is infinite or not a number.
+        let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
+        if doubt != 0.0 {
+            // A state that went wrong explains the expression that was asked for.
+            check_finite(instance)?;
+            let bad = self.slots.iter().find(|slot| !block[slot.index()].is_finite());
+            return Err(not_finite(instance, *bad.expect("one of them is not finite")));
+        }
+        let time = block[Slot::TIME.index()];
+        self.expectations.see(time, block);
+        self.recorder.see(time, block);
+        Ok(())
+    }
+}
+
+/// States and outputs must be finite; private quantities may be infinite in a branch that is not taken.
+pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
+    let layout = &instance.description().layout;
+    let finite = |slot: &usize| instance.block()[*slot].is_finite();
+    if let Some(bad) = layout.states.range().find(|slot| !finite(slot)) {
+        return Err(not_finite(instance, Slot(bad as u32)));
+    }
+    let watched = |kind| matches!(kind, Kind::SampledState | Kind::Output);
+    let outputs = instance.description().quantities.iter().filter(|quantity| watched(quantity.kind));
+    match outputs.map(|quantity| quantity.slot).find(|slot| !finite(&slot.index())) {
+        Some(bad) => Err(not_finite(instance, bad)),
+        None => Ok(()),
+    }
+}
+
+fn not_finite(instance: &Instance, slot: Slot) -> Stop {
+    let named = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
+    let path = named.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone());
+    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time: instance.get(Slot::TIME) }
+}
+
+/// What a status that is not 0 means.
+pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop> {
+    if status == 0 {
+        return Ok(());
+    }
+    let guards = &instance.description().guards;
+    let guard = guards
+        .get(status as usize - 1)
+        .unwrap_or_else(|| panic!("status {status} of a model with {} guards", guards.len()));
+    let value = instance.get(guard.slot);
+    let cause = if value.is_finite() {
+        Cause::Guard { guard: Box::new(guard.clone()), value }
+    } else {
+        Cause::NotFinite { path: guard.path.clone(), value }
+    };
+    Err(Stop { cause, time: instance.get(Slot::TIME) })
+}
+
+impl<'a> Run<'a> {
+    fn new(instance: Instance, experiment: &'a Experiment) -> Run<'a> {
+        let observer = Observer::new(experiment);
+        Run { instance, experiment, observer, work: Work::default(), notes: Vec::new() }
+    }
+
+    /// A whole number of fixed steps.
+    fn fixed(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+        let step = self.experiment.solver.step;
+        assert!(step > 0.0 && step.is_finite(), "a step of {step} s");
+        let total = (self.experiment.duration / step).round() as u64;
+        let end = total as f64 * step;
+        if (end - self.experiment.duration).abs() > 1e-9 * self.experiment.duration {
+            self.notes.push(format!("The run ends at {}, after a whole number of steps.", show::time(end)));
+        }
+        let each = !self.observer.only_last();
+        let status = self.instance.start(step);
+        check_status(&self.instance, status)?;
+        check_finite(&self.instance)?;
+        self.observer.see(&self.instance)?;
+        let mut saved = self.instance.block().to_vec();
+        while self.work.steps < total {
+            let count = BATCH.min(total - self.work.steps);
+            saved.copy_from_slice(self.instance.block());
+            let status = if each { self.seen_steps(count)? } else { self.instance.advance(count) };
+            // In a batch, what was not finite may have become so many steps ago, and may be why a guard fired.
+            if check_finite(&self.instance).is_err() {
+                self.instance.block_mut().copy_from_slice(&saved);
+                return Err(self.first_not_finite(count));
+            }
+            if status != 0 {
+                // The step that went too far is worth seeing.
+                if !each {
+                    self.observer.see(&self.instance)?;
+                }
+                check_status(&self.instance, status)?;
+            }
+            self.work.steps += count;
+            if watch(self.work.steps as f64 / total as f64).is_break() {
+                return Err(Stop { cause: Cause::Stopped, time: self.instance.get(Slot::TIME) });
+            }
+        }
+        if !each {
+            self.observer.see(&self.instance)?;
+        }
+        Ok(())
+    }
+
+    /// Steps one by one, each shown; returns the first status that is not 0.
+    fn seen_steps(&mut self, count: u64) -> Result<u64, Stop> {
+        for _ in 0..count {
+            let status = self.instance.advance(1);
+            self.observer.see(&self.instance)?;
+            if status != 0 {
+                return Ok(status);
+            }
+        }
+        Ok(0)
+    }
+
+    /// Repeats the last batch step by step up to where a state or output is not finite.
+    fn first_not_finite(&mut self, count: u64) -> Stop {
+        for _ in 0..count {
+            self.instance.advance(1);
+            if let Err(stop) = check_finite(&self.instance) {
+                return stop;
+            }
+        }
+        unreachable!("the same {count} steps gave a value that is not finite before")
+    }
+
+    fn outcome(self) -> Outcome {
+        let outputs = self.instance.description().quantities.iter().filter(|quantity| quantity.kind == Kind::Output);
+        let finals = outputs.map(|quantity| Final {
+            path: quantity.path.clone(),
+            value: self.instance.get(quantity.slot),
+            unit: quantity.unit.clone(),
+            boolean: quantity.boolean,
+        });
+        Outcome {
+            verdicts: self.observer.expectations.verdicts(),
+            recording: self.observer.recorder.recording(),
+            finals: finals.collect(),
+            time: self.instance.get(Slot::TIME),
+            work: self.work,
+            notes: self.notes,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::models::{self, Model, fixed, plot, reading};
+    use abi::Function;
+    use abi::plan::MeasureKind;
+
+    fn go(instance: Instance, experiment: &Experiment) -> Result<Outcome, Failure> {
+        run(instance, experiment, &mut |_| Continue::Continue(()))
+    }
+
+    #[test]
+    fn a_decay_is_measured_recorded_and_ends_on_its_step() {
+        let instance = models::decay();
+        let mut experiment = fixed(2.0, 1e-3);
+        experiment.plots.push(plot(&instance, &["x", "y"]));
+        experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+        experiment.expects.push(reading(&instance, MeasureKind::Integral, "y"));
+        let outcome = go(instance, &experiment).unwrap();
+        assert_eq!((outcome.work.steps, outcome.time), (2000, 2.0));
+        assert!((outcome.verdicts[0].readings[0].value - (-2f64).exp()).abs() < 1e-13);
+        // Trapezoidal: the error of one step is h³/12 y''.
+        assert!((outcome.verdicts[1].readings[0].value - 2.0 * (1.0 - (-2f64).exp())).abs() < 1e-6);
+        assert_eq!(outcome.recording.rows().len(), 2001);
+        assert_eq!((outcome.finals[0].path.as_str(), outcome.finals.len()), ("y", 1));
+        assert!((outcome.finals[0].value - 2.0 * (-2f64).exp()).abs() < 1e-13);
+        assert_eq!(outcome.notes, [""; 0]);
+    }
+
+    #[test]
+    fn a_duration_that_is_no_whole_number_of_steps_is_rounded_and_said() {
+        let outcome = go(models::decay(), &fixed(1.0, 0.3)).unwrap();
+        assert_eq!(outcome.work.steps, 3);
+        assert_eq!(outcome.notes, ["The run ends at 0.9 s, after a whole number of steps."]);
+    }
+
+    #[test]
+    fn batches_give_the_bits_of_single_steps() {
+        let instance = models::oscillator();
+        let mut experiment = fixed(10.0, 1e-3);
+        experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+        let batched = go(instance.clone(), &experiment).unwrap();
+        experiment.plots.push(plot(&instance, &["x"]));
+        let single = go(instance, &experiment).unwrap();
+        assert_eq!(batched.verdicts, single.verdicts);
+        assert_eq!(batched.finals, single.finals);
+        assert_eq!(single.recording.seen(), 10_001);
+    }
+
+    /// dx/dt = x² from 1: infinite at t = 1 s.
+    fn blow_up() -> Model {
+        Model::new("BlowUp")
+            .state("x", "m")
+            .body(Function::Start, |m| m.set_x(0, 1.0))
+            .body(Function::Derivatives, |m| m.set_dx(0, m.x(0) * m.x(0)))
+    }
+
+    #[test]
+    fn a_guard_stops_the_run_with_name_value_and_time() {
+        let instance = blow_up().within((0.0, 10.0)).build();
+        let mut experiment = fixed(2.0, 1e-3);
+        experiment.plots.push(plot(&instance, &["x"]));
+        let failure = go(instance, &experiment).unwrap_err();
+        assert_eq!(failure.to_string(), "`x` left its range 0 .. 10 m: it is 10.1 m at 0.901 s");
+        assert_eq!(failure.recording.rows().len(), 902);
+    }
+
+    #[test]
+    fn what_is_not_finite_is_named_at_its_first_step() {
+        let drawn = {
+            let instance = blow_up().build();
+            let mut experiment = fixed(20.0, 1e-3);
+            experiment.plots.push(plot(&instance, &["x"]));
+            go(instance, &experiment).unwrap_err()
+        };
+        let batched = go(blow_up().build(), &fixed(20.0, 1e-3)).unwrap_err();
+        assert_eq!((&drawn.cause, drawn.time), (&batched.cause, batched.time));
+        assert!((1.0..1.02).contains(&drawn.time), "{drawn}");
+        assert!(drawn.to_string().starts_with("`x` is infinite at 1.0"), "{drawn}");
+        assert!(drawn.recording.points(0).all(|(_, x)| x.is_finite()));
+    }
+
+    #[test]
+    fn the_caller_can_stop_and_keeps_what_was_recorded() {
+        let instance = models::decay();
+        let mut experiment = fixed(100.0, 1e-3);
+        experiment.plots.push(plot(&instance, &["x"]));
+        let mut fractions = Vec::new();
+        let failure = run(instance, &experiment, &mut |fraction| {
+            fractions.push(fraction);
+            if fraction > 0.1 { Continue::Break(()) } else { Continue::Continue(()) }
+        })
+        .unwrap_err();
+        assert_eq!(failure.cause, Cause::Stopped);
+        assert!(fractions.is_sorted() && fractions.len() == 3);
+        assert!(failure.recording.rows().len() >= 1000);
+    }
+
+    /// The cost of looking: `cargo test --release -p runtime -- --ignored --nocapture steps_cost`.
+    #[test]
+    #[ignore = "prints times, judges nothing"]
+    fn steps_cost_little_beyond_the_model() {
+        let instance = models::cheap();
+        let mut experiment = fixed(100.0, 1e-5);
+        let timed = |what: &str, experiment: &Experiment| {
+            let start = std::time::Instant::now();
+            let outcome = go(instance.clone(), experiment).unwrap();
+            let each = start.elapsed().as_secs_f64() / outcome.work.steps as f64;
+            println!("{what}: {:.1} ns a step, {} steps", 1e9 * each, outcome.work.steps);
+        };
+        timed("nothing", &experiment);
+        experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+        timed("max", &experiment);
+        experiment.expects.push(reading(&instance, MeasureKind::Rms, "x"));
+        timed("max, rms", &experiment);
+        experiment.plots.push(plot(&instance, &["x", "x"]));
+        timed("max, rms, one series", &experiment);
+        experiment.plots.push(plot(&instance, &["y"]));
+        timed("max, rms, two series", &experiment);
+    }
+
+    #[test]
+    fn an_instant_is_a_run_of_no_steps() {
+        let outcome = go(models::decay(), &fixed(0.0, 1e-3)).unwrap();
+        assert_eq!((outcome.work.steps, outcome.finals[0].value), (0, 2.0));
+    }
+}

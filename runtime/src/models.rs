@@ -1,0 +1,354 @@
+//! Models written by hand, for tests: what a compiler would make, as closures over a [`View`].
+
+use abi::description::{Automaton, Guard, Kind, Quantity, Root, Tick};
+use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Series, Solver};
+use abi::table::Interpret;
+use abi::unit::Unit;
+use abi::{Code, Description, Function, Instance, Layout, Slot};
+use std::sync::Arc;
+
+/// The block of a model while one of its functions runs.
+pub struct View<'a> {
+    block: &'a mut [f64],
+    layout: &'a Layout,
+}
+
+impl View<'_> {
+    /// Time in s.
+    pub fn t(&self) -> f64 {
+        self.block[Slot::TIME.index()]
+    }
+    pub fn p(&self, i: usize) -> f64 {
+        self.block[self.layout.params.slot(i).index()]
+    }
+    pub fn x(&self, i: usize) -> f64 {
+        self.block[self.layout.states.slot(i).index()]
+    }
+    pub fn set_x(&mut self, i: usize, value: f64) {
+        self.block[self.layout.states.slot(i).index()] = value;
+    }
+    pub fn memory(&self, i: usize) -> f64 {
+        self.block[self.layout.memory.slot(i).index()]
+    }
+    pub fn set_memory(&mut self, i: usize, value: f64) {
+        self.block[self.layout.memory.slot(i).index()] = value;
+    }
+    pub fn regime(&self, i: usize) -> f64 {
+        self.block[self.layout.regimes.slot(i).index()]
+    }
+    pub fn set_regime(&mut self, i: usize, value: f64) {
+        self.block[self.layout.regimes.slot(i).index()] = value;
+    }
+    pub fn set_y(&mut self, i: usize, value: f64) {
+        self.block[self.layout.outputs.slot(i).index()] = value;
+    }
+    pub fn set_dx(&mut self, i: usize, value: f64) {
+        self.block[self.layout.derivatives.slot(i).index()] = value;
+    }
+    pub fn set_root(&mut self, i: usize, value: f64) {
+        self.block[self.layout.roots.slot(i).index()] = value;
+    }
+    /// ∂f/∂x, all rows, then ∂f/∂t.
+    pub fn set_jacobian(&mut self, values: &[f64]) {
+        self.block[self.layout.jacobian.range()].copy_from_slice(values);
+    }
+    pub fn due(&self, i: usize) -> bool {
+        self.block[self.layout.due.slot(i).index()] == 1.0
+    }
+}
+
+type Body = Box<dyn Fn(&mut View) + Send + Sync>;
+
+/// A model in the making. Every part is optional.
+pub struct Model {
+    name: &'static str,
+    params: Vec<f64>,
+    states: Vec<(&'static str, Unit, (f64, f64))>,
+    outputs: Vec<(&'static str, Unit)>,
+    memory: u32,
+    regimes: Vec<Vec<&'static str>>,
+    roots: Vec<&'static str>,
+    periods: Vec<f64>,
+    guards: Vec<(Slot, &'static str, (f64, f64))>,
+    bodies: [Option<Body>; Function::ALL.len()],
+}
+
+impl Model {
+    pub fn new(name: &'static str) -> Model {
+        Model {
+            name,
+            params: Vec::new(),
+            states: Vec::new(),
+            outputs: Vec::new(),
+            memory: 0,
+            regimes: Vec::new(),
+            roots: Vec::new(),
+            periods: Vec::new(),
+            guards: Vec::new(),
+            bodies: [const { None }; Function::ALL.len()],
+        }
+    }
+    pub fn param(mut self, value: f64) -> Model {
+        self.params.push(value);
+        self
+    }
+    pub fn state(mut self, path: &'static str, unit: &str) -> Model {
+        self.states.push((path, Unit::parse(unit).unwrap(), (f64::NEG_INFINITY, f64::INFINITY)));
+        self
+    }
+    pub fn output(mut self, path: &'static str, unit: &str) -> Model {
+        self.outputs.push((path, Unit::parse(unit).unwrap()));
+        self
+    }
+    pub fn memory(mut self, slots: u32) -> Model {
+        self.memory = slots;
+        self
+    }
+    pub fn automaton(mut self, regimes: &[&'static str]) -> Model {
+        self.regimes.push(regimes.to_vec());
+        self
+    }
+    pub fn root(mut self, text: &'static str) -> Model {
+        self.roots.push(text);
+        self
+    }
+    /// A sampled block of this period in s.
+    pub fn every(mut self, period: f64) -> Model {
+        self.periods.push(period);
+        self
+    }
+    /// Watches the state declared last.
+    pub fn within(mut self, range: (f64, f64)) -> Model {
+        self.states.last_mut().unwrap().2 = range;
+        self
+    }
+    pub fn body(mut self, function: Function, body: impl Fn(&mut View) + Send + Sync + 'static) -> Model {
+        self.bodies[function as usize] = Some(Box::new(body));
+        self
+    }
+
+    /// The finished instance. `Step` is a classical Runge-Kutta step of the derivatives with what belongs to it.
+    pub fn build(mut self) -> Instance {
+        let n = self.states.len() as u32;
+        let layout = Layout::new([
+            self.params.len() as u32,
+            0,
+            n,
+            self.memory + self.periods.len() as u32,
+            self.regimes.len() as u32,
+            self.outputs.len() as u32,
+            n,
+            self.roots.len() as u32,
+            n * n + n,
+            self.periods.len() as u32,
+        ]);
+        let unbounded = (f64::NEG_INFINITY, f64::INFINITY);
+        let mut quantities = Vec::new();
+        let quantity = |path: &str, kind, unit: &Unit, slot, range| Quantity {
+            path: path.into(),
+            kind,
+            unit: unit.clone(),
+            boolean: false,
+            slot,
+            range,
+            doc: None,
+        };
+        let mut guards = Vec::new();
+        for (i, (path, unit, range)) in self.states.iter().enumerate() {
+            let slot = layout.states.slot(i);
+            quantities.push(quantity(path, Kind::State, unit, slot, *range));
+            if *range != unbounded {
+                self.guards.push((slot, path, *range));
+                guards.push(Guard { path: (*path).into(), slot, range: *range, unit: unit.clone() });
+            }
+        }
+        for (i, (path, unit)) in self.outputs.iter().enumerate() {
+            quantities.push(quantity(path, Kind::Output, unit, layout.outputs.slot(i), unbounded));
+        }
+        let automata = self.regimes.iter().enumerate().map(|(i, regimes)| Automaton {
+            path: String::new(),
+            regimes: regimes.iter().map(|name| (*name).to_string()).collect(),
+            slot: layout.regimes.slot(i),
+        });
+        let ticks = (0..self.periods.len())
+            .map(|i| Tick { period: layout.memory.slot(self.memory as usize + i), due: layout.due.slot(i) });
+        let description = Description {
+            name: self.name.into(),
+            quantities,
+            ticks: ticks.collect(),
+            automata: automata.collect(),
+            guards,
+            roots: self.roots.iter().map(|text| Root { text: (*text).into() }).collect(),
+            pool: Arc::new([]),
+            layout,
+        };
+        let params = self.params.clone();
+        let hand = Hand { layout: description.layout.clone(), model: self };
+        Instance::new(Arc::new(description), Code::Interpreted(Arc::new(hand)), &params)
+    }
+}
+
+struct Hand {
+    layout: Layout,
+    model: Model,
+}
+
+impl Hand {
+    fn run(&self, function: Function, block: &mut [f64]) {
+        if let Some(body) = &self.model.bodies[function as usize] {
+            body(&mut View { block, layout: &self.layout });
+        }
+    }
+
+    /// dx/dt at `x0 + h·k`, in `dx`.
+    fn slope(&self, block: &mut [f64], t: f64, x0: &[f64], k: &[f64], h: f64) -> Vec<f64> {
+        block[Slot::TIME.index()] = t;
+        let states = self.layout.states.range();
+        for ((x, x0), k) in block[states].iter_mut().zip(x0).zip(k) {
+            *x = x0 + h * k;
+        }
+        self.run(Function::Derivatives, block);
+        block[self.layout.derivatives.range()].to_vec()
+    }
+
+    fn step(&self, block: &mut [f64]) -> u64 {
+        let h = block[Slot::STEP.index()];
+        let t = block[Slot::COUNT.index()] * h;
+        let states = self.layout.states.range();
+        let x0 = block[states.clone()].to_vec();
+        let k1 = self.slope(block, t, &x0, &vec![0.0; x0.len()], 0.0);
+        let k2 = self.slope(block, t + 0.5 * h, &x0, &k1, 0.5 * h);
+        let k3 = self.slope(block, t + 0.5 * h, &x0, &k2, 0.5 * h);
+        let k4 = self.slope(block, t + h, &x0, &k3, h);
+        for (i, slot) in states.enumerate() {
+            block[slot] = x0[i] + h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+        }
+        block[Slot::COUNT.index()] += 1.0;
+        block[Slot::TIME.index()] = block[Slot::COUNT.index()] * h;
+        self.run(Function::Transitions, block);
+        self.run(Function::Outputs, block);
+        let bad = |(slot, _, range): &(Slot, &str, (f64, f64))| {
+            let value = block[slot.index()];
+            !(range.0 <= value && value <= range.1)
+        };
+        self.model.guards.iter().position(bad).map_or(0, |k| k as u64 + 1)
+    }
+}
+
+impl Interpret for Hand {
+    fn call(&self, function: Function, block: &mut [f64], _pool: &[f64], count: u64) -> u64 {
+        for _ in 0..count {
+            if function == Function::Step {
+                let status = self.step(block);
+                if status != 0 {
+                    return status;
+                }
+            } else {
+                self.run(function, block);
+                if function == Function::Start {
+                    let periods = self.layout.memory.start as usize + self.model.memory as usize;
+                    block[periods..periods + self.model.periods.len()].copy_from_slice(&self.model.periods);
+                }
+            }
+        }
+        0
+    }
+
+    fn has(&self, function: Function) -> bool {
+        function == Function::Step || self.model.bodies[function as usize].is_some()
+    }
+}
+
+/// As `decay`, by a step of four operations: what is left is the cost of whoever runs it.
+pub fn cheap() -> Instance {
+    struct Cheap(Layout);
+    impl Interpret for Cheap {
+        fn call(&self, _: Function, block: &mut [f64], _pool: &[f64], count: u64) -> u64 {
+            let (x, y) = (self.0.states.start as usize, self.0.outputs.start as usize);
+            for _ in 0..count {
+                block[Slot::COUNT.index()] += 1.0;
+                block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
+                block[x] -= block[Slot::STEP.index()] * block[x];
+                block[y] = 2.0 * block[x];
+            }
+            0
+        }
+        fn has(&self, function: Function) -> bool {
+            function != Function::Transitions
+        }
+    }
+    let decay = decay();
+    let layout = decay.description().layout.clone();
+    Instance::new(decay.description().clone(), Code::Interpreted(Arc::new(Cheap(layout))), &[])
+}
+
+/// `x = a exp(−t/tau)` by its equation, with a = 1, tau = 1 s; output `y = 2 x`.
+pub fn decay() -> Instance {
+    Model::new("Decay")
+        .state("x", "m")
+        .output("y", "m")
+        .body(Function::Start, |m| m.set_x(0, 1.0))
+        .body(Function::Derivatives, |m| m.set_dx(0, -m.x(0)))
+        .body(Function::Jacobian, |m| m.set_jacobian(&[-1.0, 0.0]))
+        .body(Function::Outputs, |m| m.set_y(0, 2.0 * m.x(0)))
+        .build()
+}
+
+/// x = sin t, v = cos t.
+pub fn oscillator() -> Instance {
+    Model::new("Oscillator")
+        .state("x", "m")
+        .state("v", "m/s")
+        .output("energy", "J")
+        .body(Function::Start, |m| {
+            m.set_x(0, 0.0);
+            m.set_x(1, 1.0);
+        })
+        .body(Function::Derivatives, |m| {
+            m.set_dx(0, m.x(1));
+            m.set_dx(1, -m.x(0));
+        })
+        .body(Function::Jacobian, |m| m.set_jacobian(&[0.0, 1.0, -1.0, 0.0, 0.0, 0.0]))
+        .body(Function::Outputs, |m| m.set_y(0, 0.5 * (m.x(0) * m.x(0) + m.x(1) * m.x(1))))
+        .build()
+}
+
+/// The slot of a quantity.
+pub fn slot(instance: &Instance, path: &str) -> Slot {
+    instance.description().quantity(path).unwrap_or_else(|| panic!("no quantity `{path}`")).slot
+}
+
+/// An experiment that neither draws nor expects.
+pub fn fixed(duration: f64, step: f64) -> Experiment {
+    let solver = Solver { method: Method::Rk4, step, tol: 0.0 };
+    Experiment { name: "test".into(), duration, solver, plots: Vec::new(), expects: Vec::new(), corners: Vec::new() }
+}
+
+/// An adaptive experiment that neither draws nor expects.
+pub fn adaptive(duration: f64, tol: f64) -> Experiment {
+    Experiment { solver: Solver { method: Method::Adaptive, step: 0.0, tol }, ..fixed(duration, 1.0) }
+}
+
+/// `text` over the whole run, for reading one measure: the condition is the measure itself.
+pub fn reading(instance: &Instance, kind: MeasureKind, path: &str) -> Expect {
+    let quantity = instance.description().quantity(path).unwrap_or_else(|| panic!("no quantity `{path}`"));
+    let measure = Measure { text: format!("{kind:?}({path})"), kind, slot: quantity.slot, unit: quantity.unit.clone() };
+    Expect {
+        text: measure.text.clone(),
+        measures: vec![measure],
+        condition: Formula::Measure(0),
+        after: 0.0,
+        before: f64::INFINITY,
+    }
+}
+
+/// A plot of these quantities over time.
+pub fn plot(instance: &Instance, paths: &[&str]) -> Plot {
+    let series = |path: &&str| Series {
+        label: (*path).into(),
+        slot: slot(instance, path),
+        unit: instance.description().quantity(path).unwrap().unit.clone(),
+        boolean: false,
+    };
+    Plot { series: paths.iter().map(series).collect(), against: None }
+}

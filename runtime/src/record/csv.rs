@@ -1,0 +1,100 @@
+//! Writes a recording as comma-separated values: `t [s],body.v [mm/s]`, one row for each point kept.
+//!
+//! Values stand in the units shown, as the shortest decimals that read back to the same bits.
+
+use super::Recording;
+use crate::show;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+/// Writes the file whole or not at all: into a neighbour first, which then takes the name.
+///
+/// # Errors
+/// What the file system answers; a file of that name is then as it was.
+pub fn save(recording: &Recording, path: &Path) -> io::Result<()> {
+    let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?;
+    let mut part = name.to_os_string();
+    part.push(format!(".{}.part", std::process::id()));
+    let part = path.with_file_name(part);
+    let written = File::create(&part).and_then(|file| {
+        let mut file = BufWriter::new(file);
+        write(recording, &mut file)?;
+        file.flush()?;
+        file.get_ref().sync_all()?;
+        fs::rename(&part, path)
+    });
+    if written.is_err() {
+        // The first error is the one worth telling.
+        let _ = fs::remove_file(&part);
+    }
+    written
+}
+
+/// Writes header and rows.
+///
+/// # Errors
+/// What the writer answers.
+pub fn write(recording: &Recording, to: impl Write) -> io::Result<()> {
+    let mut csv = ::csv::Writer::from_writer(to);
+    let header = recording.columns().iter().map(|column| match column.boolean {
+        true => column.label.clone(),
+        false => format!("{} [{}]", column.label, column.unit),
+    });
+    csv.write_record(std::iter::once("t [s]".to_string()).chain(header))?;
+    for row in recording.rows() {
+        let shown = recording.columns().iter().zip(&row[1..]).map(|(column, value)| column.unit.from_si(*value));
+        csv.write_record(std::iter::once(row[0]).chain(shown).map(show::plain))?;
+    }
+    csv.flush()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::record::Recorder;
+    use abi::Slot;
+    use abi::plan::{Plot, Series};
+    use abi::unit::Unit;
+
+    fn recording() -> Recording {
+        let series = |label: &str, slot, unit: &str, boolean| Series {
+            label: label.into(),
+            slot: Slot(slot),
+            unit: Unit::parse(unit).unwrap(),
+            boolean,
+        };
+        let plot = Plot {
+            series: vec![series("body.v", 3, "mm/s", false), series("max(a, b)", 4, "1", false)],
+            against: Some(series("fr.stick", 5, "1", true)),
+        };
+        let mut recorder = Recorder::new(&[plot]);
+        recorder.see(0.0, &[0.0, 0.0, 0.0, 0.25, 1.0 / 3.0, 1.0]);
+        recorder.see(1e-5, &[0.0, 0.0, 0.0, -0.001, 1e-20, 0.0]);
+        recorder.recording()
+    }
+
+    #[test]
+    fn headers_carry_units_and_numbers_read_back() {
+        let mut text = Vec::new();
+        write(&recording(), &mut text).unwrap();
+        let expected = "t [s],body.v [mm/s],\"max(a, b) [1]\",fr.stick\n0,250,0.3333333333333333,1\n1e-5,-1,1e-20,0\n";
+        assert_eq!(String::from_utf8(text).unwrap(), expected);
+    }
+
+    #[test]
+    fn a_file_is_whole_or_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.csv");
+        fs::write(&path, "before").unwrap();
+        save(&recording(), &path).unwrap();
+        assert!(fs::read_to_string(&path).unwrap().starts_with("t [s],"));
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+
+        // A folder of that name cannot be replaced; nothing is left behind.
+        let taken = folder.path().join("taken");
+        fs::create_dir(&taken).unwrap();
+        assert!(save(&recording(), &taken).is_err());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+    }
+}

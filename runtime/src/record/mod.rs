@@ -1,0 +1,257 @@
+//! Keeps the course of a run for plots and files in bounded memory.
+//!
+//! In: the points of a run in order of time. Out: a [`Recording`]: rows of time and values that show every minimum
+//! and maximum of every column, and no fewer than 1,000 of them if there were that many. Measures do not read it.
+
+pub mod csv;
+
+use abi::Slot;
+use abi::plan::{Plot, Series};
+use abi::unit::Unit;
+
+/// Buckets at most. When they are full, neighbours are joined, so at least half of them hold a row or more.
+const BUCKETS: usize = 4096;
+
+/// A column of a recording.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Column {
+    /// As written in the plot: `body.v`.
+    pub label: String,
+    /// The unit it is shown in; rows hold SI.
+    pub unit: Unit,
+    /// True (1) or false (0) rather than a quantity.
+    pub boolean: bool,
+}
+
+/// What a run was seen to do: one row for each point kept, in order of time. An event has two rows at one time.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Recording {
+    columns: Vec<Column>,
+    /// Time in s, then the columns in SI; row by row.
+    numbers: Vec<f64>,
+    seen: u64,
+}
+
+impl Recording {
+    /// The columns, without time.
+    pub fn columns(&self) -> &[Column] {
+        &self.columns
+    }
+
+    /// The rows: time in s, then the columns in SI.
+    pub fn rows(&self) -> impl ExactSizeIterator<Item = &[f64]> {
+        self.numbers.chunks_exact(self.columns.len() + 1)
+    }
+
+    /// Number of points of the run, kept or not.
+    pub fn seen(&self) -> u64 {
+        self.seen
+    }
+
+    /// Which column holds this series.
+    pub fn column(&self, series: &Series) -> Option<usize> {
+        self.columns.iter().position(|column| column == &Column::of(series))
+    }
+
+    /// Time in s and value in SI of one column, for drawing.
+    pub fn points(&self, column: usize) -> impl Iterator<Item = (f64, f64)> {
+        self.rows().map(move |row| (row[0], row[column + 1]))
+    }
+}
+
+impl Column {
+    fn of(series: &Series) -> Column {
+        Column { label: series.label.clone(), unit: series.unit.clone(), boolean: series.boolean }
+    }
+}
+
+/// A recording in the making.
+///
+/// Points are gathered in buckets of 1, 2, 4, … consecutive points. A bucket keeps whole rows: its first, and for each
+/// column those with the least and the greatest value. Whole rows, so that a plot of one quantity against another
+/// shows points that occurred. When all buckets are full, each two become one: the extremes of both are among theirs.
+pub struct Recorder {
+    columns: Vec<Column>,
+    slots: Vec<Slot>,
+    /// Buckets behind each other, each of 2 · columns + 1 rows, some of which may be the same.
+    /// A row is the number of its point, its time, and the columns.
+    buckets: Vec<f64>,
+    /// Points a full bucket stands for.
+    capacity: u64,
+    /// Points in the last bucket.
+    filled: u64,
+    seen: u64,
+    /// The row seen last, which ends the recording.
+    last: Vec<f64>,
+}
+
+impl Recorder {
+    /// Records every series of these plots once.
+    pub fn new(plots: &[Plot]) -> Recorder {
+        let mut columns: Vec<Column> = Vec::new();
+        let mut slots = Vec::new();
+        for series in plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against)) {
+            let column = Column::of(series);
+            if !columns.contains(&column) {
+                columns.push(column);
+                slots.push(series.slot);
+            }
+        }
+        let last = vec![0.0; slots.len() + 2];
+        Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last }
+    }
+
+    /// Whether there is nothing to record.
+    pub fn is_empty(&self) -> bool {
+        self.slots.is_empty()
+    }
+
+    /// The slots that are read.
+    pub fn slots(&self) -> impl Iterator<Item = Slot> {
+        self.slots.iter().copied()
+    }
+
+    /// Shows the state of the model at time `t` in s. Times must not decrease.
+    pub fn see(&mut self, t: f64, block: &[f64]) {
+        if self.slots.is_empty() {
+            return;
+        }
+        self.last[0] = self.seen as f64;
+        self.last[1] = t;
+        for (value, slot) in self.last[2..].iter_mut().zip(&self.slots) {
+            *value = block[slot.index()];
+        }
+        self.seen += 1;
+        if self.filled < self.capacity {
+            self.filled += 1;
+            let bucket = self.buckets.len() - self.bucket_len();
+            take(&mut self.buckets[bucket..], &self.last);
+            return;
+        }
+        if self.buckets.len() == BUCKETS * self.bucket_len() {
+            self.join();
+        }
+        self.filled = 1;
+        for _ in 0..2 * self.slots.len() + 1 {
+            self.buckets.extend_from_slice(&self.last);
+        }
+    }
+
+    /// Length of a bucket.
+    fn bucket_len(&self) -> usize {
+        (2 * self.slots.len() + 1) * self.last.len()
+    }
+
+    /// Joins each two neighbouring buckets.
+    fn join(&mut self) {
+        let (len, width) = (self.bucket_len(), self.last.len());
+        for pair in 0..BUCKETS / 2 {
+            self.buckets.copy_within(2 * pair * len..(2 * pair + 1) * len, pair * len);
+            let (joined, rest) = self.buckets.split_at_mut((2 * pair + 1) * len);
+            for row in rest[..len].chunks_exact(width) {
+                take(&mut joined[pair * len..][..len], row);
+            }
+        }
+        self.buckets.truncate(BUCKETS / 2 * len);
+        self.capacity *= 2;
+    }
+
+    /// What was recorded.
+    pub fn recording(&self) -> Recording {
+        let mut numbers = Vec::new();
+        let mut rows: Vec<&[f64]> = Vec::new();
+        for bucket in self.buckets.chunks_exact(self.bucket_len()) {
+            rows.clear();
+            rows.extend(bucket.chunks_exact(self.last.len()));
+            rows.sort_by(|a, b| a[0].total_cmp(&b[0]));
+            rows.dedup_by_key(|row| row[0]);
+            numbers.extend(rows.iter().flat_map(|row| &row[1..]));
+        }
+        if self.seen > 0 && !numbers.ends_with(&self.last[1..]) {
+            numbers.extend(&self.last[1..]);
+        }
+        Recording { columns: self.columns.clone(), numbers, seen: self.seen }
+    }
+}
+
+/// Keeps a later row in a bucket where it sets a new extreme.
+fn take(bucket: &mut [f64], row: &[f64]) {
+    let width = row.len();
+    let (_, pairs) = bucket.split_at_mut(width);
+    for (column, pair) in (2..).zip(pairs.chunks_exact_mut(2 * width)) {
+        let (min, max) = pair.split_at_mut(width);
+        if row[column] < min[column] {
+            min.copy_from_slice(row);
+        }
+        if row[column] > max[column] {
+            max.copy_from_slice(row);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A recorder of two quantities, in slots 3 and 4.
+    fn recorder() -> Recorder {
+        let series =
+            |label: &str, slot| Series { label: label.into(), slot: Slot(slot), unit: Unit::none(), boolean: false };
+        Recorder::new(&[
+            Plot { series: vec![series("a", 3), series("b", 4)], against: None },
+            Plot { series: vec![series("a", 3)], against: Some(series("b", 4)) },
+        ])
+    }
+
+    fn record(points: u64, quantities: impl Fn(f64) -> (f64, f64)) -> Recording {
+        let mut recorder = recorder();
+        for n in 0..points {
+            let (a, b) = quantities(n as f64);
+            recorder.see(n as f64, &[0.0, 0.0, 0.0, a, b]);
+        }
+        recorder.recording()
+    }
+
+    #[test]
+    fn few_points_are_kept_whole() {
+        let recording = record(1000, |n| (n.sin(), n.cos()));
+        assert_eq!(recording.rows().len(), 1000);
+        assert_eq!(recording.columns().len(), 2);
+        assert_eq!(recording.points(1).nth(7), Some((7.0, 7f64.cos())));
+    }
+
+    #[test]
+    fn decimation_keeps_spikes_ends_and_a_thousand_rows() {
+        let spikes = |n: f64| (if n == 777_777.0 { 5.0 } else { n / 1e6 }, if n == 123_456.0 { -9.0 } else { 0.0 });
+        let recording = record(1_000_000, spikes);
+        let times: Vec<f64> = recording.rows().map(|row| row[0]).collect();
+        assert!(times.is_sorted_by(|a, b| a < b));
+        assert!((1000..=5 * BUCKETS).contains(&times.len()), "{} rows", times.len());
+        assert_eq!((times[0], *times.last().unwrap()), (0.0, 999_999.0));
+        assert!(recording.points(0).any(|point| point == (777_777.0, 5.0)));
+        assert!(recording.points(1).any(|point| point == (123_456.0, -9.0)));
+        assert_eq!(recording.seen(), 1_000_000);
+    }
+
+    #[test]
+    fn the_least_number_of_rows_is_kept_at_every_length() {
+        // A constant keeps only the first row of each bucket: the worst case.
+        let mut recorder = recorder();
+        for n in 0..40_000u64 {
+            recorder.see(n as f64, &[0.0; 5]);
+            if n % 997 == 0 {
+                assert!(recorder.recording().rows().len() as u64 >= 1000.min(n + 1));
+            }
+        }
+    }
+
+    #[test]
+    fn both_sides_of_an_event_are_rows() {
+        let mut recorder = recorder();
+        for (t, a) in [(0.0, 1.0), (1.0, 2.0), (1.0, -2.0), (2.0, -2.0)] {
+            recorder.see(t, &[0.0, 0.0, 0.0, a, 0.0]);
+        }
+        let recording = recorder.recording();
+        assert_eq!(recording.points(0).collect::<Vec<_>>(), [(0.0, 1.0), (1.0, 2.0), (1.0, -2.0), (2.0, -2.0)]);
+    }
+}
