@@ -834,7 +834,8 @@ impl<'a> Emit<'a> {
                 known.insert(top, !params.contains(slot));
                 continue;
             }
-            let operands = op.operands();
+            let mut operands = Vec::new();
+            op.each_operand(|operand| operands.push(operand));
             let open: Vec<Value> = operands.iter().copied().filter(|v| !known.contains_key(v)).collect();
             if open.is_empty() {
                 known.insert(top, operands.iter().any(|v| known[v]));

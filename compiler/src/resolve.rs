@@ -102,6 +102,15 @@ impl Loaded {
         names
     }
 
+    /// Adds a text from outside, such as a value of the command line: it has places, but no names of its own.
+    pub fn add_text(&mut self, name: &str, text: &str) -> FileId {
+        let id = FileId(self.files.0.len() as u32);
+        let file = SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false };
+        self.files.0.push(file);
+        self.scopes.push(Scope::default());
+        id
+    }
+
     /// The file that was asked for.
     pub fn root(&self) -> FileId {
         FileId(0)
