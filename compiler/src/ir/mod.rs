@@ -7,6 +7,8 @@ pub mod print;
 pub mod verify;
 pub mod eval;
 pub mod build;
+#[cfg(test)]
+pub mod random;
 
 use abi::Slot;
 
