@@ -618,13 +618,16 @@ impl<'a> Flattener<'a> {
             let slot_rotary = slot.rotary || parent_rotary;
             let ports = self.interface(file, slot)?;
             self.check_fit(model, item.file, instance, rotary, ports, slot, slot_rotary);
+            let has = |name: &str| {
+                declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name)
+            };
+            let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
             if replaced {
-                let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
-                let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
                 let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
-                let kept = wiring.into_iter().filter(|arg| port(arg.name) && has(arg.name) && !given.contains(&arg.name));
-                args.extend(kept.collect::<Vec<_>>());
+                args.extend(wiring.into_iter().filter(|arg| port(arg.name) && !given.contains(&arg.name)));
             }
+            // A slot drops its wiring for a model that lacks an optional port.
+            args.retain(|arg| !port(arg.name) || has(arg.name));
         }
         self.models.push(item);
         let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
@@ -1817,7 +1820,11 @@ impl<'a> Flattener<'a> {
     fn unknown_function(&mut self, function: &Name, env: &Env) {
         let mut error = Diagnostic::error("E0204", format!("there is no function `{}`", function.text))
             .label(function.span, "not declared");
-        let own = self.loaded.visible(env.file, Space::Function);
+        let loaded = self.loaded;
+        let mut known = loaded.visible(env.file, Space::Function);
+        for name in Builtin::names() {
+            known.push(name);
+        }
         let help = match function.text.as_str() {
             "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
             "sgn" | "signum" => Some("write `sign(…)`".into()),
@@ -1825,7 +1832,7 @@ impl<'a> Flattener<'a> {
             "pow" => Some("write `a ^ b`".into()),
             "sat" | "limit" | "saturate" => Some("write `clamp(x, low, high)`".into()),
             "fabs" => Some("write `abs(…)`".into()),
-            name => nearest(name, own.into_iter().chain(Builtin::names())).map(|near| format!("did you mean `{near}`?")),
+            name => nearest(name, known).map(|near| format!("did you mean `{near}`?")),
         };
         if let Some(help) = help.or_else(|| self.module_with(&function.text).map(|m| format!("add `import {m}`"))) {
             error = error.help(help);

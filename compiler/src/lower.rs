@@ -117,7 +117,7 @@ fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     }
     let func = emit.build.finish();
     let mut block = vec![0.0; Slot::FIXED as usize + exprs.len()];
-    crate::backend::interp::run(&crate::math::expand(&func), &mut block, &plan.description.pool);
+    crate::backend::interp::run_once(&crate::math::expand(&func), &mut block, &plan.description.pool);
     block.split_off(Slot::FIXED as usize)
 }
 

@@ -29,9 +29,32 @@ const ENERGY: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 
 /// Checks and infers the units of a system.
 pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) -> Types {
+    let mut found = Vec::new();
+    let (types, strangers) = walk(system, files, &[], &mut found);
+    if strangers.is_empty() {
+        diagnostics.extend(found);
+        return types;
+    }
+    // A straight model in a rotary place gets and gives wrong units everywhere: say the cause, not what follows.
+    let mut again = Vec::new();
+    let (types, _) = walk(system, files, &strangers, &mut again);
+    diagnostics.extend(found.into_iter().filter(|diagnostic| diagnostic.code == "E0108"));
+    diagnostics.extend(again);
+    types
+}
+
+/// One pass; the quantities of `strangers` fit everything. Returns the instances found to be of the other kind of motion.
+fn walk(
+    system: &System,
+    files: &Files,
+    strangers: &[InstanceId],
+    diagnostics: &mut Vec<Diagnostic>,
+) -> (Types, Vec<InstanceId>) {
     let mut checker = Checker {
         system,
         files,
+        strangers,
+        found: Vec::new(),
         diagnostics,
         unknowns: Vec::new(),
         types: Vec::with_capacity(system.nodes.len()),
@@ -44,7 +67,8 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
     }
     checker.definitions();
     checker.statements();
-    checker.finish()
+    let found = std::mem::take(&mut checker.found);
+    (checker.finish(), found)
 }
 
 /// A dimension with unknowns in it: `base · Π unknown^exponent`.
@@ -85,6 +109,10 @@ enum Kind {
 struct Checker<'a> {
     system: &'a System,
     files: &'a Files,
+    /// Instances whose quantities fit everything.
+    strangers: &'a [InstanceId],
+    /// Instances found to be straight in a rotary place, or the reverse.
+    found: Vec<InstanceId>,
     diagnostics: &'a mut Vec<Diagnostic>,
     /// What each unknown was found to be.
     unknowns: Vec<Option<Term>>,
@@ -165,8 +193,12 @@ impl Checker<'_> {
         let boolean = boolean_vars(self.system);
         for (var, boolean) in self.system.vars.iter().zip(boolean) {
             let kind = match (&var.unit, var.kind) {
+                _ if self.strangers.contains(&var.instance) => Kind::Unknown,
                 (Some((unit, _)), _) => Kind::Real(Term::known(unit.dimension)),
                 _ if boolean => Kind::Boolean,
+                (None, VarKind::Param) if var.shown.is_some() => {
+                    Kind::Real(Term::known(var.shown.as_ref().map_or(Dimension::NONE, |unit| unit.dimension)))
+                }
                 (None, VarKind::Input) => Kind::Real(Term::known(Dimension::NONE)),
                 (None, _) => Kind::Real(self.fresh()),
             };
@@ -486,7 +518,7 @@ impl Checker<'_> {
             all.into_iter().collect()
         };
         let Some(terms) = terms else { return Kind::Unknown };
-        let mut need = |checker: &mut Self, k: usize, wanted: &Term| {
+        let need = |checker: &mut Self, k: usize, wanted: &Term| {
             if !checker.unify(&terms[k], wanted) {
                 checker.mismatch(args[k], &terms[k], wanted);
             }
@@ -720,6 +752,9 @@ impl Checker<'_> {
                 let name = &self.system.instance(var.instance).model;
                 let expects = format!("expects {} in {}", var.name, self.shown(&wanted));
                 let rotary = self.system.instance(var.instance).rotary;
+                if (!rotary && needs.rotary() == has) || (rotary && has.rotary() == needs) {
+                    self.found.push(var.instance);
+                }
                 let error = if !rotary && needs.rotary() == has {
                     let message = format!("{name} is written for straight motion, but `{}` gets {}", var.name, angular(has));
                     Diagnostic::error("E0108", message)
@@ -830,7 +865,12 @@ impl Checker<'_> {
             let unit = match (&var.unit, base(&self, kind)) {
                 (Some((unit, _)), _) => unit.clone(),
                 (None, Some((dimension, known))) => {
-                    let defined = !matches!(var.definition, Definition::Missing);
+                    let defined = match &var.definition {
+                        Definition::Missing | Definition::Free => false,
+                        Definition::Value(value, _) | Definition::Held { value, .. } => *self.kind(*value) != Kind::Unknown,
+                        Definition::Continuous { rate, .. } => *self.kind(*rate) != Kind::Unknown,
+                        Definition::Sampled { next, .. } => *self.kind(*next) != Kind::Unknown,
+                    };
                     if !known && defined && matches!(var.kind, VarKind::Output | VarKind::Let | VarKind::State) {
                         lost.push(VarId(k as u32));
                     }

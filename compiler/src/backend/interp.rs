@@ -97,3 +97,8 @@ mod tests {
         assert_eq!(block[a.index()..=b.index()], [4.0, 4.0]);
     }
 }
+
+/// Runs an expanded function once on a block of any size that holds all its slots; returns its status.
+pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
+    run(func, block, pool, &mut vec![0; func.ops.len()])
+}
