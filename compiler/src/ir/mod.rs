@@ -7,6 +7,7 @@ pub mod print;
 pub mod verify;
 pub mod eval;
 pub mod build;
+pub mod expr;
 #[cfg(test)]
 pub mod random;
 
