@@ -270,6 +270,7 @@ fn completions_and_the_man_page_are_printed() {
         folder.check(&["completions", shell], 0, "explain");
     }
     folder.check(&["man"], 0, ".TH fric 1");
+    folder.check(&["man", "run"], 0, "\\-\\-solver");
 }
 
 #[test]

@@ -44,9 +44,14 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
             terminal.print(&String::from_utf8_lossy(&out));
             End::Fine
         }
-        Command::Man => {
+        Command::Man { command } => {
             let mut out = Vec::new();
-            let rendered = clap_mangen::Man::new(Args::command()).render(&mut out);
+            let mut tree = Args::command();
+            // Only a built tree knows that a command's name is `fric run`.
+            tree.build();
+            let page = command.as_ref().and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
+            let name = command.as_ref().map_or("fric".into(), |name| format!("fric-{name}"));
+            let rendered = clap_mangen::Man::new(page).title(name).render(&mut out);
             rendered.expect("writing to memory does not fail");
             terminal.print(&String::from_utf8_lossy(&out));
             End::Fine
