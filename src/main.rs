@@ -12,7 +12,6 @@ mod project;
 mod report;
 mod results;
 #[allow(missing_docs, dead_code)]
-mod stub;
 mod terminal;
 mod value;
 
