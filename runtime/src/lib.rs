@@ -8,6 +8,10 @@ pub mod show;
 pub mod measure;
 pub mod record;
 
+mod outcome;
+
+mod observe;
+
 pub mod engine;
 pub mod sweep;
 
