@@ -1,13 +1,14 @@
 //! Runs one experiment: steps the model, shows each point to measures and recording, and tells how it ended.
 //!
 //! In: an [`Instance`] and an [`Experiment`]. Out: an [`Outcome`], or a [`Failure`] that names quantity, value and
-//! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
+//! instant. Fixed steps are in the model's own code; adaptive ones in [`solver`](crate::solver). Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
 use crate::observe::{Observer, check_finite, check_status};
 use crate::outcome::Stop;
 pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
 use crate::show;
+use crate::solver::adaptive;
 use abi::description::Kind;
 use abi::plan::{Experiment, Method};
 use abi::{Instance, Slot};
@@ -35,7 +36,7 @@ pub fn run(
     let mut run = Run::new(instance, experiment);
     let result = match experiment.solver.method {
         Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => run.fixed(watch),
-        Method::Adaptive => Err(Stop { cause: Cause::Unavailable, time: 0.0 }),
+        Method::Adaptive => adaptive::run(&mut run.instance, experiment, &mut run.observer, &mut run.work, watch),
     };
     match result {
         Ok(()) => Ok(run.outcome()),

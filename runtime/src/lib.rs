@@ -12,9 +12,10 @@ mod outcome;
 
 mod observe;
 
+mod solver;
+
 pub mod engine;
 pub mod sweep;
 
 #[cfg(test)]
-#[expect(dead_code, reason = "some helpers wait for the adaptive solver")]
 mod models;

@@ -352,3 +352,56 @@ pub fn plot(instance: &Instance, paths: &[&str]) -> Plot {
     };
     Plot { series: paths.iter().map(series).collect(), against: None }
 }
+
+/// A mass of 1 kg pulled through a spring of k = 2 N/m at 0.1 m/s, held by LuGre friction with the parameters of
+/// Canudas de Wit et al. (1995) and this micro-damping in N·s/m. States x, v, z; output: force of the spring.
+pub fn stick_slip(sigma1: f64) -> Instance {
+    const M: f64 = 1.0;
+    const K: f64 = 2.0;
+    const PULL: f64 = 0.1;
+    const SIGMA0: f64 = 1e5;
+    const SIGMA2: f64 = 0.4;
+    const FC: f64 = 1.0;
+    const FS: f64 = 1.5;
+    const VS: f64 = 1e-3;
+    let level = |v: f64| FC + (FS - FC) * (-(v / VS) * (v / VS)).exp();
+    Model::new("Pull(LuGre)")
+        .state("x", "m")
+        .state("v", "m/s")
+        .state("z", "um")
+        .output("pull", "N")
+        .root("v < 0")
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, move |m| {
+            let (x, v, z) = (m.x(0), m.x(1), m.x(2));
+            let dz = v - SIGMA0 * v.abs() / level(v) * z;
+            m.set_dx(0, v);
+            m.set_dx(1, (K * (PULL * m.t() - x) - SIGMA0 * z - sigma1 * dz - SIGMA2 * v) / M);
+            m.set_dx(2, dz);
+        })
+        .body(Function::Jacobian, move |m| {
+            let (v, z) = (m.x(1), m.x(2));
+            let g = level(v);
+            let slope = -2.0 * v / (VS * VS) * (g - FC);
+            let sign = if v < 0.0 { -1.0 } else { 1.0 };
+            let dz_dv = 1.0 - SIGMA0 * z * (sign / g - v.abs() * slope / (g * g));
+            let dz_dz = -SIGMA0 * v.abs() / g;
+            m.set_jacobian(&[
+                0.0,
+                1.0,
+                0.0,
+                -K / M,
+                (-sigma1 * dz_dv - SIGMA2) / M,
+                (-SIGMA0 - sigma1 * dz_dz) / M,
+                0.0,
+                dz_dv,
+                dz_dz,
+                0.0,
+                K * PULL / M,
+                0.0,
+            ]);
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .body(Function::Outputs, |m| m.set_y(0, K * (PULL * m.t() - m.x(0))))
+        .build()
+}

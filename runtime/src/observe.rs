@@ -33,21 +33,41 @@ impl Observer {
         self.recorder.is_empty() && self.expectations.only_last()
     }
 
+    /// The slots that are read, ascending.
+    pub(crate) fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+
+    /// Whether anything is measured rather than only drawn.
+    pub(crate) fn measures(&self) -> bool {
+        self.expectations.slots().next().is_some()
+    }
+
     /// One point of the run: the block after a step, or on one side of an event.
     pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
         let block = instance.block();
         // Zero times a value is zero unless it is infinite or not a number.
         let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
         if doubt != 0.0 {
-            // A state that went wrong explains the expression that was asked for.
-            check_finite(instance)?;
-            let bad = self.slots.iter().find(|slot| !block[slot.index()].is_finite());
-            return Err(not_finite(instance, *bad.expect("one of them is not finite")));
+            self.check(instance)?;
         }
-        let time = block[Slot::TIME.index()];
+        self.show(block[Slot::TIME.index()], block);
+        Ok(())
+    }
+
+    /// One point whose values are known to be finite.
+    pub(crate) fn show(&mut self, time: f64, block: &[f64]) {
         self.expectations.see(time, block);
         self.recorder.see(time, block);
-        Ok(())
+    }
+
+    /// Names what is read and not finite. A state that went wrong explains the expression that was asked for.
+    pub(crate) fn check(&self, instance: &Instance) -> Result<(), Stop> {
+        check_finite(instance)?;
+        match self.slots.iter().find(|slot| !instance.get(**slot).is_finite()) {
+            Some(bad) => Err(not_finite(instance, *bad)),
+            None => Ok(()),
+        }
     }
 }
 
