@@ -385,7 +385,8 @@ impl<'a> Adaptive<'a> {
         if jump * (1.0 - crossing.near) * h <= 0.1 {
             return false;
         }
-        let margin = 0.05 / jump;
+        // Not within the bracket: nothing is known there.
+        let margin = (0.05 / jump).max(4.0 * (crossing.far - crossing.near) * h);
         let before = crossing.near * h - margin;
         let (shorter, creep) =
             if before > margin { (before, 2.0 * margin) } else { (crossing.near * h + margin, f64::INFINITY) };
@@ -455,7 +456,7 @@ impl<'a> Adaptive<'a> {
     }
 
     /// By how much derivatives jump at a crossing, as error tolerances of their states gathered per second; 0 where
-    /// they jump by less than their own tolerance, or change as much beside the crossing in the same time.
+    /// they jump by less than their own tolerance, or change about as much beside the crossing in the same time.
     fn jump(&mut self, crossing: Crossing) -> f64 {
         let n = self.system.n;
         let width = crossing.far - crossing.near;
@@ -468,7 +469,10 @@ impl<'a> Adaptive<'a> {
         for (i, s) in self.scales.iter().enumerate() {
             let [before, near, far, after] = [0, 1, 2, 3].map(|row| self.slopes[row * n + i]);
             let jump = (far - near).abs();
-            let drift = (near - before).abs().max((after - far).abs());
+            // The polynomial says nothing outside its step.
+            let earlier = if beside[0] >= 0.0 { (near - before).abs() } else { 0.0 };
+            let later = if beside[3] <= 1.0 { (after - far).abs() } else { 0.0 };
+            let drift = earlier.max(later);
             if jump > self.tol * (near.abs() + s) && jump > 4.0 * drift {
                 rate = rate.max(jump / (self.tol * (self.step.x0[i].abs() + s)));
             }

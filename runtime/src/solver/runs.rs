@@ -1,7 +1,7 @@
 //! Whole adaptive runs against closed forms and published figures.
 
 use crate::engine::{Cause, Continue, Failure, Outcome, run};
-use crate::models::{self, Model, adaptive, plot, reading};
+use crate::models::{self, Contact, Model, adaptive, plot, reading};
 use abi::plan::{Experiment, MeasureKind};
 use abi::{Function, Instance};
 
@@ -315,4 +315,200 @@ fn a_pull_ends_where_it_should_by_default_too() {
     assert!((value(&outcome, 1) - 3.306792).abs() < 1e-6, "{}", value(&outcome, 1));
     let default = measured(&instance, adaptive(40.0, 1e-6), MeasureKind::Final, "x");
     assert!((default / 3.306792 - 1.0).abs() < 1e-4, "{default}");
+}
+
+#[test]
+fn dry_contacts_stick_and_slip() {
+    // Converged values of fixed-step runs: end in m, top speed in m/s.
+    for (contact, end, top) in [(Contact::Karnopp, 3.29869, 0.38767), (Contact::Kfm, 3.24011, 0.37682)] {
+        let instance = models::dry_pull(contact, None);
+        for tol in [1e-6, 1e-8] {
+            let mut experiment = adaptive(40.0, tol);
+            experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+            experiment.expects.push(reading(&instance, MeasureKind::Max, "v"));
+            let outcome = go(&instance, &experiment).unwrap_or_else(|failure| panic!("{failure}"));
+            println!("end {:.8} m, top {:.8} m/s", value(&outcome, 0), value(&outcome, 1));
+            assert!((value(&outcome, 0) / end - 1.0).abs() < 100.0 * tol.max(1e-7), "{}", value(&outcome, 0));
+            assert!((value(&outcome, 1) / top - 1.0).abs() < 100.0 * tol.max(1e-7), "{}", value(&outcome, 1));
+        }
+    }
+}
+
+#[test]
+fn dry_contacts_hold_half_their_force() {
+    for contact in [Contact::Karnopp, Contact::Kfm] {
+        let instance = models::dry_pull(contact, Some(0.5));
+        let moved = measured(&instance, adaptive(3600.0, 1e-6), MeasureKind::PeakToPeak, "x");
+        assert!(moved < 1e-9, "{moved}");
+    }
+}
+
+/// A mass of 1 kg thrown at 1 m/s on a contact that knows `stick` and `forward` exactly: at rest when its speed is 0.
+#[test]
+fn a_throw_stops_at_its_closed_form() {
+    let instance = Model::new("CoastDown")
+        .state("x", "m")
+        .state("v", "m/s")
+        .output("resting", "1")
+        .automaton(&["forward", "stick"])
+        .root("v <= 0")
+        .body(Function::Start, |m| m.set_x(1, 1.0))
+        .body(Function::Derivatives, |m| {
+            let sliding = m.regime(0) == 0.0;
+            m.set_dx(0, m.x(1));
+            m.set_dx(1, if sliding { -1.0 - 0.4 * m.x(1) } else { 0.0 });
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .body(Function::Transitions, |m| {
+            if m.regime(0) == 0.0 && m.x(1) <= 0.0 {
+                m.set_regime(0, 1.0);
+                m.set_x(1, 0.0);
+            }
+        })
+        .body(Function::Outputs, |m| m.set_y(0, m.regime(0)))
+        .build();
+    let stop = measured(&instance, adaptive(2.0, 1e-11), MeasureKind::First, "resting");
+    assert!((stop - 2.5 * 1.4f64.ln()).abs() < 1e-11, "{stop}");
+}
+
+/// A mass of 1 kg with LuGre friction under u = Kp e + i − Kv v, di/dt = Ki e, from 0 to 1 m; without a Jacobian.
+fn hunting() -> Instance {
+    Model::new("Hunting")
+        .state("x", "m")
+        .state("v", "m/s")
+        .state("z", "um")
+        .state("i", "N")
+        .root("v < 0")
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, |m| {
+            let (x, v, z, i) = (m.x(0), m.x(1), m.x(2), m.x(3));
+            let g = 1.0 + 0.5 * (-(v / 1e-3) * (v / 1e-3)).exp();
+            let dz = v - 1e5 * v.abs() / g * z;
+            let friction = 1e5 * z + 1e5f64.sqrt() * dz + 0.4 * v;
+            m.set_dx(0, v);
+            m.set_dx(1, 3.0 * (1.0 - x) + i - 6.0 * v - friction);
+            m.set_dx(2, dz);
+            m.set_dx(3, 4.0 * (1.0 - x));
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .build()
+}
+
+#[test]
+fn hunting_has_its_period_and_overshoot_without_a_jacobian() {
+    let instance = hunting();
+    let mut experiment = adaptive(300.0, 1e-8);
+    let mut period = reading(&instance, MeasureKind::Period, "x");
+    // A whole number of periods, so that the mean is the middle.
+    (period.after, period.before) = (150.0, 150.0 + 6.0 * 24.436786);
+    experiment.expects.push(period);
+    experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+    let outcome = go(&instance, &experiment).unwrap();
+    println!("period {:.7} s, overshoot to {:.6} m", value(&outcome, 0), value(&outcome, 1));
+    assert!((value(&outcome, 0) / 24.436786 - 1.0).abs() < 1e-6, "{}", value(&outcome, 0));
+    assert!((value(&outcome, 1) - 1.5005).abs() < 1e-4, "{}", value(&outcome, 1));
+}
+
+#[test]
+fn a_large_system_runs_as_a_small_one_does() {
+    // Thirty stiff decays, each following the one before it.
+    const N: usize = 30;
+    let model = (0..N).fold(Model::new("Chain"), |model, _| model.state("x", "m"));
+    let rate = |i: usize| 1.0 + 100.0 * i as f64;
+    let instance = model
+        .body(Function::Start, |m| m.set_x(0, 1.0))
+        .body(Function::Derivatives, move |m| {
+            m.set_dx(0, -m.x(0));
+            (1..N).for_each(|i| m.set_dx(i, rate(i) * (m.x(i - 1) - m.x(i))));
+        })
+        .build();
+    let mut experiment = adaptive(5.0, 1e-9);
+    experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+    let last = &mut experiment.expects[0].measures[0];
+    last.slot = instance.description().layout.states.slot(N - 1);
+    let outcome = go(&instance, &experiment).unwrap();
+    // Behind the slowest mode each member is larger than the one before by rate/(rate − 1).
+    let exact = (1..N).fold((-5f64).exp(), |x, i| x * rate(i) / (rate(i) - 1.0));
+    assert!((value(&outcome, 0) - exact).abs() < 1e-8, "{} for {exact}", value(&outcome, 0));
+    assert_eq!(outcome.work.stiff_steps, outcome.work.steps);
+}
+
+#[test]
+fn a_surface_that_is_only_grazed_is_found() {
+    // x = 1 − 1.0001 sin t dips below 0 for 28 ms; whoever looks at the ends of steps misses it.
+    let instance = Model::new("Graze")
+        .state("x", "m")
+        .state("count", "1")
+        .memory(1)
+        .root("x falls 0")
+        .body(Function::Start, |m| {
+            m.set_x(0, 1.0);
+            m.set_memory(0, 1.0);
+        })
+        .body(Function::Derivatives, |m| m.set_dx(0, -1.0001 * m.t().cos()))
+        .body(Function::Roots, |m| m.set_root(0, m.x(0)))
+        .body(Function::Transitions, |m| {
+            if m.memory(0) > 0.0 && m.x(0) <= 0.0 {
+                m.set_x(1, m.x(1) + 1.0);
+            }
+            m.set_memory(0, m.x(0));
+        })
+        .build();
+    for tol in [1e-5, 1e-7, 1e-9] {
+        assert_eq!(measured(&instance, adaptive(30.0, tol), MeasureKind::Final, "count"), 5.0, "tol {tol:e}");
+    }
+}
+
+#[test]
+fn regimes_that_pass_the_buck_are_chatter() {
+    let instance = Model::new("Buck")
+        .state("x", "m")
+        .automaton(&["left", "right"])
+        .root("x > 1")
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, |m| m.set_dx(0, 1.0))
+        .body(Function::Roots, |m| m.set_root(0, m.x(0) - 1.0))
+        .body(Function::Transitions, |m| {
+            if m.x(0) > 1.0 {
+                m.set_regime(0, 1.0 - m.regime(0));
+            }
+        })
+        .build();
+    let failure = go(&instance, &adaptive(2.0, 1e-6)).unwrap_err();
+    assert!((failure.time - 1.0).abs() < 1e-9, "{failure}");
+    assert!(failure.to_string().contains("turned more often than there are regimes"), "{failure}");
+}
+
+#[test]
+fn a_watched_range_stops_an_adaptive_run_too() {
+    let instance = Model::new("Ramp")
+        .state("x", "m")
+        .within((0.0, 1.0))
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, |m| m.set_dx(0, 1.0))
+        .build();
+    assert!(go(&instance, &adaptive(1.0, 1e-6)).is_ok());
+    let failure = go(&instance, &adaptive(2.0, 1e-6)).unwrap_err();
+    assert!(failure.to_string().starts_with("`x` left its range 0 .. 1 m: it is 1.0"), "{failure}");
+}
+
+#[test]
+fn what_blows_up_is_named() {
+    let blow_up = |power: i32| {
+        Model::new("BlowUp")
+            .state("x", "m")
+            .body(Function::Start, |m| m.set_x(0, 1.0))
+            .body(Function::Derivatives, move |m| m.set_dx(0, m.x(0).powi(power)))
+            .build()
+    };
+    let failure = go(&blow_up(2), &adaptive(2.0, 1e-6)).unwrap_err();
+    assert!((failure.time - 1.0).abs() < 1e-5 && failure.to_string().contains("`x`"), "{failure}");
+    let undefined = Model::new("Undefined")
+        .state("x", "m")
+        .body(Function::Start, |m| m.set_x(0, 1.0))
+        .body(Function::Derivatives, |m| m.set_dx(0, -m.x(0).sqrt() - 0.1))
+        .build();
+    let failure = go(&undefined, &adaptive(10.0, 1e-6)).unwrap_err();
+    assert!(failure.to_string().contains("`x`"), "{failure}");
+    println!("{failure}");
 }

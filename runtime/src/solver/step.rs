@@ -55,8 +55,9 @@ impl<'a> System<'a> {
         f.copy_from_slice(&self.instance.block()[self.derivatives.clone()]);
     }
 
-    /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: forward differences
-    /// over √ε of |x| or of the scale `s` of the state, whichever is larger.
+    /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: one-sided differences
+    /// over √ε of |x| or of the scale `s` of the state, whichever is larger; to the side where no surface is crossed,
+    /// for the derivative is that of the branch taken.
     pub(crate) fn jacobian(&mut self, t: f64, x: &[f64], f0: &[f64], s: &[f64], j: &mut [f64]) {
         if self.n == 0 {
             return;
@@ -70,19 +71,38 @@ impl<'a> System<'a> {
         const ROOT: f64 = 1.5e-8;
         let n = self.n;
         let (mut moved, mut f) = (x.to_vec(), vec![0.0; n]);
-        for column in 0..n {
-            moved[column] = x[column] + ROOT * x[column].abs().max(s[column]);
-            let width = moved[column] - x[column];
-            self.slope(t, &moved, &mut f);
-            for row in 0..n {
-                j[row * n + column] = (f[row] - f0[row]) / width;
-            }
-            moved[column] = x[column];
+        let (mut here, mut there) = (vec![0.0; self.surfaces()], vec![0.0; self.surfaces()]);
+        if !here.is_empty() {
+            self.roots(t, x, &mut here);
         }
-        let later = t + ROOT * t.max(1.0);
-        self.slope(later, x, &mut f);
-        for row in 0..n {
-            j[n * n + row] = (f[row] - f0[row]) / (later - t);
+        for column in 0..=n {
+            // The last column is time.
+            let by = ROOT * if column < n { x[column].abs().max(s[column]) } else { t.max(1.0) };
+            let mut width = by;
+            for by in [by, -by] {
+                let mut later = t;
+                if column < n {
+                    moved[column] = x[column] + by;
+                    width = moved[column] - x[column];
+                } else {
+                    later = t + by;
+                    width = later - t;
+                }
+                if !here.is_empty() {
+                    self.roots(later, &moved, &mut there);
+                }
+                self.slope(later, &moved, &mut f);
+                if here.iter().zip(&there).all(|(a, b)| a * b >= 0.0) {
+                    break;
+                }
+            }
+            for row in 0..n {
+                let entry = if column < n { row * n + column } else { n * n + row };
+                j[entry] = (f[row] - f0[row]) / width;
+            }
+            if column < n {
+                moved[column] = x[column];
+            }
         }
     }
 
