@@ -44,6 +44,15 @@ pub fn parse(file: FileId, text: &str) -> Parsed {
     Parsed { file: File { items }, diagnostics: reader.finish() }
 }
 
+/// For the formatter: where the strokes of derivatives stand, unlike those of divisions.
+pub(crate) fn derivatives(text: &str) -> Result<HashSet<usize>, Vec<Diagnostic>> {
+    let mut reader = Reader::new(FileId::default(), text);
+    reader.items();
+    let derivatives = std::mem::take(&mut reader.derivatives);
+    let diagnostics = reader.finish();
+    if diagnostics.is_empty() { Ok(derivatives) } else { Err(diagnostics) }
+}
+
 /// Reads one expression, as on a command line. Outside models `dz/dt` is a division.
 pub fn parse_expr(file: FileId, text: &str) -> (Expr, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
@@ -101,6 +110,8 @@ struct Reader<'t> {
     semicolon: bool,
     /// Whether the piece that is being built has been reported as too high.
     too_high: bool,
+    /// Where the strokes of derivatives stand.
+    derivatives: HashSet<usize>,
     diagnostics: Vec<Diagnostic>,
 }
 
@@ -160,7 +171,16 @@ impl<'t> Reader<'t> {
         let mut source = Source::new(file, text);
         let diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
-        Reader { source, names: Names::default(), base: 0, braces, semicolon: false, too_high: false, diagnostics }
+        Reader {
+            source,
+            names: Names::default(),
+            base: 0,
+            braces,
+            semicolon: false,
+            too_high: false,
+            derivatives: HashSet::new(),
+            diagnostics,
+        }
     }
 
     fn finish(mut self) -> Vec<Diagnostic> {
@@ -934,8 +954,11 @@ impl<'t> Reader<'t> {
         Equation { target, value: self.value(&mut children), span }
     }
 
-    fn target(&self, pair: Pair<Rule>) -> Target {
+    fn target(&mut self, pair: Pair<Rule>) -> Target {
         let span = self.span(&pair);
+        if pair.as_rule() == Rule::ratio {
+            self.derivatives.extend(pair.as_str().find('/').map(|stroke| span.start as usize + stroke));
+        }
         match pair.as_rule() {
             Rule::ratio => {
                 let mut children = Children::of(pair);
@@ -1234,6 +1257,7 @@ impl<'t> Reader<'t> {
                 spliced.push(whole(lower, part(stroke + 1, span.end as usize)));
                 continue;
             }
+            self.derivatives.insert(stroke);
             let (of, along) = (&upper[1..], &lower[1..]);
             let visible = |word: &str| self.names.model.contains(word) || self.names.file.contains(word);
             let before = spliced.iter().rev().find(|item| !matches!(item, Flat::Unary(..)));

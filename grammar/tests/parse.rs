@@ -413,10 +413,12 @@ fn a_million_brackets_are_one_mistake() {
     {
         let row = unit.repeat((1 << 20) / unit.len());
         for text in [format!("model M {{\n  let a = {row}\n}}\n"), row.clone(), format!("const a = {row}")] {
+            // `let a =` before a brace too many is a mistake of its own.
+            let wanted = if unit == "}" && text.starts_with("model") { 2 } else { 1 };
             let parsed = survives(text);
             assert_eq!(
                 parsed.diagnostics.len(),
-                1,
+                wanted,
                 "{unit}: {:?}",
                 &parsed.diagnostics[..3.min(parsed.diagnostics.len())]
             );
