@@ -1,6 +1,6 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use crate::stub::{Case, Loaded, Options, SourceFile, Sources, check, compile, format, load};
+pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, load};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

@@ -13,8 +13,6 @@ mod plot;
 mod project;
 mod report;
 mod results;
-#[allow(missing_docs, dead_code, clippy::disallowed_methods)]
-mod stub;
 mod terminal;
 mod value;
 

@@ -2,10 +2,9 @@
 //!
 //! In: paths and imports. Out: texts, or the reason in words why there is none. Knows nothing of the language.
 
-use grammar::ast::ImportSource;
 use std::fs;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// The library: dotted name of each file (`std.friction.lugre`) and its text, in the order of the names.
 const LIBRARY: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/library.rs"));
@@ -60,35 +59,44 @@ fn text(bytes: Vec<u8>) -> Result<String, String> {
 pub struct Disk;
 
 impl crate::compile::Sources for Disk {
-    fn import(&self, from: &str, what: &ImportSource) -> Result<(String, String), String> {
-        match what {
-            ImportSource::Library(name) => {
-                library(&name.text).map(|text| (name.text.clone(), text)).ok_or_else(|| unknown_library(&name.text))
+    /// A library name stands for its file, or for all files of its folder.
+    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+        let inside = |file: &str| file == module || file.strip_prefix(module).is_some_and(|rest| rest.starts_with('.'));
+        let found: Vec<(String, String)> = LIBRARY
+            .iter()
+            .filter(|(file, _)| inside(file))
+            .map(|(file, text)| (format!("{file}.fric"), (*text).to_string()))
+            .collect();
+        (!found.is_empty()).then_some(found)
+    }
+
+    fn modules(&self) -> Vec<String> {
+        let folder = |file: &str| file.match_indices('.').nth(1).map_or(file, |(at, _)| &file[..at]).to_string();
+        let mut folders: Vec<String> = LIBRARY.iter().map(|(file, _)| folder(file)).collect();
+        folders.dedup();
+        folders
+    }
+
+    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+        let folder = Path::new(from).parent().unwrap_or(Path::new(""));
+        let path = tidy(&folder.join(path));
+        read(&path).map(|text| (path.display().to_string(), text))
+    }
+}
+
+/// The path without `.` and `folder/..`, so that one file has one name.
+fn tidy(path: &Path) -> PathBuf {
+    let mut out = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::CurDir => {}
+            Component::ParentDir if matches!(out.components().next_back(), Some(Component::Normal(_))) => {
+                out.pop();
             }
-            ImportSource::File(file) => {
-                let folder = Path::new(from).parent().unwrap_or(Path::new(""));
-                let path = folder.join(&file.text);
-                read(&path).map(|text| (path.display().to_string(), text))
-            }
+            part => out.push(part),
         }
     }
-}
-
-/// A library name stands for its file, or for all files of its folder.
-fn library(name: &str) -> Option<String> {
-    let inside = |file: &str| file == name || file.strip_prefix(name).is_some_and(|rest| rest.starts_with('.'));
-    let texts: Vec<&str> = LIBRARY.iter().filter(|(file, _)| inside(file)).map(|(_, text)| *text).collect();
-    if texts.is_empty() { None } else { Some(texts.join("\n")) }
-}
-
-fn unknown_library(name: &str) -> String {
-    let mut folders: Vec<&str> =
-        LIBRARY.iter().map(|(file, _)| file.match_indices('.').nth(1).map_or(*file, |(at, _)| &file[..at])).collect();
-    folders.dedup();
-    match nearest(name, folders.iter().copied()) {
-        Some(near) => format!("the library has no `{name}`; did you mean `{near}`?"),
-        None => format!("the library has no `{name}`; it has {}", folders.join(", ")),
-    }
+    out
 }
 
 /// The name most like `name`, if one is like it at all.

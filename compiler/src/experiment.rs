@@ -24,12 +24,12 @@ pub struct Changes {
     pub set: Vec<String>,
     /// Another method.
     pub method: Option<Method>,
-    /// Another fixed step, as text with its unit.
-    pub step: Option<String>,
+    /// Another fixed step, in s.
+    pub step: Option<f64>,
     /// Another tolerance.
     pub tol: Option<f64>,
-    /// Another duration, as text with its unit.
-    pub duration: Option<String>,
+    /// Another duration, in s.
+    pub duration: Option<f64>,
 }
 
 /// One combination of an experiment's sweeps, lowered.
@@ -79,8 +79,8 @@ pub fn read(
     sources: &dyn Sources,
     name: &str,
     changes: &Changes,
-    pool: &[f64],
     warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Vec<Variant>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
     let given = Given::read(loaded, changes, &mut diagnostics);
@@ -117,7 +117,7 @@ pub fn read(
         let label = label(loaded, &combination);
         let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(Given::change));
         let overrides = changes.map(|c| Override { path: c.path, value: c.value, file: root }).collect();
-        match variant(loaded, sources, name, &parts, &data, overrides, &given, label, pool, warnings) {
+        match variant(loaded, sources, name, &parts, &data, overrides, &given, label, warnings, on_stage) {
             Ok(variant) => variants.push(variant),
             Err(errors) => return Err(errors),
         }
@@ -129,9 +129,9 @@ pub fn read(
 struct Given {
     set: Vec<Set>,
     method: Option<Method>,
-    step: Option<Expr>,
+    step: Option<f64>,
     tol: Option<f64>,
-    duration: Option<Expr>,
+    duration: Option<f64>,
 }
 
 /// `PATH = VALUE`
@@ -167,17 +167,8 @@ impl Given {
                 }
             }
         }
-        let mut value = |what: &str, text: &Option<String>| {
-            text.as_ref().map(|text| {
-                let id = loaded.add_text(what, text);
-                let (expr, errors) = grammar::parse::parse_expr(id, text);
-                diagnostics.extend(errors);
-                expr
-            })
-        };
-        let step = value("--step", &changes.step);
-        let duration = value("--for", &changes.duration);
-        Given { set, method: changes.method, step, tol: changes.tol, duration }
+        let &Changes { method, step, tol, duration, .. } = changes;
+        Given { set, method, step, tol, duration }
     }
 
     fn change(set: &Set) -> Change<'_> {
@@ -404,8 +395,8 @@ fn variant(
     overrides: Vec<Override>,
     given: &Given,
     label: String,
-    pool: &[f64],
     warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Variant, Vec<Diagnostic>> {
     let root = loaded.root();
     if !parts.run.instance.model.text.starts_with(|c: char| c.is_ascii_uppercase()) {
@@ -418,8 +409,8 @@ fn variant(
         observed.push(expr);
         observed.len() - 1
     };
-    let duration = given.duration.as_ref().or(parts.run.duration.as_ref()).map(&mut add);
-    let step = given.step.as_ref().or(parts.solver.and_then(|s| s.step.as_ref())).map(&mut add);
+    let duration = parts.run.duration.as_ref().map(&mut add);
+    let step = parts.solver.and_then(|s| s.step.as_ref()).map(&mut add);
     let tol = parts.solver.and_then(|solver| solver.tol.as_ref()).map(&mut add);
     let plots: Vec<(Vec<usize>, Option<usize>)> = parts
         .plots
@@ -445,8 +436,10 @@ fn variant(
         observed,
         data: data.to_vec(),
     };
+    on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
+    on_stage("check");
     let types = units::check(&system, &loaded.files, &mut diagnostics);
     if !diagnostics.iter().any(Diagnostic::is_error) {
         causality::check(&system, &loaded.files, &mut diagnostics);
@@ -460,9 +453,10 @@ fn variant(
     let mut reader = Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new() };
 
     let corners = evaluate(&system, &types, &system.corners);
-    let duration = match duration {
-        Some(at) => reader.time(nodes[at], "the duration"),
-        None => match data.first().and_then(|(_, table, _)| table.x.last()) {
+    let duration = match (given.duration, duration) {
+        (Some(duration), _) => duration,
+        (None, Some(at)) => reader.time(nodes[at], "the duration"),
+        (None, None) => match data.first().and_then(|(_, table, _)| table.x.last()) {
             Some(end) => *end,
             None => {
                 let error = Diagnostic::error("E0902", "how long does it run?")
@@ -489,7 +483,8 @@ fn variant(
         return Err(diagnostics);
     }
     warnings.extend(diagnostics);
-    let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted, pool);
+    on_stage("lower");
+    let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
         root.text = surface_text(loaded, &root.text);
@@ -591,7 +586,7 @@ impl Reader<'_> {
             method
         });
         let method = given.method.or(written).unwrap_or(Method::Adaptive);
-        let step = step.map(|step| self.time(step, "the step"));
+        let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);

@@ -55,7 +55,7 @@ pub struct Case {
 }
 
 /// Compiles an experiment of a loaded text: one case for each combination of its sweeps. `on_stage` is called with the
-/// name of each stage when it ends.
+/// name of each stage when it begins.
 ///
 /// # Errors
 /// Everything that is wrong with the experiment and the models it runs.
@@ -67,10 +67,9 @@ pub fn compile(
     warnings: &mut Vec<Diagnostic>,
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Vec<Case>, Vec<Diagnostic>> {
-    let variants = experiment::read(loaded, sources, experiment, &options.changes, math::pool(), warnings)?;
-    on_stage("check and lower");
-    let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
+    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
     on_stage("code");
+    let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
     Ok(cases)
 }
 
@@ -123,7 +122,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
             Item::Experiment(experiment) => {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();
-                match experiment::read(loaded, sources, &experiment.name.text, &changes, math::pool(), &mut warnings) {
+                match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
                     Ok(_) => all.extend(warnings),
                     Err(errors) => all.extend(errors),
                 }

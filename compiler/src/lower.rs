@@ -42,9 +42,9 @@ pub struct Lowered {
     pub observed: Vec<Slot>,
 }
 
-/// Lowers a system. `pool` is the beginning of the pool of constants, which tables are added to.
-pub fn lower(system: &System, types: &Types, wanted: &[Wanted], pool: &[f64]) -> Lowered {
-    let mut pool = pool.to_vec();
+/// Lowers a system.
+pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
+    let mut pool = crate::math::POOL.to_vec();
     let tables = place_tables(system, &mut pool);
     let mut plan = Plan::new(system, types, wanted, tables);
     plan.description.pool = Arc::from(pool);
@@ -97,7 +97,7 @@ fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
 /// Values of expressions that depend on parameters only, each parameter at its default. What depends on anything else
 /// is NaN.
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
-    let mut pool = crate::math::pool().to_vec();
+    let mut pool = crate::math::POOL.to_vec();
     let tables = place_tables(system, &mut pool);
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);

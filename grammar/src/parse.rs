@@ -25,6 +25,9 @@ pub const HEIGHT_LIMIT: usize = 1000;
 /// How many mistakes of one text are returned.
 pub const DIAGNOSTIC_LIMIT: usize = 100;
 
+/// More than one level of brackets needs on the stack, in bytes, without optimisation.
+const STACK_PER_LEVEL: usize = 64 << 10;
+
 /// What a text says, and what is wrong with it.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Parsed {
@@ -39,6 +42,15 @@ pub fn parse(file: FileId, text: &str) -> Parsed {
     let mut reader = Reader::new(file, text);
     let items = reader.items();
     Parsed { file: File { items }, diagnostics: reader.finish() }
+}
+
+/// For the formatter: where the strokes of derivatives stand, unlike those of divisions.
+pub(crate) fn derivatives(text: &str) -> Result<HashSet<usize>, Vec<Diagnostic>> {
+    let mut reader = Reader::new(FileId::default(), text);
+    reader.items();
+    let derivatives = std::mem::take(&mut reader.derivatives);
+    let diagnostics = reader.finish();
+    if diagnostics.is_empty() { Ok(derivatives) } else { Err(diagnostics) }
 }
 
 /// Reads one expression, as on a command line. Outside models `dz/dt` is a division.
@@ -92,10 +104,14 @@ struct Reader<'t> {
     names: Names<'t>,
     /// Where the piece that is being built begins in the text.
     base: usize,
+    /// Whether something is wrong with the braces.
+    braces: bool,
     /// Whether a `;` has been reported.
     semicolon: bool,
     /// Whether the piece that is being built has been reported as too high.
     too_high: bool,
+    /// Where the strokes of derivatives stand.
+    derivatives: HashSet<usize>,
     diagnostics: Vec<Diagnostic>,
 }
 
@@ -116,17 +132,19 @@ enum Flat<'t> {
     Binary(BinaryOp, Span),
 }
 
-/// Words of the language are found by their rules, which stand together at the end of the grammar.
-fn is_word(rule: Rule) -> bool {
-    (Rule::kw_after..=Rule::kw_when).contains(&rule)
+/// Whether a rule is a word or a sign of the language: these stand together at the end of the grammar.
+fn is_fixed(rule: Rule) -> bool {
+    (Rule::open..=Rule::kw_when).contains(&rule)
 }
 
-/// What a rule matched, without the words of the language.
+/// What a rule matched, without the words and signs of the language.
 struct Children<'t>(std::iter::Peekable<std::vec::IntoIter<Pair<'t, Rule>>>);
 
 impl<'t> Children<'t> {
     fn of(pair: Pair<'t, Rule>) -> Children<'t> {
-        Children(pair.into_inner().filter(|child| !is_word(child.as_rule())).collect::<Vec<_>>().into_iter().peekable())
+        Children(
+            pair.into_inner().filter(|child| !is_fixed(child.as_rule())).collect::<Vec<_>>().into_iter().peekable(),
+        )
     }
 
     /// What the grammar says must stand here.
@@ -152,7 +170,17 @@ impl<'t> Reader<'t> {
     fn new(file: FileId, text: &'t str) -> Reader<'t> {
         let mut source = Source::new(file, text);
         let diagnostics = std::mem::take(&mut source.complaints);
-        Reader { source, names: Names::default(), base: 0, semicolon: false, too_high: false, diagnostics }
+        let braces = !diagnostics.is_empty();
+        Reader {
+            source,
+            names: Names::default(),
+            base: 0,
+            braces,
+            semicolon: false,
+            too_high: false,
+            derivatives: HashSet::new(),
+            diagnostics,
+        }
     }
 
     fn finish(mut self) -> Vec<Diagnostic> {
@@ -195,24 +223,34 @@ impl<'t> Reader<'t> {
             self.report(diagnostic);
             return None;
         }
-        let (depth, deepest) = slips::depth(&self.source, piece);
-        if depth > DEPTH_LIMIT {
+        let (depth, beyond) = slips::depth(&self.source, piece, DEPTH_LIMIT);
+        if let Some(beyond) = beyond {
+            if self.braces {
+                return None;
+            }
             self.report(
                 Diagnostic::error(
                     "E0001",
                     format!("brackets and conditions lie more than {DEPTH_LIMIT} deep in each other"),
                 )
-                .label(self.source.span(deepest), "")
+                .label(self.source.span(beyond), "")
                 .help("give a part of this a name of its own with `let`"),
             );
             return None;
         }
         let (start, end) = (self.source.marks[piece.start].token.start, self.source.marks[piece.end - 1].token.end);
         (self.base, self.too_high) = (start, false);
-        match Fric::parse(rule, &self.source.text[start..end]) {
+        let text = &self.source.text[start..end];
+        // The rules of pest need many calls for each bracket.
+        match stacker::maybe_grow(STACK_PER_LEVEL * (depth + 4), STACK_PER_LEVEL * (depth + 4), || {
+            Fric::parse(rule, text)
+        }) {
             Ok(mut pairs) => pairs.next(),
             Err(error) => {
                 let stop = self.stop(piece, &error);
+                if self.braces && (stop.at >= piece.end || matches!(self.source.word(stop.at), "{" | "}")) {
+                    return None;
+                }
                 let diagnostic = slips::explain(&self.source, piece, &stop);
                 self.report(diagnostic);
                 None
@@ -266,7 +304,13 @@ impl<'t> Reader<'t> {
     /// What stands outside of all items.
     fn stray(&mut self, piece: Piece) {
         let first = piece.start;
+        if self.braces && matches!(self.source.word(first), "{" | "}") {
+            return;
+        }
         if let Some(brace) = (first..piece.end).find(|&at| self.source.is_symbol(at, "}")) {
+            if self.braces {
+                return;
+            }
             let mut diagnostic = Diagnostic::error("E0002", "one `}` too many").label(self.source.span(brace), "");
             if first > 0 && self.source.is_symbol(first - 1, "}") {
                 diagnostic = diagnostic.label(self.source.span(first - 1), "the item ends here");
@@ -410,6 +454,10 @@ impl<'t> Reader<'t> {
 
     /// A statement that stands where it may not.
     fn misplaced(&mut self, piece: Piece, place: Place) {
+        if self.braces {
+            // A brace is missing somewhere: where this stands may be right.
+            return;
+        }
         let word = self.source.word(piece.start);
         let what = if self.source.kind(piece.start) == Some(TokenKind::Word) && crate::tokens::is_keyword(word) {
             format!("`{word}` has no place in {}", place.words())
@@ -514,7 +562,6 @@ impl<'t> Reader<'t> {
                 Some(Statement::When(When { condition: condition?, resets, span }))
             }
             "go" | "reset" => {
-                let (_, _) = self.head(piece);
                 self.misplaced(piece, place);
                 None
             }
@@ -726,15 +773,15 @@ impl<'t> Reader<'t> {
     }
 
     fn rig_statement(&mut self, piece: Piece) -> Option<RigStatement> {
-        if self.source.is_word(piece.start, "hardware") {
-            if let Some((open, inside)) = self.source.block(piece).filter(|&(open, _)| open > piece.start) {
-                let head = self.read(Rule::one_rig, Piece { start: piece.start, end: open });
-                let part = head.map(|head| self.name(Children::of(head).one()));
-                let wires = self.source.statements(Place::Hardware, inside).into_iter();
-                let wires: Vec<_> =
-                    wires.filter_map(|piece| self.read(Rule::one_wire, piece).map(|pair| self.wire(pair))).collect();
-                return Some(RigStatement::Hardware(Hardware { part: part?, wires, span: self.source.span_of(piece) }));
-            }
+        if self.source.is_word(piece.start, "hardware")
+            && let Some((open, inside)) = self.source.block(piece).filter(|&(open, _)| open > piece.start)
+        {
+            let head = self.read(Rule::one_rig, Piece { start: piece.start, end: open });
+            let part = head.map(|head| self.name(Children::of(head).one()));
+            let wires = self.source.statements(Place::Hardware, inside).into_iter();
+            let wires: Vec<_> =
+                wires.filter_map(|piece| self.read(Rule::one_wire, piece).map(|pair| self.wire(pair))).collect();
+            return Some(RigStatement::Hardware(Hardware { part: part?, wires, span: self.source.span_of(piece) }));
         }
         let pair = self.read(Rule::one_rig, piece)?;
         let span = self.span(&pair);
@@ -876,6 +923,10 @@ impl<'t> Reader<'t> {
     }
 
     fn instance(&mut self, pair: Pair<'t, Rule>) -> Instance {
+        stacker::maybe_grow(2 * STACK_PER_LEVEL, 32 * STACK_PER_LEVEL, || self.roomy_instance(pair))
+    }
+
+    fn roomy_instance(&mut self, pair: Pair<'t, Rule>) -> Instance {
         let (rotary, span) = (says(&pair, Rule::kw_rotary), self.span(&pair));
         let mut children = Children::of(pair);
         let model = self.name(children.one());
@@ -903,8 +954,11 @@ impl<'t> Reader<'t> {
         Equation { target, value: self.value(&mut children), span }
     }
 
-    fn target(&self, pair: Pair<Rule>) -> Target {
+    fn target(&mut self, pair: Pair<Rule>) -> Target {
         let span = self.span(&pair);
+        if pair.as_rule() == Rule::ratio {
+            self.derivatives.extend(pair.as_str().find('/').map(|stroke| span.start as usize + stroke));
+        }
         match pair.as_rule() {
             Rule::ratio => {
                 let mut children = Children::of(pair);
@@ -1033,20 +1087,24 @@ impl<'t> Reader<'t> {
     }
 
     fn build(&mut self, pair: Pair<'t, Rule>) -> Built {
+        stacker::maybe_grow(2 * STACK_PER_LEVEL, 32 * STACK_PER_LEVEL, || self.roomy_build(pair))
+    }
+
+    fn roomy_build(&mut self, pair: Pair<'t, Rule>) -> Built {
         let start = self.span(&pair);
         let inner: Vec<Pair<'t, Rule>> = pair.into_inner().collect();
-        if let [only] = inner.as_slice() {
-            if only.as_rule() == Rule::conditional {
-                let mut children = Children::of(only.clone());
-                let [condition, then, otherwise] = [(); 3].map(|_| {
-                    let branch = children.one();
-                    self.build(branch)
-                });
-                let height = 1 + condition.height.max(then.height).max(otherwise.height);
-                let span = Span { end: otherwise.outer.end, ..start };
-                let kind = ExprKind::If(Box::new(condition.expr), Box::new(then.expr), Box::new(otherwise.expr));
-                return self.limited(Built { expr: Expr { kind, span }, outer: span, height });
-            }
+        if let [only] = inner.as_slice()
+            && only.as_rule() == Rule::conditional
+        {
+            let mut children = Children::of(only.clone());
+            let [condition, then, otherwise] = [(); 3].map(|_| {
+                let branch = children.one();
+                self.build(branch)
+            });
+            let height = 1 + condition.height.max(then.height).max(otherwise.height);
+            let span = Span { end: otherwise.outer.end, ..start };
+            let kind = ExprKind::If(Box::new(condition.expr), Box::new(then.expr), Box::new(otherwise.expr));
+            return self.limited(Built { expr: Expr { kind, span }, outer: span, height });
         }
         let flat = inner.into_iter().map(|pair| self.flat(pair)).collect();
         let flat = self.splice(flat);
@@ -1066,7 +1124,7 @@ impl<'t> Reader<'t> {
                 Flat::Ratio(span, upper, lower)
             }
             Rule::group => {
-                let inner = pair.into_inner().next().expect("parentheses hold an expression");
+                let inner = Children::of(pair).one();
                 let built = self.build(inner);
                 Flat::Operand(Built { outer: span, ..built })
             }
@@ -1101,15 +1159,14 @@ impl<'t> Reader<'t> {
         let height = 1 + args.iter().map(|arg| arg.height).max().unwrap_or(0);
         if let ("der", [Built { expr: Expr { kind: ExprKind::Path(path), .. }, .. }]) =
             (function.text.as_str(), args.as_slice())
+            && let Some(of) = path.single().filter(|_| !self.names.file.contains("der"))
         {
-            if let Some(of) = path.single().filter(|_| !self.names.file.contains("der")) {
-                self.report(
-                    Diagnostic::error("E0001", "a derivative is written as on paper")
-                        .label(span, "")
-                        .help(format!("write `d{}/dt`", of.text)),
-                );
-                return Built { expr: Expr { kind: ExprKind::Error, span }, outer: span, height: 1 };
-            }
+            self.report(
+                Diagnostic::error("E0001", "a derivative is written as on paper")
+                    .label(span, "")
+                    .help(format!("write `d{}/dt`", of.text)),
+            );
+            return Built { expr: Expr { kind: ExprKind::Error, span }, outer: span, height: 1 };
         }
         let kind = ExprKind::Call { function, args: args.into_iter().map(|arg| arg.expr).collect() };
         self.limited(Built { expr: Expr { kind, span }, outer: span, height })
@@ -1150,13 +1207,14 @@ impl<'t> Reader<'t> {
     /// A name of the model, or a derivative, that stands where a unit is read.
     fn no_unit(&self, digits: &str, unit: &UnitText) -> Option<Diagnostic> {
         let text = unit.text.as_str();
-        if let Some((upper, lower)) = text.split_once('/') {
-            if self.is_derivative(upper, lower) && !slips::is_unit(upper) {
-                let message = format!("there is no unit `{upper}`");
-                return Some(
-                    Diagnostic::error("E0102", message).help(format!("for the derivative write `{digits} * {text}`")),
-                );
-            }
+        if let Some((upper, lower)) = text.split_once('/')
+            && self.is_derivative(upper, lower)
+            && !slips::is_unit(upper)
+        {
+            let message = format!("there is no unit `{upper}`");
+            return Some(
+                Diagnostic::error("E0102", message).help(format!("for the derivative write `{digits} * {text}`")),
+            );
         }
         (self.names.model.contains(text) && !slips::is_unit(text)).then(|| {
             Diagnostic::error("E0111", format!("an operator is missing before `{text}`"))
@@ -1199,6 +1257,7 @@ impl<'t> Reader<'t> {
                 spliced.push(whole(lower, part(stroke + 1, span.end as usize)));
                 continue;
             }
+            self.derivatives.insert(stroke);
             let (of, along) = (&upper[1..], &lower[1..]);
             let visible = |word: &str| self.names.model.contains(word) || self.names.file.contains(word);
             let before = spliced.iter().rev().find(|item| !matches!(item, Flat::Unary(..)));
@@ -1411,8 +1470,22 @@ fn declaration_kind(pair: &Pair<Rule>) -> DeclarationKind {
 
 /// A rule in words, if it has any that help.
 fn words(rule: Rule) -> Option<String> {
-    if is_word(rule) {
-        return format!("{rule:?}").strip_prefix("kw_").map(|word| format!("`{word}`"));
+    if rule == Rule::kw_rotary {
+        return Some("a model with its arguments, such as `LuGre()`".to_string());
+    }
+    let sign = match rule {
+        Rule::open => "(",
+        Rule::close => ")",
+        Rule::comma => ",",
+        Rule::dots => "..",
+        Rule::colon => ":",
+        Rule::near => "~=",
+        Rule::margin => "+-",
+        _ => "",
+    };
+    if is_fixed(rule) {
+        let name = format!("{rule:?}");
+        return Some(format!("`{}`", name.strip_prefix("kw_").unwrap_or(sign)));
     }
     let word = match rule {
         Rule::expr
@@ -1436,7 +1509,7 @@ fn words(rule: Rule) -> Option<String> {
         Rule::unit | Rule::one => "a unit",
         Rule::range => "a range with `in`",
         Rule::bound | Rule::bound_op => "a bound such as `> 0`",
-        Rule::inst | Rule::inst_arg => "a model with its arguments, such as `LuGre(v = v)`",
+        Rule::inst | Rule::inst_arg => "a model with its arguments, such as `LuGre()`",
         Rule::bind | Rule::drive_arg | Rule::set => "`name = value`",
         Rule::points => "points in braces",
         Rule::fn_arg | Rule::column => "a name",
@@ -1480,9 +1553,11 @@ mod tests {
     }
 
     #[test]
-    fn words_of_the_language_are_the_last_rules() {
+    fn words_and_signs_are_the_last_rules() {
+        const SIGNS: [&str; 7] = ["open", "close", "comma", "dots", "colon", "near", "margin"];
         for rule in Rule::all_rules() {
-            assert_eq!(is_word(*rule), format!("{rule:?}").starts_with("kw_"), "{rule:?}");
+            let name = format!("{rule:?}");
+            assert_eq!(is_fixed(*rule), name.starts_with("kw_") || SIGNS.contains(&name.as_str()), "{name}");
         }
     }
 

@@ -17,7 +17,7 @@ pub(crate) struct Stop {
 
 /// What is wrong with `piece`.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
-    let finders = [character, head, operator, unit, condition, branch, reserved, neighbours, model_name];
+    let finders = [character, head, operator, condition, branch, unit, bare_unit, reserved, neighbours, model_name];
     finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
 }
 
@@ -52,7 +52,9 @@ pub(crate) fn brackets(source: &Source, piece: Piece) -> Option<Diagnostic> {
 
 fn unclosed(source: &Source, open: usize, last: usize) -> Diagnostic {
     let (bracket, close) = if source.word(open) == "(" { ("(", ")") } else { ("[", "]") };
-    let mut tail = source.text[source.marks[open].token.start..source.marks[last].token.end].to_string();
+    let called = open > 0 && source.glued(open) && source.kind(open - 1) == Some(TokenKind::Word);
+    let mut tail =
+        source.text[source.marks[open - called as usize].token.start..source.marks[last].token.end].to_string();
     let help = if tail.len() > 40 || tail.contains('\n') {
         format!("add `{close}`")
     } else {
@@ -64,11 +66,11 @@ fn unclosed(source: &Source, open: usize, last: usize) -> Diagnostic {
         .help(help)
 }
 
-/// How deep brackets and conditions lie in each other, and the mark where that is.
-pub(crate) fn depth(source: &Source, piece: Piece) -> (usize, usize) {
+/// How deep brackets and conditions lie in each other, and the first mark beyond `limit`.
+pub(crate) fn depth(source: &Source, piece: Piece, limit: usize) -> (usize, Option<usize>) {
     // For each open bracket, how many conditions stand in it so far: each lies in the one before it.
     let mut open = vec![0usize];
-    let (mut depth, mut deepest) = (0, (0, piece.start));
+    let (mut depth, mut deepest) = (0, 0);
     for at in piece.start..piece.end {
         match source.word(at) {
             "(" | "[" | "{" => {
@@ -87,11 +89,12 @@ pub(crate) fn depth(source: &Source, piece: Piece) -> (usize, usize) {
             }
             _ => {}
         }
-        if depth > deepest.0 {
-            deepest = (depth, at);
+        deepest = deepest.max(depth);
+        if depth > limit {
+            return (depth, Some(at));
         }
     }
-    deepest
+    (deepest, None)
 }
 
 /// Whether `word` is one of the known units, perhaps with a prefix.
@@ -140,7 +143,9 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         _ if found.is_alphabetic() => "names are made of the letters a to z, digits and `_`: `sigma0`, `omega`",
         _ => "remove it",
     };
-    let shown = if found.is_control() || found.is_whitespace() || found == '\u{200b}' {
+    let hidden =
+        matches!(found, '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202f}' | '\u{2060}'..='\u{206f}' | '\u{feff}');
+    let shown = if found.is_control() || found.is_whitespace() || hidden {
         format!("the character U+{:04X}", found as u32)
     } else {
         format!("`{found}`")
@@ -257,15 +262,17 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let unit_word = |at: usize| at < piece.end && source.kind(at) == Some(TokenKind::Word) && is_unit(source.word(at));
     let same_line = |at: usize| !source.marks[at].first_on_line;
     let number = (piece.start..at).rev().find(|&mark| source.kind(mark) == Some(TokenKind::Number));
-    if let Some(number) = number.filter(|&number| number + 2 == at && source.kind(at - 1) == Some(TokenKind::Unit)) {
-        if unit_word(at) && same_line(at) {
-            let mut last = at;
-            while unit_word(last + 1) && same_line(last + 1) {
-                last += 1;
-            }
-            let (value, unit, stray) = (source.word(number), source.word(at - 1), source.word(at));
-            let rest: Vec<&str> = (at - 1..=last).map(|mark| source.word(mark)).collect();
-            return Some(
+    if let Some(number) = number.filter(|&number| number + 2 == at && source.kind(at - 1) == Some(TokenKind::Unit))
+        && unit_word(at)
+        && same_line(at)
+    {
+        let mut last = at;
+        while unit_word(last + 1) && same_line(last + 1) {
+            last += 1;
+        }
+        let (value, unit, stray) = (source.word(number), source.word(at - 1), source.word(at));
+        let rest: Vec<&str> = (at - 1..=last).map(|mark| source.word(mark)).collect();
+        return Some(
                 Diagnostic::error("E0110", "a unit is written without spaces")
                     .label(
                         source.span(at - 1).to(source.span(last)),
@@ -277,7 +284,6 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
                         rest.join("*"),
                     )),
             );
-        }
     }
     // In brackets: from the bracket to its end there are only unit words and signs between them.
     let open = (piece.start..at + 1).rev().find(|&mark| source.is_symbol(mark, "["))?;
@@ -328,8 +334,8 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
 fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let missing = ["then", "else"].into_iter().find(|word| stop.expected.contains(&format!("`{word}`")))?;
     let condition = (piece.start..stop.at).rev().find(|&at| source.is_word(at, "if"))?;
-    // A stray word is a slip of its own, not a missing branch.
-    if stop.at < piece.end && !matches!(source.word(stop.at), ")" | "," | "else" | "in" | "}") {
+    // If the word comes later, something before it is wrong.
+    if (stop.at..piece.end).any(|at| source.is_word(at, missing)) {
         return None;
     }
     let (message, help) = match missing {
@@ -388,6 +394,32 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     )
 }
 
+/// The unit of a declaration without its brackets: `input v m/s`.
+fn bare_unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at != piece.start + 2
+        || at >= piece.end
+        || !stop.expected.iter().any(|expected| expected == "a unit in brackets")
+    {
+        return None;
+    }
+    let first = if source.is_symbol(at, "(") { at + 1 } else { at };
+    let end = (first..piece.end).find(|&mark| {
+        !is_unit(source.word(mark)) && !matches!(source.word(mark), "/" | "*" | "·" | "^" | "1" | "2" | "3")
+    });
+    let end = end.unwrap_or(piece.end);
+    let close = if first > at && source.is_symbol(end, ")") { end } else { end - 1 };
+    (end > first && is_unit(source.word(first))).then(|| {
+        Diagnostic::error("E0001", "the unit of a declaration stands in brackets")
+            .label(source.span(at).to(source.span(close)), "")
+            .help(format!(
+                "write `{} [{}]`",
+                slice(source, piece.start, piece.start + 1),
+                slice(source, first, end - 1)
+            ))
+    })
+}
+
 /// The name of a model in small letters.
 fn model_name(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
@@ -415,9 +447,18 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     if expected.len() > 1 {
         expected.retain(|word| word != "an operator");
     }
+    if expected.iter().any(|word| word == "a value") {
+        expected.retain(|word| !matches!(word.as_str(), "a name" | "`(`"));
+    }
+    for vague in ["the next statement", "a unit"] {
+        if expected.len() > 1 {
+            expected.retain(|word| word != vague);
+        }
+    }
     let wanted = match expected.as_slice() {
         [] => String::new(),
         [one] => format!("expected {one}"),
+        _ if stop.at == piece.start => "expected a statement".to_string(),
         [most @ .., last] if most.len() < 4 => format!("expected {} or {last}", most.join(", ")),
         _ => String::new(),
     };

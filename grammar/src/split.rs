@@ -273,6 +273,12 @@ impl<'t> Source<'t> {
                 if let Some(brace) = open.pop() {
                     self.blocks[brace] = (at, at + 1);
                 }
+            } else if self.marks[at].first_on_line && self.kind(at) == Some(TokenKind::Word) {
+                while open.len() > 1 && open.last().is_some_and(|&brace| indent(brace) >= indent(at)) {
+                    let brace = open.pop().unwrap_or(from);
+                    self.blocks[brace] = (at, at);
+                    guilty = guilty.or(Some(brace));
+                }
             }
         }
         for &brace in &open {
@@ -365,6 +371,9 @@ impl<'t> Source<'t> {
 
     /// Whether a new statement begins at `at`, in a statement that began at `first`; `inside`: in brackets.
     fn starts(&self, place: Place, first: usize, at: usize, inside: bool) -> bool {
+        if self.kind(at) == Some(TokenKind::Number) {
+            return !inside && self.marks[at].first_on_line && self.ends_operand(at - 1);
+        }
         if self.kind(at) != Some(TokenKind::Word) {
             return false;
         }
@@ -374,7 +383,8 @@ impl<'t> Source<'t> {
             return false;
         }
         let head = DECLARERS.contains(&before) && self.kind(at - 1) == Some(TokenKind::Word);
-        let ended = self.ends_operand(at - 1) && !(at - 1 == first && place.starters().contains(&before));
+        // One word alone is no statement: what follows on its line belongs to it.
+        let ended = self.ends_operand(at - 1) && (fresh || at - 1 > first);
         let begins = |sure: bool| if inside { fresh && sure } else { fresh || ended };
         if STARTERS.contains(&word) || begins_item(word) {
             let condition = word == "when"
@@ -382,7 +392,7 @@ impl<'t> Source<'t> {
                 && !(first..at).any(|mark| self.is_word(mark, "when"));
             let argument = inside && self.is_symbol(at + 1, "=");
             let call = !matches!(word, "next" | "reset") || self.is_symbol(at + 1, "(");
-            return !condition && !argument && call && !(head && !fresh) && begins(true);
+            return !condition && !argument && call && (fresh || !head) && begins(true);
         }
         if place.starters().contains(&word) && self.fits(at) {
             return begins(ended);

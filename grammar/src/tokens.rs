@@ -142,12 +142,13 @@ pub fn tokens(text: &str) -> Vec<Token> {
                 let closed = bytes.get(inside) == Some(&b'"');
                 if closed { (TokenKind::Text, inside + 1) } else { (TokenKind::OpenText, inside) }
             }
-            first => match (behind, unit_end(text, at)) {
-                (Behind::Number, Some(end)) => (TokenKind::Unit, end),
-                (Behind::Bracket, Some(end)) if closes(bytes, end) => (TokenKind::Unit, end),
-                _ if first.is_ascii_alphabetic() || first == b'_' => (TokenKind::Word, at + run(&bytes[at..], is_name)),
-                _ if first.is_ascii_digit() => (TokenKind::Number, number_end(bytes, at)),
-                _ => symbol(text, at),
+            first => match unit_behind(text, at, behind) {
+                Some(end) => (TokenKind::Unit, end),
+                None if first.is_ascii_alphabetic() || first == b'_' => {
+                    (TokenKind::Word, at + run(&bytes[at..], is_name))
+                }
+                None if first.is_ascii_digit() => (TokenKind::Number, number_end(bytes, at)),
+                None => symbol(text, at),
             },
         };
         behind = match (kind, behind) {
@@ -199,6 +200,15 @@ fn number_end(bytes: &[u8], start: usize) -> usize {
         }
     }
     end
+}
+
+/// Where the unit that begins at `at` ends, if a unit may stand there.
+fn unit_behind(text: &str, at: usize, behind: Behind) -> Option<usize> {
+    match behind {
+        Behind::Number => unit_end(text, at),
+        Behind::Bracket => unit_end(text, at).filter(|&end| closes(text.as_bytes(), end)),
+        Behind::Other => None,
+    }
 }
 
 /// Where the unit that begins at `start` ends, if one begins there. The same rule as `unit` in the grammar.

@@ -1,124 +1,20 @@
 //! Runs one experiment: steps the model, shows each point to measures and recording, and tells how it ended.
 //!
 //! In: an [`Instance`] and an [`Experiment`]. Out: an [`Outcome`], or a [`Failure`] that names quantity, value and
-//! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
+//! instant. Fixed steps are in the model's own code; adaptive ones in [`solver`](crate::solver). Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
-use crate::measure::{Expectations, Verdict};
-use crate::record::{Recorder, Recording};
+use crate::observe::{Observer, check_finite, check_status};
+use crate::outcome::Stop;
+pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
 use crate::show;
-use abi::description::{Guard, Kind};
+use crate::solver::adaptive;
+use abi::description::Kind;
 use abi::plan::{Experiment, Method};
-use abi::unit::Unit;
 use abi::{Instance, Slot};
-use std::fmt;
-use std::ops::ControlFlow;
-
-/// Whether to go on.
-pub type Continue = ControlFlow<()>;
 
 /// Fixed steps between two looks at the caller and at the whole block.
 const BATCH: u64 = 4096;
-
-/// How an experiment ended that ran to its end.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Outcome {
-    /// One for each expectation, in order.
-    pub verdicts: Vec<Verdict>,
-    /// What is drawn and written.
-    pub recording: Recording,
-    /// Outputs at the end, in the order of the description.
-    pub finals: Vec<Final>,
-    /// Time at the end in s.
-    pub time: f64,
-    /// What it took.
-    pub work: Work,
-    /// What the reader should know besides: in words, a sentence each.
-    pub notes: Vec<String>,
-}
-
-impl Outcome {
-    /// Whether every expectation held.
-    pub fn passed(&self) -> bool {
-        self.verdicts.iter().all(|verdict| verdict.holds)
-    }
-}
-
-/// The value of an output at the end.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Final {
-    /// Dotted path.
-    pub path: String,
-    /// In SI.
-    pub value: f64,
-    /// The unit it is shown in.
-    pub unit: Unit,
-    /// True (1) or false (0) rather than a quantity.
-    pub boolean: bool,
-}
-
-/// What a run took.
-#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
-pub struct Work {
-    /// Steps that count, of any kind.
-    pub steps: u64,
-}
-
-/// Why a run stopped before its end.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Failure {
-    /// The reason.
-    pub cause: Cause,
-    /// When, in s.
-    pub time: f64,
-    /// The run up to there.
-    pub recording: Recording,
-}
-
-/// The reason of a [`Failure`].
-#[derive(Clone, PartialEq, Debug)]
-pub enum Cause {
-    /// A watched quantity left its range.
-    Guard {
-        /// The quantity and its range.
-        guard: Box<Guard>,
-        /// Its value in SI.
-        value: f64,
-    },
-    /// A quantity became infinite or not a number.
-    NotFinite {
-        /// Dotted path, or the expression as written.
-        path: String,
-        /// Its value.
-        value: f64,
-    },
-    /// The solver is not there yet.
-    Unavailable,
-    /// The caller said to stop.
-    Stopped,
-}
-
-impl fmt::Display for Failure {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let time = show::time(self.time);
-        match &self.cause {
-            Cause::Guard { guard, value } => {
-                let Guard { path, range, unit, .. } = &**guard;
-                let value = show::quantity(*value, unit);
-                let (low, high) = (show::plain(unit.from_si(range.0)), show::quantity(range.1, unit));
-                write!(f, "`{path}` left its range {low} .. {high}: it is {value} at {time}")
-            }
-            Cause::NotFinite { path, value } if value.is_nan() => {
-                write!(f, "`{path}` is not a number at {time}")
-            }
-            Cause::NotFinite { path, .. } => write!(f, "`{path}` is infinite at {time}"),
-            Cause::Unavailable => write!(f, "adaptive runs are not available yet: give a `solver` with a step"),
-            Cause::Stopped => write!(f, "stopped at {time}"),
-        }
-    }
-}
-
-impl std::error::Error for Failure {}
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
 ///
@@ -140,18 +36,12 @@ pub fn run(
     let mut run = Run::new(instance, experiment);
     let result = match experiment.solver.method {
         Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => run.fixed(watch),
-        Method::Adaptive => Err(Stop { cause: Cause::Unavailable, time: 0.0 }),
+        Method::Adaptive => adaptive::run(&mut run.instance, experiment, &mut run.observer, &mut run.work, watch),
     };
     match result {
         Ok(()) => Ok(run.outcome()),
         Err(stop) => Err(Failure { cause: stop.cause, time: stop.time, recording: run.observer.recorder.recording() }),
     }
-}
-
-/// A reason to stop, and when.
-pub(crate) struct Stop {
-    pub(crate) cause: Cause,
-    pub(crate) time: f64,
 }
 
 /// A run under way.
@@ -161,86 +51,6 @@ struct Run<'a> {
     observer: Observer,
     work: Work,
     notes: Vec<String>,
-}
-
-/// Everything that looks at the points of a run.
-pub(crate) struct Observer {
-    expectations: Expectations,
-    recorder: Recorder,
-    /// Slots that are read; each must be finite.
-    slots: Vec<Slot>,
-}
-
-impl Observer {
-    fn new(experiment: &Experiment) -> Observer {
-        let expectations = Expectations::new(&experiment.expects);
-        let recorder = Recorder::new(&experiment.plots);
-        let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
-        slots.sort();
-        slots.dedup();
-        Observer { expectations, recorder, slots }
-    }
-
-    /// Whether only the last point of a run matters.
-    pub(crate) fn only_last(&self) -> bool {
-        self.recorder.is_empty() && self.expectations.only_last()
-    }
-
-    /// One point of the run: the block after a step, or on one side of an event.
-    pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
-        let block = instance.block();
-        // Zero times a value is zero unless it is infinite or not a number.
-        let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
-        if doubt != 0.0 {
-            // A state that went wrong explains the expression that was asked for.
-            check_finite(instance)?;
-            let bad = self.slots.iter().find(|slot| !block[slot.index()].is_finite());
-            return Err(not_finite(instance, *bad.expect("one of them is not finite")));
-        }
-        let time = block[Slot::TIME.index()];
-        self.expectations.see(time, block);
-        self.recorder.see(time, block);
-        Ok(())
-    }
-}
-
-/// States and outputs must be finite; private quantities may be infinite in a branch that is not taken.
-pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
-    let layout = &instance.description().layout;
-    let finite = |slot: &usize| instance.block()[*slot].is_finite();
-    if let Some(bad) = layout.states.range().find(|slot| !finite(slot)) {
-        return Err(not_finite(instance, Slot(bad as u32)));
-    }
-    let watched = |kind| matches!(kind, Kind::SampledState | Kind::Output);
-    let outputs = instance.description().quantities.iter().filter(|quantity| watched(quantity.kind));
-    match outputs.map(|quantity| quantity.slot).find(|slot| !finite(&slot.index())) {
-        Some(bad) => Err(not_finite(instance, bad)),
-        None => Ok(()),
-    }
-}
-
-fn not_finite(instance: &Instance, slot: Slot) -> Stop {
-    let named = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
-    let path = named.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone());
-    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time: instance.get(Slot::TIME) }
-}
-
-/// What a status that is not 0 means.
-pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop> {
-    if status == 0 {
-        return Ok(());
-    }
-    let guards = &instance.description().guards;
-    let guard = guards
-        .get(status as usize - 1)
-        .unwrap_or_else(|| panic!("status {status} of a model with {} guards", guards.len()));
-    let value = instance.get(guard.slot);
-    let cause = if value.is_finite() {
-        Cause::Guard { guard: Box::new(guard.clone()), value }
-    } else {
-        Cause::NotFinite { path: guard.path.clone(), value }
-    };
-    Err(Stop { cause, time: instance.get(Slot::TIME) })
 }
 
 impl<'a> Run<'a> {

@@ -8,9 +8,14 @@ pub mod show;
 pub mod measure;
 pub mod record;
 
+mod outcome;
+
+mod observe;
+
+mod solver;
+
 pub mod engine;
 pub mod sweep;
 
 #[cfg(test)]
-#[expect(dead_code, reason = "some helpers wait for the adaptive solver")]
 mod models;

@@ -352,3 +352,140 @@ pub fn plot(instance: &Instance, paths: &[&str]) -> Plot {
     };
     Plot { series: paths.iter().map(series).collect(), against: None }
 }
+
+/// A mass of 1 kg pulled through a spring of k = 2 N/m at 0.1 m/s, held by LuGre friction with the parameters of
+/// Canudas de Wit et al. (1995) and this micro-damping in N·s/m. States x, v, z; output: force of the spring.
+pub fn stick_slip(sigma1: f64) -> Instance {
+    const M: f64 = 1.0;
+    const K: f64 = 2.0;
+    const PULL: f64 = 0.1;
+    const SIGMA0: f64 = 1e5;
+    const SIGMA2: f64 = 0.4;
+    const FC: f64 = 1.0;
+    const FS: f64 = 1.5;
+    const VS: f64 = 1e-3;
+    let level = |v: f64| FC + (FS - FC) * (-(v / VS) * (v / VS)).exp();
+    Model::new("Pull(LuGre)")
+        .state("x", "m")
+        .state("v", "m/s")
+        .state("z", "um")
+        .output("pull", "N")
+        .root("v < 0")
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, move |m| {
+            let (x, v, z) = (m.x(0), m.x(1), m.x(2));
+            let dz = v - SIGMA0 * v.abs() / level(v) * z;
+            m.set_dx(0, v);
+            m.set_dx(1, (K * (PULL * m.t() - x) - SIGMA0 * z - sigma1 * dz - SIGMA2 * v) / M);
+            m.set_dx(2, dz);
+        })
+        .body(Function::Jacobian, move |m| {
+            let (v, z) = (m.x(1), m.x(2));
+            let g = level(v);
+            let slope = -2.0 * v / (VS * VS) * (g - FC);
+            let sign = if v < 0.0 { -1.0 } else { 1.0 };
+            let dz_dv = 1.0 - SIGMA0 * z * (sign / g - v.abs() * slope / (g * g));
+            let dz_dz = -SIGMA0 * v.abs() / g;
+            m.set_jacobian(&[
+                0.0,
+                1.0,
+                0.0,
+                -K / M,
+                (-sigma1 * dz_dv - SIGMA2) / M,
+                (-SIGMA0 - sigma1 * dz_dz) / M,
+                0.0,
+                dz_dv,
+                dz_dz,
+                0.0,
+                K * PULL / M,
+                0.0,
+            ]);
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .body(Function::Outputs, |m| m.set_y(0, K * (PULL * m.t() - m.x(0))))
+        .build()
+}
+
+/// What pulls the mass of [`dry_pull`].
+#[derive(Clone, Copy)]
+pub enum Contact {
+    Karnopp,
+    Kfm,
+}
+
+/// The mass and spring of [`stick_slip`] on a dry contact: 1 N sliding, 1.5 N at rest, 0.4 N·s/m. Karnopp's dead band
+/// is one condition; KFM is an automaton of `stick`, `forward` and `backward`. `load`: a constant force in N instead
+/// of the spring. States x, v, and of KFM the travel since it came to rest.
+pub fn dry_pull(contact: Contact, load: Option<f64>) -> Instance {
+    const FC: f64 = 1.0;
+    const FS: f64 = 1.5;
+    const FV: f64 = 0.4;
+    const DV: f64 = 1e-3;
+    const B: f64 = 1000.0;
+    const V_HOLD: f64 = 10e-3;
+    const X_HOLD: f64 = 10e-6;
+    let pull = move |m: &View| load.unwrap_or(2.0 * (0.1 * m.t() - m.x(0)));
+    let model = match contact {
+        Contact::Karnopp => Model::new("Pull(Karnopp)"),
+        Contact::Kfm => Model::new("Pull(KFM)").automaton(&["stick", "forward", "backward"]),
+    };
+    let model = model.state("x", "m").state("v", "m/s").state("slip", "um").output("pull", "N");
+    let friction = move |m: &View| {
+        let (v, pull) = (m.x(1), pull(m));
+        let stuck = |bleed: f64| (pull + bleed * v).clamp(-FS, FS);
+        match contact {
+            Contact::Karnopp if v.abs() < DV => stuck(FS / DV),
+            Contact::Karnopp => FC * v.signum() + FV * v,
+            Contact::Kfm => match m.regime(0) {
+                0.0 => stuck(B),
+                1.0 => FC + FV * v,
+                _ => -FC + FV * v,
+            },
+        }
+    };
+    let model = match contact {
+        Contact::Karnopp => model.root("fr: v < Dv").root("fr: -v < Dv").root("fr: clamp").root("fr: clamp").body(
+            Function::Roots,
+            move |m| {
+                let (v, force) = (m.x(1), pull(m) + FS / DV * m.x(1));
+                [v - DV, v + DV, force - FS, force + FS].into_iter().enumerate().for_each(|(i, g)| m.set_root(i, g));
+            },
+        ),
+        Contact::Kfm => (0..8)
+            .fold(model, |model, _| model.root("fr: go"))
+            .body(Function::Roots, move |m| {
+                let (v, slip, pull) = (m.x(1), m.x(2), pull(m));
+                let force = pull + B * v;
+                let stick = [pull - FS, pull + FS, v - V_HOLD, v + V_HOLD, slip - X_HOLD, slip + X_HOLD];
+                let roots = if m.regime(0) == 0.0 {
+                    [v, stick[0], stick[1], stick[2], stick[3], stick[4], stick[5], (force - FS) * (force + FS)]
+                } else {
+                    [v, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+                };
+                roots.into_iter().enumerate().for_each(|(i, g)| m.set_root(i, g));
+            })
+            .body(Function::Transitions, move |m| {
+                let (v, slip, pull) = (m.x(1), m.x(2), pull(m));
+                match m.regime(0) {
+                    0.0 if (pull > FS && v >= 0.0) || v > V_HOLD || slip > X_HOLD => m.set_regime(0, 1.0),
+                    0.0 if (pull < -FS && v <= 0.0) || v < -V_HOLD || slip < -X_HOLD => m.set_regime(0, 2.0),
+                    1.0 if v < 0.0 => m.set_regime(0, 0.0),
+                    2.0 if v > 0.0 => m.set_regime(0, 0.0),
+                    _ => return,
+                }
+                if m.regime(0) == 0.0 {
+                    m.set_x(2, 0.0);
+                }
+            }),
+    };
+    model
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, move |m| {
+            m.set_dx(0, m.x(1));
+            m.set_dx(1, pull(m) - friction(m));
+            let sticks = matches!(contact, Contact::Kfm) && m.regime(0) == 0.0;
+            m.set_dx(2, if sticks { m.x(1) } else { 0.0 });
+        })
+        .body(Function::Outputs, move |m| m.set_y(0, pull(m)))
+        .build()
+}

@@ -20,13 +20,13 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
         errors += found.iter().filter(|diagnostic| diagnostic.is_error()).count();
         warnings += found.iter().filter(|diagnostic| !diagnostic.is_error()).count();
         if args.json {
-            if let Value::Array(objects) = report::json(&loaded.files, &found) {
+            if let Value::Array(objects) = report::json(&loaded.files.0, &found) {
                 all.extend(objects);
             }
         } else if args.short {
-            terminal.print(&report::short(&loaded.files, &found));
+            terminal.print(&report::short(&loaded.files.0, &found));
         } else if !found.is_empty() {
-            terminal.line(&report::full(&loaded.files, &found, terminal.colour()));
+            terminal.line(&report::full(&loaded.files.0, &found, terminal.colour()));
         }
     }
     if args.json {
@@ -48,13 +48,8 @@ fn found_in(path: &Path, terminal: &Terminal) -> Option<(Loaded, Vec<Diagnostic>
     let name = path.display().to_string();
     match project::read(path) {
         Ok(text) => {
-            let loaded = compile::load(&name, text, &project::Disk);
-            let mut found = loaded.diagnostics.clone();
-            for diagnostic in compile::check(&loaded) {
-                if !found.contains(&diagnostic) {
-                    found.push(diagnostic);
-                }
-            }
+            let mut loaded = compile::load(&name, &text, &project::Disk);
+            let found = compile::check(&mut loaded, &project::Disk);
             Some((loaded, found))
         }
         Err(reason) => {

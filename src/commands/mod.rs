@@ -70,10 +70,10 @@ fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loade
         }
     };
     watch.stage("parse");
-    let loaded = compile::load(&name, text, &project::Disk);
+    let loaded = compile::load(&name, &text, &project::Disk);
     let failed = loaded.diagnostics.iter().any(grammar::diagnostic::Diagnostic::is_error);
     if failed {
-        terminal.report(&report::full(&loaded.files, &loaded.diagnostics, terminal.error_colour()));
+        terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));
         return None;
     }
     Some(loaded)
@@ -90,13 +90,15 @@ struct Done {
 
 /// Compiles an experiment.
 fn compiled(
-    loaded: &Loaded,
+    loaded: &mut Loaded,
     experiment: &str,
     options: &Options,
     before: &Stages,
 ) -> Result<(Vec<Case>, Stages), Vec<grammar::diagnostic::Diagnostic>> {
     let mut watch = Stopwatch::start("check");
-    let cases = compile::compile(loaded, experiment, options, &mut |stage| watch.stage(stage))?;
+    let mut warnings = Vec::new();
+    let cases =
+        compile::compile(loaded, &project::Disk, experiment, options, &mut warnings, &mut |stage| watch.stage(stage))?;
     let mut stages = before.clone();
     stages.0.extend(watch.stop().0);
     Ok((cases, stages))

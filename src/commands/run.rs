@@ -2,7 +2,7 @@
 
 use super::{Done, End, compiled, done, load};
 use crate::args::Run;
-use crate::compile::{Loaded, Options, Stages, Stopwatch};
+use crate::compile::{Changes, Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 pub fn run(args: &Run, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
-    let Some(loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
+    let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
     let stages = watch.stop();
     let names = match chosen(args, &loaded) {
         Ok(names) => names,
@@ -29,17 +29,17 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         ));
         return End::Misused;
     }
-    let options = Options {
-        set: args.set.clone(),
+    let changes = Changes {
+        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
         method: args.solver,
         step: args.step,
         tol: args.tol,
         duration: args.duration,
-        interpret: args.interpret,
     };
+    let options = Options { changes, interpret: args.interpret };
     let mut end = End::Fine;
     for name in &names {
-        if experiment(args, &loaded, name, &options, &stages, terminal) != End::Fine {
+        if experiment(args, &mut loaded, name, &options, &stages, terminal) != End::Fine {
             end = End::Failed;
         }
     }
@@ -67,7 +67,7 @@ fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
 
 fn experiment(
     args: &Run,
-    loaded: &Loaded,
+    loaded: &mut Loaded,
     name: &str,
     options: &Options,
     before: &Stages,
@@ -77,9 +77,9 @@ fn experiment(
     let (cases, stages) = match compiled(loaded, name, options, before) {
         Ok(compiled) => compiled,
         Err(diagnostics) => {
-            terminal.report(&report::full(&loaded.files, &diagnostics, terminal.error_colour()));
+            terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
             if args.json {
-                let found = report::json(&loaded.files, &diagnostics);
+                let found = report::json(&loaded.files.0, &diagnostics);
                 terminal.line(
                     &json!({ "file": file, "experiment": name, "passed": false, "diagnostics": found }).to_string(),
                 );

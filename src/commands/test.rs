@@ -27,7 +27,7 @@ pub fn test(args: &Test, terminal: &mut Terminal) -> End {
     }
     for file in &files {
         let mut watch = Stopwatch::start("read");
-        let Some(loaded) = load(file, terminal, &mut watch) else {
+        let Some(mut loaded) = load(file, terminal, &mut watch) else {
             tally.failed += 1;
             continue;
         };
@@ -38,7 +38,7 @@ pub fn test(args: &Test, terminal: &mut Terminal) -> End {
             terminal.line(&file.display().to_string());
         }
         for name in names {
-            tally.add(experiment(args, &loaded, &name, &stages, terminal));
+            tally.add(experiment(args, &mut loaded, &name, &stages, terminal));
         }
     }
     if tally.passed + tally.failed == 0 {
@@ -61,13 +61,13 @@ impl Tally {
 }
 
 /// Runs one experiment; whether all that it expects holds in every case.
-fn experiment(args: &Test, loaded: &Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
+fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
     let options = Options { interpret: args.interpret, ..Options::default() };
     let (cases, stages) = match compiled(loaded, name, &options, before) {
         Ok(compiled) => compiled,
         Err(diagnostics) => {
             terminal.line(&line(terminal, false, name, ""));
-            terminal.report(&report::full(&loaded.files, &diagnostics, terminal.error_colour()));
+            terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
             return false;
         }
     };

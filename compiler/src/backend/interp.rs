@@ -51,6 +51,11 @@ impl Interpret for Interpreter {
     }
 }
 
+/// Runs an expanded function once on a block of any size that holds all its slots; returns its status.
+pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
+    run(func, block, pool, &mut vec![0; func.ops.len()])
+}
+
 /// Runs a function once; `values` takes the bits of every value.
 fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
     for (i, op) in func.ops.iter().enumerate() {
@@ -96,9 +101,4 @@ mod tests {
         assert_eq!(code.call(Function::Step, &mut block, &[], 100), 7);
         assert_eq!(block[a.index()..=b.index()], [4.0, 4.0]);
     }
-}
-
-/// Runs an expanded function once on a block of any size that holds all its slots; returns its status.
-pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
-    run(func, block, pool, &mut vec![0; func.ops.len()])
 }

@@ -18,6 +18,11 @@ use crate::ir::expr::{Real, Shared};
 use crate::ir::{Binary, Func, Op, Unary, Value};
 pub use tables::POOL;
 
+/// The tables of the elementary functions: the beginning of every pool.
+pub fn pool() -> &'static [f64] {
+    &POOL
+}
+
 /// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));

@@ -1,0 +1,111 @@
+//! Looks at the points of a run: measures, recordings, and whether every number is one.
+//!
+//! In: instances after a step, or on one side of an event. Out: what [`measure`](crate::measure) and
+//! [`record`](crate::record) make of them, or the reason to stop. Knows no solver.
+
+use crate::measure::Expectations;
+use crate::outcome::{Cause, Stop};
+use crate::record::Recorder;
+use abi::description::Kind;
+use abi::plan::Experiment;
+use abi::{Instance, Slot};
+
+/// Everything that looks at the points of a run.
+pub(crate) struct Observer {
+    pub(crate) expectations: Expectations,
+    pub(crate) recorder: Recorder,
+    /// Slots that are read; each must be finite.
+    slots: Vec<Slot>,
+}
+
+impl Observer {
+    pub(crate) fn new(experiment: &Experiment) -> Observer {
+        let expectations = Expectations::new(&experiment.expects);
+        let recorder = Recorder::new(&experiment.plots);
+        let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
+        slots.sort();
+        slots.dedup();
+        Observer { expectations, recorder, slots }
+    }
+
+    /// Whether only the last point of a run matters.
+    pub(crate) fn only_last(&self) -> bool {
+        self.recorder.is_empty() && self.expectations.only_last()
+    }
+
+    /// The slots that are read, ascending.
+    pub(crate) fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+
+    /// Whether anything is measured rather than only drawn.
+    pub(crate) fn measures(&self) -> bool {
+        self.expectations.slots().next().is_some()
+    }
+
+    /// One point of the run: the block after a step, or on one side of an event.
+    pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
+        let block = instance.block();
+        // Zero times a value is zero unless it is infinite or not a number.
+        let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
+        if doubt != 0.0 {
+            self.check(instance)?;
+        }
+        self.show(block[Slot::TIME.index()], block);
+        Ok(())
+    }
+
+    /// One point whose values are known to be finite.
+    pub(crate) fn show(&mut self, time: f64, block: &[f64]) {
+        self.expectations.see(time, block);
+        self.recorder.see(time, block);
+    }
+
+    /// Names what is read and not finite. A state that went wrong explains the expression that was asked for.
+    pub(crate) fn check(&self, instance: &Instance) -> Result<(), Stop> {
+        check_finite(instance)?;
+        match self.slots.iter().find(|slot| !instance.get(**slot).is_finite()) {
+            Some(bad) => Err(not_finite(instance, *bad)),
+            None => Ok(()),
+        }
+    }
+}
+
+/// States and outputs must be finite; private quantities may be infinite in a branch that is not taken.
+pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
+    let layout = &instance.description().layout;
+    let finite = |slot: &usize| instance.block()[*slot].is_finite();
+    if let Some(bad) = layout.states.range().find(|slot| !finite(slot)) {
+        return Err(not_finite(instance, Slot(bad as u32)));
+    }
+    let watched = |kind| matches!(kind, Kind::SampledState | Kind::Output);
+    let outputs = instance.description().quantities.iter().filter(|quantity| watched(quantity.kind));
+    match outputs.map(|quantity| quantity.slot).find(|slot| !finite(&slot.index())) {
+        Some(bad) => Err(not_finite(instance, bad)),
+        None => Ok(()),
+    }
+}
+
+fn not_finite(instance: &Instance, slot: Slot) -> Stop {
+    let named = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
+    let path = named.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone());
+    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time: instance.get(Slot::TIME) }
+}
+
+/// What a status that is not 0 means.
+pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop> {
+    if status == 0 {
+        return Ok(());
+    }
+    let guards = &instance.description().guards;
+    let guard = guards
+        .get(status as usize - 1)
+        .unwrap_or_else(|| panic!("status {status} of a model with {} guards", guards.len()));
+    let value = instance.get(guard.slot);
+    let cause = if value.is_finite() {
+        Cause::Guard { guard: Box::new(guard.clone()), value }
+    } else {
+        Cause::NotFinite { path: guard.path.clone(), value }
+    };
+    Err(Stop { cause, time: instance.get(Slot::TIME) })
+}

@@ -1,0 +1,327 @@
+//! The stiff method: Rodas5P, a Rosenbrock method of order 5(4) with eight stages, L-stable and stiffly accurate, with
+//! a continuous extension of order four. One Jacobian, one factorisation, eight solves; no iteration.
+//!
+//!   (I/(γh) − J) u_i = f(t + c_i h, x0 + Σ_j A_ij u_j) + Σ_j (C_ij/h) u_j + h d_i ∂f/∂t       j < i
+//!   x1 = x0 + Σ_j A_8j u_j + u_8,   error ≈ u_8
+//!
+//! Source: Steinebach, Construction of Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia
+//! Differential Equations package, BIT Numer. Math. 63:27 (2023); form of the stages: Hairer & Wanner, Solving ODEs II,
+//! eq. IV.7.25. The tests check the order conditions of the coefficients as they stand here.
+
+use super::linear;
+use super::step::{Step, System};
+
+const STAGES: usize = 8;
+
+const GAMMA: f64 = 0.21193756319429014;
+
+/// Nodes, as fractions of the step.
+const C: [f64; STAGES] =
+    [0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0];
+
+/// Weights of ∂f/∂t; those of the last three stages are 0.
+const D: [f64; STAGES] = [
+    0.21193756319429014,
+    -0.42387512638858027,
+    -0.3384627126235924,
+    1.8046452872882734,
+    2.325825639765069,
+    0.0,
+    0.0,
+    0.0,
+];
+
+/// Weights of earlier stages in the argument of f; stages 6 to 8 add one stage each to the last row.
+const A: [[f64; 5]; 6] = [
+    [0.0; 5],
+    [3.0, 0.0, 0.0, 0.0, 0.0],
+    [2.849394379747939, 0.45842242204463923, 0.0, 0.0, 0.0],
+    [-6.954028509809101, 2.489845061869568, -10.358996098473584, 0.0, 0.0],
+    [2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641, 0.0],
+    [-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946],
+];
+
+/// Weights of earlier stages in the right side.
+const W: [[f64; 7]; STAGES] = [
+    [0.0; 7],
+    [-14.155112264123755, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    [-17.97296035885952, -2.859693295451294, 0.0, 0.0, 0.0, 0.0, 0.0],
+    [147.12150275711716, -1.41221402718213, 71.68940251302358, 0.0, 0.0, 0.0, 0.0],
+    [165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306, 0.0, 0.0, 0.0],
+    [24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471, 0.0, 0.0],
+    [
+        30.91273214028599,
+        -3.1208243349937974,
+        77.79954646070892,
+        34.28646028294783,
+        -19.097331116725623,
+        -28.087943162872662,
+        0.0,
+    ],
+    [
+        37.80277123390563,
+        -3.2571969029072276,
+        112.26918849496327,
+        66.9347231244047,
+        -40.06618937091002,
+        -54.66780262877968,
+        -9.48861652309627,
+    ],
+];
+
+/// Of the continuous extension.
+const H: [[f64; STAGES]; 3] = [
+    [
+        25.948786856663858,
+        -2.5579724845846235,
+        10.433815404888879,
+        -2.3679251022685204,
+        0.524948541321073,
+        1.1241088310450404,
+        0.4272876194431874,
+        -0.17202221070155493,
+    ],
+    [
+        -9.91568850695171,
+        -0.9689944594115154,
+        3.0438037242978453,
+        -24.495224566215796,
+        20.176138334709044,
+        15.98066361424651,
+        -6.789040303419874,
+        -6.710236069923372,
+    ],
+    [
+        11.419903575922262,
+        2.8879645146136994,
+        72.92137995996029,
+        80.12511834622643,
+        -52.072871366152654,
+        -59.78993625266729,
+        -0.15582684282751913,
+        4.883087185713722,
+    ],
+];
+
+/// Room for the stages and the matrix.
+pub(crate) struct Rosenbrock {
+    /// u_1 … u_8, one behind the other.
+    u: Vec<f64>,
+    /// Factors of I/(γh) − J.
+    matrix: Vec<f64>,
+    rows: Vec<usize>,
+    x: Vec<f64>,
+    f: Vec<f64>,
+    attempt: fn(&mut Rosenbrock, &mut System, &mut Step, &[f64]) -> bool,
+}
+
+impl Rosenbrock {
+    pub(crate) fn new(n: usize) -> Rosenbrock {
+        let attempt = match n {
+            1 => Rosenbrock::stages::<1>,
+            2 => Rosenbrock::stages::<2>,
+            3 => Rosenbrock::stages::<3>,
+            4 => Rosenbrock::stages::<4>,
+            5 => Rosenbrock::stages::<5>,
+            6 => Rosenbrock::stages::<6>,
+            7 => Rosenbrock::stages::<7>,
+            8 => Rosenbrock::stages::<8>,
+            _ => Rosenbrock::stages::<0>,
+        };
+        let zeros = || vec![0.0; n];
+        Rosenbrock {
+            u: vec![0.0; STAGES * n],
+            matrix: vec![0.0; n * n],
+            rows: vec![0; n],
+            x: zeros(),
+            f: zeros(),
+            attempt,
+        }
+    }
+
+    /// Fills in the step from its `t`, `h`, `end`, `x0` and `f0`, given the Jacobian at its start: ∂f/∂x, then ∂f/∂t.
+    ///
+    /// Returns false where the matrix is singular; a shorter step then is the remedy.
+    pub(crate) fn attempt(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
+        (self.attempt)(self, system, step, jacobian)
+    }
+
+    fn stages<const N: usize>(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
+        let n = if N == 0 { system.n } else { N };
+        let h = step.h;
+        let (matrix, rows) = (&mut self.matrix[..n * n], &mut self.rows[..n]);
+        let (x, f) = (&mut self.x[..n], &mut self.f[..n]);
+        let (x0, f0) = (&step.x0[..n], &step.f0[..n]);
+        let (df_dx, df_dt) = jacobian[..n * n + n].split_at(n * n);
+        for (entry, j) in matrix.iter_mut().zip(df_dx) {
+            *entry = -j;
+        }
+        for i in 0..n {
+            matrix[i * n + i] += 1.0 / (GAMMA * h);
+        }
+        if !linear::factor::<N>(n, matrix, rows) {
+            return false;
+        }
+        for stage in 0..STAGES {
+            let (done, rest) = self.u[..STAGES * n].split_at_mut(stage * n);
+            let u = &mut rest[..n];
+            if stage == 0 {
+                f.copy_from_slice(f0);
+            } else {
+                if stage < 6 {
+                    for i in 0..n {
+                        let mut sum = x0[i];
+                        for j in 0..stage {
+                            sum += A[stage][j] * done[j * n + i];
+                        }
+                        x[i] = sum;
+                    }
+                } else {
+                    for i in 0..n {
+                        x[i] += done[(stage - 1) * n + i];
+                    }
+                }
+                let t = if stage < 5 { step.t + C[stage] * h } else { step.end };
+                system.slope(t, x, f);
+            }
+            for i in 0..n {
+                let mut sum = 0.0;
+                for j in 0..stage {
+                    sum += W[stage][j] * done[j * n + i];
+                }
+                u[i] = f[i] + sum / h + h * D[stage] * df_dt[i];
+            }
+            linear::solve::<N>(n, matrix, rows, u);
+        }
+        let u = &self.u[..STAGES * n];
+        for i in 0..n {
+            let last = u[7 * n + i];
+            step.x1[i] = x[i] + last;
+            step.error[i] = last;
+            let sum = |weights: &[f64; STAGES]| {
+                let mut sum = 0.0;
+                for stage in 0..STAGES {
+                    sum += weights[stage] * u[stage * n + i];
+                }
+                sum
+            };
+            step.k1[i] = sum(&H[0]);
+            step.k2[i] = sum(&H[1]);
+            step.k3[i] = sum(&H[2]);
+        }
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::models;
+    use crate::solver::order::violation;
+
+    type Matrix = Vec<Vec<f64>>;
+
+    /// α, β = α + Γ and Γ of the classical form; weights w of the u are weights wΓ of the k.
+    fn classical() -> (Matrix, Matrix, Matrix) {
+        // Γ⁻¹ = I/γ − W is lower triangular: by rows from Γ = γ (I + W Γ).
+        let mut gamma: Matrix = Vec::new();
+        for (row, weights) in W.iter().enumerate() {
+            let entry = |column: usize| {
+                let sum: f64 = gamma.iter().zip(weights).map(|(above, w)| w * above[column]).sum();
+                GAMMA * (sum + f64::from(row == column))
+            };
+            gamma.push((0..STAGES).map(entry).collect());
+        }
+        let alpha: Matrix = (0..STAGES).map(|stage| turn(&arguments(stage), &gamma)).collect();
+        let beta = alpha.iter().zip(&gamma).map(|(a, g)| a.iter().zip(g).map(|(a, g)| a + g).collect()).collect();
+        (alpha, beta, gamma)
+    }
+
+    /// Weights of the k from weights of the u.
+    fn turn(weights: &[f64], gamma: &Matrix) -> Vec<f64> {
+        (0..STAGES).map(|j| weights.iter().zip(gamma).map(|(w, row)| w * row[j]).sum()).collect()
+    }
+
+    /// Weights of all stages in the argument of one, or for stage 8 in the solution.
+    fn arguments(stage: usize) -> Vec<f64> {
+        let mut weights = vec![0.0; STAGES];
+        weights[..5].copy_from_slice(&A[stage.min(5)]);
+        weights[5..].iter_mut().take(stage.saturating_sub(5)).for_each(|weight| *weight = 1.0);
+        weights
+    }
+
+    #[test]
+    fn the_coefficients_satisfy_the_order_conditions() {
+        let (alpha, beta, gamma) = classical();
+        let solution = turn(&arguments(8), &gamma);
+        let embedded = turn(&arguments(7), &gamma);
+        for size in 1..=5 {
+            assert!(violation(size, 1.0, &solution, &alpha, &beta) < 1e-12, "order {size}");
+        }
+        assert!(violation(6, 1.0, &solution, &alpha, &beta) > 1e-5);
+        for size in 1..=4 {
+            assert!(violation(size, 1.0, &embedded, &alpha, &beta) < 1e-12, "embedded order {size}");
+        }
+        assert!(violation(5, 1.0, &embedded, &alpha, &beta) > 1e-4);
+        for theta in [0.1, 0.5, 0.77] {
+            let weight = |i: usize| {
+                let bend = H[0][i] + theta * (H[1][i] + theta * H[2][i]);
+                theta * (arguments(8)[i] + (1.0 - theta) * bend)
+            };
+            let dense = turn(&std::array::from_fn::<f64, STAGES, _>(weight), &gamma);
+            for size in 1..=4 {
+                assert!(violation(size, theta, &dense, &alpha, &beta) < 1e-12, "dense order {size} at {theta}");
+            }
+        }
+    }
+
+    #[test]
+    fn nodes_are_the_sums_of_their_rows() {
+        let (alpha, beta, _) = classical();
+        for stage in 0..STAGES {
+            let sum = |row: &[f64]| row.iter().sum::<f64>();
+            assert!((sum(&alpha[stage]) - C[stage]).abs() < 1e-12, "node {stage}");
+            assert!((sum(&beta[stage]) - sum(&alpha[stage]) - D[stage]).abs() < 1e-12, "weight of df/dt {stage}");
+        }
+    }
+
+    /// x' = −x² cos t, x = 1/(1 + sin t), to t = 2 s: nonlinear and not autonomous.
+    fn error(steps: u32) -> (f64, f64) {
+        let mut instance = models::Model::new("Wave")
+            .state("x", "m")
+            .body(abi::Function::Derivatives, |m| m.set_dx(0, -m.x(0) * m.x(0) * m.t().cos()))
+            .body(abi::Function::Jacobian, |m| {
+                m.set_jacobian(&[-2.0 * m.x(0) * m.t().cos(), m.x(0) * m.x(0) * m.t().sin()]);
+            })
+            .build();
+        let mut system = System::new(&mut instance);
+        let (mut method, mut step) = (Rosenbrock::new(1), Step::new(1));
+        let exact = |t: f64| 1.0 / (1.0 + t.sin());
+        let h = 2.0 / f64::from(steps);
+        let (mut x, mut dense, mut j) = (1.0, 0.0f64, [0.0; 2]);
+        for k in 0..steps {
+            (step.t, step.h, step.end) = (f64::from(k) * h, h, f64::from(k + 1) * h);
+            step.x0[0] = x;
+            system.slope(step.t, &[x], &mut step.f0);
+            system.jacobian(step.t, &[x], &step.f0, &[1.0], &mut j);
+            assert!(method.attempt(&mut system, &mut step, &j));
+            let mut middle = [0.0];
+            step.at(0.5, &mut middle);
+            dense = dense.max((middle[0] - exact(step.time(0.5))).abs());
+            x = step.x1[0];
+        }
+        ((x - exact(2.0)).abs(), dense)
+    }
+
+    #[test]
+    fn halving_the_step_shows_order_five_and_four_between() {
+        let errors: Vec<(f64, f64)> = [20, 40, 80].map(error).into();
+        for pair in errors.windows(2) {
+            let order = |a: f64, b: f64| (a / b).log2();
+            let (end, between) = (order(pair[0].0, pair[1].0), order(pair[0].1, pair[1].1));
+            println!("order {end:.2} at the end, {between:.2} between");
+            assert!((4.7..5.6).contains(&end), "order {end}");
+            assert!((3.7..5.6).contains(&between), "order {between} between");
+        }
+    }
+}

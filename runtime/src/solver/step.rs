@@ -1,0 +1,173 @@
+//! The model as a solver sees it, and one step of it as a polynomial.
+
+use abi::{Function, Instance, Slot};
+use std::ops::Range;
+
+/// A model whose derivatives, Jacobian and switching surfaces are functions of time and states; everything else in
+/// its block is held.
+pub(crate) struct System<'a> {
+    pub(crate) instance: &'a mut Instance,
+    /// Number of states.
+    pub(crate) n: usize,
+    pub(crate) states: Range<usize>,
+    derivatives: Range<usize>,
+    jacobian: Range<usize>,
+    roots: Range<usize>,
+    /// Evaluations of the derivatives.
+    pub(crate) evaluations: u64,
+}
+
+impl<'a> System<'a> {
+    pub(crate) fn new(instance: &'a mut Instance) -> System<'a> {
+        let layout = &instance.description().layout;
+        let roots = if instance.has(Function::Roots) { layout.roots.range() } else { 0..0 };
+        System {
+            n: layout.states.len as usize,
+            states: layout.states.range(),
+            derivatives: layout.derivatives.range(),
+            jacobian: layout.jacobian.range(),
+            roots,
+            instance,
+            evaluations: 0,
+        }
+    }
+
+    /// Number of switching surfaces.
+    pub(crate) fn surfaces(&self) -> usize {
+        self.roots.len()
+    }
+
+    /// Puts time in s and states in SI into the block.
+    pub(crate) fn place(&mut self, t: f64, x: &[f64]) {
+        let states = self.states.clone();
+        let block = self.instance.block_mut();
+        block[Slot::TIME.index()] = t;
+        block[states].copy_from_slice(x);
+    }
+
+    /// dx/dt at (t, x), in SI per second.
+    pub(crate) fn slope(&mut self, t: f64, x: &[f64], f: &mut [f64]) {
+        self.evaluations += 1;
+        self.place(t, x);
+        if self.n > 0 {
+            self.instance.call(Function::Derivatives);
+        }
+        f.copy_from_slice(&self.instance.block()[self.derivatives.clone()]);
+    }
+
+    /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: one-sided differences
+    /// over √ε of |x| or of the scale `s` of the state, whichever is larger; to the side where no surface is crossed,
+    /// for the derivative is that of the branch taken.
+    pub(crate) fn jacobian(&mut self, t: f64, x: &[f64], f0: &[f64], s: &[f64], j: &mut [f64]) {
+        if self.n == 0 {
+            return;
+        }
+        if self.instance.has(Function::Jacobian) {
+            self.place(t, x);
+            self.instance.call(Function::Jacobian);
+            j.copy_from_slice(&self.instance.block()[self.jacobian.clone()]);
+            return;
+        }
+        const ROOT: f64 = 1.5e-8;
+        let n = self.n;
+        let (mut moved, mut f) = (x.to_vec(), vec![0.0; n]);
+        let (mut here, mut there) = (vec![0.0; self.surfaces()], vec![0.0; self.surfaces()]);
+        if !here.is_empty() {
+            self.roots(t, x, &mut here);
+        }
+        for column in 0..=n {
+            // The last column is time.
+            let by = ROOT * if column < n { x[column].abs().max(s[column]) } else { t.max(1.0) };
+            let mut width = by;
+            for by in [by, -by] {
+                let mut later = t;
+                if column < n {
+                    moved[column] = x[column] + by;
+                    width = moved[column] - x[column];
+                } else {
+                    later = t + by;
+                    width = later - t;
+                }
+                if !here.is_empty() {
+                    self.roots(later, &moved, &mut there);
+                }
+                self.slope(later, &moved, &mut f);
+                if here.iter().zip(&there).all(|(a, b)| a * b >= 0.0) {
+                    break;
+                }
+            }
+            for row in 0..n {
+                let entry = if column < n { row * n + column } else { n * n + row };
+                j[entry] = (f[row] - f0[row]) / width;
+            }
+            if column < n {
+                moved[column] = x[column];
+            }
+        }
+    }
+
+    /// Values of the switching surfaces at (t, x).
+    pub(crate) fn roots(&mut self, t: f64, x: &[f64], g: &mut [f64]) {
+        self.place(t, x);
+        self.instance.call(Function::Roots);
+        g.copy_from_slice(&self.instance.block()[self.roots.clone()]);
+    }
+}
+
+/// One step from `t` to `t + h`, with a polynomial of degree four between:
+///
+///   x(t + θh) = x0 + θ (x1 − x0) + θ (1 − θ) (k1 + θ (k2 + θ k3))
+#[derive(Default)]
+pub(crate) struct Step {
+    /// Start in s.
+    pub(crate) t: f64,
+    /// Length in s.
+    pub(crate) h: f64,
+    /// Where its last stages are evaluated: `t + h`, or just before it if a signal has a corner there.
+    pub(crate) end: f64,
+    pub(crate) x0: Vec<f64>,
+    pub(crate) x1: Vec<f64>,
+    /// dx/dt at the start.
+    pub(crate) f0: Vec<f64>,
+    pub(crate) k1: Vec<f64>,
+    pub(crate) k2: Vec<f64>,
+    pub(crate) k3: Vec<f64>,
+    /// Estimated error of each state, SI.
+    pub(crate) error: Vec<f64>,
+}
+
+impl Step {
+    pub(crate) fn new(n: usize) -> Step {
+        let zeros = || vec![0.0; n];
+        Step {
+            t: 0.0,
+            h: 0.0,
+            end: 0.0,
+            x0: zeros(),
+            x1: zeros(),
+            f0: zeros(),
+            k1: zeros(),
+            k2: zeros(),
+            k3: zeros(),
+            error: zeros(),
+        }
+    }
+
+    /// Time at θ.
+    pub(crate) fn time(&self, theta: f64) -> f64 {
+        if theta == 1.0 { self.end } else { self.t + theta * self.h }
+    }
+
+    /// States at θ.
+    pub(crate) fn at(&self, theta: f64, x: &mut [f64]) {
+        if theta == 1.0 {
+            x.copy_from_slice(&self.x1);
+            return;
+        }
+        let rest = 1.0 - theta;
+        for (i, x) in x.iter_mut().enumerate() {
+            let bend = self.k1[i] + theta * (self.k2[i] + theta * self.k3[i]);
+            *x = self.x0[i] + theta * (self.x1[i] - self.x0[i] + rest * bend);
+        }
+    }
+}

@@ -1,0 +1,210 @@
+//! Where a step first crosses a switching surface.
+//!
+//! In: a [`Step`] and the values of the surfaces along it. Out: brackets, the earliest first, at whose near end every
+//! condition has its old value and at whose far end some have their new one.
+
+use super::step::{Step, System};
+
+/// Where the first crossing of a step lies, in θ.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Crossing {
+    /// Nothing has changed yet.
+    pub(crate) near: f64,
+    /// Something has.
+    pub(crate) far: f64,
+}
+
+/// On which side of each surface the model is, and the values along one step.
+pub(crate) struct Surfaces {
+    /// −1 or 1; 0 where the model has been on the surface since the last restart.
+    sides: Vec<f64>,
+    /// Values at the end of the last step, or where the search stands within this one.
+    here: Vec<f64>,
+    /// θ of the points to look at, ascending.
+    nodes: Vec<f64>,
+    /// Values at those points, one behind the other.
+    values: Vec<f64>,
+    /// Values at a trial point, and at the far end of the last bracket.
+    trial: Vec<f64>,
+    far: Vec<f64>,
+    /// Values and sides at the start of the step.
+    start: Vec<f64>,
+    start_sides: Vec<f64>,
+    x: Vec<f64>,
+    /// Bracket width in s.
+    width: f64,
+}
+
+impl Surfaces {
+    /// Brackets will be `width` seconds wide.
+    pub(crate) fn new(system: &System, width: f64) -> Surfaces {
+        let zeros = || vec![0.0; system.surfaces()];
+        Surfaces {
+            sides: zeros(),
+            here: zeros(),
+            nodes: Vec::new(),
+            values: Vec::new(),
+            trial: zeros(),
+            far: zeros(),
+            start: zeros(),
+            start_sides: zeros(),
+            x: vec![0.0; system.n],
+            width,
+        }
+    }
+
+    /// Takes the sides at (t, x) as they are.
+    pub(crate) fn restart(&mut self, system: &mut System, t: f64, x: &[f64]) {
+        if self.sides.is_empty() {
+            return;
+        }
+        system.roots(t, x, &mut self.here);
+        for (side, g) in self.sides.iter_mut().zip(&self.here) {
+            *side = sign(*g);
+        }
+    }
+
+    /// For a step that was too long: roughly where it first crosses, in θ, if it ends behind a surface.
+    pub(crate) fn guess(&mut self, system: &mut System, step: &Step) -> Option<f64> {
+        if self.sides.is_empty() || !step.x1.iter().all(|x| x.is_finite()) {
+            return None;
+        }
+        system.roots(step.end, &step.x1, &mut self.trial);
+        let crossed = (0..self.sides.len()).filter(|&i| self.sides[i] * self.trial[i] < 0.0);
+        crossed.map(|i| self.here[i] / (self.here[i] - self.trial[i])).min_by(f64::total_cmp)
+    }
+
+    /// Goes back to the start of the step that was looked at last.
+    pub(crate) fn again(&mut self) {
+        self.here.copy_from_slice(&self.start);
+        self.sides.copy_from_slice(&self.start_sides);
+    }
+
+    /// Looks along a step. Between two points that are looked at, a surface that is touched and left again would be
+    /// missed: so a parabola through the values says where to look besides. After a restart (`fresh`) the model may
+    /// stand a rounding error beside a surface that it leaves at once: so the beginning is looked at more closely.
+    pub(crate) fn begin(&mut self, system: &mut System, step: &Step, fresh: bool) {
+        let m = self.sides.len();
+        self.nodes.clear();
+        self.values.clear();
+        if m == 0 {
+            return;
+        }
+        self.start.copy_from_slice(&self.here);
+        self.start_sides.copy_from_slice(&self.sides);
+        if fresh {
+            [1e-6, 1e-4, 1e-2, 0.1, 0.25].into_iter().for_each(|theta| self.look(system, step, theta));
+        }
+        self.look(system, step, 0.5);
+        self.look(system, step, 1.0);
+        let (middle, end) = (self.values.len() - 2 * m, self.values.len() - m);
+        for i in 0..m {
+            let (a, b, c) = (self.here[i], self.values[middle + i], self.values[end + i]);
+            if self.sides[i] * b <= 0.0 || self.sides[i] * c <= 0.0 {
+                continue;
+            }
+            // a + θ (4b − 3a − c) + 2 θ² (a − 2b + c), least where its slope is 0.
+            let (slope, bend) = (4.0 * b - 3.0 * a - c, 2.0 * (a - 2.0 * b + c));
+            let theta = -0.5 * slope / bend;
+            let least = a + 0.5 * theta * slope;
+            let near = 0.2 * a.abs().min(b.abs()).min(c.abs());
+            if theta > 0.0 && theta < 1.0 && self.sides[i] * least < near && !self.nodes.contains(&theta) {
+                self.look(system, step, theta);
+            }
+        }
+        // Few, and nearly sorted: by insertion.
+        for k in 1..self.nodes.len() {
+            let mut k = k;
+            while k > 0 && self.nodes[k - 1] > self.nodes[k] {
+                self.nodes.swap(k - 1, k);
+                let (front, back) = self.values.split_at_mut(k * m);
+                front[(k - 1) * m..].swap_with_slice(&mut back[..m]);
+                k -= 1;
+            }
+        }
+    }
+
+    fn look(&mut self, system: &mut System, step: &Step, theta: f64) {
+        step.at(theta, &mut self.x);
+        let from = self.values.len();
+        self.values.resize(from + self.sides.len(), 0.0);
+        system.roots(step.time(theta), &self.x, &mut self.values[from..]);
+        self.nodes.push(theta);
+    }
+
+    /// The first crossing behind θ = `from`, where the search stands; none up to the end of the step.
+    pub(crate) fn first(&mut self, system: &mut System, step: &Step, from: f64) -> Option<Crossing> {
+        let m = self.sides.len();
+        let mut near = from;
+        for k in 0..self.nodes.len() {
+            if self.nodes[k] <= near {
+                continue;
+            }
+            self.far.copy_from_slice(&self.values[k * m..(k + 1) * m]);
+            if self.crossed(&self.far) {
+                return Some(self.bracket(system, step, near, self.nodes[k]));
+            }
+            self.pass(false);
+            near = self.nodes[k];
+        }
+        None
+    }
+
+    /// The surfaces crossed by the last bracket.
+    pub(crate) fn changed(&self) -> impl Iterator<Item = usize> {
+        (0..self.sides.len()).filter(|&i| self.sides[i] * self.far[i] < 0.0)
+    }
+
+    /// Goes on behind the last bracket, on the new sides.
+    pub(crate) fn pass(&mut self, crossed: bool) {
+        for (side, g) in self.sides.iter_mut().zip(&self.far) {
+            if crossed || *side == 0.0 {
+                *side = if *g == 0.0 { *side } else { sign(*g) };
+            }
+        }
+        self.here.copy_from_slice(&self.far);
+    }
+
+    fn crossed(&self, g: &[f64]) -> bool {
+        self.sides.iter().zip(g).any(|(side, g)| side * g < 0.0)
+    }
+
+    /// Narrows a bracket around the first crossing by secants aimed half a width beside the zero, now on the one side,
+    /// now on the other, so that both ends close in; halved where that is slow.
+    fn bracket(&mut self, system: &mut System, step: &Step, mut near: f64, mut far: f64) -> Crossing {
+        let width = self.width.max(4.0 * f64::EPSILON * step.t) / step.h;
+        let (mut slow, mut aim) = (0, -0.5);
+        while far - near > width {
+            let zero = |i: usize| near + (far - near) * (self.here[i] / (self.here[i] - self.far[i]));
+            let first = self.changed().map(zero).fold(far, f64::min);
+            let theta = if slow == 2 { 0.5 * (near + far) } else { first + aim * width };
+            // Not a number where the values are not: halve.
+            let theta = if theta > near && theta < far { theta } else { 0.5 * (near + far) };
+            let theta = theta.clamp(near + 0.25 * width, far - 0.25 * width);
+            step.at(theta, &mut self.x);
+            system.roots(step.time(theta), &self.x, &mut self.trial);
+            let before = far - near;
+            if self.crossed(&self.trial) {
+                far = theta;
+                std::mem::swap(&mut self.far, &mut self.trial);
+                aim = -0.5;
+            } else {
+                near = theta;
+                std::mem::swap(&mut self.here, &mut self.trial);
+                aim = 0.5;
+            }
+            slow = if far - near > 0.5 * before && slow < 2 { slow + 1 } else { 0 };
+        }
+        Crossing { near, far }
+    }
+}
+
+fn sign(g: f64) -> f64 {
+    if g > 0.0 {
+        1.0
+    } else if g < 0.0 {
+        -1.0
+    } else {
+        0.0
+    }
+}
