@@ -60,7 +60,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
         Panel {
             x: x.clone(),
             y: Axis { name: names.join(", "), unit: group[0].unit.text.clone() },
-            curves: common.chain(own).collect(),
+            curves: own.chain(common).collect(),
             bands: bands.clone(),
         }
     };

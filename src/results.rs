@@ -2,8 +2,8 @@
 
 use crate::compile::Stages;
 use crate::terminal::{Style, Terminal};
-use crate::value::{count, duration, show};
-use abi::plan::Experiment;
+use crate::value::{count, duration, show, significant};
+use abi::plan::{Experiment, Method};
 use abi::unit::Unit;
 use abi::{Description, Instance};
 use runtime::engine::{Failure, Outcome};
@@ -40,6 +40,7 @@ impl Ran<'_> {
     /// The object of `--json`. Values are in the unit beside them; what is not finite is a string.
     pub fn json(&self) -> Value {
         let description = self.instance.description();
+        let adaptive = self.experiment.solver.method == Method::Adaptive;
         let mut object = json!({
             "file": self.file,
             "experiment": self.experiment.name,
@@ -50,8 +51,8 @@ impl Ran<'_> {
             "parts": parts(description),
             "solver": {
                 "method": self.experiment.solver.method.name(),
-                "step": number(self.experiment.solver.step),
-                "tol": number(self.experiment.solver.tol),
+                "step": (!adaptive).then(|| number(self.experiment.solver.step)),
+                "tol": adaptive.then(|| number(self.experiment.solver.tol)),
             },
             "duration": number(self.experiment.duration),
             "compile_seconds": self.stages.0.iter().map(|(stage, s)| (stage.to_string(), number(*s))).collect::<Value>(),
@@ -186,7 +187,6 @@ fn words(verdict: &Verdict) -> String {
 
 /// What was compiled and how long it took, on two lines.
 pub fn compiled(description: &Description, experiment: &Experiment, stages: &Stages, cases: usize) -> String {
-    use abi::plan::Method;
     let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
     let mut facts = vec![counted(states(description), "state")];
     match parts(description) {
@@ -196,7 +196,7 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     let of_cases = if cases > 1 { format!(", {cases} cases") } else { String::new() };
     let second = Unit::parse("s").expect("the second is known");
     let solver = match experiment.solver {
-        solver if solver.method == Method::Adaptive => format!("adaptive tol {}", solver.tol),
+        solver if solver.method == Method::Adaptive => format!("adaptive tol {}", significant(solver.tol, 3)),
         solver => format!("{} step {}", solver.method.name(), duration(solver.step)),
     };
     let slowest: Vec<String> =
