@@ -246,10 +246,12 @@ struct Meter {
     slot: Slot,
     after: f64,
     before: f64,
-    /// The last point seen, inside the window or not.
-    last: Option<Point>,
-    /// First and last point inside the window.
-    inside: Option<(Point, Point)>,
+    /// The last point seen, inside the window or not; in the beginning none, at an infinite time.
+    last: Point,
+    /// First and last point counted, inside the window; valid once there is one.
+    first: Point,
+    end: Point,
+    counted: bool,
     tally: Tally,
 }
 
@@ -294,23 +296,23 @@ impl Meter {
             MeasureKind::Period => Tally::Period { kept: Kept::default() },
             MeasureKind::Settling(band) => Tally::Settling { band, kept: Kept::default() },
         };
-        Meter { slot: measure.slot, after, before, last: None, inside: None, tally }
+        let none = (f64::INFINITY, 0.0);
+        Meter { slot: measure.slot, after, before, last: none, first: none, end: none, counted: false, tally }
     }
 
     /// One more point; at the edges of the window, the point on the line to the one before.
     fn see(&mut self, t: f64, v: f64) {
-        if let Some(last) = self.last {
-            if last.0 < self.after && t > self.after && self.after <= self.before {
-                self.count(self.after, self.between(last, (t, v), self.after));
-            }
-            if last.0 < self.before && t > self.before && self.after <= self.before {
-                self.count(self.before, self.between(last, (t, v), self.before));
-            }
+        let last = self.last;
+        if last.0 < self.after && t > self.after && self.after <= self.before {
+            self.count(self.after, self.between(last, (t, v), self.after));
+        }
+        if last.0 < self.before && t > self.before && self.after <= self.before {
+            self.count(self.before, self.between(last, (t, v), self.before));
         }
         if self.after <= t && t <= self.before {
             self.count(t, v);
         }
-        self.last = Some((t, v));
+        self.last = (t, v);
     }
 
     /// The value at an edge between two points. A condition keeps its value until the next point.
@@ -319,7 +321,10 @@ impl Meter {
     }
 
     fn count(&mut self, t: f64, v: f64) {
-        let previous = self.inside.map(|(_, last)| last);
+        let previous = self.end;
+        if !self.counted {
+            self.first = (t, v);
+        }
         match &mut self.tally {
             Tally::Extremes { min, max, .. } => {
                 if v < min.1 {
@@ -330,7 +335,8 @@ impl Meter {
                 }
             }
             Tally::Sum { square, sum, .. } => {
-                if let Some((t0, v0)) = previous {
+                if self.counted {
+                    let (t0, v0) = previous;
                     let (a, b) = if *square { (v0 * v0, v * v) } else { (v0, v) };
                     sum.add(0.5 * (a + b) * (t - t0));
                 }
@@ -339,10 +345,7 @@ impl Meter {
             Tally::At { instant, value } => {
                 if t == *instant {
                     *value = Some(v);
-                } else if let Some(previous) = previous
-                    && previous.0 < *instant
-                    && *instant < t
-                {
+                } else if previous.0 < *instant && *instant < t {
                     *value = Some(line(previous, (t, v), *instant));
                 }
             }
@@ -362,18 +365,21 @@ impl Meter {
             }
             Tally::Period { kept } | Tally::Settling { kept, .. } => kept.push((t, v)),
         }
-        let first = self.inside.map_or((t, v), |(first, _)| first);
-        self.inside = Some((first, (t, v)));
+        self.end = (t, v);
+        self.counted = true;
     }
 
     /// Value in SI, and the time in s where it happened; or the reason why there is none.
     fn reading(&self) -> Result<(f64, Option<f64>), String> {
-        let Some((first, last)) = self.inside else {
-            let end =
-                self.last.map_or("the run has no point".into(), |(t, _)| format!("the run ends at {}", show::time(t)));
+        if !self.counted {
+            let end = match self.last.0 {
+                f64::INFINITY => "the run has no point".into(),
+                end => format!("the run ends at {}", show::time(end)),
+            };
             let (after, before) = (show::time(self.after), show::time(self.before));
             return Err(format!("the window from {after} to {before} is empty; {end}"));
-        };
+        }
+        let (first, last) = (self.first, self.end);
         let width = last.0 - first.0;
         match &self.tally {
             Tally::Extremes { min, max, kind } => Ok(match kind {

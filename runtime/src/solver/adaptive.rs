@@ -18,8 +18,8 @@ use abi::plan::Experiment;
 use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
 
-/// Steps tried at most. A run that needs more is told so; it would take minutes.
-const MOST_ATTEMPTS: u64 = 20_000_000;
+/// Steps tried at most between two stops. A run that needs more is told so; it would take minutes.
+const MOST_ATTEMPTS: u64 = 5_000_000;
 
 /// More events than this within a millionth of the run are chatter.
 const MOST_EVENTS: usize = 100;
@@ -134,7 +134,12 @@ impl<'a> Adaptive<'a> {
             if half > 0.0 && half.is_finite() { half } else { quantity.unit.scale }
         };
         let scales: Vec<f64> = (0..states.len as usize).map(scale).collect();
-        let ticks = description.ticks.iter().map(|tick| (instance.get(tick.period), 1)).collect();
+        let period = |slot| {
+            let period = instance.get(slot);
+            assert!(period > 0.0, "a sampled block with a period of {period} s");
+            period
+        };
+        let ticks = description.ticks.iter().map(|tick| (period(tick.period), 1)).collect();
         let tol = experiment.solver.tol;
         assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
         let slots: Vec<usize> = match observer.only_last() {
@@ -211,20 +216,21 @@ impl<'a> Adaptive<'a> {
 
     /// The next instant that must be met exactly.
     fn next_stop(&self) -> f64 {
-        let corner = self.corners.iter().copied().find(|corner| *corner > self.t).unwrap_or(self.duration);
+        let corner = self.corners.partition_point(|corner| *corner <= self.t);
+        let corner = self.corners.get(corner).copied().unwrap_or(self.duration);
         let tick = self.ticks.iter().map(|(period, number)| period * *number as f64).fold(self.duration, f64::min);
         corner.min(tick).min(self.duration)
     }
 
     /// Steps up to `stop`.
     fn reach(&mut self, stop: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
-        while stop - self.t > 8.0 * f64::EPSILON * stop {
-            let attempts = self.work.steps + self.work.rejected;
-            if attempts.is_multiple_of(64) && watch(self.t / self.duration).is_break() {
-                return Err(Stop { cause: Cause::Stopped, time: self.t });
+        let before = self.attempts();
+        while stop - self.t > 32.0 * f64::EPSILON * stop {
+            if self.attempts().is_multiple_of(64) && watch(self.t / self.duration).is_break() {
+                return Err(self.stop(Cause::Stopped));
             }
-            if attempts >= MOST_ATTEMPTS {
-                return Err(self.stop(Cause::TooManySteps { steps: attempts, path: self.worst() }));
+            if self.attempts() - before >= MOST_ATTEMPTS {
+                return Err(self.stop(Cause::TooManySteps { steps: self.attempts(), path: self.worst() }));
             }
             let left = stop - self.t;
             let wanted = self.h.min(self.longest);
@@ -235,7 +241,7 @@ impl<'a> Adaptive<'a> {
             } else if h > 0.5 * left {
                 h = 0.5 * left;
             }
-            if h < 16.0 * f64::EPSILON * self.t || h < f64::MIN_POSITIVE {
+            if !hits && h < (16.0 * f64::EPSILON * self.t).max(f64::MIN_POSITIVE) {
                 return Err(self.too_short(h));
             }
             self.step.t = self.t;
@@ -508,7 +514,7 @@ impl<'a> Adaptive<'a> {
             }
             check_status(self.system.instance, status)?;
             self.work.ticks += 1;
-        } else if !self.corners.contains(&self.t) {
+        } else if self.corners.binary_search_by(|corner| corner.total_cmp(&self.t)).is_err() {
             return Ok(());
         }
         self.settle()?;
@@ -673,6 +679,11 @@ impl<'a> Adaptive<'a> {
             *span = (span.0.min(*value), span.1.max(*value));
         }
         self.observer.show(time, &self.shown.block);
+    }
+
+    /// Steps tried so far.
+    fn attempts(&self) -> u64 {
+        self.work.steps + self.work.rejected
     }
 
     fn stop(&self, cause: Cause) -> Stop {
