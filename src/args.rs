@@ -41,8 +41,12 @@ pub enum Command {
         /// Which shell
         shell: clap_complete::Shell,
     },
-    /// Print the manual page
-    Man,
+    /// Print the manual page of fric, or of one of its commands
+    Man {
+        /// Such as run
+        #[arg(value_parser = ["run", "test", "check", "fmt", "explain", "new", "completions"])]
+        command: Option<String>,
+    },
 }
 
 /// `fric run`
@@ -193,6 +197,14 @@ mod tests {
     #[test]
     fn the_tree_is_sound() {
         Args::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_its_manual_page() {
+        for command in Args::command().get_subcommands().map(|command| command.get_name().to_string()) {
+            let read = Args::try_parse_from(["fric", "man", &command]);
+            assert_eq!(read.is_ok(), command != "man", "{command}");
+        }
     }
 
     #[test]

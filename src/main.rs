@@ -3,6 +3,8 @@
 //! In: arguments, files, a terminal. Out: words, plots, files, an exit code. What a text means is the compiler's
 //! business, what a run does the runtime's; here they meet.
 
+#![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
+
 mod args;
 mod commands;
 mod compile;
@@ -11,7 +13,6 @@ mod plot;
 mod project;
 mod report;
 mod results;
-#[allow(missing_docs, dead_code)]
 mod terminal;
 mod value;
 

@@ -221,3 +221,34 @@ pub fn work(outcomes: &[&Outcome], wall: f64) -> String {
     };
     format!("  ran {} steps in {}{speed}\n", count(steps), duration(wall))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_json_has_no_number_for_is_a_string() {
+        let numbers = [1.5, f64::INFINITY, f64::NEG_INFINITY, f64::NAN].map(number);
+        assert_eq!(Value::from(numbers.to_vec()).to_string(), r#"[1.5,"inf","-inf","nan"]"#);
+    }
+
+    #[test]
+    fn a_verdict_says_value_and_margin() {
+        let unit = Unit::parse("N").expect("the newton is known");
+        let mut verdict = Verdict {
+            text: "max(F) < 1.6 N".into(),
+            holds: true,
+            readings: vec![Reading { text: "max(F)".into(), value: 1.5035, unit: unit.clone(), time: Some(3.0) }],
+            margin: Some(Margin { amount: 0.0965, value: 1.5035, limit: 1.6, unit, time: Some(3.0) }),
+            problem: None,
+        };
+        assert_eq!(words(&verdict), "1.5035 N, margin 0.0965 N");
+        verdict.holds = false;
+        assert_eq!(words(&verdict), "1.5035 N, misses by 0.0965 N, at 3 s");
+        verdict.readings[0].value = 0.75;
+        verdict.margin.as_mut().expect("it has one").time = None;
+        assert_eq!(words(&verdict), "1.5035 N (max(F) = 0.75 N), misses by 0.0965 N");
+        verdict.problem = Some("max(F): the window is empty".into());
+        assert_eq!(words(&verdict), "max(F): the window is empty");
+    }
+}

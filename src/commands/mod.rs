@@ -12,6 +12,7 @@ use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
 use clap::CommandFactory;
+use grammar::diagnostic::Diagnostic;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::{Continue, Failure, Outcome};
 use runtime::sweep;
@@ -44,9 +45,14 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
             terminal.print(&String::from_utf8_lossy(&out));
             End::Fine
         }
-        Command::Man => {
+        Command::Man { command } => {
             let mut out = Vec::new();
-            let rendered = clap_mangen::Man::new(Args::command()).render(&mut out);
+            let mut tree = Args::command();
+            // Only a built tree knows that a command's name is `fric run`.
+            tree.build();
+            let page = command.as_ref().and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
+            let name = command.as_ref().map_or("fric".into(), |name| format!("fric-{name}"));
+            let rendered = clap_mangen::Man::new(page).title(name).render(&mut out);
             rendered.expect("writing to memory does not fail");
             terminal.print(&String::from_utf8_lossy(&out));
             End::Fine
@@ -66,7 +72,7 @@ fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loade
     };
     watch.stage("parse");
     let loaded = compile::load(&name, &text, &project::Disk);
-    let failed = loaded.diagnostics.iter().any(grammar::diagnostic::Diagnostic::is_error);
+    let failed = loaded.diagnostics.iter().any(Diagnostic::is_error);
     if failed {
         terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));
         return None;
@@ -83,20 +89,29 @@ struct Done {
     stages: Stages,
 }
 
-/// Compiles an experiment.
+/// Compiles an experiment; reports what is wrong with it, and with `warn` also what deserves a look.
 fn compiled(
     loaded: &mut Loaded,
     experiment: &str,
     options: &Options,
     before: &Stages,
-) -> Result<(Vec<Case>, Stages), Vec<grammar::diagnostic::Diagnostic>> {
-    let mut watch = Stopwatch::start("check");
-    let mut warnings = Vec::new();
+    warn: bool,
+    terminal: &Terminal,
+) -> Result<(Vec<Case>, Stages), Vec<Diagnostic>> {
+    let mut watch = Stopwatch::start("names");
+    let mut found = Vec::new();
     let cases =
-        compile::compile(loaded, &project::Disk, experiment, options, &mut warnings, &mut |stage| watch.stage(stage))?;
+        compile::compile(loaded, &project::Disk, experiment, options, &mut found, &mut |stage| watch.stage(stage));
+    if !warn {
+        found.clear();
+    }
+    found.extend(cases.as_ref().err().into_iter().flatten().cloned());
+    if !found.is_empty() {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+    }
     let mut stages = before.clone();
     stages.0.extend(watch.stop().0);
-    Ok((cases, stages))
+    Ok((cases?, stages))
 }
 
 /// Runs the cases of an experiment, with a bar on a terminal if it takes a while.

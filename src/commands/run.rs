@@ -74,10 +74,10 @@ fn experiment(
     terminal: &mut Terminal,
 ) -> End {
     let file = args.file.display().to_string();
-    let (cases, stages) = match compiled(loaded, name, options, before) {
+    let talking = !args.json && !args.quiet;
+    let (cases, stages) = match compiled(loaded, name, options, before, talking, terminal) {
         Ok(compiled) => compiled,
         Err(diagnostics) => {
-            terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
             if args.json {
                 let found = report::json(&loaded.files.0, &diagnostics);
                 terminal.line(
@@ -87,7 +87,6 @@ fn experiment(
             return End::Failed;
         }
     };
-    let talking = !args.json && !args.quiet;
     if let (true, Some(case)) = (talking, cases.first()) {
         terminal.line(&terminal.styled(Style::Bold, name));
         let description = case.instance.description();

@@ -3,10 +3,10 @@
 use super::{End, compiled, done, load};
 use crate::args::Test;
 use crate::compile::{Loaded, Options, Stages, Stopwatch};
+use crate::project;
 use crate::results;
 use crate::terminal::{Style, Terminal};
 use crate::value::duration;
-use crate::{project, report};
 use std::path::PathBuf;
 
 pub fn test(args: &Test, terminal: &mut Terminal) -> End {
@@ -63,13 +63,9 @@ impl Tally {
 /// Runs one experiment; whether all that it expects holds in every case.
 fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
     let options = Options { interpret: args.interpret, ..Options::default() };
-    let (cases, stages) = match compiled(loaded, name, &options, before) {
-        Ok(compiled) => compiled,
-        Err(diagnostics) => {
-            terminal.line(&line(terminal, false, name, ""));
-            terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
-            return false;
-        }
+    let Ok((cases, stages)) = compiled(loaded, name, &options, before, false, terminal) else {
+        terminal.line(&line(terminal, false, name, ""));
+        return false;
     };
     let done = done(cases, stages, args.quiet);
     let passed = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));

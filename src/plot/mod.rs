@@ -137,4 +137,5 @@ const PALETTE: [&str; 7] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9
 const SHADES: [&str; 3] = ["#e9eef5", "#f6ecdf", "#e6f2ec"];
 
 #[cfg(test)]
+#[expect(clippy::disallowed_methods, clippy::print_stdout, reason = "pictures to look at")]
 mod tests;
