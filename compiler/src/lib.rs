@@ -90,6 +90,9 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
     }
     match method {
         Method::Adaptive => {
+            if program.description.layout.jacobian.len > 0 {
+                out.push((Function::Jacobian, derive::jacobian(program)));
+            }
             out.push((Function::Derivatives, program.derivatives.clone()));
             if program.description.layout.jacobian.len > 0 {
                 out.push((Function::Jacobian, derive::jacobian(program)));
