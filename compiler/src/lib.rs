@@ -6,6 +6,7 @@ pub mod ir;
 pub mod math;
 pub mod opt;
 pub mod program;
+pub mod derive;
 pub mod discretize;
 pub mod backend;
 
@@ -89,7 +90,13 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
     }
     match method {
         Method::Adaptive => {
+            if program.description.layout.jacobian.len > 0 {
+                out.push((Function::Jacobian, derive::jacobian(program)));
+            }
             out.push((Function::Derivatives, program.derivatives.clone()));
+            if program.description.layout.jacobian.len > 0 {
+                out.push((Function::Jacobian, derive::jacobian(program)));
+            }
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }

@@ -16,3 +16,5 @@ mod split;
 mod slips;
 
 pub mod parse;
+
+pub mod format;

@@ -246,10 +246,12 @@ struct Meter {
     slot: Slot,
     after: f64,
     before: f64,
-    /// The last point seen, inside the window or not.
-    last: Option<Point>,
-    /// First and last point inside the window.
-    inside: Option<(Point, Point)>,
+    /// The last point seen, inside the window or not; in the beginning none, at an infinite time.
+    last: Point,
+    /// First and last point counted, inside the window; valid once there is one.
+    first: Point,
+    end: Point,
+    counted: bool,
     tally: Tally,
 }
 
@@ -294,23 +296,23 @@ impl Meter {
             MeasureKind::Period => Tally::Period { kept: Kept::default() },
             MeasureKind::Settling(band) => Tally::Settling { band, kept: Kept::default() },
         };
-        Meter { slot: measure.slot, after, before, last: None, inside: None, tally }
+        let none = (f64::INFINITY, 0.0);
+        Meter { slot: measure.slot, after, before, last: none, first: none, end: none, counted: false, tally }
     }
 
     /// One more point; at the edges of the window, the point on the line to the one before.
     fn see(&mut self, t: f64, v: f64) {
-        if let Some(last) = self.last {
-            if last.0 < self.after && t > self.after && self.after <= self.before {
-                self.count(self.after, self.between(last, (t, v), self.after));
-            }
-            if last.0 < self.before && t > self.before && self.after <= self.before {
-                self.count(self.before, self.between(last, (t, v), self.before));
-            }
+        let last = self.last;
+        if last.0 < self.after && t > self.after && self.after <= self.before {
+            self.count(self.after, self.between(last, (t, v), self.after));
+        }
+        if last.0 < self.before && t > self.before && self.after <= self.before {
+            self.count(self.before, self.between(last, (t, v), self.before));
         }
         if self.after <= t && t <= self.before {
             self.count(t, v);
         }
-        self.last = Some((t, v));
+        self.last = (t, v);
     }
 
     /// The value at an edge between two points. A condition keeps its value until the next point.
@@ -319,7 +321,10 @@ impl Meter {
     }
 
     fn count(&mut self, t: f64, v: f64) {
-        let previous = self.inside.map(|(_, last)| last);
+        let previous = self.end;
+        if !self.counted {
+            self.first = (t, v);
+        }
         match &mut self.tally {
             Tally::Extremes { min, max, .. } => {
                 if v < min.1 {
@@ -330,7 +335,8 @@ impl Meter {
                 }
             }
             Tally::Sum { square, sum, .. } => {
-                if let Some((t0, v0)) = previous {
+                if self.counted {
+                    let (t0, v0) = previous;
                     let (a, b) = if *square { (v0 * v0, v * v) } else { (v0, v) };
                     sum.add(0.5 * (a + b) * (t - t0));
                 }
@@ -339,10 +345,7 @@ impl Meter {
             Tally::At { instant, value } => {
                 if t == *instant {
                     *value = Some(v);
-                } else if let Some(previous) = previous
-                    && previous.0 < *instant
-                    && *instant < t
-                {
+                } else if previous.0 < *instant && *instant < t {
                     *value = Some(line(previous, (t, v), *instant));
                 }
             }
@@ -362,18 +365,21 @@ impl Meter {
             }
             Tally::Period { kept } | Tally::Settling { kept, .. } => kept.push((t, v)),
         }
-        let first = self.inside.map_or((t, v), |(first, _)| first);
-        self.inside = Some((first, (t, v)));
+        self.end = (t, v);
+        self.counted = true;
     }
 
     /// Value in SI, and the time in s where it happened; or the reason why there is none.
     fn reading(&self) -> Result<(f64, Option<f64>), String> {
-        let Some((first, last)) = self.inside else {
-            let end =
-                self.last.map_or("the run has no point".into(), |(t, _)| format!("the run ends at {}", show::time(t)));
+        if !self.counted {
+            let end = match self.last.0 {
+                f64::INFINITY => "the run has no point".into(),
+                end => format!("the run ends at {}", show::time(end)),
+            };
             let (after, before) = (show::time(self.after), show::time(self.before));
             return Err(format!("the window from {after} to {before} is empty; {end}"));
-        };
+        }
+        let (first, last) = (self.first, self.end);
         let width = last.0 - first.0;
         match &self.tally {
             Tally::Extremes { min, max, kind } => Ok(match kind {
@@ -433,10 +439,8 @@ fn period(points: &[Point]) -> Result<f64, String> {
     let width = points[points.len() - 1].0 - points[0].0;
     let mean = if width > 0.0 { area.total() / width } else { points[0].1 };
     // Upward means from below to at or above; a value that only touches the mean from above does not cross.
-    let mut crossings = points.windows(2).filter(|pair| pair[0].1 < mean && mean <= pair[1].1).map(|pair| {
-        let part = (mean - pair[0].1) / (pair[1].1 - pair[0].1);
-        pair[0].0 + part * (pair[1].0 - pair[0].0)
-    });
+    let upward = (1..points.len()).filter(|&i| points[i - 1].1 < mean && mean <= points[i].1);
+    let mut crossings = upward.map(|i| crossing(&points[i.saturating_sub(2)..points.len().min(i + 2)], mean));
     let (mut first, mut last, mut count) = (0.0, 0.0, 0);
     for time in &mut crossings {
         if count == 0 {
@@ -449,6 +453,45 @@ fn period(points: &[Point]) -> Result<f64, String> {
         return Err(format!("three upward crossings through the mean are needed, there are {count}"));
     }
     Ok((last - first) / f64::from(count - 1))
+}
+
+/// When the cubic through four points passes `level` between the middle two; a line where there are not four, or two
+/// of them lie at one time. A line alone would be as coarse as the points.
+fn crossing(points: &[Point], level: f64) -> f64 {
+    let middle = points.windows(2).position(|pair| pair[0].1 < level && level <= pair[1].1).expect("one pair crosses");
+    let (from, to) = (points[middle], points[middle + 1]);
+    let part = (level - from.1) / (to.1 - from.1);
+    let straight = from.0 + part * (to.0 - from.0);
+    let &[p0, p1, p2, p3] = points else { return straight };
+    if !points.is_sorted_by(|a, b| a.0 < b.0) || middle != 1 {
+        return straight;
+    }
+    let over = |a: Point, b: Point, high: f64, low: f64| (high - low) / (b.0 - a.0);
+    let (d01, d12, d23) = (over(p0, p1, p1.1, p0.1), over(p1, p2, p2.1, p1.1), over(p2, p3, p3.1, p2.1));
+    let (d02, d13) = (over(p0, p2, d12, d01), over(p1, p3, d23, d12));
+    let d03 = over(p0, p3, d13, d02);
+    let height = |t: f64| p0.1 - level + (t - p0.0) * (d01 + (t - p1.0) * (d02 + (t - p2.0) * d03));
+    let (mut low, mut high, mut t) = (p1.0, p2.0, straight);
+    for _ in 0..60 {
+        let value = height(t);
+        if value == 0.0 {
+            break;
+        }
+        if value < 0.0 {
+            low = t
+        } else {
+            high = t
+        }
+        let slope =
+            d01 + (t - p1.0) * d02 + (t - p0.0) * (d02 + (2.0 * t - p1.0 - p2.0) * d03) + (t - p1.0) * (t - p2.0) * d03;
+        let newton = t - value / slope;
+        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+        if next == t || high - low <= 4.0 * f64::EPSILON * high.abs() {
+            break;
+        }
+        t = next;
+    }
+    t
 }
 
 /// The last time the value leaves the band around `end`, or none if it never is outside.
@@ -602,7 +645,14 @@ mod tests {
     #[test]
     fn the_period_is_the_mean_distance_of_upward_crossings() {
         let points = sine(0.37, 3.0, 1e-3);
-        assert!((value(MeasureKind::Period, WHOLE, &points) - 0.37).abs() < 1e-5);
+        assert!((value(MeasureKind::Period, (0.1, 3.0), &points) - 0.37).abs() < 1e-9);
+        let rough = sine(0.37, 3.0, 0.02);
+        assert!((value(MeasureKind::Period, WHOLE, &rough) - 0.37).abs() < 1e-4);
+        // Jumps have no cubic.
+        let square: Vec<Point> = (0..20)
+            .flat_map(|n| [(n as f64, 0.0), (n as f64, 1.0), (n as f64 + 0.5, 1.0), (n as f64 + 0.5, 0.0)])
+            .collect();
+        assert!((value(MeasureKind::Period, WHOLE, &square) - 1.0).abs() < 1e-12);
         let short = taken(MeasureKind::Period, (0.0, 0.7), &points).unwrap_err();
         assert_eq!(short, "three upward crossings through the mean are needed, there are 2");
     }

@@ -67,6 +67,27 @@ pub struct Work {
     pub ticks: u64,
 }
 
+impl fmt::Display for Work {
+    /// `1685 steps (1621 stiff, 64 explicit), 248 tried again, 3 events`; of a fixed step `2000 steps`.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{} steps", self.steps)?;
+        if self.evaluations == 0 {
+            return Ok(());
+        }
+        match (self.stiff_steps, self.steps - self.stiff_steps) {
+            (_, 0) => write!(f, " (stiff)")?,
+            (0, _) => write!(f, " (explicit)")?,
+            (stiff, explicit) => write!(f, " ({stiff} stiff, {explicit} explicit)")?,
+        }
+        write!(f, ", {} tried again", self.rejected)?;
+        match self.events {
+            0 => Ok(()),
+            1 => write!(f, ", 1 event"),
+            events => write!(f, ", {events} events"),
+        }
+    }
+}
+
 /// Why a run stopped before its end.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Failure {
@@ -182,4 +203,12 @@ impl std::error::Error for Failure {}
 pub(crate) struct Stop {
     pub(crate) cause: Cause,
     pub(crate) time: f64,
+}
+
+#[test]
+fn work_is_told_in_a_line() {
+    let fixed = Work { steps: 2000, ..Work::default() };
+    assert_eq!(fixed.to_string(), "2000 steps");
+    let adaptive = Work { steps: 100, stiff_steps: 60, rejected: 7, evaluations: 1000, events: 1, ..fixed };
+    assert_eq!(adaptive.to_string(), "100 steps (60 stiff, 40 explicit), 7 tried again, 1 event");
 }

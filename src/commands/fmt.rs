@@ -5,8 +5,8 @@ use crate::args::Fmt;
 use crate::compile::SourceFile;
 use crate::terminal::Terminal;
 use crate::{project, report};
-use grammar::span::FileId;
 use std::path::Path;
+use std::sync::Arc;
 
 pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
@@ -50,12 +50,12 @@ pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
 
 /// The text in its canonical layout; none if it cannot be read as a tree, which is reported.
 fn formatted(name: &str, text: &str, width: u16, terminal: &Terminal) -> Option<String> {
-    let parsed = grammar::parse::parse(FileId(0), text);
-    if parsed.diagnostics.iter().any(grammar::diagnostic::Diagnostic::is_error) {
-        let files = [SourceFile { name: name.into(), text: text.into(), ast: Default::default(), library: false }];
-        terminal.report(&report::full(&files, &parsed.diagnostics, terminal.error_colour()));
-        return None;
+    match grammar::format::format(text, usize::from(width)) {
+        Ok(formatted) => Some(formatted),
+        Err(diagnostics) => {
+            let files = [SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false }];
+            terminal.report(&report::full(&files, &diagnostics, terminal.error_colour()));
+            None
+        }
     }
-    let _ = width;
-    Some(text.to_string())
 }

@@ -3,8 +3,8 @@
 //! A [`Real`], [`Int`] or [`Truth`] is a value with the builder it lives in; operators append operations to it.
 //! Constants may stand wherever a value may.
 
-use super::Value;
 use super::build::Build;
+use super::{Unary, Value};
 use std::cell::RefCell;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Shl, Shr, Sub};
 
@@ -134,6 +134,16 @@ impl<'a> Real<'a> {
         Real::from((x, self.build))
     }
 
+    /// Another value of the same builder.
+    pub fn same(self, value: Value) -> Real<'a> {
+        Real { value, build: self.build }
+    }
+
+    /// An elementary function of it.
+    pub fn of(self, function: Unary) -> Real<'a> {
+        self.with(|b| b.unary(function, self.value))
+    }
+
     /// self · b + c, rounded once.
     pub fn fma<B, C>(self, b: B, c: C) -> Real<'a>
     where
@@ -179,6 +189,11 @@ impl<'a> Real<'a> {
     {
         let other = self.other(other);
         self.truth(|b| b.less(other, self.value))
+    }
+
+    /// Whether it is neither infinite nor NaN.
+    pub fn finite(self) -> Truth<'a> {
+        self.truth(|b| b.finite(self.value))
     }
 
     /// self = other; −0 = 0.

@@ -18,11 +18,17 @@ use abi::plan::Experiment;
 use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
 
-/// Steps tried at most. A run that needs more is told so; it would take minutes.
-const MOST_ATTEMPTS: u64 = 20_000_000;
+/// Steps tried at most between two stops. A run that needs more is told so; it would take minutes.
+const MOST_ATTEMPTS: u64 = 5_000_000;
 
 /// More events than this within a millionth of the run are chatter.
 const MOST_EVENTS: usize = 100;
+
+/// Steps are chosen this part of what the error would allow.
+const SAFETY: f64 = 0.9;
+
+/// The fifth root of an error of a hundredth: a smaller one says little about the next step.
+const LEAST_ROOT: f64 = 0.4;
 
 /// A run is shown by no fewer points than this, if it is shown at all. A prime, so that it falls in with no period.
 const LEAST_POINTS: f64 = 1009.0;
@@ -79,7 +85,7 @@ struct Adaptive<'a> {
     /// How often in a row the Jacobian spoke for the other one, and how often it must before the stiff one goes.
     doubts: u32,
     patience: u32,
-    /// Length and error of the last accepted step; none after a restart.
+    /// Length of the last accepted step, and the fifth root of its error; none after a restart.
     last: Option<(f64, f64)>,
     rejected: bool,
     /// The next step is no longer than this, for a surface is just ahead.
@@ -109,6 +115,8 @@ struct Shown {
     spans: Vec<(f64, f64)>,
     /// A straight line between two points may miss the course by this part of the span.
     bend: f64,
+    /// θ at which quantities turn, between two points.
+    turns: Vec<f64>,
     /// A block in which only time and the slots count.
     block: Vec<f64>,
     x: Vec<f64>,
@@ -126,7 +134,12 @@ impl<'a> Adaptive<'a> {
             if half > 0.0 && half.is_finite() { half } else { quantity.unit.scale }
         };
         let scales: Vec<f64> = (0..states.len as usize).map(scale).collect();
-        let ticks = description.ticks.iter().map(|tick| (instance.get(tick.period), 1)).collect();
+        let period = |slot| {
+            let period = instance.get(slot);
+            assert!(period > 0.0, "a sampled block with a period of {period} s");
+            period
+        };
+        let ticks = description.ticks.iter().map(|tick| (period(tick.period), 1)).collect();
         let tol = experiment.solver.tol;
         assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
         let slots: Vec<usize> = match observer.only_last() {
@@ -135,10 +148,11 @@ impl<'a> Adaptive<'a> {
         };
         let shown = Shown {
             theta: 0.0,
-            rows: vec![0.0; slots.len() * (DEPTH + 3)],
+            rows: vec![0.0; slots.len() * (DEPTH + 4)],
             spans: vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()],
-            // Measures deserve what the states have; a plot needs no more than its pixels.
-            bend: if observer.measures() { tol.max(1e-10) } else { 1e-3 },
+            // A plot needs no more than its pixels. Integrals want more; extremes and periods find their own way.
+            bend: if observer.measures() { tol.max(1e-5) } else { 1e-3 },
+            turns: Vec::new(),
             block: instance.block().to_vec(),
             x: vec![0.0; scales.len()],
             slots,
@@ -202,20 +216,21 @@ impl<'a> Adaptive<'a> {
 
     /// The next instant that must be met exactly.
     fn next_stop(&self) -> f64 {
-        let corner = self.corners.iter().copied().find(|corner| *corner > self.t).unwrap_or(self.duration);
+        let corner = self.corners.partition_point(|corner| *corner <= self.t);
+        let corner = self.corners.get(corner).copied().unwrap_or(self.duration);
         let tick = self.ticks.iter().map(|(period, number)| period * *number as f64).fold(self.duration, f64::min);
         corner.min(tick).min(self.duration)
     }
 
     /// Steps up to `stop`.
     fn reach(&mut self, stop: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
-        while stop - self.t > 8.0 * f64::EPSILON * stop {
-            let attempts = self.work.steps + self.work.rejected;
-            if attempts.is_multiple_of(64) && watch(self.t / self.duration).is_break() {
-                return Err(Stop { cause: Cause::Stopped, time: self.t });
+        let before = self.attempts();
+        while stop - self.t > 32.0 * f64::EPSILON * stop {
+            if self.attempts().is_multiple_of(64) && watch(self.t / self.duration).is_break() {
+                return Err(self.stop(Cause::Stopped));
             }
-            if attempts >= MOST_ATTEMPTS {
-                return Err(self.stop(Cause::TooManySteps { steps: attempts, path: self.worst() }));
+            if self.attempts() - before >= MOST_ATTEMPTS {
+                return Err(self.stop(Cause::TooManySteps { steps: self.attempts(), path: self.worst() }));
             }
             let left = stop - self.t;
             let wanted = self.h.min(self.longest);
@@ -226,7 +241,7 @@ impl<'a> Adaptive<'a> {
             } else if h > 0.5 * left {
                 h = 0.5 * left;
             }
-            if h < 16.0 * f64::EPSILON * self.t || h < f64::MIN_POSITIVE {
+            if !hits && h < (16.0 * f64::EPSILON * self.t).max(f64::MIN_POSITIVE) {
                 return Err(self.too_short(h));
             }
             self.step.t = self.t;
@@ -264,7 +279,7 @@ impl<'a> Adaptive<'a> {
         let error = if solved { self.error() } else { f64::INFINITY };
         if error > 1.0 {
             self.work.rejected += 1;
-            let part = if error.is_finite() { (0.9 / fifth_root(error)).max(0.2) } else { 0.1 };
+            let part = if error.is_finite() { (SAFETY / fifth_root(error)).max(0.2) } else { 0.1 };
             self.h = part.min(0.9) * h;
             // Where the step ran over a surface, that may be all that is wrong with it.
             if let Some(theta) = self.surfaces.guess(&mut self.system, &self.step) {
@@ -273,17 +288,17 @@ impl<'a> Adaptive<'a> {
             self.rejected = true;
             return false;
         }
-        let error = error.max(1e-10);
-        let mut part = (0.9 / fifth_root(error)).min(6.0);
-        if let Some((last_h, last_error)) = self.last {
+        let root = fifth_root(error.max(1e-10));
+        let mut part = SAFETY / root;
+        if let Some((last_h, last_root)) = self.last {
             // What the error did from step to step, it will do again.
-            part = part.min(0.9 * (h / last_h) * fifth_root(last_error / error) / fifth_root(error));
+            part = part.min(SAFETY * (h / last_h) * last_root / (root * root));
         }
         if self.rejected {
             part = part.min(1.0);
         }
         self.h = part.clamp(0.2, 6.0) * h;
-        self.last = Some((h, error.max(1e-2)));
+        self.last = Some((h, root.max(LEAST_ROOT)));
         self.rejected = false;
         self.work.steps += 1;
         self.work.stiff_steps += u64::from(stiff);
@@ -499,7 +514,7 @@ impl<'a> Adaptive<'a> {
             }
             check_status(self.system.instance, status)?;
             self.work.ticks += 1;
-        } else if !self.corners.contains(&self.t) {
+        } else if self.corners.binary_search_by(|corner| corner.total_cmp(&self.t)).is_err() {
             return Ok(());
         }
         self.settle()?;
@@ -593,27 +608,47 @@ impl<'a> Adaptive<'a> {
         Ok(())
     }
 
-    /// Shows points between two rows until straight lines between them do.
+    /// Shows points between two rows until straight lines between them do; and wherever a quantity turns.
     fn between(&mut self, from: f64, row_from: usize, to: f64, row_to: usize, depth: usize) -> Result<(), Stop> {
         let middle = 0.5 * (from + to);
         let row = DEPTH + 2 - depth;
         self.sample(row, middle)?;
         let width = self.shown.slots.len();
-        let straight = (0..width).all(|i| {
-            let value = |row: usize| self.shown.rows[row * width + i];
+        let mut straight = true;
+        self.shown.turns.clear();
+        for i in 0..width {
+            let [a, m, b] = [row_from, row, row_to].map(|row| self.shown.rows[row * width + i]);
             let (low, high) = self.shown.spans[i];
-            let (a, b, m) = (value(row_from), value(row_to), value(row));
             let span = high.max(b) - low.min(b);
-            let allowed = self.shown.bend * span + 1e-15 * m.abs();
-            (m - 0.5 * (a + b)).abs() <= allowed
-        });
-        if straight || depth == 1 {
-            return Ok(());
+            let bend = a - 2.0 * m + b;
+            straight &= 0.5 * bend.abs() <= self.shown.bend * span + 1e-15 * m.abs();
+            // On the parabola through the three, with −1 at a and 1 at b.
+            let turn = 0.5 * (a - b) / bend;
+            let beyond = 0.25 * (b - a) * turn;
+            if turn.abs() < 1.0 && beyond.abs() > 1e-9 * span {
+                self.shown.turns.push(middle + 0.5 * turn * (to - from));
+            }
         }
-        self.between(from, row_from, middle, row, depth - 1)?;
-        // The right half needs the rows below this one only.
-        self.emit(row, self.step.time(middle));
-        self.between(middle, row, to, row_to, depth - 1)
+        if !straight && depth > 1 {
+            self.between(from, row_from, middle, row, depth - 1)?;
+            // The right half needs the rows below this one only.
+            self.emit(row, self.step.time(middle));
+            return self.between(middle, row, to, row_to, depth - 1);
+        }
+        self.shown.turns.sort_by(f64::total_cmp);
+        let early = self.shown.turns.partition_point(|turn| *turn < middle);
+        for i in 0..self.shown.turns.len() {
+            if i == early {
+                self.emit(row, self.step.time(middle));
+            }
+            let turn = self.shown.turns[i];
+            self.sample(row + 1, turn)?;
+            self.emit(row + 1, self.step.time(turn));
+        }
+        if early == self.shown.turns.len() {
+            self.emit(row, self.step.time(middle));
+        }
+        Ok(())
     }
 
     /// Puts the values at θ into a row.
@@ -644,6 +679,11 @@ impl<'a> Adaptive<'a> {
             *span = (span.0.min(*value), span.1.max(*value));
         }
         self.observer.show(time, &self.shown.block);
+    }
+
+    /// Steps tried so far.
+    fn attempts(&self) -> u64 {
+        self.work.steps + self.work.rejected
     }
 
     fn stop(&self, cause: Cause) -> Stop {
@@ -698,14 +738,23 @@ impl<'a> Adaptive<'a> {
     }
 }
 
-/// The fifth root of a positive number, by Newton's method from its exponent: the same bits on every machine.
+/// The fifth root of a positive number to six digits, by Newton's method from its exponent: the same bits on every
+/// machine.
 fn fifth_root(x: f64) -> f64 {
     // A fifth of the exponent, and of the fraction as if the logarithm were straight in between.
     let bias = 1023u64 << 52;
     let mut y = f64::from_bits(x.to_bits() / 5 + bias / 5 * 4);
-    for _ in 0..5 {
+    for _ in 0..3 {
         let square = y * y;
         y += 0.2 * (x / (square * square) - y);
     }
     y
+}
+
+#[test]
+fn fifth_roots() {
+    for n in -300..300 {
+        let x = 10f64.powf(0.1 * f64::from(n));
+        assert!((fifth_root(x) / x.powf(0.2) - 1.0).abs() < 1e-6, "{x}");
+    }
 }

@@ -182,7 +182,7 @@ impl Rosenbrock {
                     }
                 }
                 let t = if stage < 5 { step.t + C[stage] * h } else { step.end };
-                system.slope(t, x, f);
+                system.sized_slope::<N>(t, x, f);
             }
             for i in 0..n {
                 let mut sum = 0.0;

@@ -41,10 +41,11 @@ fn an_oscillator_goes_explicit_and_its_measures_are_as_good_as_its_states() {
         experiment.expects.push(reading(&instance, kind, "x"));
     }
     let outcome = go(&instance, &experiment).unwrap();
-    assert!((value(&outcome, 0) - 1.0).abs() < 2e-6, "{}", value(&outcome, 0));
+    assert!((value(&outcome, 0) - 1.0).abs() < 1e-6, "{}", value(&outcome, 0));
     assert!((value(&outcome, 1) / std::f64::consts::TAU - 1.0).abs() < 1e-7, "{}", value(&outcome, 1));
     let rms = (0.5 - 200f64.sin() / 400.0).sqrt();
-    assert!((value(&outcome, 2) / rms - 1.0).abs() < 1e-6);
+    // Trapezoidal, so only as good as lines are.
+    assert!((value(&outcome, 2) / rms - 1.0).abs() < 1e-5);
     assert!((value(&outcome, 3) - 100f64.sin()).abs() < 2e-6);
     assert!(outcome.work.stiff_steps < outcome.work.steps / 2, "{:?}", outcome.work);
 }
@@ -511,4 +512,29 @@ fn what_blows_up_is_named() {
     let failure = go(&undefined, &adaptive(10.0, 1e-6)).unwrap_err();
     assert!(failure.to_string().contains("`x`"), "{failure}");
     println!("{failure}");
+}
+
+/// What a run costs: `cargo test --release -p runtime -- --ignored --nocapture adaptive_steps_cost`.
+#[test]
+#[ignore = "prints times, judges nothing"]
+fn adaptive_steps_cost() {
+    let instance = models::stick_slip(1e5f64.sqrt());
+    let timed = |what: &str, experiment: &Experiment| {
+        let start = std::time::Instant::now();
+        let runs = 100;
+        let mut work = String::new();
+        for _ in 0..runs {
+            let outcome = run(instance.clone(), experiment, &mut |_| Continue::Continue(())).unwrap();
+            work = outcome.work.to_string();
+        }
+        println!("{what}: {:.3} ms a run of {work}", 1e3 * start.elapsed().as_secs_f64() / f64::from(runs));
+    };
+    for tol in [1e-6, 1e-8] {
+        let mut experiment = adaptive(20.0, tol);
+        timed("nothing", &experiment);
+        experiment.plots.push(plot(&instance, &["x", "v"]));
+        timed("plot of two", &experiment);
+        experiment.expects.push(reading(&instance, MeasureKind::Max, "v"));
+        timed("plot and max", &experiment);
+    }
 }

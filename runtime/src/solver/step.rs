@@ -47,12 +47,21 @@ impl<'a> System<'a> {
 
     /// dx/dt at (t, x), in SI per second.
     pub(crate) fn slope(&mut self, t: f64, x: &[f64], f: &mut [f64]) {
+        self.sized_slope::<0>(t, x, f);
+    }
+
+    /// As `slope`, of `N` states where N is not 0: copies of known length need no call.
+    pub(crate) fn sized_slope<const N: usize>(&mut self, t: f64, x: &[f64], f: &mut [f64]) {
+        let n = if N == 0 { self.n } else { N };
         self.evaluations += 1;
-        self.place(t, x);
-        if self.n > 0 {
+        let (states, derivatives) = (self.states.start, self.derivatives.start);
+        let block = self.instance.block_mut();
+        block[Slot::TIME.index()] = t;
+        block[states..states + n].copy_from_slice(&x[..n]);
+        if n > 0 {
             self.instance.call(Function::Derivatives);
         }
-        f.copy_from_slice(&self.instance.block()[self.derivatives.clone()]);
+        f[..n].copy_from_slice(&self.instance.block()[derivatives..derivatives + n]);
     }
 
     /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: one-sided differences
