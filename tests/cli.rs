@@ -232,7 +232,6 @@ fn bad_input_is_a_message_and_never_a_panic() {
 }
 
 #[test]
-#[ignore = "waits for the formatter"]
 fn formatting_reads_standard_input_and_can_only_look() {
     let folder = Folder::new("fmt").with("pull.fric", "const a = 1 N   \n");
     folder.check(&["fmt", "--check", "pull.fric"], 1, "pull.fric");

@@ -1,8 +1,9 @@
 use super::*;
 use grammar::span::{FileId, Span};
+use std::sync::Arc;
 
 fn file(name: &str, text: &str) -> SourceFile {
-    SourceFile { name: name.into(), text: text.into() }
+    SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false }
 }
 
 /// The span of `words` in line `line` (from 1) of the `n`-th file.
