@@ -7,6 +7,7 @@
 
 use crate::compile::SourceFile;
 use grammar::diagnostic::{Diagnostic, Label, Severity};
+use grammar::span::Span;
 use miette::{
     GraphicalReportHandler, GraphicalTheme, LabeledSpan, MietteError, MietteSpanContents, SourceCode, SourceSpan,
     SpanContents, ThemeCharacters, ThemeStyles,
@@ -51,13 +52,18 @@ pub fn full(files: &[SourceFile], diagnostics: &[Diagnostic], colour: bool) -> S
 pub fn short(files: &[SourceFile], diagnostics: &[Diagnostic]) -> String {
     let mut out = String::new();
     for diagnostic in by_file(diagnostics).into_iter().flatten() {
-        let place = match diagnostic.labels.first().and_then(|label| Place::of(files, label)) {
-            Some(place) => format!("{}:{}:{}: ", place.file, place.line, place.column),
-            None => String::new(),
-        };
-        out += &format!("{place}{} {}\n", diagnostic.code, diagnostic.message);
+        if let Some(label) = diagnostic.labels.first() {
+            out += &format!("{}: ", place(files, label.span));
+        }
+        out += &format!("{} {}\n", diagnostic.code, diagnostic.message);
     }
     out
+}
+
+/// `file:line:column` of a place; empty if the file is not known.
+pub fn place(files: &[SourceFile], span: Span) -> String {
+    let label = Label { span, text: String::new() };
+    Place::of(files, &label).map_or(String::new(), |place| format!("{}:{}:{}", place.file, place.line, place.column))
 }
 
 /// All of them as a JSON array. Lines and columns count from 1, columns in characters; offsets are bytes.

@@ -3,7 +3,7 @@
 use crate::compile::Stages;
 use crate::terminal::{Style, Terminal};
 use crate::value::{count, duration, show, significant};
-use abi::plan::{Experiment, Method};
+use abi::plan::{Experiment, Method, Solver};
 use abi::unit::Unit;
 use abi::{Description, Instance};
 use runtime::engine::{Failure, Outcome};
@@ -185,6 +185,14 @@ fn words(verdict: &Verdict) -> String {
     format!("{value}, {distance}{time}")
 }
 
+/// `rk4 step 10 µs`, `adaptive tol 1e-6`.
+pub fn solver(solver: &Solver) -> String {
+    match solver.method {
+        Method::Adaptive => format!("adaptive tol {}", significant(solver.tol, 3)),
+        method => format!("{} step {}", method.name(), duration(solver.step)),
+    }
+}
+
 /// What was compiled and how long it took, on two lines.
 pub fn compiled(description: &Description, experiment: &Experiment, stages: &Stages, cases: usize) -> String {
     let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
@@ -195,10 +203,7 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     }
     let of_cases = if cases > 1 { format!(", {cases} cases") } else { String::new() };
     let second = Unit::parse("s").expect("the second is known");
-    let solver = match experiment.solver {
-        solver if solver.method == Method::Adaptive => format!("adaptive tol {}", significant(solver.tol, 3)),
-        solver => format!("{} step {}", solver.method.name(), duration(solver.step)),
-    };
+    let solver = solver(&experiment.solver);
     let slowest: Vec<String> =
         stages.0.iter().map(|(stage, seconds)| format!("{stage} {}", duration(*seconds))).collect();
     format!(

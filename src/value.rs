@@ -37,7 +37,7 @@ pub fn significant(value: f64, digits: usize) -> String {
         return value.abs().to_string().replacen("inf", if value < 0.0 { "-inf" } else { "inf" }, 1);
     }
     let rounded: f64 = format!("{value:.*e}", digits.max(1) - 1).parse().unwrap_or(value);
-    if (1e-4..1e9).contains(&rounded.abs()) { rounded.to_string() } else { format!("{rounded:e}") }
+    if (1e-3..1e9).contains(&rounded.abs()) { rounded.to_string() } else { format!("{rounded:e}") }
 }
 
 /// A duration with three digits in the unit that suits: `3.1 ms`, `12.5 s`.

@@ -287,3 +287,49 @@ fn colour_is_for_terminals_and_no_color_turns_it_off() {
     assert!(with.contains(&0x1b), "{}", String::from_utf8_lossy(&with));
     assert!(!without.contains(&0x1b), "{}", String::from_utf8_lossy(&without));
 }
+
+#[test]
+fn mistakes_in_models_have_places() {
+    let model =
+        |body: &str| format!("model A {{ {body} }}\nexperiment e {{ run A() for 10 ms  solver rk4 step 1 ms }}\n");
+    let folder = Folder::new("mistakes")
+        .with("undefined.fric", model("output F [N] = Fs"))
+        .with("cycle.fric", model("let a [N] = b  let b [N] = a  output F [N] = a"))
+        .with("duplicate.fric", model("output F [N] = 1 N  F = 2 N"))
+        .with("missing.fric", model("state z [um] = 0  output F [N] = 1 N/m * z"))
+        .with("nan.fric", model("state z [m] = 0  dz/dt = 1 m/s * sqrt(-1 - z / 1 m)"));
+    folder.check(&["run", "undefined.fric"], 1, "there is no `Fs` in A");
+    folder.check(&["run", "cycle.fric"], 1, "E0401");
+    folder.check(&["run", "duplicate.fric"], 1, "duplicate.fric:1:");
+    folder.check(&["run", "missing.fric"], 1, "nothing determines `z`");
+    folder.check(&["run", "nan.fric"], 1, "nan.fric:");
+    let (out, err) = folder.check(&["run", "--json", "missing.fric"], 1, "E0303");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((object["passed"].as_bool(), object["diagnostics"][0]["code"].as_str()), (Some(false), Some("E0303")));
+    assert!(err.contains("nothing determines"), "{err}");
+}
+
+#[test]
+fn a_sweep_is_one_figure_and_a_file_of_data_each() {
+    let sweep = "experiment sweeps { run Pull() for 1 s  solver rk4 step 1 ms  sweep k = 1 N/m, 2 N/m  plot x [mm] }";
+    let folder = Folder::new("sweep").with("pull.fric", format!("{PULL}{sweep}\n"));
+    folder.check(&["run", "pull.fric", "sweeps"], 0, "2 cases");
+    assert_eq!(folder.names("out"), ["sweeps-k-1-N-m.csv", "sweeps-k-2-N-m.csv", "sweeps.svg"]);
+    let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json"], 0, "");
+    let cases: Vec<Value> =
+        out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
+    assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
+}
+
+#[test]
+fn an_experiment_can_be_changed_from_outside() {
+    let folder = Folder::new("changes").with("pull.fric", PULL);
+    let args = ["run", "pull.fric", "holds", "--json", "--set", "fr.Fc=2N", "--for", "500 ms", "--step", "2ms"];
+    let (out, _) = folder.check(&[&args[..], &["--solver", "euler"]].concat(), 0, "");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(object["steps"], 250, "{out}");
+    assert_eq!((&object["solver"]["method"], &object["solver"]["tol"]), (&Value::from("euler"), &Value::Null));
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fz=2N"], 1, "Fz");
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2m"], 1, "E01");
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2 N +"], 1, "--set");
+}

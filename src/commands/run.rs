@@ -122,8 +122,11 @@ fn experiment(
     } else if args.quiet {
         complain(name, &done, terminal);
     }
-    for failure in done.results.iter().filter_map(|result| result.as_ref().err()) {
-        terminal.error(&format!("{name}: {failure}"));
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        if let Err(failure) = result {
+            let label = if case.label.is_empty() { String::new() } else { format!(", {}", case.label) };
+            terminal.error(&format!("{}: {name}{label}: {failure}", place(loaded, name)));
+        }
     }
     match written {
         Ok(paths) => {
@@ -138,6 +141,13 @@ fn experiment(
             End::Failed
         }
     }
+}
+
+/// Where an experiment stands.
+fn place(loaded: &Loaded, name: &str) -> String {
+    let all = loaded.experiments();
+    let found = all.iter().find(|experiment| experiment.name == name);
+    found.map_or(String::new(), |experiment| report::place(&loaded.files.0, experiment.span))
 }
 
 /// All that was recorded in one figure; none if the experiment plots nothing.
@@ -158,8 +168,8 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
             (case.label.as_str(), recording)
         })
         .collect();
-    let model = &first.instance.description().name;
-    Some(figure::figure(name, model, &first.experiment.plots, &cases))
+    let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
+    Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
 }
 
 /// Writes what was asked for; gives the paths, or the one that failed and why.

@@ -1,5 +1,5 @@
 use super::*;
-use grammar::span::{FileId, Span};
+use grammar::span::FileId;
 use std::sync::Arc;
 
 fn file(name: &str, text: &str) -> SourceFile {
