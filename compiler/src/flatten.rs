@@ -422,7 +422,7 @@ impl<'a> Flattener<'a> {
             DeclarationKind::Let => VarKind::Let,
         };
         let rotary = self.system.instance(id).rotary;
-        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary)?, unit.span)));
+        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary)?, self.bracketed(unit.span))));
         let shown = match &declaration.value {
             Some(Expr { kind: ExprKind::Number { unit: Some(unit), .. }, .. }) => Unit::parse(&unit.text).ok(),
             _ => None,
@@ -448,6 +448,23 @@ impl<'a> Flattener<'a> {
     fn add_var(&mut self, var: Var) -> VarId {
         self.system.vars.push(var);
         VarId(self.system.vars.len() as u32 - 1)
+    }
+
+    /// The span of a declared unit with its brackets.
+    fn bracketed(&self, span: Span) -> Span {
+        let text = self.loaded.files.get(span.file).text.as_bytes();
+        let (before, behind) = ((span.start as usize).wrapping_sub(1), span.end as usize);
+        match (text.get(before), text.get(behind)) {
+            (Some(b'['), Some(b']')) => Span::new(span.file, before, behind + 1),
+            _ => span,
+        }
+    }
+
+    /// The span of a bound with its operator: `>= 0`.
+    fn with_operator(&self, span: Span) -> Span {
+        let before = &self.loaded.files.get(span.file).text[..span.start as usize];
+        let operator = before.trim_end().trim_end_matches(['<', '>', '=']);
+        Span::new(span.file, operator.len(), span.end as usize)
     }
 
     /// A unit as written, mapped for a rotary instance; or a report.
@@ -967,7 +984,7 @@ impl<'a> Flattener<'a> {
                     BinaryOp::Less | BinaryOp::LessEqual => VarRange { low: None, high: Some((value, strict)) },
                     _ => VarRange { low: Some((value, strict)), high: None },
                 };
-                (range, bound.span)
+                (range, self.with_operator(bound.span))
             }
         }
     }
@@ -1079,6 +1096,16 @@ impl<'a> Flattener<'a> {
             None => true,
             Some(first) => {
                 defined.insert(var, first);
+                let name = &self.system.var(var).name;
+                let is_next = |span: Span| self.loaded.files.slice(span).starts_with("next");
+                if is_next(span) != is_next(first) {
+                    let error = Diagnostic::error("E0304", format!("`{name}` changes in time and at ticks"))
+                        .label(span, "again here")
+                        .label(first, "first here")
+                        .help(format!("a state is continuous, `d{name}/dt = …`, or sampled, `next({name}) = …`: keep one"));
+                    self.report(error);
+                    return false;
+                }
                 let name = &self.system.var(var).name;
                 let error = Diagnostic::error("E0301", format!("`{name}` is defined twice"))
                     .label(span, "again here")
@@ -1194,7 +1221,7 @@ impl<'a> Flattener<'a> {
                         continue;
                     }
                 };
-                here.push(InMode { var, along, value, span, statement: equation.span });
+                here.push(InMode { var, along, value, span, statement: head(equation) });
             }
             by_mode.push(here);
         }
@@ -1974,6 +2001,19 @@ impl<'a> Flattener<'a> {
             None => self.error(span),
         }
     }
+}
+
+/// The beginning of an equation: enough to know it by, `F = clamp` of `F = clamp(F_ext, -Fs, Fs)`.
+fn head(equation: &ast::Equation) -> Span {
+    let mut first = &equation.value;
+    while let ExprKind::Binary(_, _, left, _) = &first.kind {
+        first = left;
+    }
+    let end = match &first.kind {
+        ExprKind::Call { function, .. } => function.span,
+        _ => first.span,
+    };
+    equation.target.span().to(end)
 }
 
 /// How an equation gives its quantity a value.

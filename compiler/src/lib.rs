@@ -20,6 +20,10 @@ pub mod units;
 pub mod causality;
 pub mod lower;
 pub mod checks;
+pub mod interval;
+pub mod domains;
+pub mod friction;
+pub mod lints;
 pub mod experiment;
 
 pub use experiment::Changes;
@@ -160,7 +164,12 @@ fn check_model(
     }
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&flat.system, &types, &loaded.files, &mut diagnostics);
+        domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
     }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        diagnostics.extend(lints::check(&flat.system, &types, &loaded.files));
+    }
+    lints::silence(&flat.system, &mut diagnostics);
     diagnostics
 }
 

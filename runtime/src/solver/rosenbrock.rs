@@ -150,8 +150,6 @@ impl Rosenbrock {
         let n = if N == 0 { system.n } else { N };
         let h = step.h;
         let (matrix, rows) = (&mut self.matrix[..n * n], &mut self.rows[..n]);
-        let (x, f) = (&mut self.x[..n], &mut self.f[..n]);
-        let (x0, f0) = (&step.x0[..n], &step.f0[..n]);
         let (df_dx, df_dt) = jacobian[..n * n + n].split_at(n * n);
         for (entry, j) in matrix.iter_mut().zip(df_dx) {
             *entry = -j;
@@ -162,55 +160,60 @@ impl Rosenbrock {
         if !linear::factor::<N>(n, matrix, rows) {
             return false;
         }
-        for stage in 0..STAGES {
-            let (done, rest) = self.u[..STAGES * n].split_at_mut(stage * n);
-            let u = &mut rest[..n];
-            if stage == 0 {
-                f.copy_from_slice(f0);
-            } else {
-                if stage < 6 {
-                    for i in 0..n {
-                        let mut sum = x0[i];
-                        for j in 0..stage {
-                            sum += A[stage][j] * done[j * n + i];
-                        }
-                        x[i] = sum;
-                    }
-                } else {
-                    for i in 0..n {
-                        x[i] += done[(stage - 1) * n + i];
-                    }
-                }
-                let t = if stage < 5 { step.t + C[stage] * h } else { step.end };
-                system.sized_slope::<N>(t, x, f);
-            }
-            for i in 0..n {
-                let mut sum = 0.0;
-                for j in 0..stage {
-                    sum += W[stage][j] * done[j * n + i];
-                }
-                u[i] = f[i] + sum / h + h * D[stage] * df_dt[i];
-            }
-            linear::solve::<N>(n, matrix, rows, u);
-        }
+        self.stage::<N, 0>(system, step, df_dt);
+        self.stage::<N, 1>(system, step, df_dt);
+        self.stage::<N, 2>(system, step, df_dt);
+        self.stage::<N, 3>(system, step, df_dt);
+        self.stage::<N, 4>(system, step, df_dt);
+        self.stage::<N, 5>(system, step, df_dt);
+        self.stage::<N, 6>(system, step, df_dt);
+        self.stage::<N, 7>(system, step, df_dt);
+        let x = &self.x[..n];
         let u = &self.u[..STAGES * n];
         for i in 0..n {
             let last = u[7 * n + i];
             step.x1[i] = x[i] + last;
             step.error[i] = last;
-            let sum = |weights: &[f64; STAGES]| {
-                let mut sum = 0.0;
-                for stage in 0..STAGES {
-                    sum += weights[stage] * u[stage * n + i];
-                }
-                sum
-            };
-            step.k1[i] = sum(&H[0]);
-            step.k2[i] = sum(&H[1]);
-            step.k3[i] = sum(&H[2]);
+            step.k1[i] = combine::<STAGES>(&H[0], u, n, i);
+            step.k2[i] = combine::<STAGES>(&H[1], u, n, i);
+            step.k3[i] = combine::<STAGES>(&H[2], u, n, i);
         }
         true
     }
+
+    /// Stage `S`, counted from 0. Its own function for each, so that all weights are constants of the code.
+    #[inline(always)]
+    fn stage<const N: usize, const S: usize>(&mut self, system: &mut System, step: &Step, df_dt: &[f64]) {
+        let n = if N == 0 { system.n } else { N };
+        let (x, f) = (&mut self.x[..n], &mut self.f[..n]);
+        let (done, rest) = self.u.split_at_mut(S * n);
+        let u = &mut rest[..n];
+        if S == 0 {
+            f.copy_from_slice(&step.f0[..n]);
+        } else {
+            for i in 0..n {
+                x[i] =
+                    if S < 6 { step.x0[i] + combine::<S>(&A[S % 6], done, n, i) } else { x[i] + done[(S - 1) * n + i] };
+            }
+            let t = if S < 5 { step.t + C[S] * step.h } else { step.end };
+            system.sized_slope::<N>(t, x, f);
+        }
+        let per_step = 1.0 / step.h;
+        for i in 0..n {
+            u[i] = f[i] + per_step * combine::<S>(&W[S], done, n, i) + step.h * D[S] * df_dt[i];
+        }
+        linear::solve::<N>(n, &self.matrix, &self.rows, u);
+    }
+}
+
+/// The sum over the first `COUNT` stages of their weights times entry `i`.
+#[inline(always)]
+fn combine<const COUNT: usize>(weights: &[f64], u: &[f64], n: usize, i: usize) -> f64 {
+    let mut sum = 0.0;
+    for stage in 0..COUNT.min(weights.len()) {
+        sum += weights[stage] * u[stage * n + i];
+    }
+    sum
 }
 
 #[cfg(test)]
