@@ -83,9 +83,9 @@ fn shown(x: f64, unit: &Unit) -> String {
 fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
     let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
     for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
-        let open = mentioned(system, *expr).iter().any(|id| {
-            system.var(*id).kind == VarKind::Param && matches!(system.var(*id).definition, Definition::Free)
-        });
+        let open = mentioned(system, *expr)
+            .iter()
+            .any(|id| system.var(*id).kind == VarKind::Param && matches!(system.var(*id).definition, Definition::Free));
         if value > 0.0 && value.is_finite() || open {
             continue;
         }
@@ -107,8 +107,9 @@ pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>
         }
         let second = Unit::parse("s").expect("the second is known");
         let (period, step) = (shown(value, &second), shown(step, &second));
-        let mut error = Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"))
-            .label(system.span(*expr), format!("{} steps", three_digits(ratio)));
+        let mut error =
+            Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"))
+                .label(system.span(*expr), format!("{} steps", three_digits(ratio)));
         if let Some(at) = at {
             error = error.label(at, "the step");
         }

@@ -13,7 +13,7 @@ use crate::units::{self, Types, literal};
 use crate::{causality, checks};
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
-use grammar::ast::{self, BinaryOp, Expr, ExperimentStatement, SweepOver};
+use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 
@@ -247,12 +247,13 @@ fn recording(
         None => Some(Unit::none()),
         Some((_, Ok(unit))) => Some(unit),
         Some((text, Err(part))) => {
-            diagnostics.push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
+            diagnostics
+                .push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
             None
         }
     };
     let t_unit = unit(&data.columns[time])?;
-    let t: Vec<f64> = values[time].iter().map(|t| t * t_unit.scale).collect();
+    let t: Vec<f64> = values[time].iter().map(|t| t_unit.to_si(*t)).collect();
     let mut columns = Vec::new();
     for (k, column) in data.columns.iter().enumerate() {
         if column.name.text != "_" {
@@ -272,7 +273,7 @@ fn recording(
             y_dimension: unit.dimension,
             smooth: false,
             x: t.clone(),
-            y: values[k].iter().map(|y| y * unit.scale).collect(),
+            y: values[k].iter().map(|y| unit.to_si(*y)).collect(),
         };
         out.push((column.name.text.clone(), table, unit));
     }
@@ -320,7 +321,7 @@ fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
         ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
         ast::ExprKind::Number { value, unit: Some(text) } => {
             let unit = Unit::parse(&text.text).ok()?;
-            Some((value * unit.scale, unit, Some(text.clone())))
+            Some((unit.to_si(*value), unit, Some(text.clone())))
         }
         ast::ExprKind::Unary(ast::UnaryOp::Negate, a) => quantity(a).map(|(value, unit, text)| (-value, unit, text)),
         _ => None,
@@ -336,7 +337,9 @@ fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Chang
             SweepOver::Instances(all) => {
                 all.iter().map(|one| (Change { path, value: OverrideValue::Instance(one) }, None)).collect()
             }
-            SweepOver::Values(all) => all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect(),
+            SweepOver::Values(all) => {
+                all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect()
+            }
             SweepOver::Grid { .. } => grid
                 .iter()
                 .map(|one| {
@@ -355,7 +358,10 @@ fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Chang
         out = out
             .iter()
             .flat_map(|before| {
-                values.iter().map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>()).collect::<Vec<_>>()
+                values
+                    .iter()
+                    .map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>())
+                    .collect::<Vec<_>>()
             })
             .collect();
     }
@@ -432,12 +438,8 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request = Request {
-        instance: Instance::Written(&parts.run.instance, root),
-        overrides,
-        observed,
-        data: data.to_vec(),
-    };
+    let request =
+        Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
@@ -450,7 +452,9 @@ fn variant(
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
     }
     // What is wrong with the experiment alone does not hide what else is wrong with it.
-    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103") {
+    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
+        || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
+    {
         return Err(diagnostics);
     }
     diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
@@ -573,8 +577,10 @@ impl Reader<'_> {
                 true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
                     .label(span, "a pure number")
                     .help(format!("write `{text} s`")),
-                false => Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
-                    .label(span, Unit::si(self.dimension(expr)).to_string()),
+                false => {
+                    Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
+                        .label(span, Unit::si(self.dimension(expr)).to_string())
+                }
             };
             self.diagnostics.push(error);
             return 1.0;
@@ -604,7 +610,8 @@ impl Reader<'_> {
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
-            let error = Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
+            let error =
+                Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
             self.diagnostics.push(error.help("it lies between 0 and 1, such as `tol 1e-8`"));
         }
         match method {
@@ -642,8 +649,7 @@ impl Reader<'_> {
         let unit = show.unit.as_ref().and_then(|text| match Unit::parse(&text.text) {
             Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
             Ok(unit) => {
-                let message =
-                    format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
+                let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
                 let error = Diagnostic::error("E0101", message)
                     .label(text.span, unit.dimension.describe())
                     .label(self.system.span(expr), Unit::si(self.dimension(expr)).to_string());
@@ -798,7 +804,8 @@ impl Reader<'_> {
                     BinaryOp::Or => Formula::Or(a, b),
                     BinaryOp::Power => {
                         let span = self.system.span(id);
-                        let error = Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
+                        let error =
+                            Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
                         self.diagnostics.push(error.help("multiply: `max(x) * max(x)`"));
                         return None;
                     }
@@ -819,7 +826,13 @@ impl Reader<'_> {
         }
     }
 
-    fn measure(&mut self, whole: ExprId, value: ExprId, kind: MeasureKind, measures: &mut Vec<plan::Measure>) -> Formula {
+    fn measure(
+        &mut self,
+        whole: ExprId,
+        value: ExprId,
+        kind: MeasureKind,
+        measures: &mut Vec<plan::Measure>,
+    ) -> Formula {
         let text = one_line(self.loaded.files.slice(self.system.span(whole)));
         let own = self.own_unit(value);
         let seconds = Unit::parse("s").expect("the second is known");

@@ -88,7 +88,8 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             f.written(instance, &env, overrides);
         }
         Instance::Alone(model, file) => {
-            let made = Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
+            let made =
+                Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
             f.instantiate(model, *file, made, true);
         }
     }
@@ -212,7 +213,15 @@ struct Env {
 
 impl Env {
     fn file(file: FileId) -> Env {
-        Env { file, instance: None, rotary: false, locals: Rc::default(), outside: false, equation: false, instants: false }
+        Env {
+            file,
+            instance: None,
+            rotary: false,
+            locals: Rc::default(),
+            outside: false,
+            equation: false,
+            instants: false,
+        }
     }
 }
 
@@ -298,7 +307,8 @@ impl<'a> Flattener<'a> {
                     Item::Interface(_) => "an interface: it has no equations",
                     _ => "a device: it stands in a rig",
                 };
-                let error = Diagnostic::error("E0201", format!("`{}` is not a model", name.text)).label(name.span, what);
+                let error =
+                    Diagnostic::error("E0201", format!("`{}` is not a model", name.text)).label(name.span, what);
                 self.report(error.help("name a model that fits it"));
             }
             Lookup::Ambiguous(a, b) => self.ambiguous(name, a, b),
@@ -477,7 +487,10 @@ impl<'a> Flattener<'a> {
             DeclarationKind::Let => VarKind::Let,
         };
         let rotary = self.system.instance(id).rotary;
-        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary, Some(id))?, self.bracketed(unit.span))));
+        let unit = declaration
+            .unit
+            .as_ref()
+            .and_then(|unit| Some((self.unit(unit, rotary, Some(id))?, self.bracketed(unit.span))));
         let shown = match &declaration.value {
             Some(Expr { kind: ExprKind::Number { unit: Some(unit), .. }, .. }) => Unit::parse(&unit.text).ok(),
             _ => None,
@@ -546,9 +559,9 @@ impl<'a> Flattener<'a> {
             }
             self.system.strangers.push(id);
         }
-        let error = Diagnostic::error("E0109", "this model cannot be made rotary")
-            .label(span, why)
-            .help("`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin");
+        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(
+            "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin",
+        );
         self.report(error);
     }
 
@@ -606,9 +619,12 @@ impl<'a> Flattener<'a> {
         let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
         let (Some(first), Some(last)) = bounds else { return };
         if last < first || (last - first) as usize >= MOST_VARS {
-            let error = Diagnostic::error("E0502", format!("`{}` cannot repeat from {first} to {last}", part.name.text))
-                .label(repeat.span, "this range")
-                .help(format!("the last index is at least the first, and there are at most {MOST_VARS} quantities"));
+            let error =
+                Diagnostic::error("E0502", format!("`{}` cannot repeat from {first} to {last}", part.name.text))
+                    .label(repeat.span, "this range")
+                    .help(format!(
+                        "the last index is at least the first, and there are at most {MOST_VARS} quantities"
+                    ));
             self.report(error);
             return;
         }
@@ -656,10 +672,11 @@ impl<'a> Flattener<'a> {
                 ArgValue::Instance(instance) => {
                     if part.slot.is_none() {
                         let owner = &self.tree(id).model.name.text;
-                        let error = Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
-                            .label(arg.span, "another model cannot be put here")
-                            .label(part.name.span, "declared without an interface")
-                            .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
+                        let error =
+                            Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
+                                .label(arg.span, "another model cannot be put here")
+                                .label(part.name.span, "declared without an interface")
+                                .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
                         self.report(error);
                     } else {
                         chosen = (instance, arg.env);
@@ -699,9 +716,7 @@ impl<'a> Flattener<'a> {
             let slot_rotary = slot.rotary || parent_rotary;
             let ports = self.interface(file, slot)?;
             self.check_fit(model, item.file, instance, rotary, ports, slot, slot_rotary);
-            let has = |name: &str| {
-                declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name)
-            };
+            let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
             let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
             if replaced {
                 let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
@@ -728,7 +743,8 @@ impl<'a> Flattener<'a> {
                 let mut error = Diagnostic::error("E0201", format!("there is no interface `{}`", slot.interface.text))
                     .label(slot.interface.span, "not declared and not imported");
                 let names = loaded.visible(file, Space::Type);
-                let interface = |name: &&str| matches!(loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Interface(_)));
+                let interface =
+                    |name: &&str| matches!(loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Interface(_)));
                 if let Some(near) = nearest(&slot.interface.text, names.into_iter().filter(interface)) {
                     error = error.help(format!("did you mean `{near}`?"));
                 } else if let Some(module) = self.module_with(&slot.interface.text) {
@@ -764,7 +780,9 @@ impl<'a> Flattener<'a> {
             let problem = match found {
                 None if port.value.is_some() => continue,
                 None => format!("it has no `{wanted}`"),
-                Some(d) if d.kind != port.kind => format!("its `{}` is {} `{}`", d.name.text, article(d.kind.word()), d.kind.word()),
+                Some(d) if d.kind != port.kind => {
+                    format!("its `{}` is {} `{}`", d.name.text, article(d.kind.word()), d.kind.word())
+                }
                 Some(d) => match (dimension(&d.unit, rotary), dimension(&port.unit, slot_rotary)) {
                     (Some(has), Some(needs)) if has != needs => {
                         if has.rotary() == needs || needs.rotary() == has {
@@ -773,9 +791,13 @@ impl<'a> Flattener<'a> {
                             } else {
                                 ("rotary", format!("write `{name}(…)` without `rotary`"))
                             };
-                            let error = Diagnostic::error("E0108", format!("{name} is {model_is} here, the slot is not"))
-                                .label(instance.model.span, format!("its `{}` is in {}", d.name.text, Unit::si(has)))
-                                .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
+                            let error =
+                                Diagnostic::error("E0108", format!("{name} is {model_is} here, the slot is not"))
+                                    .label(
+                                        instance.model.span,
+                                        format!("its `{}` is in {}", d.name.text, Unit::si(has)),
+                                    )
+                                    .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
                             self.report(error.help(help));
                             return;
                         }
@@ -787,7 +809,10 @@ impl<'a> Flattener<'a> {
             let error = Diagnostic::error("E0206", format!("{name} does not fit {}", interface.name.text))
                 .label(instance.model.span, problem)
                 .label(slot.interface.span, format!("asks for `{wanted}`"))
-                .help(format!("a model fits {} when it has its ports with these units; add `{wanted}`", interface.name.text));
+                .help(format!(
+                    "a model fits {} when it has its ports with these units; add `{wanted}`",
+                    interface.name.text
+                ));
             self.report(error);
             return;
         }
@@ -816,7 +841,9 @@ impl<'a> Flattener<'a> {
                 _ if part => continue,
                 Some(d) if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input) => match arg.value {
                     ArgValue::Expr(_) => continue,
-                    ArgValue::Instance(_) => format!("`{}` of {} takes a value, not a model", arg.name, model.name.text),
+                    ArgValue::Instance(_) => {
+                        format!("`{}` of {} takes a value, not a model", arg.name, model.name.text)
+                    }
                 },
                 Some(d) => {
                     let kind = d.kind.word();
@@ -938,7 +965,12 @@ impl<'a> Flattener<'a> {
                 Statement::Require(require) => {
                     let condition = self.expr(&require.condition, &env);
                     let message = require.message.as_ref().map(|message| message.text.clone());
-                    self.system.requires.push(Require { instance: id, condition, message, span: require.condition.span });
+                    self.system.requires.push(Require {
+                        instance: id,
+                        condition,
+                        message,
+                        span: require.condition.span,
+                    });
                 }
                 Statement::Storage(storage) => {
                     let energy = self.expr(&storage.energy, &equations);
@@ -1147,19 +1179,23 @@ impl<'a> Flattener<'a> {
                 }
             }
             (Target::Name(_), VarKind::State) => {
-                let error = Diagnostic::error("E0301", format!("`{}` is a state: it has no equation of its own", name.text))
-                    .label(target.span(), "a state changes, it is not computed")
-                    .label(declared, "declared here")
-                    .help(format!("say how it changes, `d{0}/dt = …`, or declare it as `let {0} = …`", name.text));
+                let error =
+                    Diagnostic::error("E0301", format!("`{}` is a state: it has no equation of its own", name.text))
+                        .label(target.span(), "a state changes, it is not computed")
+                        .label(declared, "declared here")
+                        .help(format!("say how it changes, `d{0}/dt = …`, or declare it as `let {0} = …`", name.text));
                 self.report(error);
                 None
             }
             (Target::Name(_), _) => {
                 let kind = kind.word();
-                let error = Diagnostic::error("E0301", format!("`{}` is {} {kind}: its value comes from outside", name.text, article(kind)))
-                    .label(target.span(), "a second definition")
-                    .label(declared, "declared here")
-                    .help("give what is computed here another name, and declare it with `let`");
+                let error = Diagnostic::error(
+                    "E0301",
+                    format!("`{}` is {} {kind}: its value comes from outside", name.text, article(kind)),
+                )
+                .label(target.span(), "a second definition")
+                .label(declared, "declared here")
+                .help("give what is computed here another name, and declare it with `let`");
                 self.report(error);
                 None
             }
@@ -1186,7 +1222,9 @@ impl<'a> Flattener<'a> {
                     let error = Diagnostic::error("E0304", format!("`{name}` changes in time and at ticks"))
                         .label(span, "again here")
                         .label(first, "first here")
-                        .help(format!("a state is continuous, `d{name}/dt = …`, or sampled, `next({name}) = …`: keep one"));
+                        .help(format!(
+                            "a state is continuous, `d{name}/dt = …`, or sampled, `next({name}) = …`: keep one"
+                        ));
                     self.report(error);
                     return false;
                 }
@@ -1230,7 +1268,8 @@ impl<'a> Flattener<'a> {
                             if self.once(var, span, defined)
                                 && let Definition::Continuous { initial, .. } = self.system.var(var).definition
                             {
-                                self.system.vars[var.0 as usize].definition = Definition::Sampled { initial, next: value, block };
+                                self.system.vars[var.0 as usize].definition =
+                                    Definition::Sampled { initial, next: value, block };
                             }
                         }
                         Wanted::Rate { .. } => {
@@ -1254,9 +1293,10 @@ impl<'a> Flattener<'a> {
             match self.var_named(id, &reset.name.text) {
                 Some(var) if self.system.var(var).kind == VarKind::State => out.push((var, value)),
                 Some(var) => {
-                    let error = Diagnostic::error("E0307", format!("`{}` is no state: it cannot be reset", reset.name.text))
-                        .label(reset.name.span, "only a state keeps a value")
-                        .label(self.system.var(var).span, "declared here");
+                    let error =
+                        Diagnostic::error("E0307", format!("`{}` is no state: it cannot be reset", reset.name.text))
+                            .label(reset.name.span, "only a state keeps a value")
+                            .label(self.system.var(var).span, "declared here");
                     self.report(error);
                 }
                 None => self.unknown(id, &reset.name),
@@ -1311,7 +1351,8 @@ impl<'a> Flattener<'a> {
             }
             by_mode.push(here);
         }
-        let transitions: Vec<Vec<Transition>> = modes.iter().map(|mode| self.transitions(id, mode, &modes, env)).collect();
+        let transitions: Vec<Vec<Transition>> =
+            modes.iter().map(|mode| self.transitions(id, mode, &modes, env)).collect();
         for (regime, transitions) in self.system.automata[automaton].regimes.iter_mut().zip(transitions) {
             regime.transitions = transitions;
         }
@@ -1337,10 +1378,14 @@ impl<'a> Flattener<'a> {
                     .expect("some regime defines it");
                 let name = &self.system.var(var).name;
                 let text = self.loaded.files.slice(first.span).to_string();
-                let error = Diagnostic::error("E0305", format!("regime `{}` does not say what `{name}` is", mode.name.text))
-                    .label(first.statement, format!("`{}` defines {name}", other.name.text))
-                    .label(mode.head, format!("`{}` does not", mode.name.text))
-                    .help(format!("every regime defines the same quantities; add `{text} = ...` to `{}`", mode.name.text));
+                let error =
+                    Diagnostic::error("E0305", format!("regime `{}` does not say what `{name}` is", mode.name.text))
+                        .label(first.statement, format!("`{}` defines {name}", other.name.text))
+                        .label(mode.head, format!("`{}` does not", mode.name.text))
+                        .help(format!(
+                            "every regime defines the same quantities; add `{text} = ...` to `{}`",
+                            mode.name.text
+                        ));
                 self.report(error);
                 break;
             }
@@ -1376,7 +1421,13 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    fn transitions(&mut self, id: InstanceId, mode: &'a ast::Mode, modes: &[&'a ast::Mode], env: &Env) -> Vec<Transition> {
+    fn transitions(
+        &mut self,
+        id: InstanceId,
+        mode: &'a ast::Mode,
+        modes: &[&'a ast::Mode],
+        env: &Env,
+    ) -> Vec<Transition> {
         let mut out = Vec::new();
         for go in &mode.transitions {
             let condition = self.expr(&go.condition, &Env { instants: true, ..env.clone() });
@@ -1469,7 +1520,9 @@ impl<'a> Flattener<'a> {
             Node::Binary(BinaryOp::Multiply, a, b) if self.has_sign(a, inner) => {
                 Node::Binary(BinaryOp::Multiply, self.times_speed(a, speed, span), b)
             }
-            Node::Binary(BinaryOp::Multiply, a, b) => Node::Binary(BinaryOp::Multiply, a, self.times_speed(b, speed, span)),
+            Node::Binary(BinaryOp::Multiply, a, b) => {
+                Node::Binary(BinaryOp::Multiply, a, self.times_speed(b, speed, span))
+            }
             Node::Binary(BinaryOp::Divide, a, b) if self.has_sign(a, inner) => {
                 Node::Binary(BinaryOp::Divide, self.times_speed(a, speed, span), b)
             }
@@ -1495,7 +1548,9 @@ impl<'a> Flattener<'a> {
             Node::Binary(BinaryOp::Divide, a, _) => self.has_sign(*a, inner),
             Node::If(_, a, b) => self.has_sign(*a, inner) || self.has_sign(*b, inner),
             Node::Var(var) => match self.system.var(*var).definition {
-                Definition::Value(value, _) if self.system.var(*var).kind == VarKind::Let => self.has_sign(value, inner),
+                Definition::Value(value, _) if self.system.var(*var).kind == VarKind::Let => {
+                    self.has_sign(value, inner)
+                }
                 _ => false,
             },
             _ => false,
@@ -1510,7 +1565,9 @@ impl<'a> Flattener<'a> {
         match (self.system.node(a), self.system.node(b)) {
             (Node::Var(a), Node::Var(b)) => a == b,
             (Node::Negate(a), Node::Negate(b)) => self.same(*a, *b),
-            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => op == other && self.same(*a, *c) && self.same(*b, *d),
+            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => {
+                op == other && self.same(*a, *c) && self.same(*b, *d)
+            }
             _ => false,
         }
     }
@@ -1647,7 +1704,7 @@ impl<'a> Flattener<'a> {
                     Node::Error
                 }
                 Ok(unit) => {
-                    let value = value * unit.scale;
+                    let value = unit.to_si(value);
                     if env.rotary {
                         if unit.angle == Angle::Angle {
                             self.not_rotary(env.instance, span, "speaks of an angle already");
@@ -1838,7 +1895,8 @@ impl<'a> Flattener<'a> {
                     && let Some(unit) = self.unit(unit, env.rotary, env.instance)
                 {
                     let role = Role::Result { function: name.text.clone() };
-                    value = self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
+                    value =
+                        self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
                 }
                 self.open_consts.pop();
                 self.consts.insert((item, env.rotary), value);
@@ -1859,9 +1917,10 @@ impl<'a> Flattener<'a> {
             (Some(var), _) if along.text == "t" => Node::Rate(var),
             (Some(var), Some(_)) => Node::PathRate(var),
             _ => {
-                let error = Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
-                    .label(span, "not a state of this model")
-                    .help("to watch a derivative, give the model an output for it");
+                let error =
+                    Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
+                        .label(span, "not a state of this model")
+                        .help("to watch a derivative, give the model an output for it");
                 self.report(error);
                 Node::Error
             }
@@ -1906,9 +1965,10 @@ impl<'a> Flattener<'a> {
                 self.error(span)
             }
             None if MeasureName::named(&function.text).is_some() => {
-                let error = Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
-                    .label(function.span, "needs the whole course of a quantity")
-                    .help(format!("write `expect {}(…) < …` in an experiment", function.text));
+                let error =
+                    Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
+                        .label(function.span, "needs the whole course of a quantity")
+                        .help(format!("write `expect {}(…) < …` in an experiment", function.text));
                 self.report(error);
                 self.error(span)
             }
@@ -1933,8 +1993,9 @@ impl<'a> Flattener<'a> {
 
     fn wrong_count(&mut self, function: &Name, wanted: usize, got: usize) {
         let plural = if wanted == 1 { "" } else { "s" };
-        let error = Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
-            .label(function.span, format!("{got} given"));
+        let error =
+            Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
+                .label(function.span, format!("{got} given"));
         self.report(error);
     }
 
@@ -2052,12 +2113,7 @@ impl<'a> Flattener<'a> {
             return self.error(span);
         }
         self.functions.push(item);
-        let inner = Env {
-            locals: Rc::new(locals),
-            rotary: env.rotary,
-            equation: env.equation,
-            ..Env::file(item.file)
-        };
+        let inner = Env { locals: Rc::new(locals), rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
         let body = self.expr(&function.body, &inner);
         self.functions.pop();
         match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance)) {
@@ -2138,11 +2194,16 @@ fn article(word: &str) -> &'static str {
 }
 
 fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
-    let known = ["m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A", "V"];
-    let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
+    let known = [
+        "m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A",
+        "V",
+    ];
+    let error =
+        Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
     match nearest(part, known) {
         Some(near) => error.help(format!("did you mean `{near}`?")),
-        None => error.help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
+        None => error
+            .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
     }
 }
 

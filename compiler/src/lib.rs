@@ -24,6 +24,7 @@ pub mod interval;
 pub mod domains;
 pub mod friction;
 pub mod lints;
+pub mod explain;
 pub mod experiment;
 
 pub use experiment::Changes;
@@ -110,7 +111,11 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
 }
 
 /// Machine code of functions, or the interpreter where there can be none, which is noted.
-pub fn code(functions: &[(Function, ir::Func)], description: &abi::Description, interpret: bool) -> (Code, Vec<String>) {
+pub fn code(
+    functions: &[(Function, ir::Func)],
+    description: &abi::Description,
+    interpret: bool,
+) -> (Code, Vec<String>) {
     let (layout, pool) = (&description.layout, description.pool.len());
     let interpreted = || Code::Interpreted(Arc::new(backend::interp::Interpreter::new(functions, layout, pool)));
     if interpret {
@@ -120,6 +125,45 @@ pub fn code(functions: &[(Function, ir::Func)], description: &abi::Description, 
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
         Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
     }
+}
+
+/// Explains a model of a loaded text, on its own.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<explain::Explanation, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let found = loaded.models().into_iter().find(|candidate| candidate.name.text == model);
+    let Some(model) = found else {
+        return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
+    };
+    let (system, types, diagnostics) = alone(loaded, sources, model, root);
+    match diagnostics.iter().any(Diagnostic::is_error) {
+        true => Err(once(diagnostics)),
+        false => Ok(explain::explain(&system, &types, &loaded.files)),
+    }
+}
+
+/// A model on its own, flat and typed, its circles reported.
+fn alone(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+) -> (system::System, units::Types, Vec<Diagnostic>) {
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, file),
+        overrides: Vec::new(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flat = flatten::flatten(loaded, sources, &request);
+    let mut diagnostics = flat.diagnostics;
+    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        causality::check(&flat.system, &loaded.files, &mut diagnostics);
+    }
+    (flat.system, types, diagnostics)
 }
 
 /// Checks everything in a loaded text: each model on its own, each experiment.
@@ -167,28 +211,17 @@ fn check_model(
     file: FileId,
     whole: bool,
 ) -> Vec<Diagnostic> {
-    let request = flatten::Request {
-        instance: flatten::Instance::Alone(model, file),
-        overrides: Vec::new(),
-        observed: Vec::new(),
-        data: Vec::new(),
-    };
-    let flat = flatten::flatten(loaded, sources, &request);
-    let mut diagnostics = flat.diagnostics;
-    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, file);
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        causality::check(&flat.system, &loaded.files, &mut diagnostics);
-    }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&flat.system, &types, &loaded.files, &mut diagnostics);
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
         if whole {
-            domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
+            domains::check(&system, &types, &loaded.files, &mut diagnostics);
         }
     }
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
-        diagnostics.extend(lints::check(&flat.system, &types, &loaded.files));
+        diagnostics.extend(lints::check(&system, &types, &loaded.files));
     }
-    lints::silence(&flat.system, &mut diagnostics);
+    lints::silence(&system, &mut diagnostics);
     diagnostics
 }
 

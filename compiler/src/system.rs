@@ -534,7 +534,9 @@ impl Node {
                 ([None; 3], &[])
             }
             Node::InRegime(..) | Node::Crossing(_) | Node::Hole | Node::Error => ([None; 3], &[]),
-            Node::Negate(a) | Node::Not(a) | Node::Table(_, a) | Node::Fits { value: a, .. } => ([Some(*a), None, None], &[]),
+            Node::Negate(a) | Node::Not(a) | Node::Table(_, a) | Node::Fits { value: a, .. } => {
+                ([Some(*a), None, None], &[])
+            }
             Node::Binary(_, a, b) => ([Some(*a), Some(*b), None], &[]),
             Node::If(a, b, c) => ([Some(*a), Some(*b), Some(*c)], &[]),
             Node::Measure(_, a, b) => ([Some(*a), *b, None], &[]),

@@ -40,8 +40,8 @@ pub fn read(
         }
         TablePoints::File(path) => {
             let columns = columns(loaded, sources, file, path, &[true, true], diagnostics)?;
-            x.extend(columns[0].iter().map(|value| value * x_unit.scale));
-            y.extend(columns[1].iter().map(|value| value * y_unit.scale));
+            x.extend(columns[0].iter().map(|value| x_unit.to_si(*value)));
+            y.extend(columns[1].iter().map(|value| y_unit.to_si(*value)));
             for k in 0..x.len() {
                 check_order(&x[..=k], path.span, diagnostics)?;
             }
@@ -108,7 +108,8 @@ pub fn columns(
                     Some(numbers) => format!("line {} has {} columns, {count} are needed", row + 1, numbers.len()),
                     None => format!("line {} has something that is no finite number", row + 1),
                 };
-                let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
+                let error =
+                    Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
                 diagnostics.push(error);
                 return None;
             }
@@ -125,7 +126,8 @@ pub fn columns(
 fn check_order(x: &[f64], span: Span, diagnostics: &mut Vec<Diagnostic>) -> Option<()> {
     match x {
         [.., a, b] if a.partial_cmp(b) != Some(std::cmp::Ordering::Less) => {
-            let error = Diagnostic::error("E0902", "the arguments of a table must increase").label(span, "not above the one before");
+            let error = Diagnostic::error("E0902", "the arguments of a table must increase")
+                .label(span, "not above the one before");
             diagnostics.push(error.help("sort the points, and keep one for each argument"));
             None
         }
@@ -143,7 +145,8 @@ fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) 
                 Some(text) => match Unit::parse(&text.text) {
                     Ok(unit) => unit,
                     Err(part) => {
-                        let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                        let error =
+                            Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
                         diagnostics.push(error);
                         return None;
                     }
@@ -162,7 +165,7 @@ fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) 
                 diagnostics.push(error);
                 return None;
             }
-            Some(value * unit.scale)
+            Some(unit.to_si(*value))
         }
         _ => {
             let error = Diagnostic::error("E0902", "points of a table are numbers").label(expr.span, "not a number");
