@@ -84,7 +84,7 @@ impl<'a> Points<'a> {
             return Ok(());
         }
         let from = self.theta;
-        let pieces = (LEAST_POINTS * step.h * (theta - from) / self.duration).ceil().max(4.0);
+        let pieces = (LEAST_POINTS * step.h * (theta - from) / self.duration).ceil().max(2.0);
         for piece in 1..=pieces as u32 {
             let start = self.theta;
             let last = f64::from(piece) == pieces;

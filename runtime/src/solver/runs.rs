@@ -514,6 +514,41 @@ fn what_blows_up_is_named() {
     println!("{failure}");
 }
 
+/// The mass with LuGre friction under a position controller that runs a thousand times a second.
+#[test]
+fn a_sampled_controller_costs_a_step_a_tick() {
+    let instance = Model::new("Sampled")
+        .state("x", "m")
+        .state("v", "m/s")
+        .state("z", "um")
+        .root("v < 0")
+        .memory(2)
+        .every(1e-3)
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, |m| {
+            let (v, z) = (m.x(1), m.x(2));
+            let g = 1.0 + 0.5 * (-(v / 1e-3) * (v / 1e-3)).exp();
+            let dz = v - 1e5 * v.abs() / g * z;
+            m.set_dx(0, v);
+            m.set_dx(1, m.memory(0) - 1e5 * z - 1e5f64.sqrt() * dz - 0.4 * v);
+            m.set_dx(2, dz);
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .body(Function::Tick, |m| {
+            let i = m.memory(1) + 1e-3 * 4.0 * (1.0 - m.x(0));
+            m.set_memory(1, i);
+            m.set_memory(0, 3.0 * (1.0 - m.x(0)) + i - 6.0 * m.x(1));
+        })
+        .build();
+    let mut experiment = adaptive(10.0, 1e-6);
+    experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+    let outcome = go(&instance, &experiment).unwrap();
+    assert_eq!(outcome.work.ticks, 10_000);
+    assert!(outcome.work.steps + outcome.work.rejected < 10_500, "{}", outcome.work);
+    // Overshoots about as far as with the continuous controller.
+    assert!((value(&outcome, 0) - 1.5).abs() < 0.01, "{}", value(&outcome, 0));
+}
+
 /// Pulls with random parameters over several decades each: all end, and no bristle bends beyond what it holds.
 #[test]
 fn any_bristle_can_be_pulled() {
