@@ -5,4 +5,204 @@
 pub mod ir;
 pub mod math;
 pub mod opt;
+pub mod program;
+pub mod derive;
+pub mod discretize;
 pub mod backend;
+
+pub mod names;
+pub mod source;
+pub mod resolve;
+pub mod system;
+pub mod tables;
+pub mod flatten;
+pub mod units;
+pub mod causality;
+pub mod lower;
+pub mod checks;
+pub mod interval;
+pub mod domains;
+pub mod friction;
+pub mod lints;
+pub mod experiment;
+
+pub use experiment::Changes;
+pub use resolve::{ExperimentInfo, Loaded, load};
+pub use source::{Files, NoSources, SourceFile, Sources};
+
+use abi::plan::Method;
+use abi::table::Code;
+use abi::{Function, Instance};
+use grammar::ast::Item;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::FileId;
+use std::sync::Arc;
+
+/// How to compile.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Changes to the experiment.
+    pub changes: Changes,
+    /// Run the reference interpreter instead of machine code.
+    pub interpret: bool,
+}
+
+/// One combination of an experiment's sweeps, ready to run.
+pub struct Case {
+    /// `fr = LuGre()`; empty without a sweep.
+    pub label: String,
+    /// The compiled instance.
+    pub instance: Instance,
+    /// What to run.
+    pub experiment: abi::plan::Experiment,
+    /// What the user should know: a processor without what machine code needs.
+    pub notes: Vec<String>,
+}
+
+/// Compiles an experiment of a loaded text: one case for each combination of its sweeps. `on_stage` is called with the
+/// name of each stage when it begins.
+///
+/// # Errors
+/// Everything that is wrong with the experiment and the models it runs.
+pub fn compile(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Vec<Case>, Vec<Diagnostic>> {
+    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
+    on_stage("code");
+    let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
+    Ok(cases)
+}
+
+fn case(variant: experiment::Variant, interpret: bool) -> Case {
+    let program = &variant.program;
+    let functions = functions(program, variant.experiment.solver.method);
+    let (code, notes) = code(&functions, &program.description, interpret);
+    let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    Case { label: variant.label, instance, experiment: variant.experiment, notes }
+}
+
+/// The functions that a method needs, expanded to arithmetic.
+pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, ir::Func)> {
+    let mut out = vec![(Function::Start, program.start.clone()), (Function::Outputs, program.outputs.clone())];
+    if let Some(transitions) = &program.transitions {
+        out.push((Function::Transitions, transitions.clone()));
+    }
+    match method {
+        Method::Adaptive => {
+            if program.description.layout.jacobian.len > 0 {
+                out.push((Function::Jacobian, derive::jacobian(program)));
+            }
+            out.push((Function::Derivatives, program.derivatives.clone()));
+            if program.description.layout.jacobian.len > 0 {
+                out.push((Function::Jacobian, derive::jacobian(program)));
+            }
+            out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
+            out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
+        }
+        method => out.push((Function::Step, discretize::step(program, method))),
+    }
+    out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
+}
+
+/// Machine code of functions, or the interpreter where there can be none, which is noted.
+pub fn code(functions: &[(Function, ir::Func)], description: &abi::Description, interpret: bool) -> (Code, Vec<String>) {
+    let (layout, pool) = (&description.layout, description.pool.len());
+    let interpreted = || Code::Interpreted(Arc::new(backend::interp::Interpreter::new(functions, layout, pool)));
+    if interpret {
+        return (interpreted(), Vec::new());
+    }
+    match backend::jit::compile(functions, layout, pool) {
+        Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
+        Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
+    }
+}
+
+/// Checks everything in a loaded text: each model on its own, each experiment.
+pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
+    let mut all = loaded.diagnostics.clone();
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let unreadable = loaded.has_errors();
+    for item in &ast.items {
+        match item {
+            Item::Model(model) => all.extend(check_model(loaded, sources, model, root, !unreadable)),
+            Item::Experiment(experiment) => {
+                let mut warnings = Vec::new();
+                let changes = Changes::default();
+                match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
+                    Ok(_) => all.extend(warnings),
+                    Err(errors) => all.extend(errors),
+                }
+            }
+            Item::Function(_) | Item::Const(_) | Item::Table(_) => {
+                let flat = flatten::flatten_item(loaded, sources, root, item);
+                let mut diagnostics = flat.diagnostics;
+                units::check(&flat.system, &loaded.files, &mut diagnostics);
+                all.extend(diagnostics);
+            }
+            Item::Fit(fit) => {
+                let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
+                all.push(error.label(fit.name.span, "reserved for the fitting of parameters"));
+            }
+            Item::Import(_) | Item::Interface(_) | Item::Device(_) | Item::Rig(_) => {}
+        }
+    }
+    // What cannot be read elsewhere is missing here: say the cause.
+    if loaded.diagnostics.iter().any(|d| d.is_error() && d.span().file != root) {
+        all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
+    }
+    once(all)
+}
+
+/// `whole`: the text could be read in whole; else what is proven of it would rest on gaps.
+fn check_model(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+    whole: bool,
+) -> Vec<Diagnostic> {
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, file),
+        overrides: Vec::new(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flat = flatten::flatten(loaded, sources, &request);
+    let mut diagnostics = flat.diagnostics;
+    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        causality::check(&flat.system, &loaded.files, &mut diagnostics);
+    }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&flat.system, &types, &loaded.files, &mut diagnostics);
+        if whole {
+            domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
+        }
+    }
+    if whole && !diagnostics.iter().any(Diagnostic::is_error) {
+        diagnostics.extend(lints::check(&flat.system, &types, &loaded.files));
+    }
+    lints::silence(&flat.system, &mut diagnostics);
+    diagnostics
+}
+
+/// One mistake, one message: in the order of the files, each code at each place once, warnings only without errors.
+pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
+    let errors = diagnostics.iter().any(Diagnostic::is_error);
+    diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
+    diagnostics.sort_by_key(|diagnostic| diagnostic.span());
+    let mut seen = std::collections::HashSet::new();
+    let mut circle = false;
+    diagnostics.retain(|diagnostic| {
+        // A circle of models is met from each of them.
+        let again = diagnostic.message.ends_with("contains itself") && std::mem::replace(&mut circle, true);
+        seen.insert((diagnostic.code, diagnostic.span())) && !again
+    });
+    diagnostics
+}

@@ -464,6 +464,7 @@ pub struct Sweep {
 
 /// What a sweep goes through.
 #[derive(Clone, PartialEq, Debug)]
+#[allow(clippy::large_enum_variant)] // there are few
 pub enum SweepOver {
     /// Models for a slot.
     Instances(Vec<Instance>),
@@ -533,7 +534,7 @@ pub struct Fit {
 
 /// One statement of a fit.
 #[derive(Clone, PartialEq, Debug)]
-#[allow(missing_docs)]
+#[allow(missing_docs, clippy::large_enum_variant)] // there are few
 pub enum FitStatement {
     Experiment(ExperimentStatement),
     /// `vary Fs in 1 N .. 2 N, vs`

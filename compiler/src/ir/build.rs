@@ -1,1 +1,714 @@
-//! build
+//! Builds functions: shares equal operations, folds constants, and applies the identities that keep every bit.
+//!
+//! In: operations in the order of their operands. Out: a [`Func`] without dead code. Constants fold with the same
+//! [`evaluate`] that defines the operations, so that folding changes no result.
+
+use super::eval::evaluate;
+use super::verify::result;
+use super::{Binary, Func, Op, Type, Unary, Value};
+use abi::Slot;
+use std::collections::{BTreeMap, HashMap};
+use std::hash::{BuildHasherDefault, Hasher};
+use std::sync::Arc;
+
+/// What slots hold at a point of a composition; a slot that is not in it holds what it held at the beginning.
+pub type Env = HashMap<Slot, Value>;
+
+/// A function being built.
+#[derive(Clone, Default)]
+pub struct Build {
+    name: String,
+    ops: Vec<Op>,
+    types: Vec<Type>,
+    known: HashMap<Op, Value, BuildHasherDefault<Mix>>,
+    stores: BTreeMap<Slot, Value>,
+    status: Option<Value>,
+    pool: Arc<[f64]>,
+}
+
+impl Build {
+    /// An empty function of this name.
+    pub fn new(name: &str) -> Build {
+        Build { name: name.into(), ..Build::default() }
+    }
+
+    /// Lets reads of the pool at a constant place fold: `pool` is a beginning of the pool the function will run with.
+    pub fn with_pool(mut self, pool: Arc<[f64]>) -> Build {
+        self.pool = pool;
+        self
+    }
+
+    /// The operation that gives a value.
+    pub fn get(&self, value: Value) -> Op {
+        self.ops[value.index()]
+    }
+
+    /// The type of a value.
+    pub fn type_of(&self, value: Value) -> Type {
+        self.types[value.index()]
+    }
+
+    /// The value if it is a real constant.
+    pub fn constant(&self, value: Value) -> Option<f64> {
+        if let Op::Real(bits) = self.get(value) { Some(f64::from_bits(bits)) } else { None }
+    }
+
+    /// The bits of a constant of any type.
+    fn bits(&self, value: Value) -> Option<u64> {
+        match self.get(value) {
+            Op::Real(bits) => Some(bits),
+            Op::Int(n) => Some(n as u64),
+            Op::Bool(b) => Some(b.into()),
+            _ => None,
+        }
+    }
+
+    /// Adds an operation, or finds the value that equals it.
+    ///
+    /// # Panics
+    /// If an operand has the wrong type: a mistake of the pass that builds.
+    pub fn op(&mut self, op: Op) -> Value {
+        match self.rewrite(op) {
+            Rewrite::Value(value) => return value,
+            Rewrite::Op(simpler) => return self.op(simpler),
+            Rewrite::None => {}
+        }
+        let op = self.ordered(op);
+        if let Some(constant) = self.fold(op) {
+            return self.share(constant);
+        }
+        self.share(op)
+    }
+
+    fn share(&mut self, op: Op) -> Value {
+        if let Some(value) = self.known.get(&op) {
+            return *value;
+        }
+        let of = |value: Value| self.types[value.index()];
+        let of_type = result(op, of).unwrap_or_else(|what| panic!("{}: v{} = {op} {what}", self.name, self.ops.len()));
+        let value = Value(u32::try_from(self.ops.len()).expect("fewer than 2^32 operations"));
+        self.ops.push(op);
+        self.types.push(of_type);
+        self.known.insert(op, value);
+        value
+    }
+
+    /// The constant that an operation on constants gives.
+    fn fold(&self, op: Op) -> Option<Op> {
+        if let Op::Pool { base, len, index } = op {
+            let index = self.bits(index)?.min(u64::from(len) - 1);
+            return self.pool.get(base as usize + index as usize).map(|entry| Op::Real(entry.to_bits()));
+        }
+        let (mut constant, mut operands) = (true, 0);
+        op.each_operand(|operand| {
+            constant &= self.bits(operand).is_some();
+            operands += 1;
+        });
+        if !constant || operands == 0 {
+            return None;
+        }
+        let bits = evaluate(op, |operand| self.bits(operand).expect("operands are constants"))?;
+        Some(match result(op, |operand| self.type_of(operand)).ok()? {
+            // All NaN are one value: so one constant.
+            Type::Real if f64::from_bits(bits).is_nan() => Op::Real(f64::NAN.to_bits()),
+            Type::Real => Op::Real(bits),
+            Type::Int => Op::Int(bits as i64),
+            Type::Bool => Op::Bool(bits != 0),
+        })
+    }
+
+    /// Puts the operands of a commutative operation in one order, so that equal operations look equal.
+    fn ordered(&self, op: Op) -> Op {
+        let sort = |a: Value, b: Value| if a <= b { (a, b) } else { (b, a) };
+        macro_rules! sorted {
+            ($($name:ident)*) => {
+                match op {
+                    $(Op::$name(a, b) => { let (a, b) = sort(a, b); Op::$name(a, b) })*
+                    Op::Fma(a, b, c) => { let (a, b) = sort(a, b); Op::Fma(a, b, c) }
+                    other => other,
+                }
+            };
+        }
+        sorted!(Add Mul Equal And Or IntAdd IntMul IntAnd IntOr IntXor IntEqual)
+    }
+
+    /// Identities that hold to the last bit in IEEE 754 with round to nearest, all NaN counting as one value.
+    /// What is missing here is missing on purpose: x + 0 is not x for x = −0, x − x is not 0 for x = inf,
+    /// x · 0 is not 0 for x = −1, and sums and products are not associative.
+    fn rewrite(&self, op: Op) -> Rewrite {
+        use Rewrite::{None, Value as Is};
+        const MINUS_ZERO: f64 = -0.0;
+        let real = |value| self.constant(value);
+        let is = |value, constant: f64| self.bits(value) == Some(constant.to_bits()) && real(value).is_some();
+        let int = |value| if let Op::Int(n) = self.get(value) { Some(n) } else { Option::None };
+        let truth = |value| if let Op::Bool(b) = self.get(value) { Some(b) } else { Option::None };
+        let neg = |value| if let Op::Neg(a) = self.get(value) { Some(a) } else { Option::None };
+        match op {
+            // x + (−0) → x, for x = ±0 too.
+            Op::Add(a, b) if is(b, MINUS_ZERO) => Is(a),
+            Op::Add(a, b) if is(a, MINUS_ZERO) => Is(b),
+            // a + (−b) → a − b: the same real number, rounded once; both zero: +0 in both, or −0 in both.
+            Op::Add(a, b) => match (neg(a), neg(b)) {
+                (_, Some(b)) => Rewrite::Op(Op::Sub(a, b)),
+                (Some(a), Option::None) => Rewrite::Op(Op::Sub(b, a)),
+                (Option::None, Option::None) => None,
+            },
+            // x − (+0) → x, for x = ±0 too.
+            Op::Sub(a, b) if is(b, 0.0) => Is(a),
+            // (−0) − x → −x, for x = ±0 too. 0 − x is not −x for x = 0.
+            Op::Sub(a, b) if is(a, MINUS_ZERO) => Rewrite::Op(Op::Neg(b)),
+            // a − (−b) → a + b
+            Op::Sub(a, b) => neg(b).map_or(None, |b| Rewrite::Op(Op::Add(a, b))),
+            // x · 1 → x;  x · (−1) → −x
+            Op::Mul(a, b) if is(b, 1.0) => Is(a),
+            Op::Mul(a, b) if is(a, 1.0) => Is(b),
+            Op::Mul(a, b) if is(b, -1.0) => Rewrite::Op(Op::Neg(a)),
+            Op::Mul(a, b) if is(a, -1.0) => Rewrite::Op(Op::Neg(b)),
+            // (−a)(−b) → a b
+            Op::Mul(a, b) => match (neg(a), neg(b)) {
+                (Some(a), Some(b)) => Rewrite::Op(Op::Mul(a, b)),
+                _ => None,
+            },
+            // x / 1 → x;  x / (−1) → −x
+            Op::Div(a, b) if is(b, 1.0) => Is(a),
+            Op::Div(a, b) if is(b, -1.0) => Rewrite::Op(Op::Neg(a)),
+            // (−a)/(−b) → a/b
+            Op::Div(a, b) => match (neg(a), neg(b)) {
+                (Some(a), Some(b)) => Rewrite::Op(Op::Div(a, b)),
+                _ => None,
+            },
+            // −(−x) → x
+            Op::Neg(a) => neg(a).map_or(None, Is),
+            // |−x| → |x|;  ||x|| → |x|;  |x · x| → x · x, as a square is no less than +0 or NaN.
+            Op::Abs(a) => match self.get(a) {
+                Op::Neg(a) => Rewrite::Op(Op::Abs(a)),
+                Op::Abs(_) => Is(a),
+                Op::Mul(x, y) if x == y => Is(a),
+                _ => None,
+            },
+            // fma(x, 1, c) → x + c: one rounding in both. fma(x, −1, c) → c − x.
+            Op::Fma(a, b, c) if is(b, 1.0) => Rewrite::Op(Op::Add(a, c)),
+            Op::Fma(a, b, c) if is(a, 1.0) => Rewrite::Op(Op::Add(b, c)),
+            Op::Fma(a, b, c) if is(b, -1.0) => Rewrite::Op(Op::Sub(c, a)),
+            Op::Fma(a, b, c) if is(a, -1.0) => Rewrite::Op(Op::Sub(c, b)),
+            // fma(a, b, −0) → a · b, for a · b = ±0 too.
+            Op::Fma(a, b, c) if is(c, MINUS_ZERO) => Rewrite::Op(Op::Mul(a, b)),
+            Op::Fma(a, b, c) => match (neg(a), neg(b)) {
+                (Some(a), Some(b)) => Rewrite::Op(Op::Fma(a, b, c)),
+                _ => None,
+            },
+            // Whole numbers are whole.
+            Op::Floor(a) | Op::Nearest(a) => match self.get(a) {
+                Op::Floor(_) | Op::Nearest(_) => Is(a),
+                _ => None,
+            },
+            // x < x is false, for NaN too. x ≤ x and x = x are not constants: they ask for NaN.
+            Op::Less(a, b) if a == b => Rewrite::Op(Op::Bool(false)),
+            Op::And(a, b) => match (truth(a), truth(b)) {
+                (Some(true), _) => Is(b),
+                (_, Some(true)) => Is(a),
+                (Some(false), _) | (_, Some(false)) => Rewrite::Op(Op::Bool(false)),
+                _ if a == b => Is(a),
+                _ => None,
+            },
+            Op::Or(a, b) => match (truth(a), truth(b)) {
+                (Some(false), _) => Is(b),
+                (_, Some(false)) => Is(a),
+                (Some(true), _) | (_, Some(true)) => Rewrite::Op(Op::Bool(true)),
+                _ if a == b => Is(a),
+                _ => None,
+            },
+            Op::Not(a) => {
+                if let Op::Not(a) = self.get(a) {
+                    Is(a)
+                } else {
+                    None
+                }
+            }
+            Op::Select(c, a, b) => match (truth(c), self.get(c)) {
+                (Some(true), _) => Is(a),
+                (Some(false), _) => Is(b),
+                _ if a == b => Is(a),
+                (_, Op::Not(c)) => Rewrite::Op(Op::Select(c, b, a)),
+                _ => match (truth(a), truth(b)) {
+                    // if c then true else b → c or b, and so on.
+                    (Some(true), _) => Rewrite::Op(Op::Or(c, b)),
+                    (_, Some(false)) => Rewrite::Op(Op::And(c, a)),
+                    (Some(false), Some(true)) => Rewrite::Op(Op::Not(c)),
+                    _ => None,
+                },
+            },
+            // Integers wrap: a ring, so these hold always.
+            Op::IntAdd(a, b) | Op::IntOr(a, b) | Op::IntXor(a, b) if int(a) == Some(0) => Is(b),
+            Op::IntAdd(a, b) | Op::IntOr(a, b) | Op::IntXor(a, b) if int(b) == Some(0) => Is(a),
+            Op::IntSub(a, b) if int(b) == Some(0) => Is(a),
+            Op::IntMul(a, b) if int(a) == Some(1) => Is(b),
+            Op::IntMul(a, b) if int(b) == Some(1) => Is(a),
+            Op::IntAnd(a, b) if int(a) == Some(-1) || a == b => Is(b),
+            Op::IntAnd(a, b) if int(b) == Some(-1) => Is(a),
+            Op::IntOr(a, b) if a == b => Is(a),
+            Op::ShiftLeft(a, 0) | Op::ShiftRight(a, 0) | Op::ShiftRightSigned(a, 0) => Is(a),
+            Op::IntLess(a, b) if a == b => Rewrite::Op(Op::Bool(false)),
+            Op::IntEqual(a, b) if a == b => Rewrite::Op(Op::Bool(true)),
+            Op::FromBits(a) => {
+                if let Op::ToBits(a) = self.get(a) {
+                    Is(a)
+                } else {
+                    None
+                }
+            }
+            Op::ToBits(a) => {
+                if let Op::FromBits(a) = self.get(a) {
+                    Is(a)
+                } else {
+                    None
+                }
+            }
+            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } => None,
+            Op::Sqrt(_) | Op::Unary(..) | Op::Binary(..) => None,
+            Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => None,
+            Op::IntAdd(..) | Op::IntSub(..) | Op::IntMul(..) | Op::IntAnd(..) | Op::IntOr(..) => None,
+            Op::IntXor(..) | Op::ShiftLeft(..) | Op::ShiftRight(..) | Op::ShiftRightSigned(..) => None,
+            Op::IntLess(..) | Op::IntEqual(..) | Op::ToInt(_) | Op::ToReal(_) => None,
+        }
+    }
+
+    /// Will write `value` to `slot` when the function ends; a later store to the same slot takes its place.
+    pub fn store(&mut self, slot: Slot, value: Value) {
+        assert_eq!(self.type_of(value), Type::Real, "slot {} of {} holds a real", slot.0, self.name);
+        self.stores.insert(slot, value);
+    }
+
+    /// Stores every slot of `env` that `keep` accepts.
+    pub fn store_env(&mut self, env: &Env, keep: impl Fn(Slot) -> bool) {
+        for (&slot, &value) in env.iter().filter(|(slot, _)| keep(**slot)) {
+            self.store(slot, value);
+        }
+    }
+
+    /// Makes an integer the status.
+    pub fn status(&mut self, status: Value) {
+        assert_eq!(self.type_of(status), Type::Int, "the status of {}", self.name);
+        self.status = Some(status);
+    }
+
+    /// What a slot holds in `env`.
+    pub fn read(&mut self, slot: Slot, env: &Env) -> Value {
+        env.get(&slot).copied().unwrap_or_else(|| self.load(slot))
+    }
+
+    /// Appends the operations of `func` on what the slots hold in `env`; its stores change `env`, nothing is stored.
+    /// Gives its status.
+    pub fn inline(&mut self, func: &Func, env: &mut Env) -> Option<Value> {
+        let live = func.live();
+        let mut values = Vec::with_capacity(func.ops.len());
+        for (op, live) in func.ops.iter().zip(live) {
+            values.push(match op {
+                _ if !live => Value(u32::MAX),
+                Op::Load(slot) => self.read(*slot, env),
+                op => self.op(op.map(|operand| values[operand.index()])),
+            });
+        }
+        for (slot, value) in &func.stores {
+            env.insert(*slot, values[value.index()]);
+        }
+        func.status.map(|status| values[status.index()])
+    }
+
+    /// The function: stores in the order of their slots, no operation that nothing needs, and no store that writes
+    /// back what it read.
+    pub fn finish(self) -> Func {
+        let kept = |(slot, value): &(Slot, Value)| self.ops[value.index()] != Op::Load(*slot);
+        let stores = self.stores.into_iter().filter(kept).collect();
+        let func = Func { name: self.name, ops: self.ops, stores, status: self.status };
+        prune(&func)
+    }
+}
+
+/// The same function without the operations that nothing needs.
+pub fn prune(func: &Func) -> Func {
+    let live = func.live();
+    let mut moved = vec![Value(u32::MAX); func.ops.len()];
+    let mut ops = Vec::with_capacity(live.iter().filter(|live| **live).count());
+    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+        moved[i] = Value(ops.len() as u32);
+        ops.push(op.map(|operand| moved[operand.index()]));
+    }
+    Func {
+        name: func.name.clone(),
+        ops,
+        stores: func.stores.iter().map(|(slot, value)| (*slot, moved[value.index()])).collect(),
+        status: func.status.map(|status| moved[status.index()]),
+    }
+}
+
+enum Rewrite {
+    None,
+    Value(Value),
+    Op(Op),
+}
+
+macro_rules! operations {
+    ($($(#[$doc:meta])* $name:ident($($operand:ident),*) = $op:expr;)*) => {
+        /// One method an operation.
+        impl Build {
+            $($(#[$doc])* pub fn $name(&mut self, $($operand: Value),*) -> Value { self.op($op) })*
+        }
+    };
+}
+
+operations! {
+    /// a + b
+    add(a, b) = Op::Add(a, b);
+    /// a − b
+    sub(a, b) = Op::Sub(a, b);
+    /// a · b
+    mul(a, b) = Op::Mul(a, b);
+    /// a / b
+    div(a, b) = Op::Div(a, b);
+    /// −a
+    neg(a) = Op::Neg(a);
+    /// |a|
+    abs(a) = Op::Abs(a);
+    /// √a
+    sqrt(a) = Op::Sqrt(a);
+    /// a · b + c, rounded once
+    fma(a, b, c) = Op::Fma(a, b, c);
+    /// Largest whole number not above a
+    floor(a) = Op::Floor(a);
+    /// Nearest whole number, ties to even
+    nearest(a) = Op::Nearest(a);
+    /// a < b
+    less(a, b) = Op::Less(a, b);
+    /// a ≤ b
+    less_equal(a, b) = Op::LessEqual(a, b);
+    /// a = b
+    equal(a, b) = Op::Equal(a, b);
+    /// Both
+    and(a, b) = Op::And(a, b);
+    /// Either
+    or(a, b) = Op::Or(a, b);
+    /// Not
+    not(a) = Op::Not(a);
+    /// If c then a else b
+    select(c, a, b) = Op::Select(c, a, b);
+    /// Wrapping sum
+    int_add(a, b) = Op::IntAdd(a, b);
+    /// Wrapping difference
+    int_sub(a, b) = Op::IntSub(a, b);
+    /// Wrapping product
+    int_mul(a, b) = Op::IntMul(a, b);
+    /// Bitwise and
+    int_and(a, b) = Op::IntAnd(a, b);
+    /// Bitwise or
+    int_or(a, b) = Op::IntOr(a, b);
+    /// Bitwise exclusive or
+    int_xor(a, b) = Op::IntXor(a, b);
+    /// Signed comparison
+    int_less(a, b) = Op::IntLess(a, b);
+    /// Equality of integers
+    int_equal(a, b) = Op::IntEqual(a, b);
+    /// The bits of a real
+    to_bits(a) = Op::ToBits(a);
+    /// The real of these bits
+    from_bits(a) = Op::FromBits(a);
+    /// Truncated towards zero
+    to_int(a) = Op::ToInt(a);
+    /// As a real
+    to_real(a) = Op::ToReal(a);
+}
+
+impl Build {
+    /// A real constant.
+    pub fn real(&mut self, x: f64) -> Value {
+        self.op(Op::Real(x.to_bits()))
+    }
+
+    /// An integer constant.
+    pub fn int(&mut self, n: i64) -> Value {
+        self.op(Op::Int(n))
+    }
+
+    /// True or false.
+    pub fn truth(&mut self, b: bool) -> Value {
+        self.op(Op::Bool(b))
+    }
+
+    /// What a slot holds at the beginning.
+    pub fn load(&mut self, slot: Slot) -> Value {
+        self.op(Op::Load(slot))
+    }
+
+    /// Entry `index` of the table at `base` of the pool; the index is held inside.
+    pub fn pool(&mut self, base: u32, len: u32, index: Value) -> Value {
+        self.op(Op::Pool { base, len, index })
+    }
+
+    /// An elementary function.
+    pub fn unary(&mut self, function: Unary, a: Value) -> Value {
+        self.op(Op::Unary(function, a))
+    }
+
+    /// An elementary function.
+    pub fn binary(&mut self, function: Binary, a: Value, b: Value) -> Value {
+        self.op(Op::Binary(function, a, b))
+    }
+
+    /// Shifted left by a constant.
+    pub fn shift_left(&mut self, a: Value, n: u8) -> Value {
+        self.op(Op::ShiftLeft(a, n))
+    }
+
+    /// Shifted right by a constant, zeros come in.
+    pub fn shift_right(&mut self, a: Value, n: u8) -> Value {
+        self.op(Op::ShiftRight(a, n))
+    }
+
+    /// Shifted right by a constant, the sign comes in.
+    pub fn shift_right_signed(&mut self, a: Value, n: u8) -> Value {
+        self.op(Op::ShiftRightSigned(a, n))
+    }
+
+    /// `if a < b then a else b`: of NaN and b it is b.
+    pub fn min(&mut self, a: Value, b: Value) -> Value {
+        let less = self.less(a, b);
+        self.select(less, a, b)
+    }
+
+    /// `if b < a then a else b`: of NaN and b it is b.
+    pub fn max(&mut self, a: Value, b: Value) -> Value {
+        let less = self.less(b, a);
+        self.select(less, a, b)
+    }
+
+    /// `if x < lo then lo else if hi < x then hi else x`: NaN stays NaN.
+    pub fn clamp(&mut self, x: Value, lo: Value, hi: Value) -> Value {
+        let raised = self.max(lo, x);
+        self.min(hi, raised)
+    }
+
+    /// 1, −1, or 0 at 0; NaN stays NaN.
+    pub fn sign(&mut self, x: Value) -> Value {
+        let (zero, one, minus_one) = (self.real(0.0), self.real(1.0), self.real(-1.0));
+        let (positive, negative) = (self.less(zero, x), self.less(x, zero));
+        // 0 · x and not 0, so that NaN is not taken for a standstill; its derivative, too, is 0.
+        let rest = self.mul(zero, x);
+        let not_positive = self.select(negative, minus_one, rest);
+        self.select(positive, one, not_positive)
+    }
+
+    /// Whether x is neither infinite nor NaN.
+    pub fn finite(&mut self, x: Value) -> Value {
+        let (size, largest) = (self.abs(x), self.real(f64::MAX));
+        self.less_equal(size, largest)
+    }
+}
+
+/// A fast hash for operations: lookups only, so no result depends on it.
+#[derive(Default, Clone)]
+struct Mix(u64);
+
+impl Hasher for Mix {
+    fn finish(&self) -> u64 {
+        // The table takes its place from the top bits and the low ones: spread them.
+        (self.0 ^ (self.0 >> 32)).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        bytes.iter().for_each(|byte| self.write_u64(u64::from(*byte)));
+    }
+
+    fn write_u8(&mut self, n: u8) {
+        self.write_u64(n.into());
+    }
+
+    fn write_u32(&mut self, n: u32) {
+        self.write_u64(n.into());
+    }
+
+    fn write_u64(&mut self, n: u64) {
+        self.0 = (self.0.rotate_left(23) ^ n).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    }
+
+    fn write_isize(&mut self, n: isize) {
+        self.write_u64(n as u64);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Builds one value of two loads, stores it in slot 9 and gives the listing without its first line.
+    fn built(make: impl Fn(&mut Build, Value, Value) -> Value) -> String {
+        let mut build = Build::new("f");
+        let (x, y) = (build.load(Slot(3)), build.load(Slot(4)));
+        let value = make(&mut build, x, y);
+        let value = if build.type_of(value) == Type::Bool {
+            let (one, zero) = (build.real(1.0), build.real(0.0));
+            build.select(value, one, zero)
+        } else {
+            value
+        };
+        build.store(Slot(9), value);
+        let listing = build.finish().to_string();
+        listing.lines().skip(1).map(str::trim).collect::<Vec<_>>().join("; ")
+    }
+
+    #[test]
+    fn equal_operations_are_shared() {
+        let expected = "v0 = load 3; v1 = load 4; v2 = add v0 v1; v3 = mul v2 v2; store 9 = v3";
+        let both = |b: &mut Build, x, y| {
+            let (one, other) = (b.add(x, y), b.add(y, x));
+            b.mul(one, other)
+        };
+        assert_eq!(built(both), expected);
+    }
+
+    #[test]
+    fn constants_fold_as_they_are_evaluated() {
+        let sum = |b: &mut Build, _, _| {
+            let (a, c) = (b.real(0.1), b.real(0.2));
+            b.add(a, c)
+        };
+        assert_eq!(built(sum), "v0 = 0.30000000000000004; store 9 = v0");
+        let root = |b: &mut Build, _, _| {
+            let a = b.real(-1.0);
+            b.sqrt(a)
+        };
+        assert_eq!(built(root), "v0 = NaN; store 9 = v0");
+    }
+
+    #[test]
+    fn identities_hold_to_the_bit() {
+        let x = "v0 = load 3; store 9 = v0";
+        let plus = |c: f64| {
+            built(move |b, x, _| {
+                let c = b.real(c);
+                b.add(x, c)
+            })
+        };
+        assert_eq!(plus(-0.0), x);
+        assert_eq!(plus(0.0), "v0 = load 3; v1 = 0.0; v2 = add v0 v1; store 9 = v2");
+        let minus = |c: f64| {
+            built(move |b, x, _| {
+                let c = b.real(c);
+                b.sub(x, c)
+            })
+        };
+        assert_eq!(minus(0.0), x);
+        assert_eq!(minus(-0.0), "v0 = load 3; v1 = -0.0; v2 = sub v0 v1; store 9 = v2");
+        let times = |c: f64| {
+            built(move |b, x, _| {
+                let c = b.real(c);
+                b.mul(c, x)
+            })
+        };
+        assert_eq!(times(1.0), x);
+        assert_eq!(times(0.0), "v0 = load 3; v1 = 0.0; v2 = mul v0 v1; store 9 = v2");
+        assert_eq!(times(-1.0), "v0 = load 3; v1 = neg v0; store 9 = v1");
+        let twice = |b: &mut Build, x, _| {
+            let minus = b.neg(x);
+            b.neg(minus)
+        };
+        assert_eq!(built(twice), x);
+    }
+
+    /// Each rewritten operation gives the same bits as the operation as written, on edge values.
+    #[test]
+    fn rewrites_change_no_result() {
+        let edges = [0.0, -0.0, 1.0, -1.0, 0.5, 3.0, -7.25, f64::INFINITY, f64::NEG_INFINITY, f64::NAN, 5e-324, 1e308];
+        let constants = [0.0, -0.0, 1.0, -1.0, 2.0];
+        let reals: [fn(Value, Value) -> Op; 12] = [
+            Op::Add,
+            Op::Sub,
+            Op::Mul,
+            Op::Div,
+            |a, _| Op::Neg(a),
+            |a, _| Op::Abs(a),
+            |a, b| Op::Fma(a, b, a),
+            |a, b| Op::Fma(a, a, b),
+            |a, b| Op::Fma(a, b, b),
+            |a, _| Op::Floor(a),
+            |a, _| Op::Nearest(a),
+            |a, b| Op::Add(b, a),
+        ];
+        for outer in reals {
+            for (i, c) in constants.iter().enumerate() {
+                for inner in reals {
+                    let mut build = Build::new("f");
+                    let (x, c) = (build.load(Slot(3)), build.real(*c));
+                    let operand = build.op(inner(x, c));
+                    let mut other = build.neg(x);
+                    if i % 2 == 0 {
+                        other = c;
+                    }
+                    let value = build.op(outer(operand, other));
+                    for edge in edges {
+                        let plain = |op: Op, a: f64, b: f64| {
+                            f64::from_bits(evaluate(op, |v| if v.0 == 0 { a } else { b }.to_bits()).unwrap())
+                        };
+                        let c = constants[i];
+                        let second = if i % 2 == 0 { c } else { -edge };
+                        let expected =
+                            plain(outer(Value(0), Value(1)), plain(inner(Value(0), Value(1)), edge, c), second);
+                        let mut values: Vec<u64> = Vec::new();
+                        for op in &build.ops {
+                            let bits = match op {
+                                Op::Load(_) => edge.to_bits(),
+                                op => evaluate(*op, |v| values[v.index()]).unwrap(),
+                            };
+                            values.push(bits);
+                        }
+                        let found = f64::from_bits(values[value.index()]);
+                        assert!(
+                            found.to_bits() == expected.to_bits() || found.is_nan() && expected.is_nan(),
+                            "{:?} of {:?} at {edge}, {c}: {found} and not {expected}",
+                            outer(Value(0), Value(1)),
+                            inner(Value(0), Value(1))
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn functions_compose_through_their_slots() {
+        let mut first = Build::new("first");
+        let (x, two) = (first.load(Slot(3)), first.real(2.0));
+        let doubled = first.mul(x, two);
+        first.store(Slot(3), doubled);
+        let first = first.finish();
+        let mut both = Build::new("both");
+        let mut env = Env::new();
+        both.inline(&first, &mut env);
+        both.inline(&first, &mut env);
+        both.store_env(&env, |_| true);
+        assert_eq!(
+            both.finish().to_string(),
+            "both:\n  v0 = load 3\n  v1 = 2.0\n  v2 = mul v0 v1\n  v3 = mul v1 v2\n  store 3 = v3\n"
+        );
+    }
+
+    #[test]
+    fn what_is_not_needed_is_not_there() {
+        assert_eq!(built(|_, x, _| x), "v0 = load 3; store 9 = v0");
+        let mut build = Build::new("f");
+        let x = build.load(Slot(9));
+        build.store(Slot(9), x);
+        assert_eq!(build.finish().to_string(), "f:\n");
+    }
+
+    #[test]
+    fn a_million_operations_are_fine() {
+        let mut build = Build::new("long");
+        let mut x = build.load(Slot(3));
+        for i in 0..1_000_000 {
+            let c = build.real(f64::from(i));
+            x = build.add(x, c);
+        }
+        build.store(Slot(3), x);
+        assert_eq!(build.finish().ops.len(), 2_000_001);
+    }
+}

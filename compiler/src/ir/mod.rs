@@ -3,9 +3,13 @@
 //! So the interpreter, the derivative pass and every back end are one `match` in one pass over the list.
 //! After `lower` there are no units here, and names serve only printing.
 
-pub mod build;
 pub mod print;
 pub mod verify;
+pub mod eval;
+pub mod build;
+pub mod expr;
+#[cfg(test)]
+pub mod random;
 
 use abi::Slot;
 
@@ -167,4 +171,86 @@ pub struct Func {
     pub stores: Vec<(Slot, Value)>,
     /// An integer: 0, or the number of the guard that failed. None: always 0.
     pub status: Option<Value>,
+}
+
+impl Op {
+    /// The same operation on the operands that `f` gives for its own, asked from left to right.
+    pub fn map(self, mut f: impl FnMut(Value) -> Value) -> Op {
+        match self {
+            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => self,
+            Op::Pool { base, len, index } => Op::Pool { base, len, index: f(index) },
+            Op::Add(a, b) => Op::Add(f(a), f(b)),
+            Op::Sub(a, b) => Op::Sub(f(a), f(b)),
+            Op::Mul(a, b) => Op::Mul(f(a), f(b)),
+            Op::Div(a, b) => Op::Div(f(a), f(b)),
+            Op::Neg(a) => Op::Neg(f(a)),
+            Op::Abs(a) => Op::Abs(f(a)),
+            Op::Sqrt(a) => Op::Sqrt(f(a)),
+            Op::Fma(a, b, c) => Op::Fma(f(a), f(b), f(c)),
+            Op::Floor(a) => Op::Floor(f(a)),
+            Op::Nearest(a) => Op::Nearest(f(a)),
+            Op::Unary(function, a) => Op::Unary(function, f(a)),
+            Op::Binary(function, a, b) => Op::Binary(function, f(a), f(b)),
+            Op::Less(a, b) => Op::Less(f(a), f(b)),
+            Op::LessEqual(a, b) => Op::LessEqual(f(a), f(b)),
+            Op::Equal(a, b) => Op::Equal(f(a), f(b)),
+            Op::And(a, b) => Op::And(f(a), f(b)),
+            Op::Or(a, b) => Op::Or(f(a), f(b)),
+            Op::Not(a) => Op::Not(f(a)),
+            Op::Select(a, b, c) => Op::Select(f(a), f(b), f(c)),
+            Op::IntAdd(a, b) => Op::IntAdd(f(a), f(b)),
+            Op::IntSub(a, b) => Op::IntSub(f(a), f(b)),
+            Op::IntMul(a, b) => Op::IntMul(f(a), f(b)),
+            Op::IntAnd(a, b) => Op::IntAnd(f(a), f(b)),
+            Op::IntOr(a, b) => Op::IntOr(f(a), f(b)),
+            Op::IntXor(a, b) => Op::IntXor(f(a), f(b)),
+            Op::ShiftLeft(a, n) => Op::ShiftLeft(f(a), n),
+            Op::ShiftRight(a, n) => Op::ShiftRight(f(a), n),
+            Op::ShiftRightSigned(a, n) => Op::ShiftRightSigned(f(a), n),
+            Op::IntLess(a, b) => Op::IntLess(f(a), f(b)),
+            Op::IntEqual(a, b) => Op::IntEqual(f(a), f(b)),
+            Op::ToBits(a) => Op::ToBits(f(a)),
+            Op::FromBits(a) => Op::FromBits(f(a)),
+            Op::ToInt(a) => Op::ToInt(f(a)),
+            Op::ToReal(a) => Op::ToReal(f(a)),
+        }
+    }
+
+    /// Calls `f` on each operand from left to right.
+    pub fn each_operand(self, mut f: impl FnMut(Value)) {
+        self.map(|value| {
+            f(value);
+            value
+        });
+    }
+}
+
+impl Func {
+    /// The operation that gives a value.
+    pub fn op(&self, value: Value) -> Op {
+        self.ops[value.index()]
+    }
+
+    /// For each operation, whether a store or the status needs it.
+    pub fn live(&self) -> Vec<bool> {
+        let mut live = vec![false; self.ops.len()];
+        for value in self.stores.iter().map(|(_, value)| *value).chain(self.status) {
+            live[value.index()] = true;
+        }
+        for i in (0..self.ops.len()).rev() {
+            if live[i] {
+                self.ops[i].each_operand(|operand| live[operand.index()] = true);
+            }
+        }
+        live
+    }
+
+    /// The slots read, ascending.
+    pub fn loads(&self) -> Vec<Slot> {
+        let mut slots: Vec<Slot> =
+            self.ops.iter().filter_map(|op| if let Op::Load(slot) = op { Some(*slot) } else { None }).collect();
+        slots.sort_unstable();
+        slots.dedup();
+        slots
+    }
 }

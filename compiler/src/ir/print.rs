@@ -1,1 +1,168 @@
-//! print
+//! A readable listing of a function, one operation a line.
+//!
+//! ```text
+//! step:
+//!   v0 = load 4
+//!   v1 = 0.5
+//!   v2 = mul v0 v1
+//!   store 4 = v2
+//! ```
+
+use super::{Binary, Func, Op, Unary, Value};
+use std::fmt;
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "v{}", self.0)
+    }
+}
+
+impl fmt::Display for Op {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match *self {
+            Op::Real(bits) => write!(f, "{:?}", f64::from_bits(bits)),
+            Op::Int(n) => write!(f, "int {n}"),
+            Op::Bool(b) => write!(f, "{b}"),
+            Op::Load(slot) => write!(f, "load {}", slot.0),
+            Op::Pool { base, len, index } => write!(f, "pool {base}[{index} < {len}]"),
+            Op::Add(a, b) => write!(f, "add {a} {b}"),
+            Op::Sub(a, b) => write!(f, "sub {a} {b}"),
+            Op::Mul(a, b) => write!(f, "mul {a} {b}"),
+            Op::Div(a, b) => write!(f, "div {a} {b}"),
+            Op::Neg(a) => write!(f, "neg {a}"),
+            Op::Abs(a) => write!(f, "abs {a}"),
+            Op::Sqrt(a) => write!(f, "sqrt {a}"),
+            Op::Fma(a, b, c) => write!(f, "fma {a} {b} {c}"),
+            Op::Floor(a) => write!(f, "floor {a}"),
+            Op::Nearest(a) => write!(f, "nearest {a}"),
+            Op::Unary(function, a) => write!(f, "{} {a}", function.name()),
+            Op::Binary(function, a, b) => write!(f, "{} {a} {b}", function.name()),
+            Op::Less(a, b) => write!(f, "less {a} {b}"),
+            Op::LessEqual(a, b) => write!(f, "less_equal {a} {b}"),
+            Op::Equal(a, b) => write!(f, "equal {a} {b}"),
+            Op::And(a, b) => write!(f, "and {a} {b}"),
+            Op::Or(a, b) => write!(f, "or {a} {b}"),
+            Op::Not(a) => write!(f, "not {a}"),
+            Op::Select(a, b, c) => write!(f, "select {a} {b} {c}"),
+            Op::IntAdd(a, b) => write!(f, "int_add {a} {b}"),
+            Op::IntSub(a, b) => write!(f, "int_sub {a} {b}"),
+            Op::IntMul(a, b) => write!(f, "int_mul {a} {b}"),
+            Op::IntAnd(a, b) => write!(f, "int_and {a} {b}"),
+            Op::IntOr(a, b) => write!(f, "int_or {a} {b}"),
+            Op::IntXor(a, b) => write!(f, "int_xor {a} {b}"),
+            Op::ShiftLeft(a, n) => write!(f, "shift_left {a} {n}"),
+            Op::ShiftRight(a, n) => write!(f, "shift_right {a} {n}"),
+            Op::ShiftRightSigned(a, n) => write!(f, "shift_right_signed {a} {n}"),
+            Op::IntLess(a, b) => write!(f, "int_less {a} {b}"),
+            Op::IntEqual(a, b) => write!(f, "int_equal {a} {b}"),
+            Op::ToBits(a) => write!(f, "to_bits {a}"),
+            Op::FromBits(a) => write!(f, "from_bits {a}"),
+            Op::ToInt(a) => write!(f, "to_int {a}"),
+            Op::ToReal(a) => write!(f, "to_real {a}"),
+        }
+    }
+}
+
+impl fmt::Display for Func {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        writeln!(f, "{}:", self.name)?;
+        for (i, op) in self.ops.iter().enumerate() {
+            writeln!(f, "  v{i} = {op}")?;
+        }
+        for (slot, value) in &self.stores {
+            writeln!(f, "  store {} = {value}", slot.0)?;
+        }
+        match self.status {
+            Some(status) => writeln!(f, "  status {status}"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Unary {
+    /// All of them.
+    pub const ALL: [Unary; 13] = [
+        Unary::Exp,
+        Unary::Expm1,
+        Unary::Log,
+        Unary::Log1p,
+        Unary::Sin,
+        Unary::Cos,
+        Unary::Tan,
+        Unary::Asin,
+        Unary::Acos,
+        Unary::Atan,
+        Unary::Sinh,
+        Unary::Cosh,
+        Unary::Tanh,
+    ];
+
+    /// As the user writes it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Unary::Exp => "exp",
+            Unary::Expm1 => "expm1",
+            Unary::Log => "log",
+            Unary::Log1p => "log1p",
+            Unary::Sin => "sin",
+            Unary::Cos => "cos",
+            Unary::Tan => "tan",
+            Unary::Asin => "asin",
+            Unary::Acos => "acos",
+            Unary::Atan => "atan",
+            Unary::Sinh => "sinh",
+            Unary::Cosh => "cosh",
+            Unary::Tanh => "tanh",
+        }
+    }
+}
+
+impl Binary {
+    /// All of them.
+    pub const ALL: [Binary; 3] = [Binary::Atan2, Binary::Pow, Binary::Hypot];
+
+    /// As the user writes it; `^` as `pow`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Binary::Atan2 => "atan2",
+            Binary::Pow => "pow",
+            Binary::Hypot => "hypot",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use abi::Slot;
+
+    #[test]
+    fn a_listing_reads_as_the_program() {
+        let func = Func {
+            name: "step".into(),
+            ops: vec![
+                Op::Load(Slot(4)),
+                Op::Real(0.5f64.to_bits()),
+                Op::Mul(Value(0), Value(1)),
+                Op::Unary(Unary::Exp, Value(2)),
+                Op::Int(0),
+                Op::Pool { base: 8, len: 3, index: Value(4) },
+            ],
+            stores: vec![(Slot(4), Value(3)), (Slot(5), Value(5))],
+            status: Some(Value(4)),
+        };
+        let listing = "\
+step:
+  v0 = load 4
+  v1 = 0.5
+  v2 = mul v0 v1
+  v3 = exp v2
+  v4 = int 0
+  v5 = pool 8[v4 < 3]
+  store 4 = v3
+  store 5 = v5
+  status v4
+";
+        assert_eq!(func.to_string(), listing);
+    }
+}

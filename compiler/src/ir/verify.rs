@@ -1,1 +1,212 @@
-//! verify
+//! Checks what every pass and back end relies on: operands before users, types, slots, stores, tables.
+//!
+//! In: a function and the block it works on. Out: the first fault, in words.
+
+use super::{Func, Op, Type, Value};
+use abi::{Layout, Slot};
+
+/// Where a function stands among the passes.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Stage {
+    /// Elementary functions may stand in it.
+    Lowered,
+    /// Arithmetic only: what back ends take.
+    Expanded,
+}
+
+/// Checks `func` against the block it works on and the length of its pool of constants.
+pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Result<(), String> {
+    let fault = |what: String| Err(format!("{}: {what}", func.name));
+    let types = match types(func) {
+        Ok(types) => types,
+        Err(what) => return fault(what),
+    };
+    for (i, op) in func.ops.iter().enumerate() {
+        let value = Value(i as u32);
+        match *op {
+            Op::Load(slot) if slot.index() >= layout.size() => {
+                return fault(format!("{value} loads slot {} of a block of {}", slot.0, layout.size()));
+            }
+            Op::Pool { len: 0, .. } => return fault(format!("{value} reads a table without entries")),
+            Op::Pool { base, len, .. } if base as usize + len as usize > pool_len => {
+                return fault(format!("{value} reads entries {base}..{base} + {len} of a pool of {pool_len}"));
+            }
+            Op::ShiftLeft(_, n) | Op::ShiftRight(_, n) | Op::ShiftRightSigned(_, n) if n > 63 => {
+                return fault(format!("{value} shifts by {n}"));
+            }
+            Op::Unary(..) | Op::Binary(..) if stage == Stage::Expanded => {
+                return fault(format!("{value} is an elementary function that nothing has expanded"));
+            }
+            _ => {}
+        }
+    }
+    let mut stored = std::collections::HashSet::new();
+    for &(slot, value) in &func.stores {
+        if !storable(slot, layout) {
+            return fault(format!("a store to slot {}, which no function may write", slot.0));
+        }
+        if !stored.insert(slot) {
+            return fault(format!("two stores to slot {}", slot.0));
+        }
+        match types.get(value.index()) {
+            Some(Type::Real) => {}
+            Some(other) => return fault(format!("slot {} holds reals, {value} is {other:?}", slot.0)),
+            None => return fault(format!("slot {} is given {value}, which does not exist", slot.0)),
+        }
+    }
+    match func.status {
+        Some(status) if types.get(status.index()) != Some(&Type::Int) => {
+            fault(format!("the status {status} is no integer"))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Whether a function of the model may write the slot: not the step, parameters, inputs, nor what is due.
+fn storable(slot: Slot, layout: &Layout) -> bool {
+    slot.index() < layout.size()
+        && slot != Slot::STEP
+        && ![layout.params, layout.inputs, layout.due].iter().any(|segment| segment.contains(slot))
+}
+
+/// The type of every value; fails where an operand does not stand before its user or has the wrong type.
+pub fn types(func: &Func) -> Result<Vec<Type>, String> {
+    let mut types: Vec<Type> = Vec::with_capacity(func.ops.len());
+    for (i, &op) in func.ops.iter().enumerate() {
+        let value = Value(i as u32);
+        let mut late = None;
+        op.each_operand(|operand| {
+            if operand.index() >= i {
+                late = Some(operand);
+            }
+        });
+        if let Some(operand) = late {
+            return Err(format!("{value} uses {operand}, which does not stand before it"));
+        }
+        types.push(result(op, |operand| types[operand.index()]).map_err(|what| format!("{value} {what}"))?);
+    }
+    Ok(types)
+}
+
+/// The type of the result of an operation whose operands have these types.
+pub fn result(op: Op, of: impl Fn(Value) -> Type) -> Result<Type, String> {
+    use Type::{Bool, Int, Real};
+    let (operands, result): (&[Type], Type) = match op {
+        Op::Real(_) | Op::Load(_) => (&[], Real),
+        Op::Int(_) => (&[], Int),
+        Op::Bool(_) => (&[], Bool),
+        Op::Pool { .. } => (&[Int], Real),
+        Op::Add(..) | Op::Sub(..) | Op::Mul(..) | Op::Div(..) | Op::Binary(..) => (&[Real, Real], Real),
+        Op::Neg(_) | Op::Abs(_) | Op::Sqrt(_) | Op::Floor(_) | Op::Nearest(_) | Op::Unary(..) => (&[Real], Real),
+        Op::Fma(..) => (&[Real, Real, Real], Real),
+        Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => (&[Real, Real], Bool),
+        Op::And(..) | Op::Or(..) => (&[Bool, Bool], Bool),
+        Op::Not(_) => (&[Bool], Bool),
+        Op::Select(_, a, _) => match of(a) {
+            Real => (&[Bool, Real, Real], Real),
+            Int => (&[Bool, Int, Int], Int),
+            Bool => (&[Bool, Bool, Bool], Bool),
+        },
+        Op::IntAdd(..) | Op::IntSub(..) | Op::IntMul(..) | Op::IntAnd(..) | Op::IntOr(..) | Op::IntXor(..) => {
+            (&[Int, Int], Int)
+        }
+        Op::ShiftLeft(..) | Op::ShiftRight(..) | Op::ShiftRightSigned(..) => (&[Int], Int),
+        Op::IntLess(..) | Op::IntEqual(..) => (&[Int, Int], Bool),
+        Op::ToBits(_) | Op::ToInt(_) => (&[Real], Int),
+        Op::FromBits(_) | Op::ToReal(_) => (&[Int], Real),
+    };
+    let mut expected = operands.iter();
+    let mut wrong = None;
+    op.each_operand(|operand| {
+        let expected = *expected.next().expect("as many types as operands");
+        if of(operand) != expected {
+            wrong = Some(format!("needs {expected:?}, {operand} is {:?}", of(operand)));
+        }
+    });
+    wrong.map_or(Ok(result), Err)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One parameter in slot 3, one state in slot 4, one due flag in slot 5.
+    fn layout() -> Layout {
+        Layout::new([1, 0, 1, 0, 0, 0, 0, 0, 0, 1])
+    }
+
+    #[track_caller]
+    fn check(ops: &[Op], stores: &[(u32, u32)], status: Option<u32>, expected: &str) {
+        let func = Func {
+            name: "f".into(),
+            ops: ops.to_vec(),
+            stores: stores.iter().map(|&(slot, value)| (Slot(slot), Value(value))).collect(),
+            status: status.map(Value),
+        };
+        let found = verify(&func, &layout(), 8, Stage::Expanded).err().unwrap_or_default();
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn a_sound_function_passes() {
+        check(&[Op::Load(Slot(3)), Op::Int(0), Op::Add(Value(0), Value(0))], &[(4, 2), (0, 0)], Some(1), "");
+        check(&[Op::Int(9), Op::Pool { base: 3, len: 5, index: Value(0) }], &[], None, "");
+    }
+
+    #[test]
+    fn operands_stand_before_their_users() {
+        check(&[Op::Neg(Value(0))], &[], None, "f: v0 uses v0, which does not stand before it");
+        check(&[Op::Neg(Value(7))], &[], None, "f: v0 uses v7, which does not stand before it");
+    }
+
+    #[test]
+    fn types_fit() {
+        check(&[Op::Bool(true), Op::Neg(Value(0))], &[], None, "f: v1 needs Real, v0 is Bool");
+        check(
+            &[Op::Bool(true), Op::Int(1), Op::Real(0), Op::Select(Value(0), Value(1), Value(2))],
+            &[],
+            None,
+            "f: v3 needs Int, v2 is Real",
+        );
+        check(&[Op::Int(1)], &[(4, 0)], None, "f: slot 4 holds reals, v0 is Int");
+        check(&[Op::Real(0)], &[], Some(0), "f: the status v0 is no integer");
+    }
+
+    #[test]
+    fn slots_and_tables_lie_inside() {
+        check(&[Op::Load(Slot(6))], &[], None, "f: v0 loads slot 6 of a block of 6");
+        check(
+            &[Op::Int(0), Op::Pool { base: 4, len: 5, index: Value(0) }],
+            &[],
+            None,
+            "f: v1 reads entries 4..4 + 5 of a pool of 8",
+        );
+        check(
+            &[Op::Int(0), Op::Pool { base: 4, len: 0, index: Value(0) }],
+            &[],
+            None,
+            "f: v1 reads a table without entries",
+        );
+        check(&[Op::Int(0), Op::ShiftLeft(Value(0), 64)], &[], None, "f: v1 shifts by 64");
+    }
+
+    #[test]
+    fn stores_go_where_a_model_may_write_and_once() {
+        for slot in [1, 3, 5, 6] {
+            check(
+                &[Op::Real(0)],
+                &[(slot, 0)],
+                None,
+                &format!("f: a store to slot {slot}, which no function may write"),
+            );
+        }
+        check(&[Op::Real(0)], &[(4, 0), (4, 0)], None, "f: two stores to slot 4");
+        check(&[Op::Real(0)], &[(4, 3)], None, "f: slot 4 is given v3, which does not exist");
+    }
+
+    #[test]
+    fn back_ends_take_arithmetic_only() {
+        let exp = [Op::Real(0), Op::Unary(crate::ir::Unary::Exp, Value(0))];
+        check(&exp, &[], None, "f: v1 is an elementary function that nothing has expanded");
+    }
+}

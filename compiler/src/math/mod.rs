@@ -1,1 +1,122 @@
-//! math
+//! Elementary functions as arithmetic of the IR: so every back end and machine gives the same bits, and functions
+//! inline, fold and vectorise like any other code.
+//!
+//! In: a function with elementary operations. Out: the same with additions, products, fused products, table reads
+//! and selects only. Each algorithm is free of branches and right at 0, −0, inf, NaN, subnormals and overflow; no
+//! payload of a NaN becomes a number or a choice that matters. Polynomials are minimax fits, evaluated in pairs
+//! (Estrin), which is shorter in latency than Horner's chain. Coefficients and tables were computed with 60 digits.
+
+pub mod tables;
+mod exponential;
+mod logarithm;
+mod trigonometric;
+#[cfg(test)]
+mod accuracy;
+
+use crate::ir::build::Build;
+use crate::ir::expr::{Real, Shared};
+use crate::ir::{Binary, Func, Op, Unary, Value};
+pub use tables::POOL;
+
+/// The tables of the elementary functions: the beginning of every pool.
+pub fn pool() -> &'static [f64] {
+    &POOL
+}
+
+/// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
+pub fn expand(func: &Func) -> Func {
+    let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
+    let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
+    for (op, live) in func.ops.iter().zip(func.live()) {
+        let at = |operand: Value| Real::new(&build, values[operand.index()]);
+        let value = match *op {
+            _ if !live => Value(u32::MAX),
+            Op::Unary(function, x) => unary(function, at(x)).value,
+            Op::Binary(function, x, y) => binary(function, at(x), at(y)).value,
+            op => build.borrow_mut().op(op.map(|operand| values[operand.index()])),
+        };
+        values.push(value);
+    }
+    let mut build = build.into_inner();
+    for (slot, value) in &func.stores {
+        build.store(*slot, values[value.index()]);
+    }
+    if let Some(status) = func.status {
+        build.status(values[status.index()]);
+    }
+    build.finish()
+}
+
+fn unary(function: Unary, x: Real) -> Real {
+    match function {
+        Unary::Exp => exponential::exp(x),
+        Unary::Expm1 => exponential::expm1(x),
+        Unary::Sinh => exponential::sinh(x),
+        Unary::Cosh => exponential::cosh(x),
+        Unary::Tanh => exponential::tanh(x),
+        Unary::Log => logarithm::log(x),
+        Unary::Log1p => logarithm::log1p(x),
+        Unary::Sin => trigonometric::sin(x),
+        Unary::Cos => trigonometric::cos(x),
+        Unary::Tan => trigonometric::tan(x),
+        Unary::Asin => trigonometric::asin(x),
+        Unary::Acos => trigonometric::acos(x),
+        Unary::Atan => trigonometric::atan(x),
+    }
+}
+
+fn binary<'a>(function: Binary, x: Real<'a>, y: Real<'a>) -> Real<'a> {
+    match function {
+        Binary::Atan2 => trigonometric::atan2(x, y),
+        Binary::Pow => logarithm::pow(x, y),
+        Binary::Hypot => hypot(x, y),
+    }
+}
+
+/// c0 + c1 x + c2 x² + …, in pairs.
+fn polynomial<'a>(x: Real<'a>, coefficients: &[f64]) -> Real<'a> {
+    let pair = |pair: &[f64]| match *pair {
+        [c0, c1] => x.fma(c1, c0),
+        [c0] => x.constant(c0),
+        _ => unreachable!("chunks of two"),
+    };
+    let mut terms: Vec<Real> = coefficients.chunks(2).map(pair).collect();
+    let mut power = x;
+    while terms.len() > 1 {
+        power = power * power;
+        let join = |pair: &[Real<'a>]| match *pair {
+            [low, high] => power.fma(high, low),
+            [low] => low,
+            _ => unreachable!("chunks of two"),
+        };
+        terms = terms.chunks(2).map(join).collect();
+    }
+    terms[0]
+}
+
+/// √(x² + y²): scaled against overflow and underflow, the sum of squares as high and low part, the root corrected
+/// by one Newton step.
+fn hypot<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
+    let (x, y) = (x.abs(), y.abs());
+    let less = y.below(x);
+    let (large, small) = (less.choose(x, y), less.choose(y, x));
+    let (huge, tiny) = (large.above(2f64.powi(500)), large.below(2f64.powi(-450)));
+    let scale = huge.choose(2f64.powi(-600), tiny.choose(2f64.powi(600), 1.0));
+    let back = huge.choose(2f64.powi(600), tiny.choose(2f64.powi(-600), 1.0));
+    let (large, small) = (large * scale, small * scale);
+    let (a, b) = (large * large, small * small);
+    let (a_low, b_low) = (large.fma(large, -a), small.fma(small, -b));
+    let sum = a + b;
+    let low = (a - sum + b) + (a_low + b_low);
+    let root = sum.sqrt();
+    let rest = (-root).fma(root, sum) + low;
+    let root = sum.above(0.0).choose(root + rest / (root + root), root);
+    (x.is(f64::INFINITY) | y.is(f64::INFINITY)).choose(f64::INFINITY, root * back)
+}
+
+/// a + b = sum + rest exactly, for any sizes.
+fn two_sum<'a>(a: Real<'a>, b: Real<'a>) -> (Real<'a>, Real<'a>) {
+    let sum = a + b;
+    let of_b = sum - a;
+    (sum, (a - (sum - of_b)) + (b - of_b))
+}

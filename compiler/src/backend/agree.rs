@@ -1,0 +1,126 @@
+//! Every back end gives the bits of the interpreter; machine code is never writable and is given back.
+
+use super::interp::Interpreter;
+use super::jit::compile;
+use crate::ir::build::Build;
+use crate::ir::random::{self, POOL_LEN, REALS, Random};
+use crate::ir::{Func, Op, Value};
+use abi::{Code, Function, Layout, Slot};
+use std::sync::Arc;
+
+/// Equal to the bit, all NaN being one value.
+fn same(a: &[f64], b: &[f64]) -> bool {
+    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan())
+}
+
+/// Runs `func` as machine code and interpreted, each from the same block for `count` iterations.
+#[track_caller]
+fn check(func: &Func, layout: &Layout, blocks: &[Vec<f64>], pool: &[f64], count: u64, what: &str) {
+    let funcs = [(Function::Step, func.clone())];
+    let machine = Code::Machine(compile(&funcs, layout, pool.len()).unwrap().0);
+    let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
+    for start in blocks {
+        let (mut found, mut expected) = (start.clone(), start.clone());
+        let statuses = [(&machine, &mut found), (&reference, &mut expected)]
+            .map(|(code, block)| code.call(Function::Step, block, pool, count));
+        assert!(
+            same(&found, &expected) && statuses[0] == statuses[1],
+            "{what}\n{func}\nfrom {start:?}\nmachine code: {found:?} status {}\ninterpreter: {expected:?} status {}",
+            statuses[0],
+            statuses[1]
+        );
+    }
+}
+
+/// Three inputs, four states.
+fn layout() -> Layout {
+    Layout::new([0, 3, 4, 0, 0, 0, 0, 0, 0, 0])
+}
+
+/// Each operation on reals, on every pair of edge values.
+#[test]
+fn every_operation_on_reals_agrees_at_the_edges() {
+    let of_two: [fn(Value, Value) -> Op; 7] = [Op::Add, Op::Sub, Op::Mul, Op::Div, Op::Less, Op::LessEqual, Op::Equal];
+    let of_one: [fn(Value) -> Op; 7] =
+        [Op::Neg, Op::Abs, Op::Sqrt, Op::Floor, Op::Nearest, Op::ToInt, |a| Op::Fma(a, a, a)];
+    let layout = layout();
+    let blocks: Vec<Vec<f64>> =
+        REALS.iter().flat_map(|a| REALS.iter().map(|b| vec![0.0, 0.0, 0.0, *a, *b, 0.3, 0.0, 0.0, 0.0, 0.0])).collect();
+    let ops = of_two.map(|of| of(Value(0), Value(1))).into_iter().chain(of_one.map(|of| of(Value(0))));
+    for op in ops.chain([Op::Fma(Value(0), Value(1), Value(0)), Op::Fma(Value(0), Value(1), Value(1))]) {
+        let mut func =
+            Func { name: "f".into(), ops: vec![Op::Load(Slot(3)), Op::Load(Slot(4)), op], ..Func::default() };
+        let result = match op {
+            Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => {
+                func.ops.extend([Op::Select(Value(2), Value(0), Value(1))]);
+                3
+            }
+            Op::ToInt(_) => {
+                func.ops.extend([Op::ToReal(Value(2))]);
+                3
+            }
+            _ => 2,
+        };
+        func.stores = vec![(Slot(6), Value(result))];
+        check(&func, &layout, &blocks, &[], 1, "an operation");
+    }
+}
+
+/// min and max as selects become one instruction; it must be the right one, also of zeros and NaN.
+#[test]
+fn minimum_and_maximum_agree_at_the_edges() {
+    let mut build = Build::new("extremes");
+    let (x, y, z) = (build.load(Slot(3)), build.load(Slot(4)), build.load(Slot(5)));
+    let values = [build.min(x, y), build.max(x, y), build.clamp(x, y, z), build.sign(x)];
+    for (i, value) in values.into_iter().enumerate() {
+        build.store(Slot(6 + i as u32), value);
+    }
+    let blocks: Vec<Vec<f64>> =
+        REALS.iter().flat_map(|a| REALS.iter().map(|b| vec![0.0, 0.0, 0.0, *a, *b, 1.0, 0.0, 0.0, 0.0, 0.0])).collect();
+    check(&build.finish(), &layout(), &blocks, &[], 1, "extremes");
+}
+
+#[test]
+fn random_programs_agree() {
+    // 2,000 in the full run; the distribution says whether they are worth anything.
+    let (mut stopped, mut nans, mut total) = (0, 0, 0);
+    for seed in 0..2000 {
+        let mut random = Random(seed);
+        let len = 20 + random.below(120);
+        let func = random::func(&mut random, len);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let layout = random::layout();
+        let blocks: Vec<Vec<f64>> = (0..4).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
+        let count = 1 + random.below(5) as u64;
+        check(&func, &layout, &blocks, &pool, count, &format!("seed {seed}, {count} iterations"));
+        let code = Interpreter::new(&[(Function::Step, func)], &layout, POOL_LEN);
+        for mut block in blocks {
+            stopped += usize::from(abi::table::Interpret::call(&code, Function::Step, &mut block, &pool, count) != 0);
+            nans += block.iter().filter(|x| x.is_nan()).count();
+            total += block.len();
+        }
+    }
+    println!("of 8000 runs {stopped} stopped with a status; {nans} of {total} values are NaN");
+    assert!(stopped > 200 && nans * 4 < total);
+}
+
+/// The loop in the code does what as many single calls do, and stops where they stop.
+#[test]
+fn iterations_in_one_call_equal_single_calls() {
+    for seed in 5000..5100 {
+        let mut random = Random(seed);
+        let func = random::func(&mut random, 60);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let layout = random::layout();
+        let code = Code::Machine(compile(&[(Function::Step, func)], &layout, POOL_LEN).unwrap().0);
+        let start: Vec<f64> = (0..layout.size()).map(|_| random.real()).collect();
+        let (mut many, mut single) = (start.clone(), start.clone());
+        let status = code.call(Function::Step, &mut many, &pool, 7);
+        let first = (0..7).map(|_| code.call(Function::Step, &mut single, &pool, 1)).find(|status| *status != 0);
+        assert_eq!(status, first.unwrap_or(0), "seed {seed}");
+        assert!(same(&many, &single), "seed {seed}");
+        let mut untouched = start.clone();
+        assert_eq!(code.call(Function::Step, &mut untouched, &pool, 0), 0);
+        assert!(same(&untouched, &start), "seed {seed}: no iteration changes nothing");
+    }
+}

@@ -1,0 +1,104 @@
+//! The reference: runs expanded functions operation by operation, every access checked.
+
+use crate::ir::eval::evaluate;
+use crate::ir::verify::{Stage, verify};
+use crate::ir::{Func, Op};
+use abi::table::Interpret;
+use abi::{Function, Layout};
+
+/// Functions that are interpreted.
+#[derive(Clone, Default)]
+pub struct Interpreter {
+    funcs: [Option<Func>; Function::ALL.len()],
+    size: usize,
+    pool_len: usize,
+}
+
+impl Interpreter {
+    /// Takes the functions of a model over blocks of this layout.
+    ///
+    /// # Panics
+    /// If a function is not sound or not expanded: a mistake of the passes before.
+    pub fn new(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Interpreter {
+        let mut interpreter = Interpreter { size: layout.size(), pool_len, ..Interpreter::default() };
+        for (function, func) in funcs {
+            verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+            interpreter.funcs[*function as usize] = Some(func.clone());
+        }
+        interpreter
+    }
+}
+
+impl Interpret for Interpreter {
+    fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+        assert!(block.len() >= self.size, "block of {} slots, {} needed", block.len(), self.size);
+        assert!(pool.len() >= self.pool_len, "pool of {} numbers, {} needed", pool.len(), self.pool_len);
+        let func = self.funcs[function as usize]
+            .as_ref()
+            .unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
+        let mut values = vec![0; func.ops.len()];
+        for _ in 0..count {
+            let status = run(func, block, pool, &mut values);
+            if status != 0 {
+                return status;
+            }
+        }
+        0
+    }
+
+    fn has(&self, function: Function) -> bool {
+        self.funcs[function as usize].is_some()
+    }
+}
+
+/// Runs an expanded function once on a block of any size that holds all its slots; returns its status.
+pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
+    run(func, block, pool, &mut vec![0; func.ops.len()])
+}
+
+/// Runs a function once; `values` takes the bits of every value.
+fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
+    for (i, op) in func.ops.iter().enumerate() {
+        values[i] = match *op {
+            Op::Load(slot) => block[slot.index()].to_bits(),
+            Op::Pool { base, len, index } => {
+                let index = values[index.index()].min(u64::from(len) - 1);
+                pool[base as usize + index as usize].to_bits()
+            }
+            op => evaluate(op, |operand| values[operand.index()]).expect("elementary functions are expanded"),
+        };
+    }
+    for (slot, value) in &func.stores {
+        block[slot.index()] = f64::from_bits(values[value.index()]);
+    }
+    func.status.map_or(0, |status| values[status.index()])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::build::Build;
+
+    #[test]
+    fn loads_come_first_stores_last_and_a_status_stops() {
+        let layout = Layout::new([0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+        let (a, b) = (layout.states.slot(0), layout.states.slot(1));
+        let mut build = Build::new("swap");
+        let (x, y) = (build.load(a), build.load(b));
+        let one = build.real(1.0);
+        let next = build.add(x, one);
+        build.store(b, next);
+        build.store(a, y);
+        let limit = build.real(3.0);
+        let over = build.less(limit, y);
+        let (zero, code) = (build.int(0), build.int(7));
+        let status = build.select(over, code, zero);
+        build.status(status);
+        let code = Interpreter::new(&[(Function::Step, build.finish())], &layout, 0);
+        let mut block = vec![0.0, 0.0, 0.0, 1.0, 2.0];
+        assert_eq!(code.call(Function::Step, &mut block, &[], 3), 0);
+        assert_eq!(block[3..], [3.0, 3.0]);
+        assert_eq!(code.call(Function::Step, &mut block, &[], 100), 7);
+        assert_eq!(block[a.index()..=b.index()], [4.0, 4.0]);
+    }
+}

@@ -1,0 +1,247 @@
+//! Values known before anything runs: ranges and `require`, at the argument that breaks them.
+
+use crate::lower::evaluate;
+use crate::source::Files;
+use crate::system::*;
+use crate::units::{Types, three_digits};
+use abi::unit::Unit;
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
+
+/// Checks parameters against their ranges, and every `require`.
+pub fn values(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    ranges(system, types, files, diagnostics);
+    periods(system, types, diagnostics);
+    resets(system, diagnostics);
+    requires(system, types, files, diagnostics);
+}
+
+fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    let mut exprs = Vec::new();
+    let mut checked = Vec::new();
+    for id in system.var_ids() {
+        let var = system.var(id);
+        let value = match (&var.definition, var.kind) {
+            (Definition::Value(value, _), VarKind::Param) => *value,
+            (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => *initial,
+            _ => continue,
+        };
+        let bounds = [var.range.low, var.range.high];
+        if bounds.iter().all(Option::is_none) {
+            continue;
+        }
+        checked.push((id, value, exprs.len()));
+        exprs.push(value);
+        exprs.extend(bounds.iter().flatten().map(|(bound, _)| *bound));
+    }
+    let values = evaluate(system, types, &exprs);
+    for (id, node, at) in checked {
+        let var = system.var(id);
+        let value = values[at];
+        let mut next = at + 1;
+        let mut take = |bound: Option<(ExprId, bool)>| {
+            bound.map(|(_, strict)| {
+                next += 1;
+                (values[next - 1], strict)
+            })
+        };
+        let (low, high) = (take(var.range.low), take(var.range.high));
+        let below = low.is_some_and(|(low, strict)| value < low || (strict && value == low));
+        let above = high.is_some_and(|(high, strict)| value > high || (strict && value == high));
+        if !below && !above {
+            continue;
+        }
+        let unit = &types.units[id.0 as usize];
+        let show = |x: f64| shown(x, unit);
+        let (bound, word) = match below {
+            true => (low, if low.is_some_and(|(_, strict)| strict) { "above" } else { "at least" }),
+            false => (high, if high.is_some_and(|(_, strict)| strict) { "below" } else { "at most" }),
+        };
+        let bound = show(bound.expect("a bound was broken").0);
+        let model = &system.instance(var.instance).model;
+        let message = format!("`{}` of {model} must be {word} {bound}, not {}", var.name, show(value));
+        let place = match &var.definition {
+            Definition::Value(_, Origin::Argument { bind, .. }) => *bind,
+            _ => system.span(node),
+        };
+        let mut error = Diagnostic::error("E0502", message).label(place, show(value));
+        if let Some(range) = var.range_span {
+            error = error.label(range, format!("allowed: {}", files.slice(range)));
+        }
+        diagnostics.push(error.help(format!("give a value that is {word} {bound}")));
+    }
+}
+
+/// A value in the unit it is shown in.
+fn shown(x: f64, unit: &Unit) -> String {
+    let number = three_digits(unit.from_si(x));
+    if unit.text.is_empty() { number } else { format!("{number} {unit}") }
+}
+
+/// Periods are positive and known before a run.
+fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
+    let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
+    for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
+        let open = mentioned(system, *expr).iter().any(|id| {
+            system.var(*id).kind == VarKind::Param && matches!(system.var(*id).definition, Definition::Free)
+        });
+        if value > 0.0 && value.is_finite() || open {
+            continue;
+        }
+        let what = if value.is_nan() { "not constant".to_string() } else { format!("{} s", three_digits(value)) };
+        let error = Diagnostic::error("E0502", "a period must be positive and known before the run")
+            .label(system.span(*expr), what)
+            .help("write a time or a param, such as `every 1 ms`");
+        diagnostics.push(error);
+    }
+}
+
+/// E0701: with fixed steps every period is a whole number of them.
+pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>, diagnostics: &mut Vec<Diagnostic>) {
+    let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
+    for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
+        let ratio = value / step;
+        if (ratio - ratio.round()).abs() <= 1e-9 * ratio && ratio.round() >= 1.0 {
+            continue;
+        }
+        let second = Unit::parse("s").expect("the second is known");
+        let (period, step) = (shown(value, &second), shown(step, &second));
+        let mut error = Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"))
+            .label(system.span(*expr), format!("{} steps", three_digits(ratio)));
+        if let Some(at) = at {
+            error = error.label(at, "the step");
+        }
+        diagnostics.push(error.help("ticks fall on whole steps: change one of them so that it divides the other"));
+    }
+}
+
+/// `reset` sets a continuous state.
+fn resets(system: &System, diagnostics: &mut Vec<Diagnostic>) {
+    let transitions = system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
+    let all = transitions.flat_map(|t| &t.resets).chain(system.events.iter().flat_map(|event| &event.resets));
+    for (var, value) in all {
+        let var = system.var(*var);
+        if matches!(var.definition, Definition::Sampled { .. }) {
+            let error = Diagnostic::error("E0307", format!("`{}` is a sampled state: it cannot be reset", var.name))
+                .label(system.span(*value), "`reset` sets a continuous state")
+                .label(var.span, "changes at ticks only");
+            diagnostics.push(error.help(format!("let `next({})` say so, with a condition", var.name)));
+        }
+    }
+}
+
+fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    let conditions: Vec<ExprId> = system.requires.iter().map(|require| require.condition).collect();
+    let values = evaluate(system, types, &conditions);
+    for (require, value) in system.requires.iter().zip(values) {
+        if value != 0.0 {
+            continue;
+        }
+        let info = system.instance(require.instance);
+        let condition = files.slice(require.span);
+        let model = &info.model;
+        let vars = mentioned(system, require.condition);
+        let message = match (&require.message, system.node(require.condition)) {
+            (Some(message), _) => message.clone(),
+            (None, Node::Binary(op, a, b)) if vars.len() == 2 => {
+                format!("`{}` {} `{}`", files.slice(system.span(*a)), broken(*op), files.slice(system.span(*b)))
+            }
+            _ => format!("`{condition}` does not hold"),
+        };
+        let mut labels: Vec<(Span, String)> = Vec::new();
+        let mut changed: Vec<&Var> = Vec::new();
+        for &id in &vars {
+            let var = system.var(id);
+            match &var.definition {
+                Definition::Value(_, Origin::Argument { bind, .. }) => {
+                    labels.push((*bind, "set here".into()));
+                    changed.push(var);
+                }
+                Definition::Value(node, Origin::Override) => {
+                    labels.push((system.span(*node), "set here".into()));
+                    changed.push(var);
+                }
+                Definition::Value(node, _) => {
+                    let value = shown(evaluate(system, types, &[*node])[0], &types.units[id.0 as usize]);
+                    labels.push((info.span, format!("{} keeps its default, {value}", var.name)));
+                }
+                _ => {}
+            }
+        }
+        labels.sort_by_key(|(span, _)| *span);
+        labels.dedup_by_key(|(span, _)| *span);
+        let mut error = Diagnostic::error("E0501", message);
+        for (span, text) in labels {
+            error = error.label(span, text);
+        }
+        if error.labels.is_empty() {
+            error = error.label(require.span, "required here");
+        }
+        let kept = vars.iter().map(|id| system.var(*id)).find(|var| !changed.iter().any(|c| c.path == var.path));
+        let mut help = format!("{model} requires {condition}.");
+        if let (Some(kept), [set]) = (kept, changed.as_slice())
+            && let Definition::Value(node, Origin::Argument { .. }) = &set.definition
+        {
+            let given = files.slice(system.span(*node));
+            let written = instance_text(files, info.span);
+            let unit = given.trim_start_matches(|c: char| c.is_ascii_digit() || ".e-+ ".contains(c));
+            let number: f64 = given.split_whitespace().next().and_then(|n| n.parse().ok()).unwrap_or(1.0);
+            let suggestion = match written.as_deref().and_then(|text| text.strip_suffix(')')) {
+                Some(open) => format!("{open}, {} = {} {unit})", kept.name, three_digits(number * 1.5)),
+                None => format!("{model}({} = {given}, {} = …)", set.name, kept.name),
+            };
+            help = format!("{help} Set {} as well, for example\n`{suggestion}`", kept.name);
+        }
+        diagnostics.push(error.help(help));
+    }
+}
+
+/// What the opposite of a comparison is called.
+fn broken(op: BinaryOp) -> &'static str {
+    match op {
+        BinaryOp::GreaterEqual => "is smaller than",
+        BinaryOp::Greater => "is not larger than",
+        BinaryOp::LessEqual => "is larger than",
+        BinaryOp::Less => "is not smaller than",
+        _ => "does not fit",
+    }
+}
+
+/// The instance as written from the model's name to the closing bracket.
+fn instance_text(files: &Files, name: Span) -> Option<String> {
+    let text = &files.get(name.file).text[name.start as usize..];
+    let mut depth = 0;
+    for (k, c) in text.char_indices() {
+        match c {
+            '(' => depth += 1,
+            ')' => {
+                depth -= 1;
+                if depth == 0 {
+                    return Some(text[..=k].split_whitespace().collect::<Vec<_>>().join(" "));
+                }
+            }
+            _ => {}
+        }
+        if depth == 0 && c == '\n' {
+            return None;
+        }
+    }
+    None
+}
+
+/// Quantities that an expression mentions, in order.
+fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
+    let mut out = Vec::new();
+    let mut stack = vec![id];
+    while let Some(id) = stack.pop() {
+        if let Node::Var(var) = system.node(id)
+            && !out.contains(var)
+        {
+            out.push(*var);
+        }
+        let operands: Vec<ExprId> = system.node(id).operands().collect();
+        stack.extend(operands.into_iter().rev());
+    }
+    out
+}

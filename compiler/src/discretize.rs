@@ -1,0 +1,673 @@
+//! Fuses one fixed step of a method with all that belongs to it into one straight-line function.
+//!
+//! In: a [`Program`] and a method. Out: a function that advances the states, counts, renews time, runs the sampled
+//! blocks that are due, the transitions and the outputs, and watches the guards, in this order. Inputs, sampled
+//! states and regimes are frozen while the states advance.
+
+use crate::derive::{self, Gradient};
+use crate::ir::build::{Build, Env};
+use crate::ir::expr::{Real, Shared, Truth};
+use crate::ir::{Func, Unary, Value};
+use crate::program::Program;
+use abi::Slot;
+use abi::description::Guard;
+use abi::plan::Method;
+use std::collections::{BTreeMap, HashMap};
+
+/// One fixed step by `method`, of the length in [`Slot::STEP`].
+///
+/// # Panics
+/// For the adaptive method, which is no fixed step.
+pub fn step(program: &Program, method: Method) -> Func {
+    let layout = &program.description.layout;
+    let build = Shared::new(Build::new("step").with_pool(program.description.pool.clone()));
+    let model = Model::new(program, &build);
+    let next = match method {
+        Method::Euler => model.euler(),
+        Method::Rk4 => model.rk4(),
+        Method::Expo => model.expo(),
+        Method::Implicit => model.implicit(),
+        Method::Adaptive => panic!("the adaptive method is no fixed step"),
+    };
+
+    let mut env = Env::new();
+    for (k, x) in next.into_iter().enumerate() {
+        // What is left of something that has died away would only slow the processor down.
+        let settled = x.abs().below(1e-30).choose(0.0, x);
+        env.insert(layout.states.slot(k), settled.value);
+    }
+    let count = model.load(Slot::COUNT) + 1.0;
+    env.insert(Slot::COUNT, count.value);
+    env.insert(Slot::TIME, (count * model.h).value);
+    if let Some(tick) = &program.tick {
+        for block in &program.description.ticks {
+            // COUNT is a multiple of n exactly if the nearest quotient times n gives it back: both are whole.
+            let n = (model.load(block.period) / model.h).nearest();
+            let due = ((count / n).nearest() * n).is(count).choose(1.0, 0.0);
+            env.insert(block.due, due.value);
+        }
+        build.borrow_mut().inline(tick, &mut env);
+    }
+    if let Some(transitions) = &program.transitions {
+        build.borrow_mut().inline(transitions, &mut env);
+    }
+    build.borrow_mut().inline(&program.outputs, &mut env);
+    let status = watch(&build, &program.description.guards, &env);
+
+    let mut build = build.into_inner();
+    let stored = [layout.states, layout.memory, layout.regimes, layout.outputs];
+    let kept = |slot: Slot| slot.0 < Slot::FIXED || stored.iter().any(|segment| segment.contains(slot));
+    build.store_env(&env, kept);
+    if let Some(status) = status {
+        build.status(status);
+    }
+    build.finish()
+}
+
+/// The status: 0, or the number of the first guard whose quantity is not finite or out of its range by more than 1e-6
+/// of the range's width or, of a range open on one side, of its bound.
+fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
+    let mut fine: Option<Real> = None;
+    let mut outside: Option<Truth> = None;
+    let number = |n: i64| build.borrow_mut().int(n);
+    let mut first = number(0);
+    for (k, guard) in guards.iter().enumerate().rev() {
+        let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
+        // Of something infinite or NaN this is NaN, and so is the sum.
+        let zero = 0.0 * x;
+        fine = Some(fine.map_or(zero, |sum| sum + zero));
+        let (low, high) = widened(guard.range);
+        let mut bad = !x.finite();
+        for (bounded, beyond) in [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))] {
+            if bounded {
+                bad = bad | beyond;
+                outside = Some(outside.map_or(beyond, |any| any | beyond));
+            }
+        }
+        let this = number(k as i64 + 1);
+        first = build.borrow_mut().select(bad.value, this, first);
+    }
+    // One test decides; which guard it is matters only then, and code may find it out apart from the step.
+    let finite = fine?.is(0.0);
+    let any = outside.map_or(!finite, |outside| outside | !finite);
+    let none = number(0);
+    Some(build.borrow_mut().select(any.value, first, none))
+}
+
+/// A range and its tolerance.
+fn widened((low, high): (f64, f64)) -> (f64, f64) {
+    let tolerance = match (low.is_finite(), high.is_finite()) {
+        (true, true) => 1e-6 * (high - low),
+        (true, false) => 1e-6 * low.abs(),
+        (false, true) => 1e-6 * high.abs(),
+        (false, false) => 0.0,
+    };
+    (low - tolerance, high + tolerance)
+}
+
+/// dx/dt = f(t, x) with everything else frozen.
+struct Model<'a> {
+    program: &'a Program,
+    build: &'a Shared,
+    /// The step, in s.
+    h: Real<'a>,
+    /// Time at its beginning, in s.
+    t: Real<'a>,
+    /// States at its beginning.
+    x: Vec<Real<'a>>,
+}
+
+impl<'a> Model<'a> {
+    fn new(program: &'a Program, build: &'a Shared) -> Model<'a> {
+        let load = |slot| Real::new(build, build.borrow_mut().load(slot));
+        let states = program.description.layout.states;
+        let x = states.range().map(|slot| load(Slot(slot as u32))).collect();
+        Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x }
+    }
+
+    fn load(&self, slot: Slot) -> Real<'a> {
+        Real::new(self.build, self.build.borrow_mut().load(slot))
+    }
+
+    fn env(&self, t: Real<'a>, x: &[Real<'a>]) -> Env {
+        let states = self.program.description.layout.states;
+        let states = x.iter().enumerate().map(|(k, x)| (states.slot(k), x.value));
+        states.chain([(Slot::TIME, t.value)]).collect()
+    }
+
+    fn rates(&self, env: &Env) -> Vec<Real<'a>> {
+        let rates = self.program.description.layout.derivatives;
+        (0..self.x.len()).map(|k| Real::new(self.build, self.build.borrow_mut().read(rates.slot(k), env))).collect()
+    }
+
+    fn f(&self, t: Real<'a>, x: &[Real<'a>]) -> Vec<Real<'a>> {
+        let mut env = self.env(t, x);
+        self.build.borrow_mut().inline(&self.program.derivatives, &mut env);
+        self.rates(&env)
+    }
+
+    /// f and the rows of ∂f/∂x.
+    fn f_and_gradient(&self, t: Real<'a>, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Gradient>) {
+        let layout = &self.program.description.layout;
+        let mut env = self.env(t, x);
+        let states: Vec<Slot> = (0..x.len()).map(|k| layout.states.slot(k)).collect();
+        let mut gradients = derive::inline(self.build, &self.program.derivatives, &mut env, &states);
+        let rows = (0..x.len()).map(|k| gradients.remove(&layout.derivatives.slot(k)).unwrap_or_default());
+        (self.rates(&env), rows.collect())
+    }
+
+    /// x + h k
+    fn moved(&self, h: Real<'a>, k: &[Real<'a>]) -> Vec<Real<'a>> {
+        self.x.iter().zip(k).map(|(x, k)| *x + h * *k).collect()
+    }
+
+    fn euler(&self) -> Vec<Real<'a>> {
+        self.moved(self.h, &self.f(self.t, &self.x))
+    }
+
+    /// The classical method of order 4.
+    fn rk4(&self) -> Vec<Real<'a>> {
+        let (h, half) = (self.h, 0.5 * self.h);
+        let k1 = self.f(self.t, &self.x);
+        let k2 = self.f(self.t + half, &self.moved(half, &k1));
+        let k3 = self.f(self.t + half, &self.moved(half, &k2));
+        let k4 = self.f(self.t + h, &self.moved(h, &k3));
+        let mean = |k: usize| (k1[k] + 2.0 * (k2[k] + k3[k])) + k4[k];
+        let means: Vec<Real> = (0..self.x.len()).map(mean).collect();
+        self.moved(h / 6.0, &means)
+    }
+
+    /// Exact for a state that relaxes, dx/dt = b − a x; each other state linearised in itself. X is the mean over the
+    /// step, at which the others see it.
+    ///
+    ///   x' = x + h φ(h a) f,  X = x + h φ2(h a) f              f, a = min(∂f/∂x, 0) at (t, x)
+    ///   three times: r = f + a (x − X), and r in place of f    f, a at (t + h/2, X)
+    fn expo(&self) -> Vec<Real<'a>> {
+        let h = self.h;
+        let (f, a) = self.relaxation(self.t, &self.x);
+        let mean = |f: &[Real<'a>], a: &[Option<Real<'a>>]| -> Vec<Real<'a>> {
+            let one = |(k, f): (usize, &Real<'a>)| self.x[k] + h * self.phi2(a[k]) * *f;
+            f.iter().enumerate().map(one).collect()
+        };
+        let mut middle = mean(&f, &a);
+        let mut last = (f, a);
+        for _ in 0..3 {
+            let (f, a) = self.relaxation(self.t + 0.5 * h, &middle);
+            let toward = |k: usize| a[k].map_or(f[k], |a| f[k] + a * (self.x[k] - middle[k]));
+            let r: Vec<Real> = (0..self.x.len()).map(toward).collect();
+            middle = mean(&r, &a);
+            last = (r, a);
+        }
+        let (r, a) = last;
+        (0..self.x.len()).map(|k| self.x[k] + h * self.phi(a[k]) * r[k]).collect()
+    }
+
+    /// f, and for each state min(∂f/∂x, 0) of itself alone; none where it does not depend on itself.
+    fn relaxation(&self, t: Real<'a>, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Option<Real<'a>>>) {
+        let (f, rows) = self.f_and_gradient(t, x);
+        let own = |(k, row): (usize, &Gradient)| {
+            let a = Real::new(self.build, derive::entry(row, k as u32)?);
+            Some(a.below(0.0).choose(a, 0.0))
+        };
+        let a = rows.iter().enumerate().map(own).collect();
+        (f, a)
+    }
+
+    /// φ(q) = (e^q − 1)/q of q = h a; φ(0) = 1
+    fn phi(&self, a: Option<Real<'a>>) -> Real<'a> {
+        let Some(a) = a else { return self.h.constant(1.0) };
+        let q = self.h * a;
+        q.is(0.0).choose(1.0, q.of(Unary::Expm1) / q)
+    }
+
+    /// φ2(q) = (e^q − 1 − q)/q²; near 0 by its series, 1/2 + q/6 + q²/24 + …
+    fn phi2(&self, a: Option<Real<'a>>) -> Real<'a> {
+        let Some(a) = a else { return self.h.constant(0.5) };
+        let q = self.h * a;
+        let mut series = q.constant(0.0);
+        // Ten terms: for |q| < 1/8 what is left out is less than 2^-58 of it.
+        let mut factorial = (2..=11).map(f64::from).product::<f64>();
+        for k in (2..=11).rev() {
+            series = series * q + 1.0 / factorial;
+            factorial /= f64::from(k);
+        }
+        q.above(-0.125).choose(series, (q.of(Unary::Expm1) / q - 1.0) / q)
+    }
+
+    /// Order 2, L-stable, whatever J is; one factorisation. γ = 1 − 1/√2, J = ∂f/∂x at (t, x).
+    ///
+    ///   (I − γhJ) k1 = f(t, x),  (I − γhJ) k2 = f(t + h, x + h k1) − 2 k1,  x' = x + h (3 k1 + k2)/2
+    ///
+    /// Where a pivot is below 1e-12 of its row, the step is that of `expo`.
+    /// Source: Verwer, Spee, Blom, Hundsdorfer, SIAM J. Sci. Comput. 20 (1999), eq. 3.2.
+    fn implicit(&self) -> Vec<Real<'a>> {
+        let h = self.h;
+        let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
+        let (f, rows) = self.f_and_gradient(self.t, &self.x);
+        let matrix = Matrix::identity_less(gamma * h, &rows);
+        let factors = matrix.factorise();
+        let k1 = factors.solve(&f);
+        let f = self.f(self.t + h, &self.moved(h, &k1));
+        let right: Vec<Real> = f.iter().zip(&k1).map(|(f, k)| *f - 2.0 * *k).collect();
+        let k2 = factors.solve(&right);
+        let half = 0.5 * h;
+        let next = (0..self.x.len()).map(|k| self.x[k] + half * (3.0 * k1[k] + k2[k]));
+        let Some(singular) = factors.singular else { return next.collect() };
+        self.expo().into_iter().zip(next).map(|(expo, next)| singular.choose(expo, next)).collect()
+    }
+}
+
+/// A sparse square matrix, row by row.
+struct Matrix<'a> {
+    rows: Vec<BTreeMap<usize, Real<'a>>>,
+}
+
+/// A = L U, with the order in which rows and columns are eliminated.
+struct Factors<'a> {
+    order: Vec<usize>,
+    /// Below the pivots, in the columns eliminated before: the multipliers; the rest: U.
+    rows: Vec<BTreeMap<usize, Real<'a>>>,
+    /// 1/pivot of each row.
+    inverse: HashMap<usize, Real<'a>>,
+    /// Whether a pivot is too small.
+    singular: Option<Truth<'a>>,
+}
+
+impl<'a> Matrix<'a> {
+    /// I − c · J
+    fn identity_less(c: Real<'a>, jacobian: &[Gradient]) -> Matrix<'a> {
+        let row = |(i, gradient): (usize, &Gradient)| {
+            let mut row: BTreeMap<usize, Real> = BTreeMap::from([(i, c.constant(1.0))]);
+            for (j, d) in gradient {
+                let product = c * c.same(*d);
+                let entry = if i == *j as usize { 1.0 - product } else { -product };
+                row.insert(*j as usize, entry);
+            }
+            row
+        };
+        Matrix { rows: jacobian.iter().enumerate().map(row).collect() }
+    }
+
+    /// Gauss elimination, unrolled. The order is fixed: at each turn the diagonal entry whose elimination can fill in
+    /// least (Markowitz), the first among equals.
+    fn factorise(self) -> Factors<'a> {
+        let mut rows = self.rows;
+        let n = rows.len();
+        let mut left: Vec<usize> = (0..n).collect();
+        let mut factors = Factors { order: Vec::new(), rows: Vec::new(), inverse: HashMap::new(), singular: None };
+        while !left.is_empty() {
+            let in_row = |p: usize, left: &[usize]| left.iter().filter(|j| rows[p].contains_key(j)).count() - 1;
+            let in_column = |p: usize, left: &[usize]| left.iter().filter(|i| rows[**i].contains_key(&p)).count() - 1;
+            let cost = |p: &usize| (in_row(*p, &left) * in_column(*p, &left), *p);
+            let pivot = left.iter().copied().min_by_key(cost).expect("one is left");
+            left.retain(|i| *i != pivot);
+            let diagonal = rows[pivot][&pivot];
+            let others: Vec<Real> = left.iter().filter_map(|j| rows[pivot].get(j).copied()).collect();
+            // A row of its own pivot only is as good as its pivot is not 0.
+            let size = others.into_iter().map(Real::abs).reduce(|a, b| a.below(b).choose(b, a));
+            let small = match size {
+                Some(size) => !diagonal.abs().above(1e-12 * size),
+                None => !diagonal.abs().above(0.0),
+            };
+            factors.singular = Some(factors.singular.map_or(small, |any| any | small));
+            let inverse = 1.0 / diagonal;
+            factors.inverse.insert(pivot, inverse);
+            factors.order.push(pivot);
+            let of_pivot: Vec<(usize, Real)> =
+                left.iter().filter_map(|j| rows[pivot].get(j).map(|entry| (*j, *entry))).collect();
+            for &i in &left {
+                let Some(entry) = rows[i].get(&pivot).copied() else { continue };
+                let multiplier = entry * inverse;
+                rows[i].insert(pivot, multiplier);
+                for &(j, above) in &of_pivot {
+                    let product = multiplier * above;
+                    let reduced = rows[i].get(&j).map_or(-product, |entry| *entry - product);
+                    rows[i].insert(j, reduced);
+                }
+            }
+        }
+        factors.rows = rows;
+        factors
+    }
+}
+
+impl<'a> Factors<'a> {
+    fn solve(&self, right: &[Real<'a>]) -> Vec<Real<'a>> {
+        let mut x = right.to_vec();
+        for (k, &i) in self.order.iter().enumerate() {
+            for &j in &self.order[..k] {
+                if let Some(multiplier) = self.rows[i].get(&j) {
+                    x[i] = x[i] - *multiplier * x[j];
+                }
+            }
+        }
+        for (k, &i) in self.order.iter().enumerate().rev() {
+            for &j in &self.order[k + 1..] {
+                if let Some(entry) = self.rows[i].get(&j) {
+                    x[i] = x[i] - *entry * x[j];
+                }
+            }
+            x[i] = x[i] * self.inverse[&i];
+        }
+        x
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::interp::Interpreter;
+    use crate::backend::jit::compile;
+    use crate::math::{POOL, expand};
+    use abi::description::{Automaton, Tick};
+    use abi::unit::Unit;
+    use abi::{Code, Description, Function, Layout};
+    use std::sync::Arc;
+
+    /// Slots of a model with n states, one period, one held value and one output.
+    fn layout(n: u32) -> Layout {
+        Layout::new([0, 0, n, 2, 1, 1, n, 0, 0, 1])
+    }
+
+    /// dx/dt = f(t, x), and one output.
+    fn program(n: u32, f: impl for<'a> Fn(Real<'a>, &[Real<'a>]) -> (Vec<Real<'a>>, Real<'a>)) -> Program {
+        let layout = layout(n);
+        let func = |name: &str, outputs: bool| {
+            let build = Shared::new(Build::new(name));
+            let load = |slot| Real::new(&build, build.borrow_mut().load(slot));
+            let x: Vec<Real> = (0..n as usize).map(|k| load(layout.states.slot(k))).collect();
+            let (rates, output) = f(load(Slot::TIME), &x);
+            let rates: Vec<Value> = rates.iter().map(|rate| rate.value).collect();
+            let output = output.value;
+            let mut build = build.into_inner();
+            if outputs {
+                build.store(layout.outputs.slot(0), output);
+            } else {
+                rates.iter().enumerate().for_each(|(k, rate)| build.store(layout.derivatives.slot(k), *rate));
+            }
+            build.finish()
+        };
+        let (outputs, derivatives) = (func("outputs", true), func("derivatives", false));
+        let description = Description { layout, pool: POOL.as_slice().into(), ..Description::default() };
+        Program { description, outputs, derivatives, ..Program::default() }
+    }
+
+    /// dz/dt and F of the LuGre model with the textbook's values, N, m, s; `sigma1` is 316 or √1e5 there.
+    fn lugre<'a>(v: Real<'a>, z: Real<'a>, sigma1: f64) -> (Real<'a>, Real<'a>) {
+        let ratio = v / 1e-3;
+        let g = 1.0 + 0.5 * (-(ratio * ratio)).of(Unary::Exp);
+        let rate = v - 1e5 * v.abs() / g * z;
+        (rate, 1e5 * z + sigma1 * rate + 0.4 * v)
+    }
+
+    struct Run {
+        code: Code,
+        block: Vec<f64>,
+        layout: Layout,
+    }
+
+    impl Run {
+        fn new(program: &Program, method: Method, h: f64, x: &[f64]) -> Run {
+            let layout = program.description.layout.clone();
+            let step = expand(&step(program, method));
+            let code = Code::Machine(compile(&[(Function::Step, step)], &layout, POOL.len()).unwrap().0);
+            let mut block = vec![0.0; layout.size()];
+            block[Slot::STEP.index()] = h;
+            block[layout.states.range()].copy_from_slice(x);
+            Run { code, block, layout }
+        }
+
+        fn advance(&mut self, n: u64) -> u64 {
+            self.code.call(Function::Step, &mut self.block, &POOL, n)
+        }
+
+        fn x(&self, k: usize) -> f64 {
+            self.block[self.layout.states.slot(k).index()]
+        }
+    }
+
+    /// x' = cos t + x sin t, v' = −x: smooth, with known order of convergence against a fine solution.
+    #[test]
+    fn methods_have_their_orders() {
+        let program = program(2, |t, x| {
+            let (s, c) = (t.of(Unary::Sin), t.of(Unary::Cos));
+            (vec![c + x[0] * s * 0.5 - x[1], x[0] - 0.7 * x[1]], x[0])
+        });
+        let end = |method, n: u64| {
+            let mut run = Run::new(&program, method, 1.0 / n as f64, &[0.3, -0.2]);
+            run.advance(n);
+            [run.x(0), run.x(1)]
+        };
+        let exact = end(Method::Rk4, 1 << 10);
+        let error = |found: [f64; 2]| (found[0] - exact[0]).abs() + (found[1] - exact[1]).abs();
+        for (method, order) in [(Method::Euler, 1.0), (Method::Rk4, 4.0), (Method::Expo, 2.0), (Method::Implicit, 2.0)]
+        {
+            let [coarse, fine] = [16, 32].map(|n| error(end(method, n)));
+            let found = (coarse / fine).log2();
+            assert!((found - order).abs() < 0.25, "{}: order {found}, errors {coarse} and {fine}", method.name());
+        }
+    }
+
+    /// dx/dt = 2 − 50 x: expo is exact, whatever the step, and stays between x and its rest point.
+    #[test]
+    fn expo_is_exact_for_a_state_that_relaxes() {
+        let program = program(1, |_, x| (vec![2.0 - 50.0 * x[0]], x[0]));
+        for h in [1e-6, 1e-3, 0.1, 10.0] {
+            let mut run = Run::new(&program, Method::Expo, h, &[1.0]);
+            run.advance(1);
+            let exact = 0.04 + 0.96 * core_math::exp(-50.0 * h);
+            assert!((run.x(0) - exact).abs() < 1e-14, "h = {h}: {} and not {exact}", run.x(0));
+        }
+    }
+
+    /// Largest |z| in µm under 50 mm/s, 1 Hz, for 2 s: the table of the language's manual, section 8.2.
+    #[test]
+    fn driven_bristle_as_computed_elsewhere() {
+        let program = program(1, |t, x| {
+            let v = 0.05 * (t * (2.0 * std::f64::consts::PI)).of(Unary::Sin);
+            let (rate, force) = lugre(v, x[0], 316.0);
+            (vec![rate], force)
+        });
+        let largest = |method, h: f64| {
+            let mut run = Run::new(&program, method, h, &[0.0]);
+            let steps = (2.0 / h).round() as u64;
+            (0..steps).fold(0f64, |largest, _| {
+                run.advance(1);
+                if run.x(0).is_nan() { f64::INFINITY } else { largest.max(run.x(0).abs() * 1e6) }
+            })
+        };
+        let table = [
+            (1e-3, [None, None, Some(10.57), Some(10.56)]),
+            (5e-4, [None, Some(10.56), Some(10.57), Some(10.56)]),
+            (1e-4, [Some(10.57), Some(10.56), Some(10.56), Some(10.56)]),
+        ];
+        for (h, row) in table {
+            for (method, expected) in [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].into_iter().zip(row)
+            {
+                let found = largest(method, h);
+                match expected {
+                    Some(expected) => assert!((found - expected).abs() <= 0.0051, "{} at {h}: {found}", method.name()),
+                    None => assert!(found > 15.1, "{} at {h} stays in bounds: {found}", method.name()),
+                }
+            }
+        }
+    }
+
+    /// A mass of 1 kg thrown at 1 m/s travels 0.394792 m; at 1 ms expo gives 0.394793.
+    #[test]
+    fn coasting_down_loses_no_impulse() {
+        let program = program(3, |_, x| {
+            let (rate, force) = lugre(x[1], x[2], 1e5f64.sqrt());
+            (vec![x[1], -force, rate], force)
+        });
+        let mut run = Run::new(&program, Method::Expo, 1e-3, &[0.0, 1.0, 0.0]);
+        run.advance(3000);
+        assert!((run.x(0) - 0.394793).abs() < 1e-6, "{}", run.x(0));
+    }
+
+    /// A mass pulled through a spring of 2 N/m at 0.1 m/s for 40 s: end position in m. `implicit` and `rk4` as in
+    /// section 8.2; `expo` as an independent program of the same formulas gives it.
+    #[test]
+    fn pulling_ends_where_computed_elsewhere() {
+        let program = program(3, |t, x| {
+            let (rate, force) = lugre(x[1], x[2], 316.0);
+            (vec![x[1], 2.0 * (0.1 * t - x[0]) - force, rate], force)
+        });
+        let end = |method, h: f64| {
+            let mut run = Run::new(&program, method, h, &[0.0; 3]);
+            run.advance((40.0 / h).round() as u64);
+            run.x(0)
+        };
+        for (method, h, expected) in [
+            (Method::Expo, 1e-4, 3.306793),
+            (Method::Expo, 5e-4, 3.306826),
+            (Method::Expo, 1e-3, 3.306926),
+            (Method::Expo, 2e-3, 3.307287),
+            (Method::Implicit, 1e-4, 3.306792),
+            (Method::Implicit, 5e-4, 3.306806),
+            (Method::Implicit, 1e-3, 3.306846),
+            (Method::Implicit, 2e-3, 3.306972),
+            (Method::Rk4, 2e-5, 3.306792),
+        ] {
+            let found = end(method, h);
+            println!("pull, {} at {h}: {found:.7}, elsewhere {expected}", method.name());
+            assert!((found - expected).abs() < 1.1e-6, "{} at {h}: {found}", method.name());
+        }
+    }
+
+    /// The PID servo hunts: peak to peak after 50 s in mm.
+    #[test]
+    fn hunting_swings_as_computed_elsewhere() {
+        let program = program(5, |_, x| {
+            let [position, v, z, i, filtered] = x.try_into().expect("five states");
+            let e = 1.0 - position;
+            let raw = 3.0 * e + i - 600.0 * (position - filtered);
+            let u = (-(-raw).at_most(20.0)).at_most(20.0);
+            let (rate, force) = lugre(v, z, 316.0);
+            let integral = 4.0 * e + (u - raw) / 0.5;
+            (vec![v, u - force, rate, integral, 100.0 * (position - filtered)], force)
+        });
+        for (method, h, expected) in [
+            (Method::Expo, 1e-4, 126.408),
+            (Method::Expo, 5e-4, 126.407),
+            (Method::Expo, 1e-3, 126.402),
+            (Method::Expo, 2e-3, 126.385),
+            (Method::Implicit, 1e-3, 126.406),
+            (Method::Implicit, 2e-3, 126.401),
+        ] {
+            let mut run = Run::new(&program, method, h, &[0.0; 5]);
+            let steps = (50.0 / h).round() as u64;
+            run.advance(steps);
+            let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+            for _ in 0..steps {
+                run.advance(1);
+                (low, high) = (low.min(run.x(0)), high.max(run.x(0)));
+            }
+            let found = (high - low) * 1e3;
+            println!("hunting, {} at {h}: {found:.5}, elsewhere {expected}", method.name());
+            assert!((found - expected).abs() < 1e-3, "{} at {h}: {found}", method.name());
+        }
+    }
+
+    /// A pivot of exactly 0 takes the step of expo: 1 − γ h a = 0.
+    #[test]
+    fn a_singular_step_is_done_by_expo() {
+        let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
+        let program = program(1, move |_, x| (vec![x[0] * (1.0 / gamma)], x[0]));
+        let mut run = Run::new(&program, Method::Implicit, 1.0, &[1.0]);
+        let mut expo = Run::new(&program, Method::Expo, 1.0, &[1.0]);
+        run.advance(1);
+        expo.advance(1);
+        assert_eq!(run.x(0), expo.x(0));
+        assert!(run.x(0).is_finite());
+    }
+
+    #[test]
+    fn time_is_a_count_and_ticks_are_met() {
+        let mut program = program(1, |t, x| (vec![t * 0.0], x[0]));
+        let layout = program.description.layout.clone();
+        // A tick adds 1 to the held value, the transition writes the number of steps to the regime.
+        let (period, held, due) = (layout.memory.slot(0), layout.memory.slot(1), layout.due.slot(0));
+        let mut tick = Build::new("tick");
+        let (flag, before) = (tick.load(due), tick.load(held));
+        let next = tick.add(before, flag);
+        tick.store(held, next);
+        program.tick = Some(tick.finish());
+        let mut transitions = Build::new("transitions");
+        let held_now = transitions.load(held);
+        transitions.store(layout.regimes.slot(0), held_now);
+        program.transitions = Some(transitions.finish());
+        program.description.ticks = vec![Tick { period, due }];
+        program.description.automata =
+            vec![Automaton { path: String::new(), regimes: Vec::new(), slot: layout.regimes.slot(0) }];
+        let mut run = Run::new(&program, Method::Euler, 1e-3, &[0.0]);
+        run.block[period.index()] = 7e-3;
+        run.advance(10_000);
+        assert_eq!(run.block[Slot::COUNT.index()], 10_000.0);
+        assert_eq!(run.block[Slot::TIME.index()], 10_000.0 * 1e-3);
+        assert_eq!(run.block[held.index()], f64::from(10_000 / 7));
+        assert_eq!(run.block[layout.regimes.slot(0).index()], f64::from(10_000 / 7));
+        assert_eq!(run.block[due.index()], 0.0, "what is due is not stored");
+    }
+
+    #[test]
+    fn a_guard_names_the_first_that_leaves() {
+        let mut program = program(2, |_, x| (vec![x[0] * 0.0 + 1.0, 0.0 * x[0]], x[0] / x[1]));
+        let layout = program.description.layout.clone();
+        let guard = |slot, range| Guard { path: String::new(), slot, range, unit: Unit::none() };
+        program.description.guards = vec![
+            guard(layout.outputs.slot(0), (f64::NEG_INFINITY, f64::INFINITY)),
+            guard(layout.states.slot(0), (0.0, 3.0)),
+            guard(layout.states.slot(1), (f64::NEG_INFINITY, f64::INFINITY)),
+        ];
+        // Within the tolerance of 3e-6 still, then 4.
+        let mut run = Run::new(&program, Method::Euler, 1.0, &[2e-6, 1.0]);
+        assert_eq!(run.advance(100), 2);
+        assert_eq!(run.block[Slot::COUNT.index()], 4.0);
+        let mut run = Run::new(&program, Method::Euler, 1.0, &[0.0, 0.0]);
+        assert_eq!((run.advance(100), run.block[Slot::COUNT.index()]), (1, 1.0));
+        let mut run = Run::new(&program, Method::Euler, 1.0, &[0.0, f64::INFINITY]);
+        assert_eq!(run.advance(100), 3);
+        let mut run = Run::new(&program, Method::Euler, 1.0, &[-2.0, 1.0]);
+        assert_eq!(run.advance(100), 2);
+    }
+
+    #[test]
+    fn what_has_died_away_is_zero() {
+        let program = program(1, |_, x| (vec![-1.0 * x[0]], x[0]));
+        let mut run = Run::new(&program, Method::Euler, 0.5, &[1e-29]);
+        run.advance(3);
+        assert!(run.x(0) > 0.0);
+        run.advance(1);
+        assert_eq!(run.x(0).to_bits(), 0);
+    }
+
+    /// Steps of every method, interpreted and as machine code, from states of every size.
+    #[test]
+    fn steps_agree_to_the_bit() {
+        let program = program(3, |t, x| {
+            let (rate, force) = lugre(x[1], x[2], 316.0);
+            (vec![x[1], 2.0 * (0.1 * t - x[0]) - force, rate], force)
+        });
+        let layout = program.description.layout.clone();
+        let mut random = crate::ir::random::Random(3);
+        for method in [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit] {
+            let funcs = [(Function::Step, expand(&step(&program, method)))];
+            let machine = Code::Machine(compile(&funcs, &layout, POOL.len()).unwrap().0);
+            let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL.len())));
+            for case in 0..300 {
+                let mut block = vec![0.0; layout.size()];
+                block[Slot::STEP.index()] = 1e-4;
+                for slot in layout.states.range() {
+                    block[slot] = if case % 3 == 0 { random.real() } else { random.within(-1e-2, 1e-2) };
+                }
+                let mut other = block.clone();
+                machine.call(Function::Step, &mut block, &POOL, 5);
+                reference.call(Function::Step, &mut other, &POOL, 5);
+                let same =
+                    block.iter().zip(&other).all(|(a, b)| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan());
+                assert!(same, "{} case {case}: {block:?} and {other:?}", method.name());
+            }
+        }
+    }
+}

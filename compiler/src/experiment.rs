@@ -1,0 +1,857 @@
+//! Reads an experiment: what to run, how, what to show and what must hold.
+//!
+//! In: an experiment's tree and changes from outside. Out: for each combination of its sweeps a flat system with a plan
+//! that holds slots only.
+
+use crate::flatten::{Instance, Override, OverrideValue, Request, flatten};
+use crate::lower::{Lowered, Wanted, evaluate, lower};
+use crate::resolve::Loaded;
+use crate::source::Sources;
+use crate::system::*;
+use crate::tables::columns;
+use crate::units::{self, Types, literal};
+use crate::{causality, checks};
+use abi::plan::{self, Formula, MeasureKind, Method, Solver};
+use abi::unit::{Dimension, Unit};
+use grammar::ast::{self, BinaryOp, Expr, ExperimentStatement, SweepOver};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+
+/// Changes from outside to an experiment.
+#[derive(Clone, Debug, Default)]
+pub struct Changes {
+    /// `fr.Fs = 2 N`, as text.
+    pub set: Vec<String>,
+    /// Another method.
+    pub method: Option<Method>,
+    /// Another fixed step, in s.
+    pub step: Option<f64>,
+    /// Another tolerance.
+    pub tol: Option<f64>,
+    /// Another duration, in s.
+    pub duration: Option<f64>,
+}
+
+/// One combination of an experiment's sweeps, lowered.
+pub struct Variant {
+    /// `fr = LuGre()`; empty without a sweep.
+    pub label: String,
+    /// The system.
+    pub system: System,
+    /// Its types.
+    pub types: Types,
+    /// The program.
+    pub program: crate::program::Program,
+    /// What to run.
+    pub experiment: plan::Experiment,
+}
+
+/// The default of an adaptive run.
+pub const DEFAULT_TOL: f64 = 1e-6;
+/// The step of a fixed method that was chosen without one, in s.
+pub const DEFAULT_STEP: f64 = 1e-5;
+/// Most combinations of the sweeps of one experiment.
+pub const MOST_VARIANTS: usize = 100_000;
+
+/// The parts of an experiment's tree.
+struct Parts<'a> {
+    span: Span,
+    run: &'a ast::Run,
+    solver: Option<&'a ast::Solver>,
+    sweeps: Vec<&'a ast::Sweep>,
+    data: Option<&'a ast::Data>,
+    plots: Vec<&'a ast::Plot>,
+    expects: Vec<&'a ast::Expect>,
+}
+
+/// Where the value of a sweep or a change comes from.
+#[derive(Clone, Copy)]
+struct Change<'a> {
+    path: &'a ast::Path,
+    value: OverrideValue<'a>,
+}
+
+/// Reads and lowers an experiment.
+///
+/// # Errors
+/// Everything that is wrong, at least one error among it.
+pub fn read(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Vec<Variant>, Vec<Diagnostic>> {
+    let mut diagnostics = Vec::new();
+    let given = Given::read(loaded, changes, &mut diagnostics);
+    let loaded = &*loaded;
+    let root = loaded.root();
+    let file = loaded.files.get(root);
+    let found = file.ast.items.iter().find_map(|item| match item {
+        ast::Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
+        _ => None,
+    });
+    let Some(experiment) = found else {
+        let error = Diagnostic::error("E0201", format!("there is no experiment `{name}`"));
+        return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
+    };
+    let Some(parts) = parts(experiment, &mut diagnostics) else { return Err(diagnostics) };
+    let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
+    let Some(data) = data else { return Err(diagnostics) };
+    let grids = grids(loaded, &parts, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    let combinations = combinations(&parts, &grids);
+    if combinations.is_empty() || combinations.len() > MOST_VARIANTS {
+        let span = parts.sweeps.first().map_or(experiment.span, |sweep| sweep.span);
+        let message = match combinations.len() {
+            0 => "this sweep is empty".to_string(),
+            n => format!("{n} combinations are too many"),
+        };
+        let error = Diagnostic::error("E0902", message).label(span, "swept here");
+        return Err(vec![error.help(format!("between 1 and {MOST_VARIANTS} combinations can be run"))]);
+    }
+    let mut variants = Vec::new();
+    for combination in combinations {
+        let label = label(loaded, &combination);
+        let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(Given::change));
+        let overrides = changes.map(|c| Override { path: c.path, value: c.value, file: root }).collect();
+        match variant(loaded, sources, name, &parts, &data, overrides, &given, label, warnings, on_stage) {
+            Ok(variant) => variants.push(variant),
+            Err(errors) => return Err(errors),
+        }
+    }
+    Ok(variants)
+}
+
+/// Texts given on the command line, read.
+struct Given {
+    set: Vec<Set>,
+    method: Option<Method>,
+    step: Option<f64>,
+    tol: Option<f64>,
+    duration: Option<f64>,
+}
+
+/// `PATH = VALUE`
+struct Set {
+    path: ast::Path,
+    expr: Option<Expr>,
+    instance: Option<ast::Instance>,
+}
+
+impl Given {
+    fn read(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Given {
+        let mut set = Vec::new();
+        for text in &changes.set {
+            let id = loaded.add_text("--set", text);
+            match text.split_once('=') {
+                Some((path, value)) if looks_like_instance(value) => {
+                    // Read with blanks in place of the path, so that places stay true.
+                    let (found, errors) = grammar::parse::parse_path(id, path);
+                    diagnostics.extend(errors);
+                    let blanks = " ".repeat(path.len() + 1);
+                    let (instance, errors) = grammar::parse::parse_instance(id, &format!("{blanks}{value}"));
+                    diagnostics.extend(errors);
+                    if let (Some(path), Some(instance)) = (found, instance) {
+                        set.push(Set { path, expr: None, instance: Some(instance) });
+                    }
+                }
+                _ => {
+                    let (setting, errors) = grammar::parse::parse_setting(id, text);
+                    diagnostics.extend(errors);
+                    if let Some((path, expr)) = setting {
+                        set.push(Set { path, expr: Some(expr), instance: None });
+                    }
+                }
+            }
+        }
+        let &Changes { method, step, tol, duration, .. } = changes;
+        Given { set, method, step, tol, duration }
+    }
+
+    fn change(set: &Set) -> Change<'_> {
+        let value = match (&set.expr, &set.instance) {
+            (_, Some(instance)) => OverrideValue::Instance(instance),
+            (Some(expr), None) => OverrideValue::Expr(expr),
+            (None, None) => unreachable!("a setting has a value"),
+        };
+        Change { path: &set.path, value }
+    }
+}
+
+fn looks_like_instance(value: &str) -> bool {
+    let value = value.trim_start().trim_start_matches("rotary ").trim_start();
+    let name = value.trim_start_matches(|c: char| c.is_ascii_alphanumeric() || c == '_');
+    value.starts_with(|c: char| c.is_ascii_uppercase()) && name.trim_start().starts_with('(')
+}
+
+fn parts<'a>(experiment: &'a ast::Experiment, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
+    let mut run: Option<&ast::Run> = None;
+    let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
+    let mut twice = |what: &str, span: Span, first: Span| {
+        let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
+            .label(span, "again here")
+            .label(first, "first here");
+        diagnostics.push(error.help("remove one, or write another experiment"));
+    };
+    for statement in &experiment.body {
+        match statement {
+            ExperimentStatement::Run(one) => match run {
+                Some(first) => twice("run", one.span, first.span),
+                None => run = Some(one),
+            },
+            ExperimentStatement::Solver(one) => match parts.0 {
+                Some(first) => twice("solver", one.span, std::convert::identity::<&ast::Solver>(first).span),
+                None => parts.0 = Some(one),
+            },
+            ExperimentStatement::Sweep(one) => parts.1.push(one),
+            ExperimentStatement::Data(one) => match parts.2 {
+                Some(first) => twice("data", one.span, std::convert::identity::<&ast::Data>(first).span),
+                None => parts.2 = Some(one),
+            },
+            ExperimentStatement::Plot(one) => parts.3.push(one),
+            ExperimentStatement::Expect(one) => parts.4.push(one),
+            ExperimentStatement::Allow(_) => {}
+        }
+    }
+    let Some(run) = run else {
+        let error = Diagnostic::error("E0902", format!("experiment `{}` runs nothing", experiment.name.text))
+            .label(experiment.name.span, "there is no `run` in it");
+        diagnostics.push(error.help("add `run Model(…) for 10 s`"));
+        return None;
+    };
+    let (solver, sweeps, data, plots, expects) = parts;
+    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects })
+}
+
+/// Columns of a recording as tables over time.
+fn recording(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    root: FileId,
+    data: &ast::Data,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Vec<(String, Table, Unit)>> {
+    let wanted: Vec<bool> = data.columns.iter().map(|column| column.name.text != "_").collect();
+    let values = columns(loaded, sources, root, &data.file, &wanted, diagnostics)?;
+    let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
+        let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
+        diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
+        return None;
+    };
+    let mut out = Vec::new();
+    let mut unit = |column: &ast::Argument| match column.unit.as_ref().map(|text| (text, Unit::parse(&text.text))) {
+        None => Some(Unit::none()),
+        Some((_, Ok(unit))) => Some(unit),
+        Some((text, Err(part))) => {
+            diagnostics.push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
+            None
+        }
+    };
+    let t_unit = unit(&data.columns[time])?;
+    let t: Vec<f64> = values[time].iter().map(|t| t * t_unit.scale).collect();
+    let mut columns = Vec::new();
+    for (k, column) in data.columns.iter().enumerate() {
+        if column.name.text != "_" {
+            columns.push((k, column, unit(column)?));
+        }
+    }
+    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
+        let error = Diagnostic::error("E0903", "the times of a recording must increase")
+            .label(data.file.span, format!("row {} is not after the one before", row + 1));
+        diagnostics.push(error);
+        return None;
+    }
+    for (k, column, unit) in columns {
+        let table = Table {
+            name: format!("data.{}", column.name.text),
+            x_dimension: Dimension::of([0, 0, 1, 0, 0]),
+            y_dimension: unit.dimension,
+            smooth: false,
+            x: t.clone(),
+            y: values[k].iter().map(|y| y * unit.scale).collect(),
+        };
+        out.push((column.name.text.clone(), table, unit));
+    }
+    Some(out)
+}
+
+/// Values of `first .. last by step` as expressions, one list for each sweep.
+fn grids(loaded: &Loaded, parts: &Parts, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
+    let mut out = Vec::new();
+    for sweep in &parts.sweeps {
+        let mut values = Vec::new();
+        if let SweepOver::Grid { first, last, step } = &sweep.over {
+            match (quantity(first), quantity(last), quantity(step)) {
+                (Some((a, unit, text)), Some((b, other, _)), Some((h, third, _)))
+                    if unit.dimension == other.dimension && unit.dimension == third.dimension && h > 0.0 =>
+                {
+                    let count = ((b - a) / h + 1e-9).floor();
+                    for k in 0..=(count.clamp(-1.0, MOST_VARIANTS as f64) as i64) {
+                        let value = unit.from_si(a + k as f64 * h);
+                        let kind = ast::ExprKind::Number { value: rounded(value), unit: text.clone() };
+                        values.push(Expr { kind, span: first.span });
+                    }
+                }
+                _ => {
+                    let error = Diagnostic::error("E0902", "a sweep goes from a number to a number by a positive step")
+                        .label(sweep.span, loaded.files.slice(sweep.span).lines().next().unwrap_or_default())
+                        .help("all three in units of one kind: `sweep fr.Fs = 1 N .. 2 N by 0.25 N`");
+                    diagnostics.push(error);
+                }
+            }
+        }
+        out.push(values);
+    }
+    out
+}
+
+/// A number without the noise of `a + k·h`: twelve digits.
+fn rounded(x: f64) -> f64 {
+    format!("{x:.11e}").parse().unwrap_or(x)
+}
+
+/// A literal in SI with its unit.
+fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
+    match &expr.kind {
+        ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
+        ast::ExprKind::Number { value, unit: Some(text) } => {
+            let unit = Unit::parse(&text.text).ok()?;
+            Some((value * unit.scale, unit, Some(text.clone())))
+        }
+        ast::ExprKind::Unary(ast::UnaryOp::Negate, a) => quantity(a).map(|(value, unit, text)| (-value, unit, text)),
+        _ => None,
+    }
+}
+
+/// All combinations of the sweeps, the last one fastest; each with the text of its value.
+fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Change<'a>, Option<String>)>> {
+    let mut out: Vec<Vec<(Change<'a>, Option<String>)>> = vec![Vec::new()];
+    for (sweep, grid) in parts.sweeps.iter().zip(grids) {
+        let path = &sweep.path;
+        let values: Vec<(Change<'a>, Option<String>)> = match &sweep.over {
+            SweepOver::Instances(all) => {
+                all.iter().map(|one| (Change { path, value: OverrideValue::Instance(one) }, None)).collect()
+            }
+            SweepOver::Values(all) => all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect(),
+            SweepOver::Grid { .. } => grid
+                .iter()
+                .map(|one| {
+                    let text = match &one.kind {
+                        ast::ExprKind::Number { value, unit: Some(unit) } => format!("{value} {}", unit.text),
+                        ast::ExprKind::Number { value, unit: None } => format!("{value}"),
+                        _ => unreachable!("a grid holds numbers"),
+                    };
+                    (Change { path, value: OverrideValue::Expr(one) }, Some(text))
+                })
+                .collect(),
+        };
+        if out.len().saturating_mul(values.len()) > MOST_VARIANTS {
+            return vec![Vec::new(); MOST_VARIANTS + 1];
+        }
+        out = out
+            .iter()
+            .flat_map(|before| {
+                values.iter().map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>()).collect::<Vec<_>>()
+            })
+            .collect();
+    }
+    out
+}
+
+/// `fr = LuGre(), k = 2 N/m`
+fn label(loaded: &Loaded, combination: &[(Change, Option<String>)]) -> String {
+    let one = |(change, text): &(Change, Option<String>)| {
+        let value = text.clone().unwrap_or_else(|| match change.value {
+            OverrideValue::Expr(expr) => loaded.files.slice(expr.span).to_string(),
+            OverrideValue::Instance(instance) => one_line(loaded.files.slice(instance.span)),
+        });
+        format!("{} = {value}", loaded.files.slice(change.path.span))
+    };
+    combination.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+/// The text on one line.
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Positions of an expectation's expressions among the observed ones.
+struct ExpectAt {
+    value: usize,
+    near: Option<(usize, usize)>,
+    after: Option<usize>,
+    before: Option<usize>,
+}
+
+#[allow(clippy::too_many_arguments)]
+fn variant(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    parts: &Parts,
+    data: &[(String, Table, Unit)],
+    overrides: Vec<Override>,
+    given: &Given,
+    label: String,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Variant, Vec<Diagnostic>> {
+    let root = loaded.root();
+    if !parts.run.instance.model.text.starts_with(|c: char| c.is_ascii_uppercase()) {
+        let error = Diagnostic::error("E0905", "running a rig in an experiment is not available yet");
+        return Err(vec![error.label(parts.run.instance.span, "a rig")]);
+    }
+    // Every expression of the experiment is read as one of the instance; then each is picked out again.
+    let mut observed: Vec<&Expr> = Vec::new();
+    let mut add = |expr| {
+        observed.push(expr);
+        observed.len() - 1
+    };
+    let duration = parts.run.duration.as_ref().map(&mut add);
+    let step = parts.solver.and_then(|s| s.step.as_ref()).map(&mut add);
+    let tol = parts.solver.and_then(|solver| solver.tol.as_ref()).map(&mut add);
+    let plots: Vec<(Vec<usize>, Option<usize>)> = parts
+        .plots
+        .iter()
+        .map(|plot| {
+            let shows = plot.shows.iter().map(|show| add(&show.value)).collect();
+            (shows, plot.against.as_ref().map(|show| add(&show.value)))
+        })
+        .collect();
+    let expects: Vec<ExpectAt> = parts
+        .expects
+        .iter()
+        .map(|expect| ExpectAt {
+            value: add(&expect.value),
+            near: expect.near.as_ref().map(|(target, tolerance)| (add(target), add(tolerance))),
+            after: expect.after.as_ref().map(&mut add),
+            before: expect.before.as_ref().map(&mut add),
+        })
+        .collect();
+    let request = Request {
+        instance: Instance::Written(&parts.run.instance, root),
+        overrides,
+        observed,
+        data: data.to_vec(),
+    };
+    on_stage("flatten");
+    let flat = flatten(loaded, sources, &request);
+    let (system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
+    on_stage("check");
+    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
+        causality::check(&system, &loaded.files, &mut diagnostics);
+    }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    // What is wrong with the experiment alone does not hide what else is wrong with it.
+    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103") {
+        return Err(diagnostics);
+    }
+    diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
+    let mut reader = Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new() };
+
+    let corners = evaluate(&system, &types, &system.corners);
+    let duration = match (given.duration, duration) {
+        (Some(duration), _) => duration,
+        (None, Some(at)) => reader.time(nodes[at], "the duration"),
+        (None, None) => match data.first().and_then(|(_, table, _)| table.x.last()) {
+            Some(end) => *end,
+            None => {
+                let error = Diagnostic::error("E0902", "how long does it run?")
+                    .label(parts.run.span, "no duration")
+                    .help("add `for 10 s`");
+                reader.diagnostics.push(error);
+                1.0
+            }
+        },
+    };
+    let solver = reader.solver(parts, given, step.map(|at| nodes[at]), tol.map(|at| nodes[at]));
+    if solver.method != Method::Adaptive {
+        let at = step.map(|at| system.span(nodes[at]));
+        checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+    }
+    let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
+    for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {
+        let shows = plot.shows.iter().zip(shows).map(|(show, at)| reader.show(show, nodes[*at])).collect();
+        let against = plot.against.as_ref().zip(*against).map(|(show, at)| reader.show(show, nodes[at]));
+        series_at.push((shows, against));
+    }
+    let mut expects_at = Vec::new();
+    for (expect, at) in parts.expects.iter().zip(&expects) {
+        expects_at.push(reader.expect(expect, at, &nodes, duration));
+    }
+    let (wanted, diagnostics) = (std::mem::take(&mut reader.wanted), std::mem::take(&mut reader.diagnostics));
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    warnings.extend(diagnostics);
+    on_stage("lower");
+    let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);
+    program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
+    for root in &mut program.description.roots {
+        root.text = surface_text(loaded, &root.text);
+    }
+    let series = |at: usize| plan::Series {
+        label: wanted[at].text.clone(),
+        slot: slots[at],
+        unit: wanted[at].unit.clone().unwrap_or_default(),
+        boolean: types.boolean[wanted[at].expr.0 as usize],
+    };
+    let plots = series_at
+        .iter()
+        .map(|(shows, against)| plan::Plot {
+            series: shows.iter().map(|at| series(*at)).collect(),
+            against: against.map(series),
+        })
+        .collect();
+    let expects = expects_at
+        .into_iter()
+        .flatten()
+        .map(|mut expect| {
+            for measure in &mut expect.measures {
+                measure.slot = slots[measure.slot.index()];
+            }
+            expect
+        })
+        .collect();
+    let mut corners: Vec<f64> = corners.into_iter().filter(|t| *t > 0.0 && *t < duration).collect();
+    corners.sort_by(f64::total_cmp);
+    corners.dedup();
+    let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };
+    Ok(Variant { label, system, types, program, experiment })
+}
+
+/// Whether what is said concerns something outside of a place.
+fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
+    let span = diagnostic.span();
+    span.file != place.file || span.start < place.start || span.end > place.end
+}
+
+/// The text of a surface from the place that stands for it.
+fn surface_text(loaded: &Loaded, place: &str) -> String {
+    let parse = || {
+        let (file, range) = place.split_once(':')?;
+        let (start, end) = range.split_once("..")?;
+        let file = FileId(file.parse().ok()?);
+        let span = Span::new(file, start.parse().ok()?, end.parse().ok()?);
+        Some(one_line(loaded.files.slice(span)))
+    };
+    parse().unwrap_or_else(|| place.to_string())
+}
+
+struct Reader<'a> {
+    loaded: &'a Loaded,
+    system: &'a System,
+    types: &'a Types,
+    diagnostics: Vec<Diagnostic>,
+    wanted: Vec<Wanted>,
+}
+
+impl Reader<'_> {
+    fn constant(&self, expr: ExprId) -> f64 {
+        literal(self.system, expr).unwrap_or_else(|| evaluate(self.system, self.types, &[expr])[0])
+    }
+
+    fn dimension(&self, expr: ExprId) -> Dimension {
+        self.types.nodes[expr.0 as usize].unwrap_or(Dimension::NONE)
+    }
+
+    /// A positive time known before the run.
+    fn time(&mut self, expr: ExprId, what: &str) -> f64 {
+        let value = self.constant(expr);
+        let seconds = Dimension::of([0, 0, 1, 0, 0]);
+        let span = self.system.span(expr);
+        if self.dimension(expr) != seconds && value != 0.0 {
+            let text = self.loaded.files.slice(span);
+            let error = match self.dimension(expr).is_none() {
+                true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                    .label(span, "a pure number")
+                    .help(format!("write `{text} s`")),
+                false => Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
+                    .label(span, Unit::si(self.dimension(expr)).to_string()),
+            };
+            self.diagnostics.push(error);
+            return 1.0;
+        }
+        if !(value.is_finite() && value > 0.0) {
+            let error = Diagnostic::error("E0902", format!("{what} must be positive and known before the run"))
+                .label(span, if value.is_nan() { "not constant".to_string() } else { format!("{value} s") });
+            self.diagnostics.push(error.help("write a time, such as `10 s`"));
+            return 1.0;
+        }
+        value
+    }
+
+    fn solver(&mut self, parts: &Parts, given: &Given, step: Option<ExprId>, tol: Option<ExprId>) -> Solver {
+        let written = parts.solver.and_then(|solver| {
+            let method = Method::named(&solver.method.text);
+            if method.is_none() {
+                let names: Vec<&str> = Method::ALL.iter().map(|method| method.name()).collect();
+                let error = Diagnostic::error("E0201", format!("there is no solver `{}`", solver.method.text))
+                    .label(solver.method.span, "not known");
+                self.diagnostics.push(error.help(format!("solvers are {}", names.join(", "))));
+            }
+            method
+        });
+        let method = given.method.or(written).unwrap_or(Method::Adaptive);
+        let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
+        let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
+        if !(tol > 0.0 && tol < 1.0) {
+            let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+            let error = Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
+            self.diagnostics.push(error.help("it lies between 0 and 1, such as `tol 1e-8`"));
+        }
+        match method {
+            Method::Adaptive => Solver { method, step: 0.0, tol },
+            _ => Solver { method, step: step.unwrap_or(DEFAULT_STEP), tol },
+        }
+    }
+
+    /// Wants an expression; returns its number.
+    fn want(&mut self, expr: ExprId, unit: Option<Unit>) -> usize {
+        let text = one_line(self.loaded.files.slice(self.system.span(expr)));
+        let unit = unit.or_else(|| Some(self.own_unit(expr)));
+        self.wanted.push(Wanted { expr, text, unit });
+        self.wanted.len() - 1
+    }
+
+    /// The unit in which an expression is shown if nobody says: that of a plain quantity, else SI.
+    fn own_unit(&self, expr: ExprId) -> Unit {
+        match self.system.node(expr) {
+            Node::Var(id) => self.types.units[id.0 as usize].clone(),
+            Node::Time => Unit::parse("s").expect("the second is known"),
+            Node::Call(Builtin::Abs, args) => self.own_unit(args[0]),
+            Node::Negate(a) => self.own_unit(*a),
+            Node::Table(table, _) => Unit::si(self.system.tables[*table as usize].y_dimension),
+            Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
+                let (a, b) = (self.own_unit(*a), self.own_unit(*b));
+                if a == b { a } else { Unit::si(self.dimension(expr)) }
+            }
+            _ if self.types.boolean[expr.0 as usize] => Unit::none(),
+            _ => Unit::si(self.dimension(expr)),
+        }
+    }
+
+    fn show(&mut self, show: &ast::Show, expr: ExprId) -> usize {
+        let unit = show.unit.as_ref().and_then(|text| match Unit::parse(&text.text) {
+            Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
+            Ok(unit) => {
+                let message =
+                    format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
+                let error = Diagnostic::error("E0101", message)
+                    .label(text.span, unit.dimension.describe())
+                    .label(self.system.span(expr), Unit::si(self.dimension(expr)).to_string());
+                self.diagnostics.push(error.help("give it a unit of its own kind"));
+                None
+            }
+            Err(part) => {
+                let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                self.diagnostics.push(error);
+                None
+            }
+        });
+        if let Node::Measure(..) = self.system.node(expr) {
+            let error = Diagnostic::error("E0901", "a measure belongs in `expect`, not in `plot`")
+                .label(self.system.span(expr), "one number for the whole run");
+            self.diagnostics.push(error);
+        }
+        self.want(expr, unit)
+    }
+
+    fn expect(&mut self, expect: &ast::Expect, at: &ExpectAt, nodes: &[ExprId], duration: f64) -> Option<plan::Expect> {
+        let text = self.loaded.files.slice(expect.span);
+        let text = one_line(text.strip_prefix("expect").unwrap_or(text));
+        let mut measures = Vec::new();
+        let value = self.formula(nodes[at.value], &mut measures)?;
+        let condition = match at.near {
+            None => {
+                if !self.types.boolean[nodes[at.value].0 as usize] {
+                    let error = Diagnostic::error("E0901", "an expectation is a condition")
+                        .label(self.system.span(nodes[at.value]), "neither true nor false")
+                        .help("compare it: `expect max(F) < 2 N`, `expect final(x) ~= 1 m +- 1 %`");
+                    self.diagnostics.push(error);
+                    return None;
+                }
+                value
+            }
+            Some((target, tolerance)) => {
+                let (value_node, target_node, tolerance_node) = (nodes[at.value], nodes[target], nodes[tolerance]);
+                let relative = self.loaded.files.slice(self.system.span(tolerance_node)).trim_end().ends_with('%');
+                let any = |node: ExprId| matches!(self.system.node(node), Node::Number { dimension: None, .. });
+                for (node, skip) in [(target_node, false), (tolerance_node, relative)] {
+                    if !skip && !any(node) && self.dimension(node) != self.dimension(value_node) {
+                        let (found, wanted) = (self.dimension(node), self.dimension(value_node));
+                        let text = self.loaded.files.slice(self.system.span(node));
+                        let error = match found.is_none() {
+                            true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                                .label(self.system.span(node), "a pure number")
+                                .help(format!("write `{text} {}`", Unit::si(wanted))),
+                            false => {
+                                let message = format!("cannot compare {} with {}", wanted.describe(), found.describe());
+                                Diagnostic::error("E0101", message)
+                                    .label(self.system.span(node), Unit::si(found).to_string())
+                                    .label(self.system.span(value_node), Unit::si(wanted).to_string())
+                            }
+                        };
+                        self.diagnostics.push(error);
+                        return None;
+                    }
+                }
+                let target = self.formula(target_node, &mut measures)?;
+                let tolerance = self.formula(tolerance_node, &mut measures)?;
+                Formula::Near {
+                    value: Box::new(value),
+                    target: Box::new(target),
+                    tolerance: Box::new(tolerance),
+                    relative,
+                }
+            }
+        };
+        let mut edge = |at: Option<usize>, default: f64| match at {
+            Some(at) if self.constant(nodes[at]) == 0.0 => 0.0,
+            Some(at) => self.time(nodes[at], "a window"),
+            None => default,
+        };
+        let (after, before) = (edge(at.after, 0.0), edge(at.before, duration).min(duration));
+        if after > before || (after == before && after > 0.0 && at.after.is_some() && after > duration) {
+            let error = Diagnostic::error("E0902", "the window of this expectation is empty")
+                .label(expect.span, format!("from {after} s to {before} s"))
+                .help(format!("the run takes {duration} s"));
+            self.diagnostics.push(error);
+            return None;
+        }
+        Some(plan::Expect { text, measures, condition, after, before })
+    }
+
+    /// Arithmetic over measures. The slot of a measure is the number of what it measures among the wanted ones.
+    fn formula(&mut self, id: ExprId, measures: &mut Vec<plan::Measure>) -> Option<Formula> {
+        let node = self.system.node(id).clone();
+        if !self.measured(id) {
+            if self.types.boolean[id.0 as usize] {
+                if let Node::Binary(op, a, b) = node
+                    && !matches!(op, BinaryOp::And | BinaryOp::Or)
+                {
+                    let (a, b) = (self.formula(a, measures)?, self.formula(b, measures)?);
+                    return Some(compare(op, a, b));
+                }
+                // A condition without a measure is its value at the end.
+                return Some(self.measure(id, id, MeasureKind::Final, measures));
+            }
+            if let Some(value) = literal(self.system, id) {
+                return Some(Formula::Number(value));
+            }
+            let value = self.constant(id);
+            if !value.is_nan() {
+                return Some(Formula::Number(value));
+            }
+            let text = one_line(self.loaded.files.slice(self.system.span(id)));
+            let error = Diagnostic::error("E0901", format!("`{text}` changes during the run: which value is meant?"))
+                .label(self.system.span(id), "not a measure")
+                .help(format!("write `final({text})`, `max({text})`, `at({text}, 1 s)` or another measure"));
+            self.diagnostics.push(error);
+            return None;
+        }
+        let pair = |reader: &mut Self, a, b, measures: &mut Vec<plan::Measure>| {
+            Some((Box::new(reader.formula(a, measures)?), Box::new(reader.formula(b, measures)?)))
+        };
+        match node {
+            Node::Measure(name, value, second) => {
+                let second = second.map(|second| self.constant(second));
+                let kind = match name {
+                    MeasureName::Min => MeasureKind::Min,
+                    MeasureName::Max => MeasureKind::Max,
+                    MeasureName::Mean => MeasureKind::Mean,
+                    MeasureName::Rms => MeasureKind::Rms,
+                    MeasureName::Integral => MeasureKind::Integral,
+                    MeasureName::Final => MeasureKind::Final,
+                    MeasureName::PeakToPeak => MeasureKind::PeakToPeak,
+                    MeasureName::Crossings => MeasureKind::Crossings,
+                    MeasureName::Period => MeasureKind::Period,
+                    MeasureName::First => MeasureKind::First,
+                    MeasureName::At => MeasureKind::At(second.expect("`at` has two arguments")),
+                    MeasureName::Settling => MeasureKind::Settling(second.expect("`settling` has two arguments")),
+                };
+                if self.measured(value) {
+                    let error = Diagnostic::error("E0901", "a measure of a measure")
+                        .label(self.system.span(id), "the inner one is a single number already");
+                    self.diagnostics.push(error);
+                    return None;
+                }
+                Some(self.measure(id, value, kind, measures))
+            }
+            Node::Negate(a) => Some(Formula::Negate(Box::new(self.formula(a, measures)?))),
+            Node::Not(a) => Some(Formula::Not(Box::new(self.formula(a, measures)?))),
+            Node::Binary(op, a, b) => {
+                let (a, b) = pair(self, a, b, measures)?;
+                Some(match op {
+                    BinaryOp::Add => Formula::Add(a, b),
+                    BinaryOp::Subtract => Formula::Subtract(a, b),
+                    BinaryOp::Multiply => Formula::Multiply(a, b),
+                    BinaryOp::Divide => Formula::Divide(a, b),
+                    BinaryOp::And => Formula::And(a, b),
+                    BinaryOp::Or => Formula::Or(a, b),
+                    BinaryOp::Power => {
+                        let span = self.system.span(id);
+                        let error = Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
+                        self.diagnostics.push(error.help("multiply: `max(x) * max(x)`"));
+                        return None;
+                    }
+                    op => compare(op, *a, *b),
+                })
+            }
+            Node::Call(Builtin::Abs, args) => Some(Formula::Abs(Box::new(self.formula(args[0], measures)?))),
+            Node::Call(Builtin::Sqrt, args) => Some(Formula::Sqrt(Box::new(self.formula(args[0], measures)?))),
+            Node::Call(Builtin::Min, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Min(a, b)),
+            Node::Call(Builtin::Max, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Max(a, b)),
+            _ => {
+                let error = Diagnostic::error("E0901", "this cannot be computed from measures")
+                    .label(self.system.span(id), "not arithmetic")
+                    .help("use + - * / abs sqrt min max and comparisons around measures");
+                self.diagnostics.push(error);
+                None
+            }
+        }
+    }
+
+    fn measure(&mut self, whole: ExprId, value: ExprId, kind: MeasureKind, measures: &mut Vec<plan::Measure>) -> Formula {
+        let text = one_line(self.loaded.files.slice(self.system.span(whole)));
+        let own = self.own_unit(value);
+        let seconds = Unit::parse("s").expect("the second is known");
+        let unit = match kind {
+            MeasureKind::Integral => Unit::si(self.dimension(whole)),
+            MeasureKind::Crossings => Unit::none(),
+            MeasureKind::Period | MeasureKind::Settling(_) | MeasureKind::First => seconds,
+            _ => own,
+        };
+        let at = self.want(value, None);
+        measures.push(plan::Measure { text, kind, slot: abi::Slot(at as u32), unit });
+        Formula::Measure(measures.len() - 1)
+    }
+
+    fn measured(&self, id: ExprId) -> bool {
+        let node = self.system.node(id);
+        matches!(node, Node::Measure(..)) || node.operands().any(|operand| self.measured(operand))
+    }
+}
+
+fn compare(op: BinaryOp, a: Formula, b: Formula) -> Formula {
+    let (a, b) = (Box::new(a), Box::new(b));
+    match op {
+        BinaryOp::Less => Formula::Less(a, b),
+        BinaryOp::LessEqual => Formula::LessEqual(a, b),
+        BinaryOp::Greater => Formula::Greater(a, b),
+        BinaryOp::GreaterEqual => Formula::GreaterEqual(a, b),
+        BinaryOp::NotEqual => Formula::Not(Box::new(equal(a, b))),
+        _ => equal(a, b),
+    }
+}
+
+fn equal(a: Box<Formula>, b: Box<Formula>) -> Formula {
+    Formula::Near { value: a, target: b, tolerance: Box::new(Formula::Number(0.0)), relative: false }
+}

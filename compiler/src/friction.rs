@@ -1,0 +1,336 @@
+//! The physics of a model that fits `Friction`: does it jump at rest, does it hold, does it dissipate?
+//!
+//! In: a model on its own. Out: warnings, and a [`Verdict`] for those who ask. The model's own functions are evaluated
+//! by the reference interpreter on a fixed grid, so the work is bounded and the answer the same everywhere.
+
+use crate::derive;
+use crate::ir::Func;
+use crate::ir::build::{Build, Env};
+use crate::ir::expr::Shared;
+use crate::lower::{Lowered, Wanted, lower};
+use crate::program::Program;
+use crate::source::Files;
+use crate::system::*;
+use crate::units::{Types, three_digits};
+use abi::description::Slot;
+use abi::unit::{Dimension, Unit};
+use grammar::diagnostic::Diagnostic;
+
+/// What is known of the dissipation of a model.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Verdict {
+    /// No counterexample among so many points.
+    Holds(usize),
+    /// Power is given out at this point.
+    Fails(Counterexample),
+    /// A model with states needs a `storage` to say.
+    NotChecked,
+}
+
+/// Where a model gives out power.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Counterexample {
+    /// Velocity, SI.
+    pub v: f64,
+    /// Continuous states, SI, in the order of the layout.
+    pub states: Vec<f64>,
+    /// Friction force, SI.
+    pub force: f64,
+}
+
+const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
+const FORCE: Dimension = Dimension::of([1, 1, -2, 0, 0]);
+/// A velocity at which every regularised sign is still next to nothing, m/s.
+const CRAWL: f64 = 1e-15;
+
+/// The ports of a friction model on its own.
+struct Contact {
+    v: VarId,
+    force: VarId,
+    external: Option<VarId>,
+}
+
+fn contact(system: &System, types: &Types) -> Option<Contact> {
+    let port = |name: &str, kind: VarKind, dimension: Dimension| {
+        system.var_ids().find(|id| {
+            let var = system.var(*id);
+            var.instance == InstanceId(0)
+                && var.name == name
+                && var.kind == kind
+                && types.units[id.0 as usize].dimension == dimension
+        })
+    };
+    let (v, force) = (port("v", VarKind::Input, VELOCITY)?, port("F", VarKind::Output, FORCE)?);
+    Some(Contact { v, force, external: port("F_ext", VarKind::Input, FORCE) })
+}
+
+/// A model that can be evaluated at points.
+struct Bench {
+    program: Program,
+    outputs: Func,
+    start: Func,
+    v: Slot,
+    external: Option<Slot>,
+    force: Slot,
+    /// Writes dV/dt into the first slot of the jacobian, if there is a `storage` and a state.
+    flow: Option<Func>,
+    block: Vec<f64>,
+}
+
+impl Bench {
+    fn new(system: &System, types: &Types, contact: &Contact) -> Option<Bench> {
+        // Every open parameter must have a value, every other input too.
+        let open = system.var_ids().any(|id| {
+            let var = system.var(id);
+            matches!(var.definition, Definition::Free | Definition::Missing)
+                && id != contact.v
+                && Some(id) != contact.external
+        });
+        if open {
+            return None;
+        }
+        let energy = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0));
+        let wanted: Vec<Wanted> =
+            energy.map(|(_, expr)| Wanted { expr: *expr, text: "storage".into(), unit: None }).into_iter().collect();
+        let Lowered { program, observed } = lower(system, types, &wanted);
+        let flow = observed.first().and_then(|energy| energy_flow(&program, *energy));
+        let slot = |id: VarId| program.description.quantity(&system.var(id).path).map(|quantity| quantity.slot);
+        let (v, force) = (slot(contact.v)?, slot(contact.force)?);
+        let external = contact.external.and_then(slot);
+        let outputs = crate::math::expand(&program.outputs);
+        let start = crate::math::expand(&program.start);
+        let mut block = vec![0.0; program.description.layout.size()];
+        block[program.description.layout.params.range()].copy_from_slice(&program.params);
+        Some(Bench { program, outputs, start, v, external, force, flow, block })
+    }
+
+    fn run(&mut self, func: &Func) {
+        crate::backend::interp::run_once(func, &mut self.block, &self.program.description.pool);
+    }
+
+    /// The force at this velocity, from the states it starts in.
+    fn force_at(&mut self, v: f64, external: f64) -> f64 {
+        self.block[self.v.index()] = v;
+        if let Some(slot) = self.external {
+            self.block[slot.index()] = external;
+        }
+        let (start, outputs) = (self.start.clone(), self.outputs.clone());
+        self.run(&start);
+        self.run(&outputs);
+        self.block[self.force.index()]
+    }
+}
+
+/// Warnings of a friction model; nothing for other models.
+pub fn check(system: &System, types: &Types, files: &Files, found: &mut Vec<Diagnostic>) {
+    let Some(contact) = contact(system, types) else { return };
+    let Some(mut bench) = Bench::new(system, types, &contact) else { return };
+    let force = system.var(contact.force);
+    let memory = !system.automata.is_empty()
+        || system.vars.iter().any(|var| !matches!(var.definition, Definition::Value(..) | Definition::Free));
+    if !memory && contact.external.is_none() {
+        let (plus, minus) = (bench.force_at(CRAWL, 0.0), bench.force_at(-CRAWL, 0.0));
+        let scale = bench.force_at(1.0, 0.0).abs().max(f64::MIN_POSITIVE);
+        if (plus - minus).abs() > 1e-3 * scale {
+            let text = format!("from {} N to {} N at v = 0", three_digits(minus), three_digits(plus));
+            let warning = Diagnostic::warning("W0701", "this friction force jumps at rest")
+                .label(force.span, text)
+                .help("in a loop that comes to rest it will chatter: use KFM or Karnopp there, or a smooth sign,\n`tanh(v / v0)`. For a static map: `allow jumps \"...\"`");
+            found.push(warning);
+        } else if plus.abs() <= 1e-3 * scale {
+            creep(system, &mut bench, force, found);
+        }
+    }
+    if let Verdict::Fails(point) = dissipation_of(system, &contact, &mut bench) {
+        found.push(pushes(system, types, files, force, &bench, &point));
+    }
+}
+
+/// The load that a contact without stiction gives way to, and how fast.
+fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagnostic>) {
+    let coulomb = system
+        .var_ids()
+        .find(|id| system.var(*id).name == "Fc" && system.var(*id).instance == InstanceId(0))
+        .and_then(|id| bench.program.description.quantity(&system.var(id).path))
+        .map(|quantity| bench.block[quantity.slot.index()])
+        .filter(|value| *value > 0.0);
+    let largest = (-60..=10).map(|k| bench.force_at(decade(k, 10), 0.0)).fold(0.0, f64::max);
+    if largest <= 0.0 {
+        return; // No friction at all: nothing that could hold.
+    }
+    let load = 0.5 * coulomb.unwrap_or(largest);
+    // The least speed at which the force reaches the load: bracketed by a grid, then halved.
+    let Some(k) = (-90..=20).find(|k| bench.force_at(decade(*k, 10), 0.0) >= load) else { return };
+    let (mut low, mut high) = (decade(k - 1, 10), decade(k, 10));
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if bench.force_at(middle, 0.0) >= load { high = middle } else { low = middle }
+    }
+    let warning = Diagnostic::warning("W0702", "this friction model cannot hold a load")
+        .label(force.span, format!("{} N moves it at {}", three_digits(load), speed(high)))
+        .help("at rest it carries nothing: use KFM, Karnopp or a model with a bristle to hold a load.\nTo keep it: `allow creep \"...\"`");
+    found.push(warning);
+}
+
+/// 10^(k/n), from a table of exact powers and roots so that it is the same everywhere.
+fn decade(k: i32, n: i32) -> f64 {
+    let whole = k.div_euclid(n);
+    let part = f64::from(k.rem_euclid(n)) / f64::from(n);
+    // exp(part · ln 10) by its series: exact enough for a grid, and the same on every machine.
+    let x = part * std::f64::consts::LN_10;
+    let (mut term, mut sum) = (1.0, 1.0);
+    for i in 1..40 {
+        term *= x / f64::from(i);
+        sum += term;
+    }
+    (0..whole.abs()).fold(sum, |value, _| if whole > 0 { value * 10.0 } else { value / 10.0 })
+}
+
+/// A speed with a handy prefix.
+fn speed(v: f64) -> String {
+    let (scale, unit) = match v.abs() {
+        x if x < 1e-6 => (1e-9, "nm/s"),
+        x if x < 1e-3 => (1e-6, "um/s"),
+        x if x < 1.0 => (1e-3, "mm/s"),
+        _ => (1.0, "m/s"),
+    };
+    format!("{} {unit}", three_digits(v / scale))
+}
+
+/// Whether a friction model on its own dissipates: F v − dV/dt ≥ 0, and F v ≥ min(0, F_ext v) with an external force.
+pub fn dissipation(system: &System, types: &Types) -> Option<Verdict> {
+    let contact = contact(system, types)?;
+    let mut bench = Bench::new(system, types, &contact)?;
+    Some(dissipation_of(system, &contact, &mut bench))
+}
+
+fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
+    let layout = bench.program.description.layout.clone();
+    let n = layout.states.len as usize;
+    let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
+    if n > 0 && storage.is_none() || !system.blocks.is_empty() {
+        return Verdict::NotChecked;
+    }
+    let flow = bench.flow.clone();
+    // States at the ends of their ranges, at rest and half-way; those without a range where they start.
+    let mut choices: Vec<Vec<f64>> = Vec::new();
+    for k in 0..n {
+        let slot = layout.states.slot(k);
+        let range = bench.program.description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
+        choices.push(match range {
+            Some((low, high)) if low.is_finite() && high.is_finite() => {
+                vec![low, high, 0.0_f64.clamp(low, high), 0.5 * low, 0.5 * high]
+            }
+            _ => return Verdict::NotChecked,
+        });
+    }
+    let regimes: usize = system.automata.iter().map(|automaton| automaton.regimes.len()).product();
+    if n > 4 || regimes > 1 {
+        return Verdict::NotChecked;
+    }
+    let corners: usize = choices.iter().map(Vec::len).product();
+    let externals: &[f64] = if contact.external.is_some() { &[0.0, 0.3, -0.3, 1.0, -1.0, 3.0, -3.0, 10.0, -10.0] } else { &[0.0] };
+    let mut points = 0;
+    // Powers of ten first, so that a counterexample has a round velocity; then the grid between them.
+    let speeds = (-6..=1).map(|k| decade(k, 1)).chain((-60..=10).map(|k| decade(k, 10)));
+    for v in speeds.flat_map(|v| [v, -v]) {
+        for &external in externals {
+            for corner in 0..corners {
+                let mut rest = corner;
+                let states: Vec<f64> = choices
+                    .iter()
+                    .map(|choice| {
+                        let value = choice[rest % choice.len()];
+                        rest /= choice.len();
+                        value
+                    })
+                    .collect();
+                bench.force_at(v, external);
+                bench.block[layout.states.range()].copy_from_slice(&states);
+                let outputs = bench.outputs.clone();
+                bench.run(&outputs);
+                let force = bench.block[bench.force.index()];
+                let rise = match &flow {
+                    Some(flow) => {
+                        bench.run(flow);
+                        bench.block[layout.jacobian.start as usize]
+                    }
+                    None => 0.0,
+                };
+                let given = if contact.external.is_some() { (external * v).min(0.0) } else { 0.0 };
+                let lost = force * v - rise - given;
+                let scale = (force * v).abs() + rise.abs();
+                points += 1;
+                if lost < -1e-9 * scale {
+                    return Verdict::Fails(Counterexample { v, states, force });
+                }
+            }
+        }
+    }
+    Verdict::Holds(points)
+}
+
+/// dV/dt = Σ ∂V/∂x · dx/dt, where V is the output in slot `energy`; none without states.
+fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
+    let layout = &program.description.layout;
+    let n = layout.states.len as usize;
+    if n == 0 || layout.jacobian.len == 0 {
+        return None;
+    }
+    let states: Vec<Slot> = (0..n).map(|k| layout.states.slot(k)).collect();
+    let build = Shared::new(Build::new("energy flow"));
+    let gradients = derive::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let mut build = build.into_inner();
+    let mut env = Env::new();
+    build.inline(&program.derivatives, &mut env);
+    let mut flow = build.real(0.0);
+    for k in 0..n {
+        let Some(slope) = gradients.get(&energy).and_then(|gradient| derive::entry(gradient, k as u32)) else { continue };
+        let term = build.mul(slope, env[&layout.derivatives.slot(k)]);
+        flow = build.add(flow, term);
+    }
+    build.store(layout.jacobian.slot(0), flow);
+    Some(crate::math::expand(&build.finish()))
+}
+
+fn pushes(
+    system: &System,
+    types: &Types,
+    files: &Files,
+    force: &Var,
+    bench: &Bench,
+    point: &Counterexample,
+) -> Diagnostic {
+    let states = system.var_ids().filter(|id| matches!(system.var(*id).definition, Definition::Continuous { .. }));
+    let mut at = vec![format!("v = {} m/s", three_digits(point.v))];
+    for (id, value) in states.zip(&point.states) {
+        let unit = &types.units[id.0 as usize];
+        at.push(format!("{} = {} {}", system.var(id).name, three_digits(unit.from_si(*value)), plain(unit)));
+    }
+    let force_text = format!("F = {} N", three_digits(point.force));
+    let mut warning = Diagnostic::warning("W0703", "this friction model can push: it is not dissipative")
+        .label(force.span, format!("at {}: {force_text}, so it drives the motion", at.join(", ")));
+    if let Some((_, energy)) = system.storages.first() {
+        warning = warning.label(system.span(*energy), "and gives out more than it has stored");
+    }
+    let value = |name: &str| {
+        let quantity = bench.program.description.quantity(name)?;
+        Some(bench.block[quantity.slot.index()])
+    };
+    let keep = "To keep it: `allow not-dissipative \"...\"`";
+    let _ = files;
+    match (value("sigma1"), value("sigma2"), value("Fs"), value("Fc")) {
+        (Some(sigma1), Some(_), Some(fs), Some(fc)) if fc > 0.0 => {
+            let needed = three_digits(sigma1 * (fs - fc) / fc);
+            warning.help(format!(
+                "holds when sigma2 >= sigma1*(Fs - Fc)/Fc ({needed} N·s/m for these values), or let sigma1 fade\nwith speed, as LuGre does for vd = 10 mm/s. {keep}"
+            ))
+        }
+        _ => warning.help(keep),
+    }
+}
+
+/// A unit in letters that a text can hold.
+fn plain(unit: &Unit) -> String {
+    unit.to_string().replace('µ', "u")
+}

@@ -1,0 +1,122 @@
+//! What deserves a look in a model that compiles: names that nothing reads, regimes that nothing reaches, and the
+//! physics of friction. Each has a name and can be silenced by `allow NAME "reason"`.
+
+use crate::domains::Prover;
+use crate::friction;
+use crate::source::Files;
+use crate::system::*;
+use crate::units::Types;
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+
+/// Name and code of every lint.
+pub const LINTS: &[(&str, &str)] = &[
+    ("unused", "W0201"),
+    ("angle", "W0107"),
+    ("dead-regime", "W0311"),
+    ("dead-transition", "W0312"),
+    ("jumps", "W0701"),
+    ("creep", "W0702"),
+    ("not-dissipative", "W0703"),
+    ("large-step", "W0704"),
+    ("chatter", "W0705"),
+    ("emulation-limit", "W0801"),
+    ("coarse-encoder", "W0802"),
+    ("coarse-speed", "W0803"),
+    ("coarse-torque", "W0804"),
+    ("bus-load", "W0805"),
+    ("dbc-unit", "W0806"),
+    ("no-drive-timeout", "W0807"),
+];
+
+/// All warnings of a model on its own.
+pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
+    let mut found = Vec::new();
+    unused(system, &mut found);
+    regimes(system, files, &mut found);
+    friction::check(system, types, files, &mut found);
+    found
+}
+
+/// Takes out warnings that the model allows.
+pub fn silence(system: &System, diagnostics: &mut Vec<Diagnostic>) {
+    let Some(top) = system.instances.first() else { return };
+    let allowed: Vec<&str> = LINTS
+        .iter()
+        .filter(|(name, _)| top.allows.iter().any(|allow| allow == name))
+        .map(|(_, code)| *code)
+        .collect();
+    diagnostics.retain(|diagnostic| diagnostic.is_error() || !allowed.contains(&diagnostic.code));
+}
+
+fn unused(system: &System, found: &mut Vec<Diagnostic>) {
+    let mut read = vec![false; system.vars.len()];
+    for node in &system.nodes {
+        match node {
+            Node::Var(var) | Node::Rate(var) | Node::PathRate(var) => read[var.0 as usize] = true,
+            _ => {}
+        }
+    }
+    for (var, read) in system.vars.iter().zip(read) {
+        let private = matches!(var.kind, VarKind::Param | VarKind::Input | VarKind::Let);
+        if read || !private || var.instance != InstanceId(0) {
+            continue;
+        }
+        let word = var.kind.word();
+        let warning = Diagnostic::warning("W0201", format!("{word} `{}` is never read", var.name))
+            .label(var.span, "declared, but nothing uses it")
+            .help(format!("use it or remove it; to keep it: `allow unused \"...\"`"));
+        found.push(warning);
+    }
+}
+
+fn regimes(system: &System, files: &Files, found: &mut Vec<Diagnostic>) {
+    let mut prover = Prover::new(system);
+    for automaton in system.automata.iter().filter(|automaton| automaton.instance == InstanceId(0)) {
+        let mut reached = vec![false; automaton.regimes.len()];
+        let mut stack = vec![automaton.initial as usize];
+        while let Some(k) = stack.pop() {
+            if !std::mem::replace(&mut reached[k], true) {
+                stack.extend(automaton.regimes[k].transitions.iter().map(|transition| transition.target as usize));
+            }
+        }
+        for (regime, reached) in automaton.regimes.iter().zip(reached) {
+            if !reached {
+                let warning = Diagnostic::warning("W0311", format!("no path leads to regime `{}`", regime.name))
+                    .label(regime.span, "never active")
+                    .help(format!("add `go {} when …` to another regime, or remove it", regime.name));
+                found.push(warning);
+                continue;
+            }
+            for transition in &regime.transitions {
+                if never(system, &mut prover, transition.condition) {
+                    let text = files.slice(system.span(transition.condition)).to_string();
+                    let warning = Diagnostic::warning("W0312", format!("`{text}` can never hold"))
+                        .label(transition.span, "this transition is never taken")
+                        .help("check the sign and the ranges of what is compared");
+                    found.push(warning);
+                }
+            }
+        }
+    }
+}
+
+/// Whether a condition is false for all values within the declared ranges.
+fn never(system: &System, prover: &mut Prover, id: ExprId) -> bool {
+    match system.node(id) {
+        Node::Bool(truth) => !truth,
+        Node::Binary(BinaryOp::And, a, b) => never(system, prover, *a) || never(system, prover, *b),
+        Node::Binary(BinaryOp::Or, a, b) => never(system, prover, *a) && never(system, prover, *b),
+        Node::Binary(op, a, b) => {
+            let (a, b) = (prover.interval(*a), prover.interval(*b));
+            match op {
+                BinaryOp::Less => a.low >= b.high,
+                BinaryOp::LessEqual => a.low > b.high,
+                BinaryOp::Greater => a.high <= b.low,
+                BinaryOp::GreaterEqual => a.high < b.low,
+                _ => false,
+            }
+        }
+        _ => false,
+    }
+}

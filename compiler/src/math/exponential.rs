@@ -1,0 +1,138 @@
+//! exp, expm1, sinh, cosh, tanh.
+//!
+//! One reduction for all: x = k ln2/64 + r with |r| ≤ ln2/128, and e^x = 2^(k/64) e^r with 2^(k/64) from a table of
+//! 64 numbers and e^r − 1 a polynomial of degree 5.
+
+use super::{polynomial, tables, two_sum};
+use crate::ir::expr::{Int, Real};
+
+/// (e^r − 1 − r)/r² on |r| ≤ ln2/128; error 2^-59.4 of e^r.
+const EXP: [f64; 4] = [0.49999999999948563, 0.16666666666654179, 0.04166672336772232, 0.008333343410773145];
+/// The same with relative error 2^-62.2 of e^r − 1.
+const EXP_LONG: [f64; 5] = [0.5, 0.16666666666659316, 0.04166666666664381, 0.00833334143428054, 0.0013888902912655746];
+/// 64/ln2
+const STEPS: f64 = 92.33248261689366;
+/// ln2/64: its first 38 bits, so that k times it taken from x is exact; and the rest.
+const STEP: (f64, f64) = (0.010830424696223417, 2.572804622327669e-14);
+/// Added to a number below 2^51, it rounds it to a whole number, which the low bits then hold.
+pub const ROUND: f64 = 6755399441055744.0;
+
+/// e^x = scale · (1 + r + tail + r² q)
+#[derive(Clone, Copy)]
+pub struct Parts<'a> {
+    /// Bits of 2^(k/64); out of the range of normal numbers they wrap.
+    scale: Int<'a>,
+    r: Real<'a>,
+    tail: Real<'a>,
+    q: Real<'a>,
+}
+
+impl<'a> Parts<'a> {
+    /// Of x, finite and |x| < 1e6; of NaN, `r` and `q` are NaN.
+    fn of(x: Real<'a>) -> Parts<'a> {
+        let (parts, ..) = Parts::reduced(x);
+        Parts { q: polynomial(parts.r, &EXP), ..parts }
+    }
+
+    /// Of x + `more`, a small number, with the rounding error of r in the tail.
+    pub fn exact(x: Real<'a>, more: Option<Real<'a>>) -> Parts<'a> {
+        let (mut parts, k, high) = Parts::reduced(x);
+        let first = parts.r;
+        parts.tail = parts.tail + k.fma(-STEP.1, high - first);
+        if let Some(more) = more {
+            parts.r = first + more;
+            parts.tail = parts.tail + ((first - parts.r) + more);
+        }
+        Parts { q: polynomial(parts.r, &EXP_LONG), ..parts }
+    }
+
+    /// All but q; k, and x − k ln2/64 for the first 38 bits of ln2/64.
+    fn reduced(x: Real<'a>) -> (Parts<'a>, Real<'a>, Real<'a>) {
+        let rounded = x.fma(STEPS, ROUND);
+        let (k, bits) = (rounded - ROUND, rounded.bits());
+        let high = k.fma(-STEP.0, x);
+        let r = k.fma(-STEP.1, high);
+        let index = bits & i64::from(tables::EXP_LEN - 1);
+        let scale = index.entry(tables::EXP_SCALE, tables::EXP_LEN).bits() + (bits << 46);
+        let tail = index.entry(tables::EXP_TAIL, tables::EXP_LEN);
+        (Parts { scale, r, tail, q: r }, k, high)
+    }
+
+    /// e^x where 2^(k/64) is normal.
+    fn normal(self) -> Real<'a> {
+        let scale = self.scale.real_of_bits();
+        scale.fma((self.r * self.r).fma(self.q, self.r + self.tail), scale)
+    }
+
+    /// e^x · 2^`doublings` for any x, −1 ≤ `doublings` ≤ 0.
+    pub fn scaled(self, x: Real<'a>, doublings: i64) -> Real<'a> {
+        let scale = self.scale + (doublings << 52);
+        let normal = Parts { scale, ..self }.normal();
+        // Near overflow and underflow the scale is taken nearer to 1 and the rest multiplied afterwards.
+        let large = x.above(0.0);
+        let nearer = scale + large.choose_int(-1009 << 52, 1022 << 52);
+        let rest = large.choose(2f64.powi(1009), 2f64.powi(-1022));
+        let edge = Parts { scale: nearer, ..self }.normal() * rest;
+        let beyond = x.above(745.0).choose(f64::INFINITY, x.below(-746.0).choose(0.0, edge));
+        x.abs().below(707.0).choose(normal, beyond)
+    }
+
+    /// e^x − 1 as high and low part, for −50 < x < 700.
+    fn less_one(self) -> (Real<'a>, Real<'a>) {
+        let scale = self.scale.real_of_bits();
+        let whole = scale - 1.0;
+        let lost = scale - (whole + 1.0);
+        let low = (self.r * self.r).fma(self.q, self.tail);
+        let p = self.r + low;
+        let p_low = (self.r - p) + low;
+        let part = scale * p;
+        let part_low = scale.fma(p, -part);
+        let high = whole + part;
+        (high, ((whole - high) + part) + (part_low + scale.fma(p_low, lost)))
+    }
+}
+
+/// Within 0.52 ulp where the result is normal.
+pub fn exp(x: Real) -> Real {
+    Parts::of(x).scaled(x, 0)
+}
+
+/// e^x − 1, within 1 ulp.
+pub fn expm1(x: Real) -> Real {
+    let (high, low) = Parts::exact(x, None).less_one();
+    let large = x.above(700.0).choose(exp(x), x.below(-50.0).choose(-1.0, high + low));
+    x.abs().below(2f64.powi(-54)).choose(x, large)
+}
+
+/// (e^a − e^−a)/2 of a = |x|, by t + t/(t + 1) with t = e^a − 1, which loses nothing near 0. Within 2 ulp.
+pub fn sinh(x: Real) -> Real {
+    let a = x.abs();
+    let (t, low) = Parts::exact(a, None).less_one();
+    let t = t + low;
+    let near = 0.5 * (t + t / (t + 1.0));
+    let size = a.above(40.0).choose(Parts::of(a).scaled(a, -1), near);
+    let odd = x.below(0.0).choose(-size, size);
+    a.below(2f64.powi(-28)).choose(x, odd)
+}
+
+/// e^a/2 + 1/(4 · e^a/2) of a = |x|. Within 1 ulp.
+pub fn cosh(x: Real) -> Real {
+    let a = x.abs();
+    let half = Parts::of(a).scaled(a, -1);
+    half + 0.25 / half
+}
+
+/// t/(t + 2) with t = e^(2a) − 1 of a = |x|, as high and low parts, the quotient corrected once.
+/// Within 0.6 ulp.
+pub fn tanh(x: Real) -> Real {
+    // From 20 on it is 1.
+    let a = x.abs().at_most(20.0);
+    let (t, t_low) = Parts::exact(a + a, None).less_one();
+    let (sum, sum_low) = two_sum(t, t.constant(2.0));
+    let inverse = 1.0 / sum;
+    let q = t * inverse;
+    let rest = (-q).fma(sum, t) + (-q).fma(sum_low + t_low, t_low);
+    let size = inverse.fma(rest, q);
+    let odd = x.below(0.0).choose(-size, size);
+    a.below(2f64.powi(-28)).choose(x, odd)
+}

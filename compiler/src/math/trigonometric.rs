@@ -1,0 +1,181 @@
+//! sin, cos, tan, and their inverses.
+
+use super::exponential::ROUND;
+use super::{polynomial, tables, two_sum};
+use crate::ir::expr::{Int, Real};
+
+/// (sin r − r)/r³ in r² on |r| ≤ π/4; relative error 2^-58.0 of the sine.
+const SIN: [f64; 6] = [
+    -0.16666666666666632,
+    0.008333333333322318,
+    -0.0001984126982972735,
+    2.7557313662832506e-06,
+    -2.50507533903876e-08,
+    1.5896512486086446e-10,
+];
+/// (cos r − 1 + r²/2)/r⁴ in r² on |r| ≤ π/4; error 2^-64.2 of the cosine.
+const COS: [f64; 6] = [
+    0.0416666666666666,
+    -0.0013888888888874114,
+    2.480158728946166e-05,
+    -2.7557314343241703e-07,
+    2.0875721684238954e-09,
+    -1.135954999442831e-11,
+];
+/// (atan t − t)/t³ in t² on |t| ≤ 7/16; relative error 2^-57.7 of the arctangent.
+const ATAN: [f64; 11] = [
+    -0.3333333333333292,
+    0.19999999999873957,
+    -0.14285714272271133,
+    0.11111110394805558,
+    -0.09090886852197246,
+    0.07691871617802067,
+    -0.06661025384461196,
+    0.058332523517626356,
+    -0.04975570106299553,
+    0.03650125657223734,
+    -0.016255564130286195,
+];
+/// (asin x − x)/x³ in x² on |x| ≤ 1/2; relative error 2^-55.9 of the arcsine.
+const ASIN: [f64; 12] = [
+    0.16666666666665383,
+    0.07500000000343059,
+    0.04464285682347297,
+    0.030381959331552265,
+    0.022371753518239584,
+    0.017359771156640797,
+    0.013884598174538984,
+    0.012173280392799059,
+    0.0065108511397473316,
+    0.01957390741948599,
+    -0.01629407005424309,
+    0.03195896028358816,
+];
+/// π/2 in three parts.
+const HALF_PI: [f64; 3] = [std::f64::consts::FRAC_PI_2, 6.123233995736766e-17, -1.4973849048591698e-33];
+/// Up to here the reduction is exact to 2^-110; beyond, sin is 0 and cos is 1.
+const LIMIT: f64 = 1099511627776.0;
+
+/// Sine and cosine of r in ±π/4 with x = q π/2 + r.
+struct Reduced<'a> {
+    quarters: Int<'a>,
+    sin: Real<'a>,
+    cos: Real<'a>,
+}
+
+impl<'a> Reduced<'a> {
+    fn of(x: Real<'a>) -> Reduced<'a> {
+        let rounded = x.fma(std::f64::consts::FRAC_2_PI, ROUND);
+        let (k, quarters) = (rounded - ROUND, rounded.bits());
+        // Exact: k · π/2 is a multiple of 2^-52 and so is what it leaves, which is less than 1.
+        let first = k.fma(-HALF_PI[0], x);
+        let product = k * HALF_PI[1];
+        let product_low = k.fma(HALF_PI[1], -product);
+        let (r, rest) = two_sum(first, -product);
+        let low = k.fma(-HALF_PI[2], rest - product_low);
+        let z = r * r;
+        let half = 0.5 * z;
+        let one_less_half = 1.0 - half;
+        let sin = r + (z * r).fma(polynomial(z, &SIN), low * one_less_half);
+        let cos = one_less_half + (((1.0 - one_less_half) - half) + (z * z).fma(polynomial(z, &COS), (-r) * low));
+        Reduced { quarters, sin, cos }
+    }
+
+    /// Whether an odd number of quarters.
+    fn odd(&self) -> crate::ir::expr::Truth<'a> {
+        (self.quarters & 1).is(1)
+    }
+}
+
+/// Within 0.8 ulp up to 1e12; beyond, 0.
+pub fn sin(x: Real) -> Real {
+    let reduced = Reduced::of(x);
+    let size = reduced.odd().choose(reduced.cos, reduced.sin);
+    let value = (reduced.quarters & 2).is(2).choose(-size, size);
+    let near = x.abs().below(2f64.powi(-27)).choose(x, value);
+    // 0 · x is NaN for infinite x.
+    x.abs().below(LIMIT).choose(near, 0.0 * x)
+}
+
+/// Within 0.8 ulp up to 1e12; beyond, 1.
+pub fn cos(x: Real) -> Real {
+    let reduced = Reduced::of(x);
+    let size = reduced.odd().choose(reduced.sin, reduced.cos);
+    let value = ((reduced.quarters + 1) & 2).is(2).choose(-size, size);
+    x.abs().below(LIMIT).choose(value, 0.0 * x + 1.0)
+}
+
+/// sin/cos, or −cos/sin in odd quarters. Within 2 ulp up to 1e12; beyond, 0.
+pub fn tan(x: Real) -> Real {
+    let reduced = Reduced::of(x);
+    let odd = reduced.odd();
+    let value = odd.choose(-reduced.cos, reduced.sin) / odd.choose(reduced.sin, reduced.cos);
+    let near = x.abs().below(2f64.powi(-27)).choose(x, value);
+    x.abs().below(LIMIT).choose(near, 0.0 * x)
+}
+
+/// asin s − s, in s + s z R(z) with z = s²; of |x| > 1/2 through s = √((1 − |x|)/2).
+fn asin_parts<'a>(x: Real<'a>) -> (Real<'a>, Real<'a>) {
+    let a = x.abs();
+    let near = a.below(0.5);
+    let z = near.choose(a * a, 0.5 * (1.0 - a));
+    let s = near.choose(a, z.sqrt());
+    (s, s * z * polynomial(z, &ASIN))
+}
+
+/// Within 2 ulp; of |x| > 1 it is NaN.
+pub fn asin(x: Real) -> Real {
+    let a = x.abs();
+    let (s, more) = asin_parts(x);
+    // π/2 − 2 s is exact or nearly so: first it, then what is small.
+    let far = (HALF_PI[0] - 2.0 * s) - (2.0 * more - HALF_PI[1]);
+    a.below(0.5).choose(s + more, far).with_sign(x)
+}
+
+/// Within 1.2 ulp; of |x| > 1 it is NaN.
+pub fn acos(x: Real) -> Real {
+    let (s, more) = asin_parts(x);
+    let (signed, signed_more) = (s.with_sign(x), x.below(0.0).choose(-more, more));
+    let near = HALF_PI[0] - (signed - (HALF_PI[1] - signed_more));
+    let double = 2.0 * (s + more);
+    let far = x.below(0.0).choose(2.0 * HALF_PI[0] - (double - 2.0 * HALF_PI[1]), double);
+    x.abs().below(0.5).choose(near, far)
+}
+
+/// atan(y/x) for y, x ≥ 0, neither both 0 nor both infinite: from the nearest c of five by the difference formula,
+/// atan(y/x) = atan c + atan t with c = b/a, t = (a y − b x)/(b y + a x), |t| ≤ 7/16.
+fn atan_quotient<'a>(y: Real<'a>, x: Real<'a>) -> Real<'a> {
+    let below = |c: f64, then: Int<'a>, index: i64| y.below(c * x).choose_int(index, then);
+    let last = y.below(39.0 / 16.0 * x).choose_int(3, 4);
+    let index = below(7.0 / 16.0, below(11.0 / 16.0, below(19.0 / 16.0, last, 2), 1), 0);
+    let entry = |base| index.entry(base, tables::ATAN_LEN);
+    let (a, b) = (entry(tables::ATAN_A), entry(tables::ATAN_B));
+    let t = a.fma(y, -(b * x)) / b.fma(y, a * x);
+    let z = t * t;
+    entry(tables::ATAN_HIGH) + (t + (t * z).fma(polynomial(z, &ATAN), entry(tables::ATAN_LOW)))
+}
+
+/// Within 0.9 ulp; ±π/2 at ±inf.
+pub fn atan(x: Real) -> Real {
+    // From 2^66 on it is π/2.
+    let a = x.abs().at_most(2f64.powi(66));
+    atan_quotient(a, a.constant(1.0)).with_sign(x)
+}
+
+/// The angle of the point (x, y), within 1.5 ulp and as IEEE 754 defines it at the edges.
+pub fn atan2<'a>(y: Real<'a>, x: Real<'a>) -> Real<'a> {
+    let (ay, ax) = (y.abs(), x.abs());
+    // Infinite ones become 1, and what is finite beside them 0.
+    let (iy, ix) = (ay.is(f64::INFINITY), ax.is(f64::INFINITY));
+    let (fy, fx) = (ix.choose(0.0, ay), iy.choose(0.0, ax));
+    let (fy, fx) = (iy.choose(1.0, fy), ix.choose(1.0, fx));
+    // Both large: their sum would overflow. Both tiny: their products would lose bits.
+    let large = fy.above(2f64.powi(1000)) | fx.above(2f64.powi(1000));
+    let tiny = fy.below(2f64.powi(-900)) & fx.below(2f64.powi(-900));
+    let scale = large.choose(0.25, tiny.choose(2f64.powi(120), 1.0));
+    let (fy, fx) = (fy * scale, fx * scale);
+    let quotient = fy.is(0.0).choose(0.0, atan_quotient(fy, fx));
+    let left = x.bits().below(0);
+    let angle = left.choose(2.0 * HALF_PI[0] - (quotient - 2.0 * HALF_PI[1]), quotient);
+    (x.is(x) & y.is(y)).choose(angle.with_sign(y), f64::NAN)
+}

@@ -1,0 +1,25 @@
+//! A lowered model: straight-line functions over one block, and what it says of itself.
+
+use crate::ir::Func;
+use abi::Description;
+
+/// The functions of a model before a fixed step is fused and before any back end sees them.
+#[derive(Clone, Debug, Default)]
+pub struct Program {
+    /// Quantities and layout. Its pool begins with the constants of the elementary functions.
+    pub description: Description,
+    /// Defaults of the parameters, SI, as many as the layout has.
+    pub params: Vec<f64>,
+    /// Initial values, and the blocks due at 0.
+    pub start: Func,
+    /// Outputs and observed quantities.
+    pub outputs: Func,
+    /// dx/dt.
+    pub derivatives: Func,
+    /// Sampled blocks, each if it is due.
+    pub tick: Option<Func>,
+    /// One transition per automaton, events, resets, and the memory of crossings.
+    pub transitions: Option<Func>,
+    /// Switching surfaces.
+    pub roots: Option<Func>,
+}

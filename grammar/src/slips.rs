@@ -1,0 +1,490 @@
+//! Recognises the commonest slips in a statement that could not be read, and says what was probably meant.
+//!
+//! In: the marks of one statement and where reading stopped. Out: one diagnostic in the words of the text. Knows
+//! nothing of rules; what would have fitted comes as words.
+
+use crate::diagnostic::Diagnostic;
+use crate::span::Span;
+use crate::split::{Piece, Source};
+use crate::tokens::{TokenKind, is_keyword};
+
+/// Where reading a piece stopped, and what would have fitted there, in words.
+pub(crate) struct Stop {
+    /// The mark that did not fit; the end of the piece if something is missing behind it.
+    pub at: usize,
+    pub expected: Vec<String>,
+}
+
+/// What is wrong with `piece`.
+pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
+    let finders = [character, head, operator, condition, branch, unit, bare_unit, reserved, neighbours, model_name];
+    finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
+}
+
+/// Brackets of `piece`: one that is not closed, or one too many. Braces are matched elsewhere.
+pub(crate) fn brackets(source: &Source, piece: Piece) -> Option<Diagnostic> {
+    let mut open: Vec<usize> = Vec::new();
+    for at in piece.start..piece.end {
+        if source.kind(at) != Some(TokenKind::Symbol) {
+            continue;
+        }
+        match source.word(at) {
+            "(" | "[" => open.push(at),
+            close @ (")" | "]") => {
+                let wanted = if close == ")" { "(" } else { "[" };
+                match open.pop() {
+                    Some(before) if source.word(before) == wanted => {}
+                    Some(before) => return Some(unclosed(source, before, at - 1)),
+                    None => {
+                        return Some(
+                            Diagnostic::error("E0002", format!("one `{close}` too many"))
+                                .label(source.span(at), format!("no `{wanted}` belongs to it"))
+                                .help(format!("remove it, or add `{wanted}` before it")),
+                        );
+                    }
+                }
+            }
+            _ => {}
+        }
+    }
+    open.last().map(|&before| unclosed(source, before, piece.end - 1))
+}
+
+fn unclosed(source: &Source, open: usize, last: usize) -> Diagnostic {
+    let (bracket, close) = if source.word(open) == "(" { ("(", ")") } else { ("[", "]") };
+    let called = open > 0 && source.glued(open) && source.kind(open - 1) == Some(TokenKind::Word);
+    let mut tail =
+        source.text[source.marks[open - called as usize].token.start..source.marks[last].token.end].to_string();
+    let help = if tail.len() > 40 || tail.contains('\n') {
+        format!("add `{close}`")
+    } else {
+        tail.push_str(close);
+        format!("add `{close}`, for example `{tail}`")
+    };
+    Diagnostic::error("E0002", format!("this `{bracket}` is not closed"))
+        .label(source.span(open), format!("no `{close}` belongs to it"))
+        .help(help)
+}
+
+/// How deep brackets and conditions lie in each other, and the first mark beyond `limit`.
+pub(crate) fn depth(source: &Source, piece: Piece, limit: usize) -> (usize, Option<usize>) {
+    // For each open bracket, how many conditions stand in it so far: each lies in the one before it.
+    let mut open = vec![0usize];
+    let (mut depth, mut deepest) = (0, 0);
+    for at in piece.start..piece.end {
+        match source.word(at) {
+            "(" | "[" | "{" => {
+                open.push(1);
+                depth += 1;
+            }
+            ")" | "]" | "}" if open.len() > 1 => depth -= open.pop().unwrap_or(0),
+            "if" => {
+                *open.last_mut().expect("the outermost stays") += 1;
+                depth += 1;
+            }
+            "," if open.len() > 1 => {
+                let ifs = open.last_mut().expect("the outermost stays");
+                depth -= *ifs - 1;
+                *ifs = 1;
+            }
+            _ => {}
+        }
+        deepest = deepest.max(depth);
+        if depth > limit {
+            return (depth, Some(at));
+        }
+    }
+    (deepest, None)
+}
+
+/// Whether `word` is one of the known units, perhaps with a prefix.
+pub(crate) fn is_unit(word: &str) -> bool {
+    const UNITS: [&str; 20] = [
+        "m", "g", "s", "A", "K", "N", "J", "W", "Pa", "V", "Ohm", "Ω", "Hz", "rad", "deg", "rev", "rpm", "bit", "min",
+        "h",
+    ];
+    const PREFIXES: [char; 8] = ['G', 'M', 'k', 'm', 'u', 'n', 'µ', 'μ'];
+    let known = |word: &str| UNITS.contains(&word);
+    matches!(word, "%" | "°" | "cm" | "Nm")
+        || known(word)
+        || word.strip_prefix(PREFIXES).is_some_and(|rest| known(rest) || rest == "Nm")
+}
+
+/// A character that the language does not have.
+fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = (piece.start..piece.end.min(stop.at + 1))
+        .rev()
+        .find(|&at| matches!(source.kind(at), Some(TokenKind::Unknown | TokenKind::OpenText)))?;
+    if source.kind(at) == Some(TokenKind::OpenText) {
+        return Some(
+            Diagnostic::error("E0002", "this text is not closed")
+                .label(source.span(at), "no `\"` before the end of the line")
+                .help("add `\"`"),
+        );
+    }
+    let found = source.word(at).chars().next()?;
+    let instead = match found {
+        '−' | '–' | '—' => "write `-`",
+        '×' | '⋅' | '∙' | '•' => "write `*`; between units `·`",
+        '·' => "between values write `*`; in a unit `·` has no blank around it",
+        '÷' => "write `/`",
+        '²' => "write `^2`",
+        '³' => "write `^3`",
+        '≤' => "write `<=`",
+        '≥' => "write `>=`",
+        '≠' => "write `!=`",
+        '&' => "write `and`",
+        '|' => "write `or`; for the magnitude `abs(x)`",
+        '!' => "write `not`",
+        '\'' => "a derivative is written `dz/dt`, text in double quotes `\"`",
+        '“' | '”' | '„' => "text stands in plain double quotes, `\"`",
+        '#' => "a comment begins with `//`",
+        '\u{a0}' | '\u{2009}' | '\u{202f}' | '\u{200b}' => "write a plain space",
+        _ if found.is_alphabetic() => "names are made of the letters a to z, digits and `_`: `sigma0`, `omega`",
+        _ => "remove it",
+    };
+    let hidden =
+        matches!(found, '\u{200b}'..='\u{200f}' | '\u{2028}'..='\u{202f}' | '\u{2060}'..='\u{206f}' | '\u{feff}');
+    let shown = if found.is_control() || found.is_whitespace() || hidden {
+        format!("the character U+{:04X}", found as u32)
+    } else {
+        format!("`{found}`")
+    };
+    Some(Diagnostic::error("E0001", format!("{shown} has no place here")).label(source.span(at), "").help(instead))
+}
+
+/// The first words: a declaration in another language's words, an assignment, a derivative in another form.
+fn head(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let first = piece.start;
+    let word = source.word(first);
+    let derivative = |of: &str| format!("write `d{of}/dt = ...`");
+    if source.kind(first) != Some(TokenKind::Word) {
+        return None;
+    }
+    let named = source.kind(first + 1) == Some(TokenKind::Word) && first + 1 < piece.end;
+    if named && !is_keyword(word) && stop.at <= first + 1 {
+        let right = match word {
+            "var" | "def" | "real" | "Real" | "float" | "double" | "auto" | "local" | "variable" | "signal" | "val" => {
+                "let"
+            }
+            "parameter" | "parameters" | "params" | "Parameter" => "param",
+            "constant" | "final" => "const",
+            "inputs" | "in" => "input",
+            "outputs" | "out" => "output",
+            "states" => "state",
+            "assert" | "requires" => "require",
+            "function" | "func" | "fun" => "fn",
+            "class" | "block" | "system" => "model",
+            "test" => "experiment",
+            "include" | "use" | "using" => "import",
+            "parts" | "component" => "part",
+            "case" | "regime" => "mode",
+            _ => "",
+        };
+        if !right.is_empty() {
+            return Some(
+                Diagnostic::error("E0001", format!("`{word}` begins no statement here"))
+                    .label(source.span(first), format!("expected `{right}`"))
+                    .help(format!("write `{right} {}`", source.word(first + 1))),
+            );
+        }
+    }
+    if let Some(at) = (first..piece.end).find(|&at| source.is_symbol(at, ":=")) {
+        return Some(
+            Diagnostic::error("E0001", "an equation is written with `=`")
+                .label(source.span(at), "")
+                .help(format!("write `{} = ...`", slice(source, first, at - 1))),
+        );
+    }
+    if source.is_symbol(first + 1, "==") && !is_keyword(word) {
+        return Some(
+            Diagnostic::error("E0001", "an equation is written with one `=`")
+                .label(source.span(first + 1), "compares two values")
+                .help(format!("write `{word} = ...`")),
+        );
+    }
+    if source.is_symbol(first + 1, "(") && source.is_symbol(first + 3, ")") && !is_keyword(word) {
+        let of = source.word(first + 2);
+        if matches!(word, "der" | "diff" | "ddt" | "dot" | "D") && source.kind(first + 2) == Some(TokenKind::Word) {
+            return Some(
+                Diagnostic::error("E0001", "a derivative is written as on paper")
+                    .label(source.span(first).to(source.span(first + 3)), "")
+                    .help(derivative(of)),
+            );
+        }
+    }
+    spaced_derivative(source, piece).map(|(span, of, along)| {
+        Diagnostic::error("E0003", "a derivative is written without spaces")
+            .label(span, "reads as a division")
+            .help(format!("write `{of}/{along} = ...`"))
+    })
+}
+
+/// `dz / dt =` at the start of a piece: its place and both words.
+pub(crate) fn spaced_derivative<'t>(source: &Source<'t>, piece: Piece) -> Option<(Span, &'t str, &'t str)> {
+    let first = piece.start;
+    let word = |at: usize| {
+        source.kind(at) == Some(TokenKind::Word) && source.word(at).len() > 1 && source.word(at).starts_with('d')
+    };
+    let shape = first + 3 < piece.end
+        && word(first)
+        && source.is_symbol(first + 1, "/")
+        && word(first + 2)
+        && source.is_symbol(first + 3, "=")
+        && !(source.glued(first + 1) && source.glued(first + 2));
+    shape.then(|| (source.span(first).to(source.span(first + 2)), source.word(first), source.word(first + 2)))
+}
+
+/// Operators of other languages.
+fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at >= piece.end {
+        return None;
+    }
+    let (before, here) = (if at > piece.start { source.word(at - 1) } else { "" }, source.word(at));
+    let instead = match (before, here) {
+        ("*", "*") => "a power is written `^`",
+        ("+", "-") | ("-", "-") | ("+", "+") | ("-", "+") => "write the second sign in parentheses, or leave it out",
+        (_, "+-") => "`+-` gives a tolerance in `expect`; to subtract write `-`",
+        (_, "~=") => "`~=` compares in `expect` only, with `+-`; `!=` means different",
+        ("not", "not") => "two `not` cancel: leave both out",
+        _ => return None,
+    };
+    Some(Diagnostic::error("E0001", format!("`{here}` does not fit here")).label(source.span(at), "").help(instead))
+}
+
+/// A unit with blanks: `2 N m`, `[N m]`.
+fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at <= piece.start || at >= piece.end {
+        return None;
+    }
+    let unit_word = |at: usize| at < piece.end && source.kind(at) == Some(TokenKind::Word) && is_unit(source.word(at));
+    let same_line = |at: usize| !source.marks[at].first_on_line;
+    let number = (piece.start..at).rev().find(|&mark| source.kind(mark) == Some(TokenKind::Number));
+    if let Some(number) = number.filter(|&number| number + 2 == at && source.kind(at - 1) == Some(TokenKind::Unit))
+        && unit_word(at)
+        && same_line(at)
+    {
+        let mut last = at;
+        while unit_word(last + 1) && same_line(last + 1) {
+            last += 1;
+        }
+        let (value, unit, stray) = (source.word(number), source.word(at - 1), source.word(at));
+        let rest: Vec<&str> = (at - 1..=last).map(|mark| source.word(mark)).collect();
+        return Some(
+                Diagnostic::error("E0110", "a unit is written without spaces")
+                    .label(
+                        source.span(at - 1).to(source.span(last)),
+                        format!("reads as {value} {unit}, followed by a stray name `{stray}`"),
+                    )
+                    .help(format!(
+                        "write `{value} {}` (or `{value} {}`). To multiply by a variable `{stray}`, write `{value} {unit} * {stray}`",
+                        rest.join("·"),
+                        rest.join("*"),
+                    )),
+            );
+    }
+    // In brackets: from the bracket to its end there are only unit words and signs between them.
+    let open = (piece.start..at + 1).rev().find(|&mark| source.is_symbol(mark, "["))?;
+    let close = (open..piece.end).find(|&mark| source.is_symbol(mark, "]"))?;
+    let inside: Vec<&str> = (open + 1..close).map(|mark| source.word(mark)).collect();
+    let sign = |word: &str| matches!(word, "·" | "*" | "/");
+    let units = inside.len() > 1
+        && inside.iter().all(|word| {
+            sign(word) || word.split(['·', '*', '/', '^']).all(|part| is_unit(part) || part.parse::<i32>().is_ok())
+        });
+    if !units || at > close {
+        return None;
+    }
+    let mut joined = String::new();
+    for word in inside {
+        if !joined.is_empty() && !sign(word) && !joined.ends_with(['·', '*', '/']) {
+            joined.push('·');
+        }
+        joined.push_str(word);
+    }
+    Some(
+        Diagnostic::error("E0110", "a unit is written without spaces")
+            .label(source.span(open + 1).to(source.span(close - 1)), "")
+            .help(format!("write `[{joined}]`")),
+    )
+}
+
+/// `=` where values are compared.
+fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at <= piece.start || at >= piece.end || !source.is_symbol(at, "=") {
+        return None;
+    }
+    let compares = matches!(source.word(piece.start), "require" | "when" | "go" | "expect" | "stop")
+        || (piece.start..at).any(|mark| source.is_word(mark, "if"));
+    if !compares {
+        return None;
+    }
+    let right = if at + 1 < piece.end { source.word(at + 1) } else { "..." };
+    Some(
+        Diagnostic::error("E0001", "a comparison is written `==`")
+            .label(source.span(at), "`=` defines")
+            .help(format!("write `{} == {right}`", operand_before(source, piece, at))),
+    )
+}
+
+/// `if` without `then` or `else`.
+fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let missing = ["then", "else"].into_iter().find(|word| stop.expected.contains(&format!("`{word}`")))?;
+    let condition = (piece.start..stop.at).rev().find(|&at| source.is_word(at, "if"))?;
+    // If the word comes later, something before it is wrong.
+    if (stop.at..piece.end).any(|at| source.is_word(at, missing)) {
+        return None;
+    }
+    let (message, help) = match missing {
+        "then" => ("`if` needs a `then`", "write `if c then a else b`"),
+        _ => ("`if` needs an `else`", "both cases have a value: add `else ...`"),
+    };
+    let end = source.span(stop.at.max(piece.start + 1) - 1);
+    Some(
+        Diagnostic::error("E0001", message)
+            .label(source.span(condition).to(end), format!("`{missing}` is missing behind this"))
+            .help(help),
+    )
+}
+
+/// A reserved word where a name should stand.
+fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at >= piece.end || source.kind(at) != Some(TokenKind::Word) || !is_keyword(source.word(at)) {
+        return None;
+    }
+    let word = source.word(at);
+    let named = stop.expected.iter().any(|expected| expected == "a name");
+    let value = stop.expected.iter().any(|expected| expected == "a value");
+    (named || value && !matches!(word, "then" | "else" | "in" | "and" | "or")).then(|| {
+        Diagnostic::error("E0001", format!("`{word}` is a word of the language"))
+            .label(source.span(at), if named { "expected a name" } else { "expected a value" })
+            .help(format!("as a name write for example `{word}_`"))
+    })
+}
+
+/// Two operands without an operator between them.
+fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at <= piece.start || at >= piece.end || !stop.expected.iter().any(|expected| expected == "an operator") {
+        return None;
+    }
+    let begins = match source.kind(at) {
+        Some(TokenKind::Word) => !is_keyword(source.word(at)),
+        Some(TokenKind::Number) => true,
+        Some(TokenKind::Symbol) => source.word(at) == "(",
+        _ => false,
+    };
+    if !begins || !source.ends_operand(at - 1) || source.kind(at - 1) == Some(TokenKind::Text) {
+        return None;
+    }
+    let left = operand_before(source, piece, at);
+    let right = match (source.word(at), source.is_symbol(at + 1, "(")) {
+        ("(", _) => "(...)".to_string(),
+        (word, true) if source.kind(at) == Some(TokenKind::Word) => format!("{word}(...)"),
+        (word, _) => word.to_string(),
+    };
+    Some(
+        Diagnostic::error("E0111", format!("an operator is missing before `{}`", source.word(at)))
+            .label(source.span(at), "")
+            .help(format!("to multiply write `{left} * {right}`")),
+    )
+}
+
+/// The unit of a declaration without its brackets: `input v m/s`.
+fn bare_unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at != piece.start + 2
+        || at >= piece.end
+        || !stop.expected.iter().any(|expected| expected == "a unit in brackets")
+    {
+        return None;
+    }
+    let first = if source.is_symbol(at, "(") { at + 1 } else { at };
+    let end = (first..piece.end).find(|&mark| {
+        !is_unit(source.word(mark)) && !matches!(source.word(mark), "/" | "*" | "·" | "^" | "1" | "2" | "3")
+    });
+    let end = end.unwrap_or(piece.end);
+    let close = if first > at && source.is_symbol(end, ")") { end } else { end - 1 };
+    (end > first && is_unit(source.word(first))).then(|| {
+        Diagnostic::error("E0001", "the unit of a declaration stands in brackets")
+            .label(source.span(at).to(source.span(close)), "")
+            .help(format!(
+                "write `{} [{}]`",
+                slice(source, piece.start, piece.start + 1),
+                slice(source, first, end - 1)
+            ))
+    })
+}
+
+/// The name of a model in small letters.
+fn model_name(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    if at >= piece.end || source.kind(at) != Some(TokenKind::Word) {
+        return None;
+    }
+    stop.expected.iter().find(|expected| *expected == CAPITAL)?;
+    let word = source.word(at).trim_start_matches('_');
+    let mut letters = word.chars();
+    let capital: String = letters.next().map(|c| c.to_ascii_uppercase()).into_iter().chain(letters).collect();
+    Some(
+        Diagnostic::error("E0001", "names of models, interfaces and devices begin with a capital letter")
+            .label(source.span(at), "")
+            .help(format!("write `{capital}`")),
+    )
+}
+
+/// What `expected` says for a name that begins with a capital letter.
+pub(crate) const CAPITAL: &str = "a name with a capital letter";
+
+/// No slip that we know: what stands there, and what would have fitted.
+fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
+    let mut expected = stop.expected.clone();
+    // Where an expression may go on, an operator is always possible; what matters is what may follow it.
+    if expected.len() > 1 {
+        expected.retain(|word| word != "an operator");
+    }
+    if expected.iter().any(|word| word == "a value") {
+        expected.retain(|word| !matches!(word.as_str(), "a name" | "`(`"));
+    }
+    for vague in ["the next statement", "a unit"] {
+        if expected.len() > 1 {
+            expected.retain(|word| word != vague);
+        }
+    }
+    let wanted = match expected.as_slice() {
+        [] => String::new(),
+        [one] => format!("expected {one}"),
+        _ if stop.at == piece.start => "expected a statement".to_string(),
+        [most @ .., last] if most.len() < 4 => format!("expected {} or {last}", most.join(", ")),
+        _ => String::new(),
+    };
+    if stop.at >= piece.end {
+        let message =
+            if wanted.is_empty() { "something is missing here".to_string() } else { format!("{wanted} here") };
+        return Diagnostic::error("E0001", message).label(source.span(piece.end - 1), "behind this");
+    }
+    let found = source.word(stop.at);
+    let shown: String = found.chars().take(30).collect();
+    Diagnostic::error("E0001", format!("`{shown}` does not fit here")).label(source.span(stop.at), wanted)
+}
+
+/// The operand that ends before `at`, if it is short enough to be shown.
+fn operand_before(source: &Source, piece: Piece, at: usize) -> String {
+    let last = at - 1;
+    let mut first = last;
+    if source.kind(last) == Some(TokenKind::Unit) && last > piece.start {
+        first = last - 1;
+    }
+    while first > piece.start + 1 && source.is_symbol(first - 1, ".") {
+        first -= 2;
+    }
+    if matches!(source.word(last), ")" | "]") { "(...)".to_string() } else { slice(source, first, last).to_string() }
+}
+
+fn slice<'t>(source: &Source<'t>, first: usize, last: usize) -> &'t str {
+    &source.text[source.marks[first].token.start..source.marks[last].token.end]
+}

@@ -1,0 +1,181 @@
+//! The canonical form of a text.
+
+use grammar::format::{canonical_unit, format};
+use grammar::parse::parse;
+use grammar::span::FileId;
+
+const SAMPLES: [(&str, &str); 11] = [
+    ("00", include_str!("data/00_interfaces.fric")),
+    ("01", include_str!("data/01_tustin.fric")),
+    ("02", include_str!("data/02_kfm.fric")),
+    ("03", include_str!("data/03_karnopp.fric")),
+    ("04", include_str!("data/04_bliman_sorine.fric")),
+    ("05", include_str!("data/05_lugre.fric")),
+    ("06", include_str!("data/06_lugre_observer.fric")),
+    ("07", include_str!("data/07_pid.fric")),
+    ("08", include_str!("data/08_servo_sil.fric")),
+    ("09", include_str!("data/09_rig_hil.fric")),
+    ("10", include_str!("data/10_gms.fric")),
+];
+
+/// Lines that their author laid out by hand: for them the canonical form differs.
+const BY_HAND: [&str; 11] = [
+    "  input  v [m/s]",
+    "  input  v  [m/s]",
+    "    go forward  when (F_ext >  Fs and v >= 0) or v >  v_hold or slip >  x_hold",
+    "    go backward when (F_ext < -Fs and v <= 0) or v < -v_hold or slip < -x_hold",
+    "  output stuck   = abs(v) < Dv",
+    "  output F [N]   = if stuck then clamp(F_ext + Fs / Dv * v, -Fs, Fs)",
+    "                   else Fc * sign(v) + Fv * v",
+    "  dxf/ds = ( f1 * sign(v) - xf) / (eta * eps_f)",
+    "  let    g  = stribeck(v, Fc, Fs, vs, 2)",
+    "  output v_out [m/s] = if stuck then 0 else v        /// the velocity, dead-banded",
+    "  let    e  = r - y",
+];
+
+#[test]
+fn samples_are_canonical_but_for_a_few_lines() {
+    let mut different = Vec::new();
+    for (name, text) in SAMPLES {
+        let formatted = format(text, 100).unwrap();
+        let pairs = text.lines().zip(formatted.lines()).filter(|(a, b)| a != b && !BY_HAND.contains(a));
+        different.extend(pairs.map(|(a, b)| format!("{name}\n  {a}\n  {b}")));
+        assert_eq!(text.lines().count(), formatted.lines().count());
+    }
+    assert_eq!(different, [""; 0], "{}", different.join("\n"));
+}
+
+#[track_caller]
+fn becomes(text: &str, wanted: &str) {
+    assert_eq!(format(text, 100).unwrap(), wanted);
+    keeps_its_tree(text, 100);
+}
+
+/// The tree without places, with canonical units.
+fn shape(text: &str) -> String {
+    let parsed = parse(FileId(0), text);
+    assert_eq!(parsed.diagnostics, [], "{text}");
+    let debug = format!("{:?}", parsed.file);
+    let mut shape = String::with_capacity(debug.len() / 2);
+    let mut rest = debug.as_str();
+    while let Some(at) = rest.find("Span { file") {
+        shape.push_str(&rest[..at]);
+        rest = &rest[at + rest[at..].find('}').unwrap() + 1..];
+    }
+    shape.push_str(rest);
+    let mut units = String::with_capacity(shape.len());
+    let mut rest = shape.as_str();
+    while let Some(at) = rest.find("UnitText { text: \"") {
+        let from = at + "UnitText { text: \"".len();
+        let to = from + rest[from..].find('"').unwrap();
+        units.push_str(&rest[..from]);
+        units.push_str(&canonical_unit(&rest[from..to]));
+        rest = &rest[to..];
+    }
+    units + rest
+}
+
+#[track_caller]
+fn keeps_its_tree(text: &str, width: usize) {
+    let once = format(text, width).unwrap();
+    assert_eq!(shape(text), shape(&once), "\n{text}\n{once}");
+    assert_eq!(format(&once, width).unwrap(), once, "formatting it twice, from\n{text}");
+}
+
+#[test]
+fn blanks_and_units_become_canonical() {
+    becomes(
+        "model M{param  a=2N*m in>0\nparam Fs=3Nm}",
+        "model M {\n  param  a  = 2 N·m        in > 0\n  param  Fs = 3 N·m\n}\n",
+    );
+    becomes("const a=3 µm+4 N/m*s-(2)^-x", "const a = 3 um + 4 N·s/m - (2)^-x\n");
+    becomes(
+        "model M { state z = 0 dz/dt = delta/depth*-a  }",
+        "model M {\n  state  z = 0\n  dz/dt = delta / depth * -a\n}\n",
+    );
+    becomes("\n\n// a\n\n\n// b\nimport   std.friction // c", "// a\n\n// b\nimport std.friction  // c\n");
+    becomes(
+        "table t(v [m/s])[N]=linear{0 m/s:1 N,1 m/s:2 N}",
+        "table t(v [m/s]) [N] = linear { 0 m/s: 1 N, 1 m/s: 2 N }\n",
+    );
+    for (unit, canonical) in [
+        ("N*m", "N·m"),
+        ("Nm", "N·m"),
+        ("kNm", "kN·m"),
+        ("N/m·s", "N·s/m"),
+        ("N/m/s", "N/m/s"),
+        ("1/s", "1/s"),
+        ("µm^2", "um^2"),
+        ("°", "deg"),
+        ("kΩ", "kOhm"),
+        ("1/m·s", "s/m"),
+        ("1", "1"),
+        ("%", "%"),
+        ("nm", "nm"),
+    ] {
+        assert_eq!(canonical_unit(unit), canonical);
+        assert_eq!(canonical_unit(canonical), canonical);
+    }
+}
+
+#[test]
+fn mistakes_are_returned() {
+    assert_eq!(format("model M { param T = 2 N m }", 100).unwrap_err()[0].code, "E0110");
+}
+
+#[test]
+fn long_lines_are_broken_behind_a_comma() {
+    becomes(
+        "model M { part fr = LuGre(v = body.v, F_ext = pid.u + pid.u + pid.u, sigma0 = 1000 N/m, sigma1 = 1000 N·s/m, vs = 3 mm/s) }",
+        "model M {\n  part   fr = LuGre(v = body.v, F_ext = pid.u + pid.u + pid.u, sigma0 = 1000 N/m,\n                    sigma1 = 1000 N·s/m, vs = 3 mm/s)\n}\n",
+    );
+}
+
+/// SplitMix64: the same numbers on every machine.
+struct Chance(u64);
+
+impl Chance {
+    fn below(&mut self, bound: usize) -> usize {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut x = self.0;
+        x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((x ^ (x >> 31)) % bound.max(1) as u64) as usize
+    }
+}
+
+#[test]
+fn trees_survive_and_twice_is_once() {
+    let rounds = std::env::var("FRIC_MUTATIONS").ok().and_then(|rounds| rounds.parse().ok()).unwrap_or(300);
+    for (_, text) in SAMPLES {
+        for width in [40, 80, 100] {
+            keeps_its_tree(text, width);
+        }
+    }
+    let mut tried = 0;
+    for seed in 0..rounds {
+        let mut chance = Chance(seed);
+        let mut text = SAMPLES[chance.below(SAMPLES.len())].1.to_string();
+        for _ in 0..1 + chance.below(6) {
+            let tokens = grammar::tokens::tokens(&text);
+            let (one, other) = (tokens[chance.below(tokens.len())], tokens[chance.below(tokens.len())]);
+            let (a, b) = (one.text(&text).to_string(), other.text(&text).to_string());
+            match chance.below(6) {
+                0 if one.is_trivia() => text.replace_range(one.start..one.end, " "),
+                1 if one.is_trivia() => text.replace_range(one.start..one.end, "\n"),
+                2 if one.is_trivia() => text.replace_range(one.start..one.end, " // why\n"),
+                3 => text.replace_range(one.start..one.end, ""),
+                4 => text.replace_range(one.start..one.end, &b),
+                _ => text.insert_str(one.start, &a),
+            }
+        }
+        if parse(FileId(0), &text).diagnostics.is_empty() {
+            tried += 1;
+            let width = 40 + chance.below(80);
+            if std::panic::catch_unwind(|| keeps_its_tree(&text, width)).is_err() {
+                panic!("seed {seed}");
+            }
+        }
+    }
+    assert!(tried > rounds / 10, "{tried} of {rounds} can be read");
+}

@@ -1,0 +1,224 @@
+//! What can be typed: every command, option and value in one tree.
+//!
+//! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
+//! usage and not a failed run.
+
+use crate::value;
+use abi::plan::Method;
+use abi::unit::{Dimension, Unit};
+use clap::{Parser, Subcommand, ValueHint};
+use std::path::PathBuf;
+
+/// A small equation language for friction models, controllers and the rigs they run on.
+#[derive(Parser, Debug)]
+#[command(name = "fric", version, arg_required_else_help = true, after_help = EXIT_CODES)]
+pub struct Args {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage.\n\
+    Colour and progress appear on a terminal only; NO_COLOR=1 turns colour off.";
+
+/// One command.
+#[derive(Subcommand, Debug)]
+pub enum Command {
+    /// Compile and run experiments, draw their plots, check what they expect
+    Run(Run),
+    /// Run every experiment that has an `expect`; last line: `N passed, N failed`
+    Test(Test),
+    /// Find mistakes without running anything
+    Check(Check),
+    /// Rewrite files in the one canonical layout
+    Fmt(Fmt),
+    /// Say what an error or warning means, with an example
+    Explain(Explain),
+    /// Make a folder with a first model and its experiment
+    New(New),
+    /// Print completions for a shell
+    Completions {
+        /// Which shell
+        shell: clap_complete::Shell,
+    },
+    /// Print the manual page of fric, or of one of its commands
+    Man {
+        /// Such as run
+        #[arg(value_parser = ["run", "test", "check", "fmt", "explain", "new", "completions"])]
+        command: Option<String>,
+    },
+}
+
+/// `fric run`
+#[derive(clap::Args, Debug)]
+pub struct Run {
+    /// The text to run
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// Experiments in it; all if none is named
+    pub experiments: Vec<String>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Relative tolerance of an adaptive run, such as 1e-8
+    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
+    pub tol: Option<f64>,
+    /// Simulated time, such as 20s
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+    /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --csv or --json]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+    /// Write the plot of one experiment to this file: .svg or .png
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
+    pub plot: Option<PathBuf>,
+    /// Write the data of one experiment to this file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub csv: Option<PathBuf>,
+    /// Print one JSON object a line for each run instead of words and plots
+    #[arg(long)]
+    pub json: bool,
+    /// Print failures only
+    #[arg(long, short, conflicts_with = "json")]
+    pub quiet: bool,
+    /// Interpret instead of making machine code: slow, for comparison
+    #[arg(long)]
+    pub interpret: bool,
+}
+
+/// `fric test`
+#[derive(clap::Args, Debug)]
+pub struct Test {
+    /// Texts, or folders to look through for them
+    #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
+    pub paths: Vec<PathBuf>,
+    /// Print failures and the last line only
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Interpret instead of making machine code: slow, for comparison
+    #[arg(long)]
+    pub interpret: bool,
+}
+
+/// `fric check`
+#[derive(clap::Args, Debug)]
+pub struct Check {
+    /// Texts
+    #[arg(required = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub files: Vec<PathBuf>,
+    /// Print a JSON array of what was found
+    #[arg(long)]
+    pub json: bool,
+    /// Print one line each: `file:line:column: E0101 message`
+    #[arg(long, conflicts_with = "json")]
+    pub short: bool,
+}
+
+/// `fric fmt`
+#[derive(clap::Args, Debug)]
+pub struct Fmt {
+    /// Texts; `-` reads one from the standard input and prints the result
+    #[arg(required = true, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub files: Vec<PathBuf>,
+    /// Change nothing; fail and name the files that would change
+    #[arg(long)]
+    pub check: bool,
+    /// Columns to fit into
+    #[arg(long, value_name = "COLUMNS", default_value_t = 120, value_parser = clap::value_parser!(u16).range(40..=1000))]
+    pub width: u16,
+}
+
+/// `fric explain`
+#[derive(clap::Args, Debug)]
+pub struct Explain {
+    /// Such as E0101 or W0703
+    pub code: String,
+}
+
+/// `fric new`
+#[derive(clap::Args, Debug)]
+pub struct New {
+    /// Folder to make; it must not hold anything yet
+    #[arg(value_hint = ValueHint::DirPath)]
+    pub dir: PathBuf,
+}
+
+fn setting(text: &str) -> Result<(String, String), String> {
+    let (path, value) = text.split_once('=').ok_or("write it as PATH=VALUE, for example fr.Fs=2N")?;
+    let (path, value) = (path.trim(), value.trim());
+    if path.is_empty() || value.is_empty() {
+        return Err("write it as PATH=VALUE, for example fr.Fs=2N".into());
+    }
+    Ok((path.into(), value.into()))
+}
+
+fn solver(text: &str) -> Result<Method, String> {
+    let names = || Method::ALL.map(Method::name).join(", ");
+    Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
+}
+
+fn positive_time(text: &str) -> Result<f64, String> {
+    let (value, unit) = value::parse(text)?;
+    let second = Unit::parse("s").expect("the second is known").dimension;
+    match unit.dimension {
+        dimension if dimension == second => {}
+        Dimension::NONE if unit.text.is_empty() => return Err(format!("a time needs its unit, for example {text}s")),
+        dimension => return Err(format!("a time is needed, not {}", dimension.describe())),
+    }
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a time greater than 0 is needed".into()) }
+}
+
+fn tolerance(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(tol) if tol > 0.0 && tol < 1.0 => Ok(tol),
+        _ => Err("a number between 0 and 1 is needed, for example 1e-8".into()),
+    }
+}
+
+fn picture(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some("svg" | "png") => Ok(path),
+        _ => Err("the name of a plot ends in .svg or .png".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_tree_is_sound() {
+        Args::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_its_manual_page() {
+        for command in Args::command().get_subcommands().map(|command| command.get_name().to_string()) {
+            let read = Args::try_parse_from(["fric", "man", &command]);
+            assert_eq!(read.is_ok(), command != "man", "{command}");
+        }
+    }
+
+    #[test]
+    fn times_carry_units() {
+        assert_eq!(positive_time("10us"), Ok(1e-5));
+        assert_eq!(positive_time("1.5 min"), Ok(90.0));
+        assert_eq!(positive_time("10").unwrap_err(), "a time needs its unit, for example 10s");
+        assert_eq!(positive_time("3N").unwrap_err(), "a time is needed, not a force");
+        assert!(positive_time("0s").is_err() && positive_time("-1s").is_err() && positive_time("infs").is_err());
+    }
+
+    #[test]
+    fn settings_split_at_the_first_equals_sign() {
+        assert_eq!(setting("fr=LuGre(Fs = 2 N)"), Ok(("fr".into(), "LuGre(Fs = 2 N)".into())));
+        assert!(setting("fr.Fs").is_err() && setting("=2").is_err() && setting("fr.Fs=").is_err());
+    }
+}

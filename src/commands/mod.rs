@@ -1,0 +1,146 @@
+//! The commands, one file each. A command prints what it has to say and returns how it ended.
+
+mod check;
+mod explain;
+mod fmt;
+mod new;
+mod run;
+mod test;
+
+use crate::args::{Args, Command};
+use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
+use crate::terminal::Terminal;
+use crate::{project, report};
+use clap::CommandFactory;
+use grammar::diagnostic::Diagnostic;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use runtime::engine::{Continue, Failure, Outcome};
+use runtime::sweep;
+use std::path::Path;
+use std::time::Instant;
+
+/// How a command ended.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum End {
+    /// Exit code 0.
+    Fine,
+    /// The input or an expectation failed: exit code 1.
+    Failed,
+    /// Wrong usage that only the input shows, such as one plot file for two experiments: exit code 2.
+    Misused,
+}
+
+/// Does what was asked for.
+pub fn run(args: &Args, terminal: &mut Terminal) -> End {
+    match &args.command {
+        Command::Run(run) => run::run(run, terminal),
+        Command::Test(test) => test::test(test, terminal),
+        Command::Check(check) => check::check(check, terminal),
+        Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
+        Command::Explain(explain) => explain::explain(explain, terminal),
+        Command::New(new) => new::new(new, terminal),
+        Command::Completions { shell } => {
+            let mut out = Vec::new();
+            clap_complete::generate(*shell, &mut Args::command(), "fric", &mut out);
+            terminal.print(&String::from_utf8_lossy(&out));
+            End::Fine
+        }
+        Command::Man { command } => {
+            let mut out = Vec::new();
+            let mut tree = Args::command();
+            // Only a built tree knows that a command's name is `fric run`.
+            tree.build();
+            let page = command.as_ref().and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
+            let name = command.as_ref().map_or("fric".into(), |name| format!("fric-{name}"));
+            let rendered = clap_mangen::Man::new(page).title(name).render(&mut out);
+            rendered.expect("writing to memory does not fail");
+            terminal.print(&String::from_utf8_lossy(&out));
+            End::Fine
+        }
+    }
+}
+
+/// Reads and loads a text; reports what is wrong with it. None if it cannot be used.
+fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
+    let name = path.display().to_string();
+    let text = match project::read(path) {
+        Ok(text) => text,
+        Err(reason) => {
+            terminal.error(&format!("cannot read {name}: {reason}"));
+            return None;
+        }
+    };
+    watch.stage("parse");
+    let loaded = compile::load(&name, &text, &project::Disk);
+    let failed = loaded.diagnostics.iter().any(Diagnostic::is_error);
+    if failed {
+        terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));
+        return None;
+    }
+    Some(loaded)
+}
+
+/// An experiment, compiled and run.
+struct Done {
+    cases: Vec<Case>,
+    results: Vec<Result<Outcome, Failure>>,
+    /// Seconds that all cases took.
+    wall: f64,
+    stages: Stages,
+}
+
+/// Compiles an experiment; reports what is wrong with it, and with `warn` also what deserves a look.
+fn compiled(
+    loaded: &mut Loaded,
+    experiment: &str,
+    options: &Options,
+    before: &Stages,
+    warn: bool,
+    terminal: &Terminal,
+) -> Result<(Vec<Case>, Stages), Vec<Diagnostic>> {
+    let mut watch = Stopwatch::start("names");
+    let mut found = Vec::new();
+    let cases =
+        compile::compile(loaded, &project::Disk, experiment, options, &mut found, &mut |stage| watch.stage(stage));
+    if !warn {
+        found.clear();
+    }
+    found.extend(cases.as_ref().err().into_iter().flatten().cloned());
+    if !found.is_empty() {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+    }
+    let mut stages = before.clone();
+    stages.0.extend(watch.stop().0);
+    Ok((cases?, stages))
+}
+
+/// Runs the cases of an experiment, with a bar on a terminal if it takes a while.
+fn done(cases: Vec<Case>, stages: Stages, quiet: bool) -> Done {
+    let bar = ProgressBar::with_draw_target(
+        Some(1000),
+        if quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() },
+    );
+    if let Ok(style) = ProgressStyle::with_template("  {bar:40} {percent:>3} %  {elapsed} of about {duration}") {
+        bar.set_style(style.progress_chars("━╸ "));
+    }
+    let begin = Instant::now();
+    let watch = |fraction: f64| {
+        // A short run needs no bar, and a bar costs more than a batch of steps.
+        if begin.elapsed().as_millis() > 400 {
+            bar.set_position((1000.0 * fraction) as u64);
+        }
+        Continue::Continue(())
+    };
+    let runs: Vec<sweep::Case> = cases
+        .iter()
+        .map(|case| sweep::Case {
+            label: case.label.clone(),
+            instance: case.instance.clone(),
+            experiment: case.experiment.clone(),
+        })
+        .collect();
+    let results = sweep::run(&runs, &watch);
+    let wall = begin.elapsed().as_secs_f64();
+    bar.finish_and_clear();
+    Done { cases, results, wall, stages }
+}

@@ -1,0 +1,269 @@
+//! `fric run`: compiles experiments, runs them, shows and writes what they did.
+
+use super::{Done, End, compiled, done, load};
+use crate::args::Run;
+use crate::compile::{Changes, Loaded, Options, Stages, Stopwatch};
+use crate::plot::{self, Figure};
+use crate::results::{self, Ran};
+use crate::terminal::{Style, Terminal};
+use crate::{figure, project, report};
+use runtime::record::csv;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+pub fn run(args: &Run, terminal: &mut Terminal) -> End {
+    let mut watch = Stopwatch::start("read");
+    let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
+    let stages = watch.stop();
+    let names = match chosen(args, &loaded) {
+        Ok(names) => names,
+        Err(message) => {
+            terminal.error(&message);
+            return End::Failed;
+        }
+    };
+    if names.len() > 1 && (args.plot.is_some() || args.csv.is_some()) {
+        terminal.error(&format!(
+            "--plot and --csv are for one experiment, and this runs {}: name one, or use --out DIR",
+            names.join(", ")
+        ));
+        return End::Misused;
+    }
+    let changes = Changes {
+        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
+        method: args.solver,
+        step: args.step,
+        tol: args.tol,
+        duration: args.duration,
+    };
+    let options = Options { changes, interpret: args.interpret };
+    let mut end = End::Fine;
+    for name in &names {
+        if experiment(args, &mut loaded, name, &options, &stages, terminal) != End::Fine {
+            end = End::Failed;
+        }
+    }
+    end
+}
+
+/// The experiments to run: those named, else all.
+fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
+    let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
+    let file = args.file.display();
+    if all.is_empty() {
+        return Err(format!("{file} has no experiment to run"));
+    }
+    for name in &args.experiments {
+        if !all.contains(name) {
+            let help = match project::nearest(name, all.iter().map(String::as_str)) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => format!("it has {}", all.join(", ")),
+            };
+            return Err(format!("{file} has no experiment `{name}`; {help}"));
+        }
+    }
+    Ok(if args.experiments.is_empty() { all } else { args.experiments.clone() })
+}
+
+fn experiment(
+    args: &Run,
+    loaded: &mut Loaded,
+    name: &str,
+    options: &Options,
+    before: &Stages,
+    terminal: &mut Terminal,
+) -> End {
+    let file = args.file.display().to_string();
+    let talking = !args.json && !args.quiet;
+    let (cases, stages) = match compiled(loaded, name, options, before, talking, terminal) {
+        Ok(compiled) => compiled,
+        Err(diagnostics) => {
+            if args.json {
+                let found = report::json(&loaded.files.0, &diagnostics);
+                terminal.line(
+                    &json!({ "file": file, "experiment": name, "passed": false, "diagnostics": found }).to_string(),
+                );
+            }
+            return End::Failed;
+        }
+    };
+    if let (true, Some(case)) = (talking, cases.first()) {
+        terminal.line(&terminal.styled(Style::Bold, name));
+        let description = case.instance.description();
+        terminal.print(&results::compiled(description, &case.experiment, &stages, cases.len()));
+        for note in &case.notes {
+            terminal.line(&format!("  note: {note}"));
+        }
+    }
+
+    let done = done(cases, stages, !talking);
+    let drawn = drawn(name, &done);
+    // Files come first: when the reader of our words has gone, they are there all the same.
+    let written = write(args, name, &done, drawn.as_ref());
+    let mut passed = true;
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        let ran = Ran {
+            file: &file,
+            experiment: &case.experiment,
+            label: &case.label,
+            instance: &case.instance,
+            notes: &case.notes,
+            result,
+            wall: done.wall,
+            stages: &done.stages,
+        };
+        passed &= ran.passed();
+        if args.json {
+            terminal.line(&ran.json().to_string());
+        }
+    }
+    if talking {
+        tell(&done, drawn.as_ref(), terminal);
+    } else if args.quiet {
+        complain(name, &done, terminal);
+    }
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        if let Err(failure) = result {
+            let label = if case.label.is_empty() { String::new() } else { format!(", {}", case.label) };
+            terminal.error(&format!("{}: {name}{label}: {failure}", place(loaded, name)));
+        }
+    }
+    match written {
+        Ok(paths) => {
+            if talking && !paths.is_empty() {
+                let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+                terminal.line(&format!("  wrote {}\n", paths.join(", ")));
+            }
+            if passed { End::Fine } else { End::Failed }
+        }
+        Err((path, error)) => {
+            terminal.error(&format!("cannot write {}: {error}", path.display()));
+            End::Failed
+        }
+    }
+}
+
+/// Where an experiment stands.
+fn place(loaded: &Loaded, name: &str) -> String {
+    let all = loaded.experiments();
+    let found = all.iter().find(|experiment| experiment.name == name);
+    found.map_or(String::new(), |experiment| report::place(&loaded.files.0, experiment.span))
+}
+
+/// All that was recorded in one figure; none if the experiment plots nothing.
+fn drawn(name: &str, done: &Done) -> Option<Figure> {
+    let first = done.cases.first()?;
+    if first.experiment.plots.is_empty() {
+        return None;
+    }
+    let cases: Vec<figure::Recorded> = done
+        .cases
+        .iter()
+        .zip(&done.results)
+        .map(|(case, result)| {
+            let recording = match result {
+                Ok(outcome) => &outcome.recording,
+                Err(failure) => &failure.recording,
+            };
+            (case.label.as_str(), recording)
+        })
+        .collect();
+    let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
+    Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
+}
+
+/// Writes what was asked for; gives the paths, or the one that failed and why.
+fn write(
+    args: &Run,
+    name: &str,
+    done: &Done,
+    drawn: Option<&Figure>,
+) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
+    let by_default = args.plot.is_none() && args.csv.is_none() && !args.json;
+    let folder = args.out.clone().or(by_default.then(|| PathBuf::from("out")));
+    let mut files: Vec<(PathBuf, Vec<u8>)> = Vec::new();
+    if let Some(figure) = drawn {
+        for path in folder.iter().map(|folder| folder.join(format!("{name}.svg"))).chain(args.plot.clone()) {
+            let png = path.extension().is_some_and(|extension| extension == "png");
+            files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
+        }
+        for (case, result) in done.cases.iter().zip(&done.results) {
+            let recording = match result {
+                Ok(outcome) => &outcome.recording,
+                Err(failure) => &failure.recording,
+            };
+            let mut bytes = Vec::new();
+            csv::write(recording, &mut bytes).expect("writing to memory does not fail");
+            for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {
+                files.push((for_case(&path, &case.label), bytes.clone()));
+            }
+        }
+    }
+    let mut paths = Vec::new();
+    for (path, bytes) in files {
+        project::write(&path, &bytes).map_err(|error| (path.clone(), error))?;
+        paths.push(path);
+    }
+    Ok(paths)
+}
+
+/// The path with the label of a case before its extension: `compare-fr-LuGre.csv`.
+fn for_case(path: &Path, label: &str) -> PathBuf {
+    let words: Vec<&str> =
+        label.split(|c: char| !(c.is_alphanumeric() || c == '.' || c == '_')).filter(|word| !word.is_empty()).collect();
+    if words.is_empty() {
+        return path.to_path_buf();
+    }
+    let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let extension = path.extension().map(|extension| extension.to_string_lossy().into_owned()).unwrap_or_default();
+    path.with_file_name(format!("{stem}-{}.{extension}", words.join("-")))
+}
+
+/// Work, plot and verdicts in full.
+fn tell(done: &Done, drawn: Option<&Figure>, terminal: &mut Terminal) {
+    let outcomes: Vec<_> = done.results.iter().filter_map(|result| result.as_ref().ok()).collect();
+    if !outcomes.is_empty() {
+        terminal.print(&results::work(&outcomes, done.wall));
+    }
+    let mut notes: Vec<&String> = outcomes.iter().flat_map(|outcome| &outcome.notes).collect();
+    notes.dedup();
+    for note in notes {
+        terminal.line(&format!("  note: {note}"));
+    }
+    if let Some(figure) = drawn {
+        let text = plot::terminal(figure, terminal.width(), terminal.colour());
+        terminal.line(&format!("\n{text}"));
+    }
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        let Ok(outcome) = result else { continue };
+        if !case.label.is_empty() && !outcome.verdicts.is_empty() {
+            terminal.line(&format!("  {}", case.label));
+        }
+        terminal.print(&results::verdicts(terminal, &outcome.verdicts, "  "));
+    }
+}
+
+/// What did not hold, on the standard error.
+fn complain(name: &str, done: &Done, terminal: &Terminal) {
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        let Ok(outcome) = result else { continue };
+        let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.holds).cloned().collect();
+        if !failed.is_empty() {
+            let label = if case.label.is_empty() { String::new() } else { format!(", {}", case.label) };
+            terminal.report(&format!("{name}{label}\n{}", results::verdicts(terminal, &failed, "  ")));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_of_a_sweep_carry_their_case() {
+        let path = Path::new("out/compare.csv");
+        assert_eq!(for_case(path, ""), path);
+        assert_eq!(for_case(path, "fr = LuGre(vd = 10 mm/s)"), Path::new("out/compare-fr-LuGre-vd-10-mm-s.csv"));
+        assert_eq!(for_case(path, "fr.Fs = 1.25 N"), Path::new("out/compare-fr.Fs-1.25-N.csv"));
+    }
+}

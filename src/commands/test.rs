@@ -1,0 +1,92 @@
+//! `fric test`: runs every experiment that expects something.
+
+use super::{End, compiled, done, load};
+use crate::args::Test;
+use crate::compile::{Loaded, Options, Stages, Stopwatch};
+use crate::project;
+use crate::results;
+use crate::terminal::{Style, Terminal};
+use crate::value::duration;
+use std::path::PathBuf;
+
+pub fn test(args: &Test, terminal: &mut Terminal) -> End {
+    let mut tally = Tally::default();
+    let mut files: Vec<PathBuf> = Vec::new();
+    for path in &args.paths {
+        if !path.is_dir() {
+            files.push(path.clone());
+            continue;
+        }
+        match project::texts_in(path) {
+            Ok(found) => files.extend(found),
+            Err(error) => {
+                terminal.error(&format!("cannot read {}: {error}", path.display()));
+                tally.failed += 1;
+            }
+        }
+    }
+    for file in &files {
+        let mut watch = Stopwatch::start("read");
+        let Some(mut loaded) = load(file, terminal, &mut watch) else {
+            tally.failed += 1;
+            continue;
+        };
+        let stages = watch.stop();
+        let names: Vec<String> =
+            loaded.experiments().into_iter().filter(|info| info.has_expect).map(|info| info.name).collect();
+        if !args.quiet && !names.is_empty() {
+            terminal.line(&file.display().to_string());
+        }
+        for name in names {
+            tally.add(experiment(args, &mut loaded, &name, &stages, terminal));
+        }
+    }
+    if tally.passed + tally.failed == 0 {
+        terminal.error("nothing to test: no experiment has an `expect`");
+    }
+    terminal.line(&format!("{} passed, {} failed", tally.passed, tally.failed));
+    if tally.failed == 0 && tally.passed > 0 { End::Fine } else { End::Failed }
+}
+
+#[derive(Default)]
+struct Tally {
+    passed: u32,
+    failed: u32,
+}
+
+impl Tally {
+    fn add(&mut self, passed: bool) {
+        if passed { self.passed += 1 } else { self.failed += 1 }
+    }
+}
+
+/// Runs one experiment; whether all that it expects holds in every case.
+fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
+    let options = Options { interpret: args.interpret, ..Options::default() };
+    let Ok((cases, stages)) = compiled(loaded, name, &options, before, false, terminal) else {
+        terminal.line(&line(terminal, false, name, ""));
+        return false;
+    };
+    let done = done(cases, stages, args.quiet);
+    let passed = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));
+    if !(passed && args.quiet) {
+        terminal.line(&line(terminal, passed, name, &duration(done.wall)));
+    }
+    for (case, result) in done.cases.iter().zip(&done.results) {
+        let label = if case.label.is_empty() { String::new() } else { format!("{}: ", case.label) };
+        match result {
+            Ok(outcome) if outcome.passed() => {}
+            Ok(outcome) => {
+                let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.holds).cloned().collect();
+                terminal.print(&results::verdicts(terminal, &failed, &format!("          {label}")));
+            }
+            Err(failure) => terminal.line(&format!("          {label}{failure}")),
+        }
+    }
+    passed
+}
+
+fn line(terminal: &Terminal, passed: bool, name: &str, time: &str) -> String {
+    let word = if passed { terminal.styled(Style::Good, "ok    ") } else { terminal.styled(Style::Bad, "FAILED") };
+    format!("  {word}  {name:28} {time:>8}").trim_end().into()
+}

@@ -1,0 +1,207 @@
+//! Texts on disk and in the embedded library, and files written whole.
+//!
+//! In: paths and imports. Out: texts, or the reason in words why there is none. Knows nothing of the language.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Component, Path, PathBuf};
+
+/// The library: dotted name of each file (`std.friction.lugre`) and its text, in the order of the names.
+const LIBRARY: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/library.rs"));
+
+/// A text longer than this is not one that somebody wrote.
+const MOST_BYTES: u64 = 64 << 20;
+
+/// Reads a text.
+///
+/// # Errors
+/// Why not, in words.
+pub fn read(path: &Path) -> Result<String, String> {
+    let about = |error: io::Error| match error.kind() {
+        io::ErrorKind::NotFound => "there is no such file".to_string(),
+        io::ErrorKind::PermissionDenied => "it may not be read (permission denied)".into(),
+        io::ErrorKind::IsADirectory => "it is a folder, not a file".into(),
+        _ => error.to_string(),
+    };
+    let metadata = fs::metadata(path).map_err(about)?;
+    if metadata.is_dir() {
+        return Err("it is a folder, not a file".into());
+    }
+    if metadata.len() > MOST_BYTES {
+        return Err(format!("it is larger than {} MB", MOST_BYTES >> 20));
+    }
+    text(fs::read(path).map_err(about)?)
+}
+
+/// Reads the text on the standard input.
+///
+/// # Errors
+/// Why not, in words.
+pub fn read_input() -> Result<String, String> {
+    let mut bytes = Vec::new();
+    let mut input = io::Read::take(io::stdin().lock(), MOST_BYTES);
+    io::Read::read_to_end(&mut input, &mut bytes).map_err(|error| error.to_string())?;
+    text(bytes)
+}
+
+fn text(bytes: Vec<u8>) -> Result<String, String> {
+    if let Some(at) = bytes.iter().position(|byte| *byte == 0) {
+        return Err(format!("it is not a text: byte {at} is zero"));
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        let line = error.as_bytes()[..at].iter().filter(|byte| **byte == b'\n').count() + 1;
+        format!("it is not a text in UTF-8: line {line}, byte {at} of the file")
+    })
+}
+
+/// Where the compiler finds what a text imports.
+pub struct Disk;
+
+impl crate::compile::Sources for Disk {
+    /// A library name stands for its file, or for all files of its folder.
+    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+        let inside = |file: &str| file == module || file.strip_prefix(module).is_some_and(|rest| rest.starts_with('.'));
+        let found: Vec<(String, String)> = LIBRARY
+            .iter()
+            .filter(|(file, _)| inside(file))
+            .map(|(file, text)| (format!("{file}.fric"), (*text).to_string()))
+            .collect();
+        (!found.is_empty()).then_some(found)
+    }
+
+    fn modules(&self) -> Vec<String> {
+        let folder = |file: &str| file.match_indices('.').nth(1).map_or(file, |(at, _)| &file[..at]).to_string();
+        let mut folders: Vec<String> = LIBRARY.iter().map(|(file, _)| folder(file)).collect();
+        folders.dedup();
+        folders
+    }
+
+    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+        let folder = Path::new(from).parent().unwrap_or(Path::new(""));
+        let path = tidy(&folder.join(path));
+        read(&path).map(|text| (path.display().to_string(), text))
+    }
+}
+
+/// The path without `.` and `folder/..`, so that one file has one name.
+fn tidy(path: &Path) -> PathBuf {
+    let mut out = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::CurDir => {}
+            Component::ParentDir if matches!(out.components().next_back(), Some(Component::Normal(_))) => {
+                out.pop();
+            }
+            part => out.push(part),
+        }
+    }
+    out
+}
+
+/// The name most like `name`, if one is like it at all.
+pub fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    let distance = |other: &str| strsim::damerau_levenshtein(&name.to_lowercase(), &other.to_lowercase());
+    names
+        .map(|other| (distance(other), other))
+        .filter(|(distance, other)| *distance <= 1 + name.len().min(other.len()) / 3)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, other)| other)
+}
+
+/// All `.fric` files in a folder and its folders, in the order of their names. What is hidden or made by tools is left
+/// out: names that begin with a dot, and folders called `target` or `out`.
+///
+/// # Errors
+/// Why a folder cannot be read.
+pub fn texts_in(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    let mut entries: Vec<PathBuf> = fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<io::Result<_>>()?;
+    entries.sort();
+    for path in entries {
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        // A link to a folder may lead back here.
+        let folder = path.is_dir() && !path.is_symlink();
+        if name.starts_with('.') || folder && matches!(name.as_str(), "target" | "out") {
+            continue;
+        }
+        if folder {
+            found.extend(texts_in(&path)?);
+        } else if path.extension().is_some_and(|extension| extension == "fric") {
+            found.push(path);
+        }
+    }
+    Ok(found)
+}
+
+/// The files a command is given, each folder replaced by the texts in it.
+///
+/// # Errors
+/// The folder that cannot be read, and why.
+pub fn expanded(paths: &[PathBuf]) -> Result<Vec<PathBuf>, (PathBuf, io::Error)> {
+    let mut files = Vec::new();
+    for path in paths {
+        if path.is_dir() {
+            files.extend(texts_in(path).map_err(|error| (path.clone(), error))?);
+        } else {
+            files.push(path.clone());
+        }
+    }
+    Ok(files)
+}
+
+/// Makes the folder a file is to lie in.
+///
+/// # Errors
+/// Why not.
+pub fn make_folder_of(path: &Path) -> io::Result<()> {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => fs::create_dir_all(folder),
+        Some(_) | None => Ok(()),
+    }
+}
+
+/// Writes a file whole or not at all: into a neighbour first, which then takes the name.
+///
+/// # Errors
+/// Why not; a file of that name is then as it was.
+pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    make_folder_of(path)?;
+    if fs::metadata(path).is_ok_and(|old| !old.is_file()) {
+        // A pipe or a device takes what it is given; its name is not ours to take.
+        return fs::OpenOptions::new().write(true).open(path)?.write_all(bytes);
+    }
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
+    let written = fs::File::create(&neighbour)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        // Who may read the old file may read the new one.
+        .and_then(|()| match fs::metadata(path) {
+            Ok(old) => fs::set_permissions(&neighbour, old.permissions()),
+            Err(_) => Ok(()),
+        })
+        .and_then(|()| fs::rename(&neighbour, path));
+    if written.is_err() {
+        let _ = fs::remove_file(&neighbour);
+    }
+    written
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_text_is_refused_with_its_place() {
+        assert_eq!(text(b"a\0b".to_vec()).unwrap_err(), "it is not a text: byte 1 is zero");
+        assert_eq!(text(b"a\nb\xff".to_vec()).unwrap_err(), "it is not a text in UTF-8: line 2, byte 3 of the file");
+    }
+
+    #[test]
+    fn names_are_near_when_a_slip_apart() {
+        let names = ["stick_slip", "hunting", "hold"];
+        assert_eq!(nearest("stickslip", names.into_iter()), Some("stick_slip"));
+        assert_eq!(nearest("huntnig", names.into_iter()), Some("hunting"));
+        assert_eq!(nearest("coast_down", names.into_iter()), None);
+    }
+}

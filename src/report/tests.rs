@@ -1,0 +1,293 @@
+use super::*;
+use std::sync::Arc;
+
+fn file(name: &str, text: &str) -> SourceFile {
+    SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false }
+}
+
+/// The span of `words` in line `line` (from 1) of the `n`-th file.
+fn at(files: &[SourceFile], n: usize, line: usize, words: &str) -> Span {
+    let text = &files[n].text;
+    let from: usize = text.split_inclusive('\n').take(line - 1).map(str::len).sum();
+    let start = from + text[from..].find(words).unwrap_or_else(|| panic!("no `{words}` in line {line}"));
+    Span::new(FileId(n as u32), start, start + words.len())
+}
+
+/// Labels: line, words (behind `…|` those after a first occurrence), text. The first is the primary one.
+fn check_golden(code: &'static str, message: &str, labels: &[(usize, &str, &str)], help: &str) {
+    let read = |extension: &str| {
+        let path = format!("{}/tests/errors/{code}.{extension}", env!("CARGO_MANIFEST_DIR"));
+        std::fs::read_to_string(path).unwrap()
+    };
+    let files = [file(&format!("{code}.fric"), &read("fric"))];
+    let severity = if code.starts_with('W') { Severity::Warning } else { Severity::Error };
+    let mut diagnostic = Diagnostic { severity, ..Diagnostic::error(code, message) }.help(help);
+    for (line, words, text) in labels {
+        let span = match words.split_once('|') {
+            Some((before, words)) => {
+                let all = at(&files, 0, *line, &format!("{before}{words}"));
+                Span::new(FileId(0), all.start as usize + before.len(), all.end as usize)
+            }
+            None => at(&files, 0, *line, words),
+        };
+        diagnostic = diagnostic.label(span, *text);
+    }
+    let shown = full(&files, &[diagnostic], false);
+    assert_eq!(shown, read("txt"), "{code}:\n{shown}");
+}
+
+#[test]
+fn the_golden_messages_to_the_letter() {
+    check_golden(
+        "E0101",
+        "cannot add a force and a velocity",
+        &[(6, "= |Fc", "N"), (6, "vs * sign(v)", "m/s")],
+        "`vs` is the Stribeck velocity (line 4). A coefficient in N·s/m is missing;\n\
+         `Fv` is one. Did you mean `Fc * sign(v) + Fv * v`?",
+    );
+    check_golden(
+        "E0103",
+        "`1.5` needs a unit",
+        &[(3, "[N]", "declared in newton"), (3, "1.5", "a pure number")],
+        "write `param Fs = 1.5 N`",
+    );
+    check_golden(
+        "E0108",
+        "LuGre is written for straight motion, but `v` gets an angular velocity",
+        &[(7, "LuGre", "expects v in m/s"), (7, "(v = |w", "rad/s")],
+        "write `rotary LuGre(...)`: the same model with N -> N·m, m -> rad, kg -> kg·m^2",
+    );
+    check_golden(
+        "E0110",
+        "a unit is written without spaces",
+        &[(2, "= 2 |N m", "reads as 2 N, followed by a stray name `m`")],
+        "write `2 N·m` (or `2 N*m`). To multiply by a variable `m`, write `2 N * m`",
+    );
+    check_golden(
+        "E0204",
+        "there is no `sigma_0` in Bristle",
+        &[(6, "sigma_0", "not declared")],
+        "did you mean `sigma0` (param, N/m, line 4)?",
+    );
+    check_golden(
+        "E0209",
+        "`dx/dy` can be a derivative or a division",
+        &[(9, "dx/dy", "`dx` and `dy` are declared, and so are the state `x` and `y`")],
+        "for the division write `dx / dy`, with spaces;\nfor the derivative give `dx` or `dy` another name",
+    );
+    check_golden(
+        "E0303",
+        "nothing determines `z`",
+        &[(3, "z", "a state needs one equation for how it changes")],
+        "add `dz/dt = ...` (in m/s) for a state in continuous time,\n\
+         or `next(z) = ...` inside an `every` block for a sampled one",
+    );
+    check_golden(
+        "E0305",
+        "regime `slip` does not say what `F` is",
+        &[(7, "F = clamp", "`stick` defines F"), (10, "mode slip", "`slip` does not")],
+        "every regime defines the same quantities; add `F = ...` to `slip`",
+    );
+    check_golden(
+        "E0306",
+        "a computed velocity is practically never exactly zero",
+        &[(5, "v == 0", "this branch would not be taken")],
+        "say what you mean by rest:\n  - a dead band, as in Karnopp: `if abs(v) < Dv then ...`\n  \
+         - or regimes, as in KFM: `go stick when v falls 0`",
+    );
+    check_golden(
+        "E0401",
+        "the friction force depends on itself in the same instant",
+        &[(8, "fr.F", "2. and u needs fr.F"), (9, "F_ext = u", "1. fr.F needs F_ext, which is u")],
+        "break the loop with something that has memory:\n  \
+         - cancel with an estimate that has its own state: `pid.u + obs.F_hat`\n  \
+         - or give the actuator its lag: `part act = Lag(u = pid.u + fr.F, T = 1 ms)`\n\
+         fric does not solve loops numerically: a step must take a bounded time",
+    );
+    check_golden(
+        "E0501",
+        "`Fs` is smaller than `Fc`",
+        &[(6, "LuGre", "Fs keeps its default, 1.5 N"), (6, "Fc = 2 N", "set here")],
+        "LuGre requires Fs >= Fc. Set Fs as well, for example\n`LuGre(v = body.v, Fc = 2 N, Fs = 3 N)`",
+    );
+    check_golden(
+        "E0601",
+        "`g` can be zero, so this can divide by zero",
+        &[(6, ">= 0", "Fc may be 0"), (8, "g", "then g reaches 0 N for large v"), (9, "/ g", "here")],
+        "declare `param Fc = 1 N in > 0`",
+    );
+    check_golden(
+        "E0702",
+        "rk4 at 1 ms is not stable for this model",
+        &[
+            (5, "rotary LuGre()", "dz/dt = ... - sigma0*|v|/g * z: a rate of 1e5 1/s per rad/s"),
+            (7, "rk4", "stable at 1 ms only for |v| <= 28 mrad/s"),
+            (8, "10 rad/s", "up to here it would need a step of 2.8 us"),
+        ],
+        "dz/dt is linear in z, so `solver expo` steps it exactly at any speed.\n\
+         `fric explain E0702.fric --step` shows the numbers per state",
+    );
+    check_golden(
+        "W0107",
+        "50 Hz is 50 rad/s here, not 50 revolutions per second",
+        &[(2, "[rad/s]", "an angular velocity"), (2, "50 Hz", "a rate, without an angle")],
+        "write `50 rev/s` (314 rad/s), or `50 rad/s` if that is what you mean",
+    );
+    check_golden(
+        "W0703",
+        "this friction model can push: it is not dissipative",
+        &[
+            (15, "F", "at v = 0.1 m/s, z = 15 um: F = -14.3 N, so it drives the motion"),
+            (16, "0.5 * sigma0 * z^2", "and gives out more than it has stored"),
+        ],
+        "holds when sigma2 >= sigma1*(Fs - Fc)/Fc (158 N·s/m for these values), or let sigma1 fade with speed, \
+         as LuGre does for vd = 10 mm/s. To keep it: `allow not-dissipative \"...\"`",
+    );
+}
+
+#[test]
+fn places_in_odd_texts_are_found() {
+    let text = "\u{feff}model A {\r\n\tlet\tb = \u{1b}[31mé·x\r\n}\r\n";
+    let files = [file("a.fric", text)];
+    let diagnostic = Diagnostic::error("E0204", "there is no `x`").label(at(&files, 0, 2, "x"), "here");
+    let shown = full(&files, std::slice::from_ref(&diagnostic), false);
+    assert_eq!(
+        shown,
+        "E0204
+
+  × there is no `x`
+   ╭─[a.fric:2:17]
+ 2 │     let b = ␛[31mé·x
+   ·                    ┬
+   ·                    ╰── here
+   ╰────
+",
+        "{shown}"
+    );
+    assert_eq!(short(&files, &[diagnostic]), "a.fric:2:17: E0204 there is no `x`\n");
+
+    let mark = Diagnostic::error("E0001", "expected an item").label(Span::new(FileId(0), 0, 3), "here");
+    assert!(
+        full(&files, std::slice::from_ref(&mark), false).contains(" 1 │ model A {\n"),
+        "{}",
+        full(&files, &[mark], false)
+    );
+}
+
+#[test]
+fn a_place_at_the_end_of_a_text_is_shown() {
+    for text in ["", "model A {", "model A {\n", "\u{feff}", "\n\n\n", "é"] {
+        let files = [file("a.fric", text)];
+        let end = Span::new(FileId(0), text.len(), text.len());
+        let diagnostic = Diagnostic::error("E0002", "`{` is never closed").label(end, "the text ends here");
+        let shown = full(&files, &[diagnostic], false);
+        assert!(shown.contains("the text ends here"), "{text:?}:\n{shown}");
+    }
+}
+
+#[test]
+fn a_place_outside_the_text_does_no_harm() {
+    let files = [file("a.fric", "é\né\n")];
+    for (start, end) in [(1, 2), (100, 200), (4, 5), (0, 100)] {
+        let diagnostic = Diagnostic::error("E0001", "odd").label(Span::new(FileId(0), start, end), "here");
+        full(&files, std::slice::from_ref(&diagnostic), true);
+        short(&files, std::slice::from_ref(&diagnostic));
+        json(&files, &[diagnostic]);
+    }
+    let nowhere = Diagnostic::error("E0001", "odd").label(Span::new(FileId(7), 0, 1), "here").help("none");
+    assert_eq!(full(&files, &[nowhere], false), "E0001\n\n  × odd\n  help: none\n");
+}
+
+#[test]
+fn a_very_long_line_is_cut_around_its_label() {
+    let text = format!("let a = {} + b{}\n", "x + ".repeat(200_000), " + y".repeat(100_000));
+    let files = [file("a.fric", &text)];
+    let diagnostic = Diagnostic::error("E0204", "there is no `b`").label(at(&files, 0, 1, "b"), "not declared");
+    let shown = full(&files, &[diagnostic], false);
+    assert!(shown.contains("…") && shown.contains("+ b + y") && shown.contains("a.fric:1:800012"), "{shown}");
+    assert!(shown.lines().all(|line| line.chars().count() < 200), "{shown}");
+}
+
+#[test]
+fn a_label_over_many_lines_marks_the_first() {
+    let text = format!("model A {{\n{}}}\n", "let a = 1\n".repeat(50));
+    let files = [file("a.fric", &text)];
+    let all = Span::new(FileId(0), 0, text.len());
+    let shown = full(&files, &[Diagnostic::error("E0000", "odd").label(all, "all of it")], false);
+    assert!(shown.lines().count() < 10 && shown.contains("all of it"), "{shown}");
+    let few = Span::new(FileId(0), 0, at(&files, 0, 3, "let a = 1").end as usize);
+    let shown = full(&files, &[Diagnostic::error("E0000", "odd").label(few, "three lines")], false);
+    assert!(shown.contains(" 3 │") && shown.contains("three lines"), "{shown}");
+}
+
+#[test]
+fn labels_in_two_files_are_two_excerpts_before_the_help() {
+    let files = [file("a.fric", "part fr = LuGre(Fc = 2 N)\n"), file("std.friction", "\nrequire Fs >= Fc\n")];
+    let diagnostic = Diagnostic::error("E0501", "`Fs` is smaller than `Fc`")
+        .label(at(&files, 0, 1, "Fc = 2 N"), "set here")
+        .label(at(&files, 1, 2, "Fs >= Fc"), "required here")
+        .help("set Fs as well");
+    assert_eq!(
+        full(&files, &[diagnostic], false),
+        "E0501
+
+  × `Fs` is smaller than `Fc`
+   ╭─[a.fric:1:17]
+ 1 │ part fr = LuGre(Fc = 2 N)
+   ·                 ────┬───
+   ·                     ╰── set here
+   ╰────
+   ╭─[std.friction:2:9]
+ 2 │ require Fs >= Fc
+   ·         ────┬───
+   ·             ╰── required here
+   ╰────
+  help: set Fs as well
+"
+    );
+}
+
+#[test]
+fn ten_of_a_file_are_shown_and_the_rest_counted() {
+    let files = [file("a.fric", &"x\n".repeat(42)), file("b.fric", "y")];
+    let mut all: Vec<Diagnostic> = (0..42)
+        .rev()
+        .map(|line| {
+            let span = Span::new(FileId(0), 2 * line, 2 * line + 1);
+            Diagnostic::error("E0001", format!("mistake {line}")).label(span, "")
+        })
+        .collect();
+    all.push(Diagnostic::error("E0002", "in b").label(Span::new(FileId(1), 0, 1), ""));
+    let shown = full(&files, &all, false);
+    assert!(shown.contains("mistake 9\n") && !shown.contains("mistake 10\n"), "{shown}");
+    assert!(shown.contains("\n… and 32 more in a.fric\n") && shown.contains("in b"), "{shown}");
+    assert_eq!(short(&files, &all).lines().count(), 43);
+}
+
+#[test]
+fn colour_is_given_only_when_asked_for() {
+    let files = [file("a.fric", "x")];
+    let all = [Diagnostic::error("E0001", "odd").label(Span::new(FileId(0), 0, 1), "here")];
+    assert!(full(&files, &all, true).contains('\x1b'));
+    assert!(!full(&files, &all, false).contains('\x1b'));
+}
+
+#[test]
+fn json_has_every_place() {
+    let files = [file("a.fric", "a\nbé c\n")];
+    let all =
+        [Diagnostic::warning("W0201", "`c` is never read").label(at(&files, 0, 2, "c"), "here").help("remove it")];
+    let expected = r#"[{"code":"W0201","severity":"warning","message":"`c` is never read","labels":[{"file":"a.fric","line":2,"column":4,"end_line":2,"end_column":5,"start":6,"end":7,"text":"here"}],"help":"remove it"}]"#;
+    assert_eq!(json(&files, &all).to_string(), expected);
+}
+
+#[test]
+fn twenty_thousand_mistakes_are_told_without_delay() {
+    let files = [file("a.fric", &"x;".repeat(20_000))];
+    let all: Vec<Diagnostic> = (0..20_000)
+        .map(|i| Diagnostic::error("E0001", "odd").label(Span::new(FileId(0), 2 * i, 2 * i + 1), ""))
+        .collect();
+    assert!(short(&files, &all).ends_with("\na.fric:1:39999: E0001 odd\n"));
+    assert_eq!(json(&files, &all).as_array().unwrap().len(), 20_000);
+    assert_eq!(full(&files, &all, false).lines().last(), Some("… and 19990 more in a.fric"));
+}

@@ -1,0 +1,259 @@
+//! What became of a run, in words and as JSON.
+
+use crate::compile::Stages;
+use crate::terminal::{Style, Terminal};
+use crate::value::{count, duration, show, significant};
+use abi::plan::{Experiment, Method, Solver};
+use abi::unit::Unit;
+use abi::{Description, Instance};
+use runtime::engine::{Failure, Outcome};
+use runtime::measure::{Margin, Reading, Verdict};
+use runtime::record::Recording;
+use serde_json::{Value, json};
+
+/// One run and all that is told of it.
+pub struct Ran<'a> {
+    /// The text.
+    pub file: &'a str,
+    /// The experiment.
+    pub experiment: &'a Experiment,
+    /// What sets the case apart in a sweep; else empty.
+    pub label: &'a str,
+    /// The instance before the run.
+    pub instance: &'a Instance,
+    /// Remarks of the compiler.
+    pub notes: &'a [String],
+    /// How it ended.
+    pub result: &'a Result<Outcome, Failure>,
+    /// Seconds that all cases of the experiment took.
+    pub wall: f64,
+    /// Seconds from text to code.
+    pub stages: &'a Stages,
+}
+
+impl Ran<'_> {
+    /// Whether it ran to its end and every expectation held.
+    pub fn passed(&self) -> bool {
+        self.result.as_ref().is_ok_and(Outcome::passed)
+    }
+
+    /// The object of `--json`. Values are in the unit beside them; what is not finite is a string.
+    pub fn json(&self) -> Value {
+        let description = self.instance.description();
+        let adaptive = self.experiment.solver.method == Method::Adaptive;
+        let mut object = json!({
+            "file": self.file,
+            "experiment": self.experiment.name,
+            "case": Some(self.label).filter(|label| !label.is_empty()),
+            "passed": self.passed(),
+            "model": description.name,
+            "states": states(description),
+            "parts": parts(description),
+            "solver": {
+                "method": self.experiment.solver.method.name(),
+                "step": (!adaptive).then(|| number(self.experiment.solver.step)),
+                "tol": adaptive.then(|| number(self.experiment.solver.tol)),
+            },
+            "duration": number(self.experiment.duration),
+            "compile_seconds": self.stages.0.iter().map(|(stage, s)| (stage.to_string(), number(*s))).collect::<Value>(),
+            "wall_seconds": number(self.wall),
+        });
+        match self.result {
+            Ok(outcome) => {
+                object["steps"] = json!(outcome.work.steps);
+                object["time"] = number(outcome.time);
+                object["expects"] = outcome.verdicts.iter().map(verdict_json).collect();
+                object["finals"] = finals(outcome);
+                object["notes"] = self.notes.iter().chain(&outcome.notes).map(String::as_str).collect();
+            }
+            Err(failure) => {
+                object["error"] = json!(failure.to_string());
+                object["time"] = number(failure.time);
+                object["notes"] = self.notes.iter().map(String::as_str).collect();
+            }
+        }
+        object
+    }
+}
+
+/// Number of states, sampled ones included.
+pub fn states(description: &Description) -> usize {
+    use abi::description::Kind;
+    description.quantities.iter().filter(|quantity| matches!(quantity.kind, Kind::State | Kind::SampledState)).count()
+}
+
+/// Number of parts: different paths before a last dot.
+pub fn parts(description: &Description) -> usize {
+    use abi::description::Kind;
+    let own = description.quantities.iter().filter(|quantity| quantity.kind != Kind::Observed);
+    let mut paths: Vec<&str> = own.filter_map(|quantity| Some(quantity.path.rsplit_once('.')?.0)).collect();
+    paths.sort_unstable();
+    paths.dedup();
+    paths.len()
+}
+
+/// A number of JSON, or `"inf"`, `"-inf"`, `"nan"`.
+fn number(value: f64) -> Value {
+    match serde_json::Number::from_f64(value) {
+        Some(number) => Value::Number(number),
+        None if value.is_nan() => json!("nan"),
+        None => json!(if value > 0.0 { "inf" } else { "-inf" }),
+    }
+}
+
+fn shown(si: f64, unit: &Unit, boolean: bool) -> (Value, Value) {
+    if boolean { (json!(si > 0.5), Value::Null) } else { (number(unit.from_si(si)), json!(unit.text)) }
+}
+
+/// Final values of all outputs, and of what was plotted besides, by path.
+fn finals(outcome: &Outcome) -> Value {
+    let mut finals = serde_json::Map::new();
+    for end in &outcome.finals {
+        let (value, unit) = shown(end.value, &end.unit, end.boolean);
+        finals.insert(end.path.clone(), json!({ "value": value, "unit": unit }));
+    }
+    for (label, value, unit, boolean) in plotted(&outcome.recording) {
+        let (value, unit) = shown(value, unit, boolean);
+        finals.entry(label).or_insert(json!({ "value": value, "unit": unit }));
+    }
+    Value::Object(finals)
+}
+
+/// Last value of each recorded column in SI.
+fn plotted(recording: &Recording) -> Vec<(&str, f64, &Unit, bool)> {
+    let Some(last) = recording.rows().last() else { return Vec::new() };
+    let columns = recording.columns().iter().zip(&last[1..]);
+    columns.map(|(column, value)| (column.label.as_str(), *value, &column.unit, column.boolean)).collect()
+}
+
+fn verdict_json(verdict: &Verdict) -> Value {
+    let reading = |reading: &Reading| {
+        json!({
+            "text": reading.text,
+            "value": number(reading.unit.from_si(reading.value)),
+            "unit": reading.unit.text,
+            "time": reading.time.map(number),
+        })
+    };
+    let margin = verdict.margin.as_ref();
+    let part = |of: fn(&Margin) -> f64| margin.map(|margin| number(margin.unit.from_si(of(margin))));
+    json!({
+        "text": verdict.text,
+        "holds": verdict.holds,
+        "value": part(|margin| margin.value),
+        "limit": part(|margin| margin.limit),
+        "margin": part(|margin| margin.amount),
+        "unit": margin.map(|margin| margin.unit.text.as_str()),
+        "time": margin.and_then(|margin| margin.time).map(number),
+        "readings": verdict.readings.iter().map(reading).collect::<Vec<_>>(),
+        "problem": verdict.problem,
+    })
+}
+
+/// One line each: mark, text, value, margin.
+pub fn verdicts(terminal: &Terminal, verdicts: &[Verdict], indent: &str) -> String {
+    let width = verdicts.iter().map(|verdict| verdict.text.chars().count()).max().unwrap_or(0).min(60);
+    let mut out = String::new();
+    for verdict in verdicts {
+        let mark = if verdict.holds { terminal.styled(Style::Good, "✓") } else { terminal.styled(Style::Bad, "✗") };
+        out += &format!("{indent}{mark} {:width$}  {}\n", verdict.text, words(verdict));
+    }
+    out
+}
+
+/// The value, how far from the limit, and when.
+fn words(verdict: &Verdict) -> String {
+    if let Some(problem) = &verdict.problem {
+        return problem.clone();
+    }
+    let readings = || {
+        let one = |reading: &Reading| format!("{} = {}", reading.text, show(reading.value, &reading.unit, 6));
+        verdict.readings.iter().map(one).collect::<Vec<_>>().join(", ")
+    };
+    let Some(margin) = &verdict.margin else { return readings() };
+    // One measure against a limit speaks for itself; arithmetic over several shows what went in.
+    let value = match verdict.readings.as_slice() {
+        [reading] if reading.value == margin.value => show(margin.value, &reading.unit, 6),
+        _ => format!("{} ({})", show(margin.value, &margin.unit, 6), readings()),
+    };
+    let amount = show(margin.amount.abs(), &margin.unit, 3);
+    let distance = if verdict.holds { format!("margin {amount}") } else { format!("misses by {amount}") };
+    let time = match margin.time {
+        Some(time) if !verdict.holds => format!(", at {}", runtime::show::time(time)),
+        Some(_) | None => String::new(),
+    };
+    format!("{value}, {distance}{time}")
+}
+
+/// `rk4 step 10 µs`, `adaptive tol 1e-6`.
+pub fn solver(solver: &Solver) -> String {
+    match solver.method {
+        Method::Adaptive => format!("adaptive tol {}", significant(solver.tol, 3)),
+        method => format!("{} step {}", method.name(), duration(solver.step)),
+    }
+}
+
+/// What was compiled and how long it took, on two lines.
+pub fn compiled(description: &Description, experiment: &Experiment, stages: &Stages, cases: usize) -> String {
+    let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
+    let mut facts = vec![counted(states(description), "state")];
+    match parts(description) {
+        0 => {}
+        parts => facts.push(counted(parts, "part")),
+    }
+    let of_cases = if cases > 1 { format!(", {cases} cases") } else { String::new() };
+    let second = Unit::parse("s").expect("the second is known");
+    let solver = solver(&experiment.solver);
+    let slowest: Vec<String> =
+        stages.0.iter().map(|(stage, seconds)| format!("{stage} {}", duration(*seconds))).collect();
+    format!(
+        "  {}: {}{of_cases}; {solver} for {}\n  compiled in {}: {}\n",
+        description.name,
+        facts.join(", "),
+        show(experiment.duration, &second, 6),
+        duration(stages.total()),
+        slowest.join(", ")
+    )
+}
+
+/// How much work the runs were.
+pub fn work(outcomes: &[&Outcome], wall: f64) -> String {
+    let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
+    let simulated: f64 = outcomes.iter().map(|outcome| outcome.time).sum();
+    let speed = match simulated / wall {
+        speed if speed.is_finite() && speed >= 2.0 => format!(", {} times real time", count(speed as u64)),
+        _ => String::new(),
+    };
+    format!("  ran {} steps in {}{speed}\n", count(steps), duration(wall))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_json_has_no_number_for_is_a_string() {
+        let numbers = [1.5, f64::INFINITY, f64::NEG_INFINITY, f64::NAN].map(number);
+        assert_eq!(Value::from(numbers.to_vec()).to_string(), r#"[1.5,"inf","-inf","nan"]"#);
+    }
+
+    #[test]
+    fn a_verdict_says_value_and_margin() {
+        let unit = Unit::parse("N").expect("the newton is known");
+        let mut verdict = Verdict {
+            text: "max(F) < 1.6 N".into(),
+            holds: true,
+            readings: vec![Reading { text: "max(F)".into(), value: 1.5035, unit: unit.clone(), time: Some(3.0) }],
+            margin: Some(Margin { amount: 0.0965, value: 1.5035, limit: 1.6, unit, time: Some(3.0) }),
+            problem: None,
+        };
+        assert_eq!(words(&verdict), "1.5035 N, margin 0.0965 N");
+        verdict.holds = false;
+        assert_eq!(words(&verdict), "1.5035 N, misses by 0.0965 N, at 3 s");
+        verdict.readings[0].value = 0.75;
+        verdict.margin.as_mut().expect("it has one").time = None;
+        assert_eq!(words(&verdict), "1.5035 N (max(F) = 0.75 N), misses by 0.0965 N");
+        verdict.problem = Some("max(F): the window is empty".into());
+        assert_eq!(words(&verdict), "max(F): the window is empty");
+    }
+}

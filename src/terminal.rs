@@ -1,0 +1,102 @@
+//! Standard output and standard error: colour, width, and readers that went away.
+
+use std::io::{self, ErrorKind, IsTerminal, Write};
+
+/// Columns where nothing better is known.
+const WIDTH: usize = 80;
+
+/// What is printed goes through here.
+///
+/// When the reader of a pipe has gone, the rest is dropped without a word; the work goes on, so that files are written
+/// and the exit code tells the truth.
+pub struct Terminal {
+    closed: bool,
+    colour: bool,
+    error_colour: bool,
+}
+
+/// How words are set off.
+#[derive(Clone, Copy)]
+pub enum Style {
+    /// Headings.
+    Bold,
+    /// What went well.
+    Good,
+    /// What did not.
+    Bad,
+}
+
+impl Terminal {
+    /// The process's own.
+    pub fn new() -> Terminal {
+        let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
+            && std::env::var_os("TERM").is_none_or(|term| term != "dumb");
+        Terminal {
+            closed: false,
+            colour: wanted && io::stdout().is_terminal(),
+            error_colour: wanted && io::stderr().is_terminal(),
+        }
+    }
+
+    /// Whether what is printed may have colour.
+    pub fn colour(&self) -> bool {
+        self.colour
+    }
+
+    /// Whether what is reported may have colour.
+    pub fn error_colour(&self) -> bool {
+        self.error_colour
+    }
+
+    /// Columns for plots: of the terminal, at most 100.
+    pub fn width(&self) -> usize {
+        match terminal_size::terminal_size_of(io::stdout()) {
+            Some((terminal_size::Width(width), _)) => usize::from(width).min(100),
+            None => WIDTH,
+        }
+    }
+
+    /// Words in a style, if what is printed may have colour.
+    pub fn styled(&self, style: Style, words: &str) -> String {
+        styled(self.colour, style, words)
+    }
+
+    /// Prints to the standard output.
+    pub fn print(&mut self, text: &str) {
+        if self.closed {
+            return;
+        }
+        let mut out = io::stdout().lock();
+        if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+            self.closed = true;
+            // A full disk is worth a word, a closed pipe is not.
+            if error.kind() != ErrorKind::BrokenPipe {
+                self.report(&format!("cannot print: {error}\n"));
+            }
+        }
+    }
+
+    /// Prints a line to the standard output.
+    pub fn line(&mut self, text: &str) {
+        self.print(&format!("{text}\n"));
+    }
+
+    /// Prints to the standard error. If that is gone too, nobody is left to be told.
+    pub fn report(&self, text: &str) {
+        let _ = io::stderr().lock().write_all(text.as_bytes());
+    }
+
+    /// Reports a failure that has no place in a text.
+    pub fn error(&self, message: &str) {
+        self.report(&format!("{} {message}\n", styled(self.error_colour, Style::Bad, "error:")));
+    }
+}
+
+fn styled(colour: bool, style: Style, words: &str) -> String {
+    let code = match style {
+        Style::Bold => "1",
+        Style::Good => "32",
+        Style::Bad => "1;31",
+    };
+    if colour { format!("\x1b[{code}m{words}\x1b[0m") } else { words.into() }
+}

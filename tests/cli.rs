@@ -1,0 +1,337 @@
+//! The command as a person or a script meets it: exit codes, what goes where, odd input, readers that go away.
+
+use serde_json::Value;
+use std::fs;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+/// A model and three experiments: one that holds, one that does not, one that expects nothing.
+const PULL: &str = r#"
+model Contact {
+  input  v [m/s]
+  param  Fc = 1 N        in > 0
+  param  vt = 10 mm/s    in > 0
+  output F [N] = Fc * tanh(v / vt)
+  allow  creep "it need not hold a load"
+}
+
+model Pull {
+  param  k  = 2 N/m      in > 0
+  part   fr = Contact(v = v)
+  state  x [m] = 0
+  state  v [mm/s] = 0
+  dx/dt  = v
+  dv/dt  = (k * (0.1 m/s * t - x) - fr.F) / 1 kg
+}
+
+experiment holds {
+  run    Pull() for 2 s
+  solver rk4 step 1 ms
+  plot   x [mm], v [mm/s]
+  expect max(fr.F) < 1.1 N
+}
+
+experiment breaks {
+  run    Pull() for 2 s
+  solver rk4 step 1 ms
+  expect final(x) > 1 km
+}
+
+experiment silent {
+  run    Pull() for 2 s
+  solver rk4 step 1 ms
+  plot   x [mm]
+}
+"#;
+
+/// A folder of its own for one test, empty at its start.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Folder {
+        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir_all(&path).unwrap();
+        Folder(path)
+    }
+
+    fn with(self, name: &str, text: impl AsRef<[u8]>) -> Folder {
+        fs::write(self.0.join(name), text).unwrap();
+        self
+    }
+
+    fn fric(&self, args: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
+        command.current_dir(&self.0).args(args).env_remove("NO_COLOR").stdin(Stdio::null());
+        command
+    }
+
+    fn run(&self, args: &[&str]) -> Output {
+        self.fric(args).output().unwrap()
+    }
+
+    /// Runs it and looks at the exit code and for words in what was said; gives both streams.
+    #[track_caller]
+    fn check(&self, args: &[&str], code: i32, words: &str) -> (String, String) {
+        let output = self.run(args);
+        let (out, err) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+        assert_eq!(output.status.code(), Some(code), "{args:?}\n{out}\n{err}");
+        assert!(out.contains(words) || err.contains(words), "{args:?}: no `{words}` in\n{out}\n{err}");
+        assert!(!out.contains('\x1b') && !err.contains('\x1b'), "{args:?}: colour without a terminal");
+        (out, err)
+    }
+
+    /// Names of what lies in a folder below.
+    fn names(&self, below: &str) -> Vec<String> {
+        let Ok(entries) = fs::read_dir(self.0.join(below)) else { return Vec::new() };
+        let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+}
+
+#[test]
+fn exit_codes_tell_how_it_went() {
+    let folder = Folder::new("exit-codes").with("pull.fric", PULL);
+    folder.check(&["run", "pull.fric", "holds"], 0, "✓ max(fr.F) < 1.1 N");
+    folder.check(&["run", "pull.fric", "breaks"], 1, "✗ final(x) > 1 km");
+    folder.check(&["run", "pull.fric", "hlods"], 1, "did you mean `holds`?");
+    folder.check(&["test", "pull.fric"], 1, "1 passed, 1 failed\n");
+    folder.check(&["--help"], 0, "Usage: fric");
+    folder.check(&["run", "--help"], 0, "--set <PATH=VALUE>");
+    folder.check(&["--version"], 0, "fric ");
+}
+
+#[test]
+fn wrong_usage_is_told_apart_from_wrong_input() {
+    let folder = Folder::new("usage").with("pull.fric", PULL);
+    folder.check(&[], 2, "Usage: fric");
+    folder.check(&["rnu"], 2, "unrecognized subcommand 'rnu'");
+    folder.check(&["run"], 2, "<FILE>");
+    folder.check(&["run", "pull.fric", "--step", "10"], 2, "a time needs its unit, for example 10s");
+    folder.check(&["run", "pull.fric", "--step", "1N"], 2, "a time is needed, not a force");
+    folder.check(&["run", "pull.fric", "--for=-1s"], 2, "greater than 0");
+    folder.check(&["run", "pull.fric", "--solver", "rk5"], 2, "the solvers are adaptive, expo, implicit, rk4, euler");
+    folder.check(&["run", "pull.fric", "--set", "k"], 2, "PATH=VALUE");
+    folder.check(&["run", "pull.fric", "--tol", "0"], 2, "between 0 and 1");
+    folder.check(&["run", "pull.fric", "holds", "--plot", "a.jpg"], 2, ".svg or .png");
+    folder.check(&["run", "pull.fric", "--plot", "a.svg"], 2, "one experiment");
+    assert_eq!(folder.names("."), ["pull.fric"], "wrong usage writes nothing");
+}
+
+#[test]
+fn the_last_line_of_test_is_a_count() {
+    let folder = Folder::new("test-count").with("pull.fric", PULL);
+    let (out, _) = folder.check(&["test", "."], 1, "FAILED  breaks");
+    assert_eq!(out.lines().last(), Some("1 passed, 1 failed"), "{out}");
+    let (out, _) = folder.check(&["test", "-q", "pull.fric"], 1, "breaks");
+    assert!(!out.contains("holds"), "{out}");
+    let empty = Folder::new("test-nothing").with("a.fric", "const g = 9.81 m/s^2\n");
+    let (out, _) = empty.check(&["test", "."], 1, "nothing to test");
+    assert_eq!(out, "0 passed, 0 failed\n");
+}
+
+#[test]
+fn files_are_written_where_they_were_asked_for() {
+    let folder = Folder::new("files").with("pull.fric", PULL);
+    folder.check(&["run", "pull.fric", "holds"], 0, "wrote out/holds.svg, out/holds.csv");
+    assert_eq!(folder.names("out"), ["holds.csv", "holds.svg"]);
+    let csv = fs::read_to_string(folder.0.join("out/holds.csv")).unwrap();
+    assert!(csv.starts_with("t [s],x [mm],v [mm/s]\n"), "{}", csv.lines().next().unwrap_or_default());
+    assert!(csv.lines().count() > 1000);
+
+    folder.check(&["run", "pull.fric", "silent", "--out", "a/b"], 0, "a/b/silent.svg");
+    assert_eq!(folder.names("a/b"), ["silent.csv", "silent.svg"]);
+    folder.check(&["run", "pull.fric", "holds", "--plot", "p/x.png", "--csv", "c/x.csv"], 0, "p/x.png");
+    assert!(fs::read(folder.0.join("p/x.png")).unwrap().starts_with(b"\x89PNG"));
+    assert_eq!(folder.names("c"), ["x.csv"]);
+
+    fs::write(folder.0.join("taken"), "").unwrap();
+    folder.check(&["run", "pull.fric", "holds", "--out", "taken"], 1, "cannot write taken/holds.svg");
+}
+
+#[test]
+fn json_is_json_and_writes_no_files_unasked() {
+    let folder = Folder::new("json").with("pull.fric", PULL);
+    let (out, err) = folder.check(&["run", "pull.fric", "--json"], 1, "");
+    assert_eq!(err, "");
+    let objects: Vec<Value> = out.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let names: Vec<&str> = objects.iter().map(|object| object["experiment"].as_str().unwrap()).collect();
+    assert_eq!(names, ["holds", "breaks", "silent"]);
+    assert_eq!((objects[0]["passed"].as_bool(), objects[1]["passed"].as_bool()), (Some(true), Some(false)));
+    assert!(objects[0]["steps"].as_u64() == Some(2000) && objects[0]["wall_seconds"].is_number());
+    assert!(objects[0]["compile_seconds"].as_object().is_some_and(|stages| !stages.is_empty()));
+    let expect = &objects[0]["expects"][0];
+    assert_eq!((expect["text"].as_str(), expect["unit"].as_str()), (Some("max(fr.F) < 1.1 N"), Some("N")));
+    assert!(objects[0]["finals"]["x"]["unit"] == "mm" && objects[0]["finals"]["x"]["value"].is_number());
+    assert_eq!(folder.names("."), ["pull.fric"]);
+
+    let (out, _) = folder.check(&["check", "--json", "pull.fric"], 0, "");
+    assert_eq!(serde_json::from_str::<Value>(&out).unwrap(), Value::Array(Vec::new()));
+}
+
+#[test]
+fn quiet_says_nothing_when_all_is_well() {
+    let folder = Folder::new("quiet").with("pull.fric", PULL);
+    let (out, err) = folder.check(&["run", "-q", "pull.fric", "holds"], 0, "");
+    assert_eq!((out.as_str(), err.as_str()), ("", ""));
+    let (out, err) = folder.check(&["run", "-q", "pull.fric", "breaks"], 1, "final(x) > 1 km");
+    assert!(out.is_empty() && err.contains('✗'), "{out}{err}");
+}
+
+#[test]
+fn a_reader_that_goes_away_is_no_failure() {
+    let folder = Folder::new("closed-pipe").with("pull.fric", PULL);
+    for args in [&["run", "pull.fric", "holds"][..], &["man"], &["completions", "bash"], &["test", "pull.fric"]] {
+        let mut child = folder.fric(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        drop(child.stdout.take());
+        let mut err = String::new();
+        child.stderr.take().unwrap().read_to_string(&mut err).unwrap();
+        let expected = i32::from(args[0] == "test");
+        assert_eq!(child.wait().unwrap().code(), Some(expected), "{args:?}: {err}");
+        assert_eq!(err, "", "{args:?}");
+    }
+    assert_eq!(folder.names("out"), ["holds.csv", "holds.svg"], "files are written all the same");
+}
+
+#[test]
+fn bad_input_is_a_message_and_never_a_panic() {
+    let folder = Folder::new("bad-input")
+        .with("empty.fric", "")
+        .with("binary.fric", [0x7f, b'E', b'L', b'F', 0, 1, 2])
+        .with("latin1.fric", b"model A {\n  // \xe9\n}\n")
+        .with("open.fric", "(".repeat(1 << 20))
+        .with("deep.fric", format!("const a = {}1{}\n", "(".repeat(100_000), ")".repeat(100_000)))
+        .with("words.fric", "once upon a time")
+        .with("odd.fric", "\u{feff}model A {\r\n\tinput é [m]\r\n\u{1b}[31m\r\n}\u{202e}");
+    fs::create_dir(folder.0.join("folder.fric")).unwrap();
+    for (file, words) in [
+        ("missing.fric", "there is no such file"),
+        ("folder.fric", "it is a folder"),
+        ("binary.fric", "byte 4 is zero"),
+        ("latin1.fric", "line 2"),
+        ("empty.fric", "no experiment"),
+        ("open.fric", "open.fric:1:"),
+        ("deep.fric", "deep.fric:1:"),
+        ("words.fric", "words.fric:1:1"),
+        ("odd.fric", "odd.fric:"),
+    ] {
+        let (_, err) = folder.check(&["run", file], 1, words);
+        assert!(!err.contains("panicked") && err.len() < 20_000, "{file}: {} bytes of\n{err:.2000}", err.len());
+    }
+    folder.check(&["check", "empty.fric"], 0, "1 file: 0 errors, 0 warnings");
+    folder.check(&["check", "missing.fric", "words.fric"], 1, "words.fric:1:1");
+    let (out, _) = folder.check(&["check", "--short", "words.fric"], 1, "");
+    assert!(out.starts_with("words.fric:1:1: E0"), "{out}");
+    let (out, _) = folder.check(&["check", "--json", "words.fric"], 1, "");
+    let found: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(found[0]["labels"][0]["line"], 1, "{out}");
+    folder.check(&["test", "missing.fric"], 1, "0 passed, 1 failed");
+    folder.check(&["fmt", "words.fric"], 1, "words.fric:1:1");
+    assert_eq!(fs::read_to_string(folder.0.join("words.fric")).unwrap(), "once upon a time", "left as it was");
+}
+
+#[test]
+fn formatting_reads_standard_input_and_can_only_look() {
+    let folder = Folder::new("fmt").with("pull.fric", "const a = 1 N   \n");
+    folder.check(&["fmt", "--check", "pull.fric"], 1, "pull.fric");
+    assert_eq!(fs::read_to_string(folder.0.join("pull.fric")).unwrap(), "const a = 1 N   \n");
+    folder.check(&["fmt", "pull.fric"], 0, "");
+    assert_eq!(fs::read_to_string(folder.0.join("pull.fric")).unwrap(), "const a = 1 N\n");
+    folder.check(&["fmt", "--check", "pull.fric"], 0, "");
+
+    let mut child = folder.fric(&["fmt", "-"]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    child.stdin.take().unwrap().write_all(b"const a = 1 N  \n").unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), "const a = 1 N\n");
+}
+
+#[test]
+fn a_code_has_a_page() {
+    let folder = Folder::new("explain");
+    folder.check(&["explain", "E0101"], 0, "## E0101 units differ");
+    folder.check(&["explain", "w0703"], 0, "not-dissipative");
+    folder.check(&["explain", "E0100"], 1, "did you mean E01");
+}
+
+#[test]
+fn a_new_folder_holds_a_model_that_passes() {
+    let folder = Folder::new("new");
+    folder.check(&["new", "mine"], 0, "fric run mine/model.fric");
+    folder.check(&["test", "mine"], 0, "1 passed, 0 failed");
+    folder.check(&["fmt", "--check", "mine/model.fric"], 0, "");
+    folder.check(&["check", "mine/model.fric"], 0, "0 errors, 0 warnings");
+    folder.check(&["new", "mine"], 1, "mine is not empty; nothing was changed");
+}
+
+#[test]
+fn completions_and_the_man_page_are_printed() {
+    let folder = Folder::new("completions");
+    for shell in ["bash", "zsh", "fish"] {
+        folder.check(&["completions", shell], 0, "explain");
+    }
+    folder.check(&["man"], 0, ".TH fric 1");
+    folder.check(&["man", "run"], 0, "\\-\\-solver");
+}
+
+#[test]
+fn colour_is_for_terminals_and_no_color_turns_it_off() {
+    let folder = Folder::new("colour").with("words.fric", "once upon a time");
+    // `script` of util-linux gives a program a terminal; elsewhere there is nothing to see.
+    let on_terminal = |no_color: &str| {
+        let line = format!("{} check words.fric", env!("CARGO_BIN_EXE_fric"));
+        let mut command = Command::new("script");
+        command.current_dir(&folder.0).args(["-qec", &line, "/dev/null"]).stdin(Stdio::null());
+        command.env("TERM", "xterm").env("NO_COLOR", no_color).output().ok().map(|output| output.stdout)
+    };
+    let (Some(with), Some(without)) = (on_terminal(""), on_terminal("1")) else { return };
+    assert!(with.contains(&0x1b), "{}", String::from_utf8_lossy(&with));
+    assert!(!without.contains(&0x1b), "{}", String::from_utf8_lossy(&without));
+}
+
+#[test]
+fn mistakes_in_models_have_places() {
+    let model =
+        |body: &str| format!("model A {{ {body} }}\nexperiment e {{ run A() for 10 ms  solver rk4 step 1 ms }}\n");
+    let folder = Folder::new("mistakes")
+        .with("undefined.fric", model("output F [N] = Fs"))
+        .with("cycle.fric", model("let a [N] = b  let b [N] = a  output F [N] = a"))
+        .with("duplicate.fric", model("output F [N] = 1 N  F = 2 N"))
+        .with("missing.fric", model("state z [um] = 0  output F [N] = 1 N/m * z"))
+        .with("nan.fric", model("state z [m] = 0  dz/dt = 1 m/s * sqrt(-1 - z / 1 m)"));
+    folder.check(&["run", "undefined.fric"], 1, "there is no `Fs` in A");
+    folder.check(&["run", "cycle.fric"], 1, "E0401");
+    folder.check(&["run", "duplicate.fric"], 1, "duplicate.fric:1:");
+    folder.check(&["run", "missing.fric"], 1, "nothing determines `z`");
+    folder.check(&["run", "nan.fric"], 1, "nan.fric:");
+    let (out, err) = folder.check(&["run", "--json", "missing.fric"], 1, "E0303");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((object["passed"].as_bool(), object["diagnostics"][0]["code"].as_str()), (Some(false), Some("E0303")));
+    assert!(err.contains("nothing determines"), "{err}");
+}
+
+#[test]
+fn a_sweep_is_one_figure_and_a_file_of_data_each() {
+    let sweep = "experiment sweeps { run Pull() for 1 s  solver rk4 step 1 ms  sweep k = 1 N/m, 2 N/m  plot x [mm] }";
+    let folder = Folder::new("sweep").with("pull.fric", format!("{PULL}{sweep}\n"));
+    folder.check(&["run", "pull.fric", "sweeps"], 0, "2 cases");
+    assert_eq!(folder.names("out"), ["sweeps-k-1-N-m.csv", "sweeps-k-2-N-m.csv", "sweeps.svg"]);
+    let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json"], 0, "");
+    let cases: Vec<Value> =
+        out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
+    assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
+}
+
+#[test]
+fn an_experiment_can_be_changed_from_outside() {
+    let folder = Folder::new("changes").with("pull.fric", PULL);
+    let args = ["run", "pull.fric", "holds", "--json", "--set", "fr.Fc=2N", "--for", "500 ms", "--step", "2ms"];
+    let (out, _) = folder.check(&[&args[..], &["--solver", "euler"]].concat(), 0, "");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(object["steps"], 250, "{out}");
+    assert_eq!((&object["solver"]["method"], &object["solver"]["tol"]), (&Value::from("euler"), &Value::Null));
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fz=2N"], 1, "Fz");
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2m"], 1, "E01");
+    folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2 N +"], 1, "--set");
+}
