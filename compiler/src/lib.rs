@@ -105,7 +105,7 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }
-        method => out.push((Function::Step, discretize::step(program, method))),
+        method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
     }
     out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
 }
