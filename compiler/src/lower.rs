@@ -12,7 +12,7 @@ use crate::units::Types;
 use abi::description::{Automaton, Description, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 /// Where the value of a quantity lies while a model runs.
@@ -583,16 +583,18 @@ impl<'a> Plan<'a> {
 
     /// Surfaces on which a branch of what moves the states changes, or a transition or event happens.
     fn roots(&self, mut emit: Emit) -> (Func, Vec<Root>) {
+        // Conditions first: a surface that a branch shares with a condition counts as the condition's.
         let mut from: Vec<ExprId> = Vec::new();
+        for automaton in &self.system.automata {
+            from.extend(automaton.regimes.iter().flat_map(|regime| &regime.transitions).map(|t| t.condition));
+        }
+        from.extend(self.system.events.iter().map(|event| event.condition));
+        let deciding = self.comparisons(&from);
         for id in &self.states {
             if let Definition::Continuous { rate, .. } = self.system.var(*id).definition {
                 from.push(rate);
             }
         }
-        for automaton in &self.system.automata {
-            from.extend(automaton.regimes.iter().flat_map(|regime| &regime.transitions).map(|t| t.condition));
-        }
-        from.extend(self.system.events.iter().map(|event| event.condition));
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
@@ -673,9 +675,25 @@ impl<'a> Plan<'a> {
         let mut roots = Vec::new();
         for (k, (value, id)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
-            roots.push(Root { text: self.root_text(*id) });
+            roots.push(Root { text: self.root_text(*id), decides: deciding.contains(id) });
         }
         (emit.build.finish(), roots)
+    }
+
+    /// The comparisons and crossings that conditions are joined of.
+    fn comparisons(&self, conditions: &[ExprId]) -> HashSet<ExprId> {
+        let mut out = HashSet::new();
+        let mut stack = conditions.to_vec();
+        while let Some(id) = stack.pop() {
+            match self.system.node(id) {
+                Node::Binary(BinaryOp::And | BinaryOp::Or, a, b) => stack.extend([*a, *b]),
+                Node::Not(a) => stack.push(*a),
+                _ => {
+                    out.insert(id);
+                }
+            }
+        }
+        out
     }
 
     /// A short name of a surface; the caller knows the text.
