@@ -137,8 +137,14 @@ pub struct Fmt {
 /// `fric explain`
 #[derive(clap::Args, Debug)]
 pub struct Explain {
-    /// Such as E0101 or W0703
-    pub code: String,
+    /// A code such as E0101, or a file
+    #[arg(value_name = "CODE|FILE")]
+    pub subject: String,
+    /// Models of the file to explain; all if none is named
+    pub models: Vec<String>,
+    /// One JSON object per model
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `fric new`

@@ -1,6 +1,8 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, load};
+pub use compiler::explain::Explanation;
+pub use compiler::friction::Verdict;
+pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, explain, load};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

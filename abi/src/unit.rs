@@ -284,7 +284,25 @@ impl Unit {
 
     /// A value in SI as a number in this unit.
     pub fn from_si(&self, si: f64) -> f64 {
-        si / self.scale
+        match self.divisor() {
+            Some(divisor) => si * divisor,
+            None => si / self.scale,
+        }
+    }
+
+    /// A number in this unit as a value in SI. Of `20 us` it is the nearest to 2e-5.
+    pub fn to_si(&self, number: f64) -> f64 {
+        match self.divisor() {
+            Some(divisor) => number / divisor,
+            None => number * self.scale,
+        }
+    }
+
+    /// The whole number that one in SI is of this unit, if it is one: dividing by 1000 rounds once, multiplying with
+    /// 0.001 twice.
+    fn divisor(&self) -> Option<f64> {
+        let divisor = (1.0 / self.scale).round();
+        (self.scale < 1.0 && (divisor * self.scale - 1.0).abs() < 1e-14).then_some(divisor)
     }
 
     /// The unit of the rotary twin of a quantity declared in this one: `um` → `µrad`, `N` → `N·m`.

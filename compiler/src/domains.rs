@@ -210,7 +210,9 @@ impl<'a> Prover<'a> {
             (Node::Var(x), Node::Var(y)) => x == y,
             (Node::Number { value: x, .. }, Node::Number { value: y, .. }) => x == y,
             (Node::Negate(x), Node::Negate(y)) => self.same(*x, *y),
-            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => op == other && self.same(*a, *c) && self.same(*b, *d),
+            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => {
+                op == other && self.same(*a, *c) && self.same(*b, *d)
+            }
             (Node::Call(f, xs), Node::Call(g, ys)) => {
                 f == g && xs.len() == ys.len() && xs.iter().zip(ys).all(|(x, y)| self.same(*x, *y))
             }
@@ -374,7 +376,9 @@ impl<'a> Prover<'a> {
             Builtin::Expm1 => values[0].rising(bounds::expm1, (-1.0, f64::INFINITY)),
             Builtin::Sin | Builtin::Cos => unit,
             Builtin::Tanh => values[0].rising(bounds::tanh, (-1.0, 1.0)),
-            Builtin::Atan => values[0].rising(bounds::atan, (-std::f64::consts::FRAC_PI_2, std::f64::consts::FRAC_PI_2)),
+            Builtin::Atan => {
+                values[0].rising(bounds::atan, (-std::f64::consts::FRAC_PI_2, std::f64::consts::FRAC_PI_2))
+            }
             Builtin::Cosh => Interval { low: 1.0, above_low: false, not_zero: true, ..Interval::ALL },
             Builtin::Hypot => Interval { low: 0.0, above_low: false, ..Interval::ALL },
             Builtin::Random => Interval { low: 0.0, high: 1.0, above_low: false, below_high: true, not_zero: false },
@@ -459,7 +463,9 @@ impl Visit {
                         }
                     }
                     _ if x.is_not_negative() => {}
-                    _ => diagnostics.push(domain(prover, files, *a, "a power with a broken exponent", "negative", "abs")),
+                    _ => {
+                        diagnostics.push(domain(prover, files, *a, "a power with a broken exponent", "negative", "abs"))
+                    }
                 }
             }
             Node::Call(Builtin::Sqrt, args) if !prover.interval(args[0]).is_not_negative() => {
@@ -522,21 +528,26 @@ fn division(prover: &mut Prover, types: &Types, files: &Files, divisor: ExprId) 
             Definition::Value(value, _) => format!(" = {}", files.slice(system.span(value))),
             _ => String::new(),
         };
-        return error
-            .label(here, "here")
-            .help(format!("declare `{} {}{default} in > 0`", var.kind.word(), var.name));
+        return error.label(here, "here").help(format!("declare `{} {}{default} in > 0`", var.kind.word(), var.name));
     }
     let error = Diagnostic::error("E0601", message).label(here, "not proven to stay away from 0");
     let free = params.iter().map(|id| system.var(*id)).find(|var| var.range_span.is_none());
     match (system.node(divisor), free) {
         (Node::Var(id), _) if matches!(system.var(*id).kind, VarKind::Param | VarKind::Input) => {
             let var = system.var(*id);
-            error.label(var.span, "declared without a range").help(format!("declare its range: `{} {} … in > 0`", var.kind.word(), var.name))
+            error.label(var.span, "declared without a range").help(format!(
+                "declare its range: `{} {} … in > 0`",
+                var.kind.word(),
+                var.name
+            ))
         }
-        (_, Some(var)) => error
-            .label(var.span, format!("{} has no range", var.name))
-            .help(format!("declare its range: `{} {} … in > 0`", var.kind.word(), var.name)),
-        _ => error.help(format!("guard it: `if abs({text}) > … then … / {text} else …`, or keep it away from 0 with `max`")),
+        (_, Some(var)) => error.label(var.span, format!("{} has no range", var.name)).help(format!(
+            "declare its range: `{} {} … in > 0`",
+            var.kind.word(),
+            var.name
+        )),
+        _ => error
+            .help(format!("guard it: `if abs({text}) > … then … / {text} else …`, or keep it away from 0 with `max`")),
     }
 }
 
@@ -577,7 +588,9 @@ fn vanishing(system: &System, id: VarId) -> Option<String> {
     let mut stack = vec![(value, false)];
     while let Some((id, inside)) = stack.pop() {
         match system.node(id) {
-            Node::Var(var) if inside && system.var(*var).kind == VarKind::Input => return Some(system.var(*var).name.clone()),
+            Node::Var(var) if inside && system.var(*var).kind == VarKind::Input => {
+                return Some(system.var(*var).name.clone());
+            }
             Node::Call(Builtin::Exp, args) => stack.push((args[0], true)),
             node => stack.extend(node.operands().map(|operand| (operand, inside))),
         }

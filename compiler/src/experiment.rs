@@ -13,7 +13,7 @@ use crate::units::{self, Types, literal};
 use crate::{causality, checks};
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
-use grammar::ast::{self, BinaryOp, Expr, ExperimentStatement, SweepOver};
+use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 
@@ -55,6 +55,7 @@ pub const MOST_VARIANTS: usize = 100_000;
 
 /// The parts of an experiment's tree.
 struct Parts<'a> {
+    span: Span,
     run: &'a ast::Run,
     solver: Option<&'a ast::Solver>,
     sweeps: Vec<&'a ast::Sweep>,
@@ -223,7 +224,7 @@ fn parts<'a>(experiment: &'a ast::Experiment, diagnostics: &mut Vec<Diagnostic>)
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Parts { run, solver, sweeps, data, plots, expects })
+    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects })
 }
 
 /// Columns of a recording as tables over time.
@@ -234,7 +235,8 @@ fn recording(
     data: &ast::Data,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<(String, Table, Unit)>> {
-    let values = columns(loaded, sources, root, &data.file, data.columns.len(), diagnostics)?;
+    let wanted: Vec<bool> = data.columns.iter().map(|column| column.name.text != "_").collect();
+    let values = columns(loaded, sources, root, &data.file, &wanted, diagnostics)?;
     let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
         let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
         diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
@@ -245,12 +247,13 @@ fn recording(
         None => Some(Unit::none()),
         Some((_, Ok(unit))) => Some(unit),
         Some((text, Err(part))) => {
-            diagnostics.push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
+            diagnostics
+                .push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
             None
         }
     };
     let t_unit = unit(&data.columns[time])?;
-    let t: Vec<f64> = values[time].iter().map(|t| t * t_unit.scale).collect();
+    let t: Vec<f64> = values[time].iter().map(|t| t_unit.to_si(*t)).collect();
     let mut columns = Vec::new();
     for (k, column) in data.columns.iter().enumerate() {
         if column.name.text != "_" {
@@ -270,7 +273,7 @@ fn recording(
             y_dimension: unit.dimension,
             smooth: false,
             x: t.clone(),
-            y: values[k].iter().map(|y| y * unit.scale).collect(),
+            y: values[k].iter().map(|y| unit.to_si(*y)).collect(),
         };
         out.push((column.name.text.clone(), table, unit));
     }
@@ -318,7 +321,7 @@ fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
         ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
         ast::ExprKind::Number { value, unit: Some(text) } => {
             let unit = Unit::parse(&text.text).ok()?;
-            Some((value * unit.scale, unit, Some(text.clone())))
+            Some((unit.to_si(*value), unit, Some(text.clone())))
         }
         ast::ExprKind::Unary(ast::UnaryOp::Negate, a) => quantity(a).map(|(value, unit, text)| (-value, unit, text)),
         _ => None,
@@ -334,7 +337,9 @@ fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Chang
             SweepOver::Instances(all) => {
                 all.iter().map(|one| (Change { path, value: OverrideValue::Instance(one) }, None)).collect()
             }
-            SweepOver::Values(all) => all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect(),
+            SweepOver::Values(all) => {
+                all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect()
+            }
             SweepOver::Grid { .. } => grid
                 .iter()
                 .map(|one| {
@@ -353,7 +358,10 @@ fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Chang
         out = out
             .iter()
             .flat_map(|before| {
-                values.iter().map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>()).collect::<Vec<_>>()
+                values
+                    .iter()
+                    .map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>())
+                    .collect::<Vec<_>>()
             })
             .collect();
     }
@@ -430,26 +438,26 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request = Request {
-        instance: Instance::Written(&parts.run.instance, root),
-        overrides,
-        observed,
-        data: data.to_vec(),
-    };
+    let request =
+        Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
     on_stage("check");
     let types = units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
+    if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
         causality::check(&system, &loaded.files, &mut diagnostics);
     }
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
     }
-    if diagnostics.iter().any(Diagnostic::is_error) {
+    // What is wrong with the experiment alone does not hide what else is wrong with it.
+    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
+        || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
+    {
         return Err(diagnostics);
     }
+    diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
     let mut reader = Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new() };
 
     let corners = evaluate(&system, &types, &system.corners);
@@ -468,6 +476,10 @@ fn variant(
         },
     };
     let solver = reader.solver(parts, given, step.map(|at| nodes[at]), tol.map(|at| nodes[at]));
+    if solver.method != Method::Adaptive {
+        let at = step.map(|at| system.span(nodes[at]));
+        checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+    }
     let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
     for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {
         let shows = plot.shows.iter().zip(shows).map(|(show, at)| reader.show(show, nodes[*at])).collect();
@@ -519,6 +531,12 @@ fn variant(
     Ok(Variant { label, system, types, program, experiment })
 }
 
+/// Whether what is said concerns something outside of a place.
+fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
+    let span = diagnostic.span();
+    span.file != place.file || span.start < place.start || span.end > place.end
+}
+
 /// The text of a surface from the place that stands for it.
 fn surface_text(loaded: &Loaded, place: &str) -> String {
     let parse = || {
@@ -559,8 +577,10 @@ impl Reader<'_> {
                 true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
                     .label(span, "a pure number")
                     .help(format!("write `{text} s`")),
-                false => Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
-                    .label(span, Unit::si(self.dimension(expr)).to_string()),
+                false => {
+                    Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
+                        .label(span, Unit::si(self.dimension(expr)).to_string())
+                }
             };
             self.diagnostics.push(error);
             return 1.0;
@@ -590,7 +610,8 @@ impl Reader<'_> {
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
-            let error = Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
+            let error =
+                Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
             self.diagnostics.push(error.help("it lies between 0 and 1, such as `tol 1e-8`"));
         }
         match method {
@@ -628,8 +649,7 @@ impl Reader<'_> {
         let unit = show.unit.as_ref().and_then(|text| match Unit::parse(&text.text) {
             Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
             Ok(unit) => {
-                let message =
-                    format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
+                let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
                 let error = Diagnostic::error("E0101", message)
                     .label(text.span, unit.dimension.describe())
                     .label(self.system.span(expr), Unit::si(self.dimension(expr)).to_string());
@@ -784,7 +804,8 @@ impl Reader<'_> {
                     BinaryOp::Or => Formula::Or(a, b),
                     BinaryOp::Power => {
                         let span = self.system.span(id);
-                        let error = Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
+                        let error =
+                            Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
                         self.diagnostics.push(error.help("multiply: `max(x) * max(x)`"));
                         return None;
                     }
@@ -805,7 +826,13 @@ impl Reader<'_> {
         }
     }
 
-    fn measure(&mut self, whole: ExprId, value: ExprId, kind: MeasureKind, measures: &mut Vec<plan::Measure>) -> Formula {
+    fn measure(
+        &mut self,
+        whole: ExprId,
+        value: ExprId,
+        kind: MeasureKind,
+        measures: &mut Vec<plan::Measure>,
+    ) -> Formula {
         let text = one_line(self.loaded.files.slice(self.system.span(whole)));
         let own = self.own_unit(value);
         let seconds = Unit::parse("s").expect("the second is known");

@@ -71,19 +71,7 @@ pub struct Flat {
 
 /// Flattens an instance.
 pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flat {
-    let mut f = Flattener {
-        loaded,
-        sources,
-        system: System::default(),
-        diagnostics: Vec::new(),
-        instances: Vec::new(),
-        functions: Vec::new(),
-        tables: HashMap::new(),
-        consts: HashMap::new(),
-        open_consts: Vec::new(),
-        models: Vec::new(),
-        data: HashMap::new(),
-    };
+    let mut f = Flattener::new(loaded, sources);
     for (name, table, unit) in &request.data {
         let number = f.system.tables.len() as u32;
         f.system.tables.push(table.clone());
@@ -100,12 +88,18 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             f.written(instance, &env, overrides);
         }
         Instance::Alone(model, file) => {
-            let made = Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
+            let made =
+                Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
             f.instantiate(model, *file, made, true);
         }
     }
     for index in 0..f.instances.len() {
         f.define(InstanceId(index as u32));
+    }
+    for arg in std::mem::take(&mut f.dropped) {
+        if let ArgValue::Expr(expr) = arg.value {
+            f.expr(expr, &arg.env);
+        }
     }
     let observed = match f.instances.first().map(|top| top.file) {
         Some(_) => {
@@ -116,6 +110,44 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
         }
         None => Vec::new(),
+    };
+    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+}
+
+/// Reads a function, constant or table on its own: a function's arguments come from outside.
+pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
+    let mut f = Flattener::new(loaded, sources);
+    let env = Env::file(file);
+    let observed = match item {
+        Item::Function(function) => {
+            let mut locals = Vec::new();
+            for arg in &function.args {
+                let unit = match &arg.unit {
+                    None => Some(Unit::none()),
+                    Some(unit) => f.unit(unit, false, None),
+                };
+                let Some(unit) = unit else { continue };
+                let argument = Node::Number { value: f64::NAN, dimension: Some(unit.dimension), angle: unit.angle };
+                locals.push((arg.name.text.clone(), f.system.push(argument, arg.name.span)));
+            }
+            if let Lookup::Found(item, _) = loaded.find(file, Space::Function, &function.name.text) {
+                f.functions.push(item);
+            }
+            let value = f.expr(&function.body, &Env { locals: Rc::new(locals), ..env });
+            match function.unit.as_ref().and_then(|unit| f.unit(unit, false, None)) {
+                Some(unit) => {
+                    let role = Role::Result { function: function.name.text.clone() };
+                    vec![f.system.push(Node::Fits { value, dimension: unit.dimension, role }, function.body.span)]
+                }
+                None => vec![value],
+            }
+        }
+        Item::Const(constant) => f.constant(&constant.name, &env).into_iter().collect(),
+        Item::Table(table) => {
+            crate::tables::read(loaded, sources, file, table, &mut f.diagnostics);
+            Vec::new()
+        }
+        _ => Vec::new(),
     };
     Flat { system: f.system, observed, diagnostics: f.diagnostics }
 }
@@ -134,6 +166,10 @@ struct Flattener<'a> {
     open_consts: Vec<ItemRef>,
     /// Models being instantiated: to find circles.
     models: Vec<ItemRef>,
+    /// Wiring of slots that the present model has no port for: another model may read it.
+    dropped: Vec<Arg<'a>>,
+    /// Quantities whose definition was refused, and reported.
+    refused: Vec<VarId>,
     data: HashMap<String, (u32, Unit)>,
 }
 
@@ -171,11 +207,21 @@ struct Env {
     outside: bool,
     /// In an equation rather than a declaration: E0109 looks there.
     equation: bool,
+    /// In the condition of a transition or event: crossings may stand there.
+    instants: bool,
 }
 
 impl Env {
     fn file(file: FileId) -> Env {
-        Env { file, instance: None, rotary: false, locals: Rc::default(), outside: false, equation: false }
+        Env {
+            file,
+            instance: None,
+            rotary: false,
+            locals: Rc::default(),
+            outside: false,
+            equation: false,
+            instants: false,
+        }
     }
 }
 
@@ -214,6 +260,24 @@ struct Making<'a> {
 }
 
 impl<'a> Flattener<'a> {
+    fn new(loaded: &'a Loaded, sources: &'a dyn Sources) -> Flattener<'a> {
+        Flattener {
+            loaded,
+            sources,
+            system: System::default(),
+            diagnostics: Vec::new(),
+            instances: Vec::new(),
+            functions: Vec::new(),
+            tables: HashMap::new(),
+            consts: HashMap::new(),
+            open_consts: Vec::new(),
+            models: Vec::new(),
+            refused: Vec::new(),
+            dropped: Vec::new(),
+            data: HashMap::new(),
+        }
+    }
+
     fn report(&mut self, diagnostic: Diagnostic) {
         self.diagnostics.push(diagnostic);
     }
@@ -243,7 +307,8 @@ impl<'a> Flattener<'a> {
                     Item::Interface(_) => "an interface: it has no equations",
                     _ => "a device: it stands in a rig",
                 };
-                let error = Diagnostic::error("E0201", format!("`{}` is not a model", name.text)).label(name.span, what);
+                let error =
+                    Diagnostic::error("E0201", format!("`{}` is not a model", name.text)).label(name.span, what);
                 self.report(error.help("name a model that fits it"));
             }
             Lookup::Ambiguous(a, b) => self.ambiguous(name, a, b),
@@ -422,7 +487,10 @@ impl<'a> Flattener<'a> {
             DeclarationKind::Let => VarKind::Let,
         };
         let rotary = self.system.instance(id).rotary;
-        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary)?, self.bracketed(unit.span))));
+        let unit = declaration
+            .unit
+            .as_ref()
+            .and_then(|unit| Some((self.unit(unit, rotary, Some(id))?, self.bracketed(unit.span))));
         let shown = match &declaration.value {
             Some(Expr { kind: ExprKind::Number { unit: Some(unit), .. }, .. }) => Unit::parse(&unit.text).ok(),
             _ => None,
@@ -468,11 +536,11 @@ impl<'a> Flattener<'a> {
     }
 
     /// A unit as written, mapped for a rotary instance; or a report.
-    fn unit(&mut self, unit: &ast::UnitText, rotary: bool) -> Option<Unit> {
+    fn unit(&mut self, unit: &ast::UnitText, rotary: bool, owner: Option<InstanceId>) -> Option<Unit> {
         match Unit::parse(&unit.text) {
             Ok(parsed) => {
                 if rotary && parsed.angle == Angle::Angle {
-                    self.not_rotary(unit.span, "speaks of an angle already");
+                    self.not_rotary(owner, unit.span, "speaks of an angle already");
                     return None;
                 }
                 Some(if rotary { parsed.rotary() } else { parsed })
@@ -484,10 +552,16 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    fn not_rotary(&mut self, span: Span, why: &str) {
-        let error = Diagnostic::error("E0109", "this model cannot be made rotary")
-            .label(span, why)
-            .help("`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin");
+    fn not_rotary(&mut self, owner: Option<InstanceId>, span: Span, why: &str) {
+        if let Some(id) = owner {
+            if self.system.strangers.contains(&id) {
+                return;
+            }
+            self.system.strangers.push(id);
+        }
+        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(
+            "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin",
+        );
         self.report(error);
     }
 
@@ -539,12 +613,18 @@ impl<'a> Flattener<'a> {
         env: &Env,
         changes: Vec<Change<'a>>,
     ) {
+        // Read as expressions too, so that what they mention counts as read.
+        self.expr(&repeat.first, env);
+        self.expr(&repeat.last, env);
         let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
         let (Some(first), Some(last)) = bounds else { return };
         if last < first || (last - first) as usize >= MOST_VARS {
-            let error = Diagnostic::error("E0502", format!("`{}` cannot repeat from {first} to {last}", part.name.text))
-                .label(repeat.span, "this range")
-                .help(format!("the last index is at least the first, and there are at most {MOST_VARS} quantities"));
+            let error =
+                Diagnostic::error("E0502", format!("`{}` cannot repeat from {first} to {last}", part.name.text))
+                    .label(repeat.span, "this range")
+                    .help(format!(
+                        "the last index is at least the first, and there are at most {MOST_VARS} quantities"
+                    ));
             self.report(error);
             return;
         }
@@ -592,10 +672,11 @@ impl<'a> Flattener<'a> {
                 ArgValue::Instance(instance) => {
                     if part.slot.is_none() {
                         let owner = &self.tree(id).model.name.text;
-                        let error = Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
-                            .label(arg.span, "another model cannot be put here")
-                            .label(part.name.span, "declared without an interface")
-                            .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
+                        let error =
+                            Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
+                                .label(arg.span, "another model cannot be put here")
+                                .label(part.name.span, "declared without an interface")
+                                .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
                         self.report(error);
                     } else {
                         chosen = (instance, arg.env);
@@ -635,16 +716,16 @@ impl<'a> Flattener<'a> {
             let slot_rotary = slot.rotary || parent_rotary;
             let ports = self.interface(file, slot)?;
             self.check_fit(model, item.file, instance, rotary, ports, slot, slot_rotary);
-            let has = |name: &str| {
-                declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name)
-            };
+            let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
             let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
             if replaced {
                 let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
                 args.extend(wiring.into_iter().filter(|arg| port(arg.name) && !given.contains(&arg.name)));
             }
             // A slot drops its wiring for a model that lacks an optional port.
-            args.retain(|arg| !port(arg.name) || has(arg.name));
+            let (kept, dropped) = args.into_iter().partition(|arg| !port(arg.name) || has(arg.name));
+            args = kept;
+            self.dropped.extend::<Vec<_>>(dropped);
         }
         self.models.push(item);
         let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
@@ -662,7 +743,8 @@ impl<'a> Flattener<'a> {
                 let mut error = Diagnostic::error("E0201", format!("there is no interface `{}`", slot.interface.text))
                     .label(slot.interface.span, "not declared and not imported");
                 let names = loaded.visible(file, Space::Type);
-                let interface = |name: &&str| matches!(loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Interface(_)));
+                let interface =
+                    |name: &&str| matches!(loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Interface(_)));
                 if let Some(near) = nearest(&slot.interface.text, names.into_iter().filter(interface)) {
                     error = error.help(format!("did you mean `{near}`?"));
                 } else if let Some(module) = self.module_with(&slot.interface.text) {
@@ -698,7 +780,9 @@ impl<'a> Flattener<'a> {
             let problem = match found {
                 None if port.value.is_some() => continue,
                 None => format!("it has no `{wanted}`"),
-                Some(d) if d.kind != port.kind => format!("its `{}` is {} `{}`", d.name.text, article(d.kind.word()), d.kind.word()),
+                Some(d) if d.kind != port.kind => {
+                    format!("its `{}` is {} `{}`", d.name.text, article(d.kind.word()), d.kind.word())
+                }
                 Some(d) => match (dimension(&d.unit, rotary), dimension(&port.unit, slot_rotary)) {
                     (Some(has), Some(needs)) if has != needs => {
                         if has.rotary() == needs || needs.rotary() == has {
@@ -707,9 +791,13 @@ impl<'a> Flattener<'a> {
                             } else {
                                 ("rotary", format!("write `{name}(…)` without `rotary`"))
                             };
-                            let error = Diagnostic::error("E0108", format!("{name} is {model_is} here, the slot is not"))
-                                .label(instance.model.span, format!("its `{}` is in {}", d.name.text, Unit::si(has)))
-                                .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
+                            let error =
+                                Diagnostic::error("E0108", format!("{name} is {model_is} here, the slot is not"))
+                                    .label(
+                                        instance.model.span,
+                                        format!("its `{}` is in {}", d.name.text, Unit::si(has)),
+                                    )
+                                    .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
                             self.report(error.help(help));
                             return;
                         }
@@ -721,7 +809,10 @@ impl<'a> Flattener<'a> {
             let error = Diagnostic::error("E0206", format!("{name} does not fit {}", interface.name.text))
                 .label(instance.model.span, problem)
                 .label(slot.interface.span, format!("asks for `{wanted}`"))
-                .help(format!("a model fits {} when it has its ports with these units; add `{wanted}`", interface.name.text));
+                .help(format!(
+                    "a model fits {} when it has its ports with these units; add `{wanted}`",
+                    interface.name.text
+                ));
             self.report(error);
             return;
         }
@@ -750,7 +841,9 @@ impl<'a> Flattener<'a> {
                 _ if part => continue,
                 Some(d) if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input) => match arg.value {
                     ArgValue::Expr(_) => continue,
-                    ArgValue::Instance(_) => format!("`{}` of {} takes a value, not a model", arg.name, model.name.text),
+                    ArgValue::Instance(_) => {
+                        format!("`{}` of {} takes a value, not a model", arg.name, model.name.text)
+                    }
                 },
                 Some(d) => {
                     let kind = d.kind.word();
@@ -782,6 +875,7 @@ impl<'a> Flattener<'a> {
             locals: tree.locals.clone(),
             outside: false,
             equation: false,
+            instants: false,
         }
     }
 
@@ -864,14 +958,19 @@ impl<'a> Flattener<'a> {
                 Statement::Equation(equation) => self.equation(id, equation, &equations, &mut defined, &mut rates),
                 Statement::Every(every) => self.every(id, every, &equations, &mut defined),
                 Statement::When(when) => {
-                    let condition = self.expr(&when.condition, &equations);
+                    let condition = self.expr(&when.condition, &Env { instants: true, ..equations.clone() });
                     let resets = self.resets(id, &when.resets, &equations);
                     self.system.events.push(Event { instance: id, condition, resets, span: when.span });
                 }
                 Statement::Require(require) => {
                     let condition = self.expr(&require.condition, &env);
                     let message = require.message.as_ref().map(|message| message.text.clone());
-                    self.system.requires.push(Require { instance: id, condition, message, span: require.condition.span });
+                    self.system.requires.push(Require {
+                        instance: id,
+                        condition,
+                        message,
+                        span: require.condition.span,
+                    });
                 }
                 Statement::Storage(storage) => {
                     let energy = self.expr(&storage.energy, &equations);
@@ -1012,6 +1111,7 @@ impl<'a> Flattener<'a> {
             }
             Wanted::Rate { along } => rates.push((var, Rate { value, along, span: equation.target.span() })),
             Wanted::Next => {
+                self.refused.push(var);
                 let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                     .label(equation.target.span(), "when is the next tick?")
                     .help(format!("write `every Ts {{ next({}) = … }}`", equation.target.name().text));
@@ -1039,6 +1139,22 @@ impl<'a> Flattener<'a> {
         };
         let kind = self.system.var(var).kind;
         let declared = self.system.var(var).span;
+        let wanted = self.wanted(id, target, var, kind, declared);
+        if wanted.is_none() {
+            self.refused.push(var);
+        }
+        wanted
+    }
+
+    fn wanted(
+        &mut self,
+        id: InstanceId,
+        target: &'a Target,
+        var: VarId,
+        kind: VarKind,
+        declared: Span,
+    ) -> Option<(VarId, Wanted)> {
+        let name = target.name();
         match (target, kind) {
             (Target::Name(_), VarKind::Output | VarKind::Let) => Some((var, Wanted::Value)),
             (Target::Next { .. }, VarKind::State) => Some((var, Wanted::Next)),
@@ -1063,19 +1179,23 @@ impl<'a> Flattener<'a> {
                 }
             }
             (Target::Name(_), VarKind::State) => {
-                let error = Diagnostic::error("E0301", format!("`{}` is a state: it has no equation of its own", name.text))
-                    .label(target.span(), "a state changes, it is not computed")
-                    .label(declared, "declared here")
-                    .help(format!("say how it changes, `d{0}/dt = …`, or declare it as `let {0} = …`", name.text));
+                let error =
+                    Diagnostic::error("E0301", format!("`{}` is a state: it has no equation of its own", name.text))
+                        .label(target.span(), "a state changes, it is not computed")
+                        .label(declared, "declared here")
+                        .help(format!("say how it changes, `d{0}/dt = …`, or declare it as `let {0} = …`", name.text));
                 self.report(error);
                 None
             }
             (Target::Name(_), _) => {
                 let kind = kind.word();
-                let error = Diagnostic::error("E0301", format!("`{}` is {} {kind}: its value comes from outside", name.text, article(kind)))
-                    .label(target.span(), "a second definition")
-                    .label(declared, "declared here")
-                    .help("give what is computed here another name, and declare it with `let`");
+                let error = Diagnostic::error(
+                    "E0301",
+                    format!("`{}` is {} {kind}: its value comes from outside", name.text, article(kind)),
+                )
+                .label(target.span(), "a second definition")
+                .label(declared, "declared here")
+                .help("give what is computed here another name, and declare it with `let`");
                 self.report(error);
                 None
             }
@@ -1102,7 +1222,9 @@ impl<'a> Flattener<'a> {
                     let error = Diagnostic::error("E0304", format!("`{name}` changes in time and at ticks"))
                         .label(span, "again here")
                         .label(first, "first here")
-                        .help(format!("a state is continuous, `d{name}/dt = …`, or sampled, `next({name}) = …`: keep one"));
+                        .help(format!(
+                            "a state is continuous, `d{name}/dt = …`, or sampled, `next({name}) = …`: keep one"
+                        ));
                     self.report(error);
                     return false;
                 }
@@ -1146,10 +1268,12 @@ impl<'a> Flattener<'a> {
                             if self.once(var, span, defined)
                                 && let Definition::Continuous { initial, .. } = self.system.var(var).definition
                             {
-                                self.system.vars[var.0 as usize].definition = Definition::Sampled { initial, next: value, block };
+                                self.system.vars[var.0 as usize].definition =
+                                    Definition::Sampled { initial, next: value, block };
                             }
                         }
                         Wanted::Rate { .. } => {
+                            self.refused.push(var);
                             let name = &equation.target.name().text;
                             let error = Diagnostic::error("E0308", "a derivative does not belong inside `every`")
                                 .label(span, "sampled code changes at ticks only")
@@ -1169,9 +1293,10 @@ impl<'a> Flattener<'a> {
             match self.var_named(id, &reset.name.text) {
                 Some(var) if self.system.var(var).kind == VarKind::State => out.push((var, value)),
                 Some(var) => {
-                    let error = Diagnostic::error("E0307", format!("`{}` is no state: it cannot be reset", reset.name.text))
-                        .label(reset.name.span, "only a state keeps a value")
-                        .label(self.system.var(var).span, "declared here");
+                    let error =
+                        Diagnostic::error("E0307", format!("`{}` is no state: it cannot be reset", reset.name.text))
+                            .label(reset.name.span, "only a state keeps a value")
+                            .label(self.system.var(var).span, "declared here");
                     self.report(error);
                 }
                 None => self.unknown(id, &reset.name),
@@ -1214,6 +1339,7 @@ impl<'a> Flattener<'a> {
                     Wanted::Value => None,
                     Wanted::Rate { along } => Some(along),
                     Wanted::Next => {
+                        self.refused.push(var);
                         let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                             .label(span, "a regime is continuous")
                             .help("write an `every` block beside the regimes; a regime's name can be used in it as a condition");
@@ -1225,7 +1351,8 @@ impl<'a> Flattener<'a> {
             }
             by_mode.push(here);
         }
-        let transitions: Vec<Vec<Transition>> = modes.iter().map(|mode| self.transitions(id, mode, &modes, env)).collect();
+        let transitions: Vec<Vec<Transition>> =
+            modes.iter().map(|mode| self.transitions(id, mode, &modes, env)).collect();
         for (regime, transitions) in self.system.automata[automaton].regimes.iter_mut().zip(transitions) {
             regime.transitions = transitions;
         }
@@ -1251,10 +1378,14 @@ impl<'a> Flattener<'a> {
                     .expect("some regime defines it");
                 let name = &self.system.var(var).name;
                 let text = self.loaded.files.slice(first.span).to_string();
-                let error = Diagnostic::error("E0305", format!("regime `{}` does not say what `{name}` is", mode.name.text))
-                    .label(first.statement, format!("`{}` defines {name}", other.name.text))
-                    .label(mode.head, format!("`{}` does not", mode.name.text))
-                    .help(format!("every regime defines the same quantities; add `{text} = ...` to `{}`", mode.name.text));
+                let error =
+                    Diagnostic::error("E0305", format!("regime `{}` does not say what `{name}` is", mode.name.text))
+                        .label(first.statement, format!("`{}` defines {name}", other.name.text))
+                        .label(mode.head, format!("`{}` does not", mode.name.text))
+                        .help(format!(
+                            "every regime defines the same quantities; add `{text} = ...` to `{}`",
+                            mode.name.text
+                        ));
                 self.report(error);
                 break;
             }
@@ -1290,10 +1421,16 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    fn transitions(&mut self, id: InstanceId, mode: &'a ast::Mode, modes: &[&'a ast::Mode], env: &Env) -> Vec<Transition> {
+    fn transitions(
+        &mut self,
+        id: InstanceId,
+        mode: &'a ast::Mode,
+        modes: &[&'a ast::Mode],
+        env: &Env,
+    ) -> Vec<Transition> {
         let mut out = Vec::new();
         for go in &mode.transitions {
-            let condition = self.expr(&go.condition, env);
+            let condition = self.expr(&go.condition, &Env { instants: true, ..env.clone() });
             let resets = self.resets(id, &go.resets, env);
             match modes.iter().position(|other| other.name.text == go.target.text) {
                 Some(target) => out.push(Transition { target: target as u32, condition, resets, span: go.span }),
@@ -1350,7 +1487,8 @@ impl<'a> Flattener<'a> {
                 .help("one of them must change along time: `ds/dt = …`");
             self.report(error);
             for (var, rate) in waiting {
-                self.set_rate(var, rate.value, None, rate.span);
+                let unknown = self.system.push(Node::Error, rate.span);
+                self.set_rate(var, unknown, None, rate.span);
             }
         }
     }
@@ -1382,7 +1520,9 @@ impl<'a> Flattener<'a> {
             Node::Binary(BinaryOp::Multiply, a, b) if self.has_sign(a, inner) => {
                 Node::Binary(BinaryOp::Multiply, self.times_speed(a, speed, span), b)
             }
-            Node::Binary(BinaryOp::Multiply, a, b) => Node::Binary(BinaryOp::Multiply, a, self.times_speed(b, speed, span)),
+            Node::Binary(BinaryOp::Multiply, a, b) => {
+                Node::Binary(BinaryOp::Multiply, a, self.times_speed(b, speed, span))
+            }
             Node::Binary(BinaryOp::Divide, a, b) if self.has_sign(a, inner) => {
                 Node::Binary(BinaryOp::Divide, self.times_speed(a, speed, span), b)
             }
@@ -1408,7 +1548,9 @@ impl<'a> Flattener<'a> {
             Node::Binary(BinaryOp::Divide, a, _) => self.has_sign(*a, inner),
             Node::If(_, a, b) => self.has_sign(*a, inner) || self.has_sign(*b, inner),
             Node::Var(var) => match self.system.var(*var).definition {
-                Definition::Value(value, _) if self.system.var(*var).kind == VarKind::Let => self.has_sign(value, inner),
+                Definition::Value(value, _) if self.system.var(*var).kind == VarKind::Let => {
+                    self.has_sign(value, inner)
+                }
                 _ => false,
             },
             _ => false,
@@ -1423,7 +1565,9 @@ impl<'a> Flattener<'a> {
         match (self.system.node(a), self.system.node(b)) {
             (Node::Var(a), Node::Var(b)) => a == b,
             (Node::Negate(a), Node::Negate(b)) => self.same(*a, *b),
-            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => op == other && self.same(*a, *c) && self.same(*b, *d),
+            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => {
+                op == other && self.same(*a, *c) && self.same(*b, *d)
+            }
             _ => false,
         }
     }
@@ -1434,7 +1578,7 @@ impl<'a> Flattener<'a> {
         for declaration in declarations(model) {
             let Some(var) = self.var_named(id, &declaration.name.text) else { continue };
             let span = declaration.name.span;
-            if defined.contains_key(&var) || self.system.var(var).span != span {
+            if defined.contains_key(&var) || self.refused.contains(&var) || self.system.var(var).span != span {
                 continue;
             }
             let name = &declaration.name.text;
@@ -1509,13 +1653,20 @@ impl<'a> Flattener<'a> {
         let mut value = self.operand(first, env);
         while let Some((whole, op, _, right)) = spine.pop() {
             let right = self.expr(right, env);
-            value = self.binary(op, value, right, whole.span);
+            value = self.binary(op, value, right, whole.span, env);
         }
         value
     }
 
-    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span) -> ExprId {
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span, env: &Env) -> ExprId {
         let node = match op {
+            BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls if !env.instants => {
+                let error = Diagnostic::error("E0308", format!("`{}` is an instant, not a value", op.text()))
+                    .label(span, "true at one instant only")
+                    .help("it belongs in `go … when …` and `when …`; for a value compare with `<` or `>`");
+                self.report(error);
+                Node::Error
+            }
             BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls => {
                 let difference = self.system.push(Node::Binary(BinaryOp::Subtract, a, b), span);
                 self.system.crossings.push(Crossing { kind: op, difference });
@@ -1553,12 +1704,12 @@ impl<'a> Flattener<'a> {
                     Node::Error
                 }
                 Ok(unit) => {
-                    let value = value * unit.scale;
+                    let value = unit.to_si(value);
                     if env.rotary {
                         if unit.angle == Angle::Angle {
-                            self.not_rotary(span, "speaks of an angle already");
+                            self.not_rotary(env.instance, span, "speaks of an angle already");
                         } else if env.equation && unit.dimension.rotary() != unit.dimension {
-                            self.not_rotary(span, "a constant with a straight unit inside an equation");
+                            self.not_rotary(env.instance, span, "a constant with a straight unit inside an equation");
                         }
                     }
                     let dimension = if env.rotary { unit.dimension.rotary() } else { unit.dimension };
@@ -1741,10 +1892,11 @@ impl<'a> Flattener<'a> {
                 let inner = Env { rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
                 let mut value = self.expr(&constant.value, &inner);
                 if let Some(unit) = &constant.unit
-                    && let Some(unit) = self.unit(unit, env.rotary)
+                    && let Some(unit) = self.unit(unit, env.rotary, env.instance)
                 {
                     let role = Role::Result { function: name.text.clone() };
-                    value = self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
+                    value =
+                        self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
                 }
                 self.open_consts.pop();
                 self.consts.insert((item, env.rotary), value);
@@ -1765,9 +1917,10 @@ impl<'a> Flattener<'a> {
             (Some(var), _) if along.text == "t" => Node::Rate(var),
             (Some(var), Some(_)) => Node::PathRate(var),
             _ => {
-                let error = Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
-                    .label(span, "not a state of this model")
-                    .help("to watch a derivative, give the model an output for it");
+                let error =
+                    Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
+                        .label(span, "not a state of this model")
+                        .help("to watch a derivative, give the model an output for it");
                 self.report(error);
                 Node::Error
             }
@@ -1812,9 +1965,10 @@ impl<'a> Flattener<'a> {
                 self.error(span)
             }
             None if MeasureName::named(&function.text).is_some() => {
-                let error = Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
-                    .label(function.span, "needs the whole course of a quantity")
-                    .help(format!("write `expect {}(…) < …` in an experiment", function.text));
+                let error =
+                    Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
+                        .label(function.span, "needs the whole course of a quantity")
+                        .help(format!("write `expect {}(…) < …` in an experiment", function.text));
                 self.report(error);
                 self.error(span)
             }
@@ -1839,8 +1993,9 @@ impl<'a> Flattener<'a> {
 
     fn wrong_count(&mut self, function: &Name, wanted: usize, got: usize) {
         let plural = if wanted == 1 { "" } else { "s" };
-        let error = Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
-            .label(function.span, format!("{got} given"));
+        let error =
+            Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
+                .label(function.span, format!("{got} given"));
         self.report(error);
     }
 
@@ -1875,6 +2030,7 @@ impl<'a> Flattener<'a> {
         let parts = loop {
             let segment = &path.segments[at];
             match (&binding, segment.index) {
+                (Binding::Broken, _) => return Some(self.error(span)),
                 (Binding::Parts(parts, _), None) => break parts.clone(),
                 (Binding::Parts(parts, first), Some(index)) => {
                     let part = *parts.get(usize::try_from(i64::from(index) - first).ok()?)?;
@@ -1934,7 +2090,7 @@ impl<'a> Flattener<'a> {
             let value = self.expr(expr, env);
             let dimension = match &arg.unit {
                 None => Some(Dimension::NONE),
-                Some(unit) => self.unit(unit, env.rotary).map(|unit| unit.dimension),
+                Some(unit) => self.unit(unit, env.rotary, env.instance).map(|unit| unit.dimension),
             };
             let value = match dimension {
                 Some(dimension) => {
@@ -1957,15 +2113,10 @@ impl<'a> Flattener<'a> {
             return self.error(span);
         }
         self.functions.push(item);
-        let inner = Env {
-            locals: Rc::new(locals),
-            rotary: env.rotary,
-            equation: env.equation,
-            ..Env::file(item.file)
-        };
+        let inner = Env { locals: Rc::new(locals), rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
         let body = self.expr(&function.body, &inner);
         self.functions.pop();
-        match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary)) {
+        match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance)) {
             Some(unit) => {
                 let role = Role::Result { function: function.name.text.clone() };
                 self.system.push(Node::Fits { value: body, dimension: unit.dimension, role }, span)
@@ -2043,11 +2194,16 @@ fn article(word: &str) -> &'static str {
 }
 
 fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
-    let known = ["m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A", "V"];
-    let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
+    let known = [
+        "m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A",
+        "V",
+    ];
+    let error =
+        Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
     match nearest(part, known) {
         Some(near) => error.help(format!("did you mean `{near}`?")),
-        None => error.help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
+        None => error
+            .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
     }
 }
 

@@ -229,7 +229,8 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
         return Verdict::NotChecked;
     }
     let corners: usize = choices.iter().map(Vec::len).product();
-    let externals: &[f64] = if contact.external.is_some() { &[0.0, 0.3, -0.3, 1.0, -1.0, 3.0, -3.0, 10.0, -10.0] } else { &[0.0] };
+    let externals: &[f64] =
+        if contact.external.is_some() { &[0.0, 0.3, -0.3, 1.0, -1.0, 3.0, -3.0, 10.0, -10.0] } else { &[0.0] };
     let mut points = 0;
     // Powers of ten first, so that a counterexample has a round velocity; then the grid between them.
     let speeds = (-6..=1).map(|k| decade(k, 1)).chain((-60..=10).map(|k| decade(k, 10)));
@@ -285,7 +286,9 @@ fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
     build.inline(&program.derivatives, &mut env);
     let mut flow = build.real(0.0);
     for k in 0..n {
-        let Some(slope) = gradients.get(&energy).and_then(|gradient| derive::entry(gradient, k as u32)) else { continue };
+        let Some(slope) = gradients.get(&energy).and_then(|gradient| derive::entry(gradient, k as u32)) else {
+            continue;
+        };
         let term = build.mul(slope, env[&layout.derivatives.slot(k)]);
         flow = build.add(flow, term);
     }

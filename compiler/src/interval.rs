@@ -17,13 +17,8 @@ pub struct Interval {
 
 impl Interval {
     /// Everything.
-    pub const ALL: Interval = Interval {
-        low: f64::NEG_INFINITY,
-        high: f64::INFINITY,
-        above_low: true,
-        below_high: true,
-        not_zero: false,
-    };
+    pub const ALL: Interval =
+        Interval { low: f64::NEG_INFINITY, high: f64::INFINITY, above_low: true, below_high: true, not_zero: false };
 
     /// One number; everything, if it is NaN.
     pub fn point(x: f64) -> Interval {
@@ -229,7 +224,8 @@ impl Interval {
 
 /// The smallest interval around ends, each with whether it is left out.
 fn around(ends: &[(f64, bool)]) -> Interval {
-    let mut out = Interval { low: f64::INFINITY, high: f64::NEG_INFINITY, above_low: true, below_high: true, not_zero: false };
+    let mut out =
+        Interval { low: f64::INFINITY, high: f64::NEG_INFINITY, above_low: true, below_high: true, not_zero: false };
     for &(x, open) in ends {
         if x < out.low || (x == out.low && !open) {
             (out.low, out.above_low) = (x, open);

@@ -24,6 +24,7 @@ pub mod interval;
 pub mod domains;
 pub mod friction;
 pub mod lints;
+pub mod explain;
 pub mod experiment;
 
 pub use experiment::Changes;
@@ -110,7 +111,11 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
 }
 
 /// Machine code of functions, or the interpreter where there can be none, which is noted.
-pub fn code(functions: &[(Function, ir::Func)], description: &abi::Description, interpret: bool) -> (Code, Vec<String>) {
+pub fn code(
+    functions: &[(Function, ir::Func)],
+    description: &abi::Description,
+    interpret: bool,
+) -> (Code, Vec<String>) {
     let (layout, pool) = (&description.layout, description.pool.len());
     let interpreted = || Code::Interpreted(Arc::new(backend::interp::Interpreter::new(functions, layout, pool)));
     if interpret {
@@ -122,34 +127,30 @@ pub fn code(functions: &[(Function, ir::Func)], description: &abi::Description, 
     }
 }
 
-/// Checks everything in a loaded text: each model on its own, each experiment.
-pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
-    let mut all = loaded.diagnostics.clone();
+/// Explains a model of a loaded text, on its own.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<explain::Explanation, Vec<Diagnostic>> {
     let root = loaded.root();
-    let ast = loaded.files.get(root).ast.clone();
-    for item in &ast.items {
-        match item {
-            Item::Model(model) => all.extend(check_model(loaded, sources, model, root)),
-            Item::Experiment(experiment) => {
-                let mut warnings = Vec::new();
-                let changes = Changes::default();
-                match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
-                    Ok(_) => all.extend(warnings),
-                    Err(errors) => all.extend(errors),
-                }
-            }
-            _ => {}
-        }
+    let found = loaded.models().into_iter().find(|candidate| candidate.name.text == model);
+    let Some(model) = found else {
+        return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
+    };
+    let (system, types, diagnostics) = alone(loaded, sources, model, root);
+    match diagnostics.iter().any(Diagnostic::is_error) {
+        true => Err(once(diagnostics)),
+        false => Ok(explain::explain(&system, &types, &loaded.files)),
     }
-    once(all)
 }
 
-fn check_model(
+/// A model on its own, flat and typed, its circles reported.
+fn alone(
     loaded: &Loaded,
     sources: &dyn Sources,
     model: &grammar::ast::Model,
     file: FileId,
-) -> Vec<Diagnostic> {
+) -> (system::System, units::Types, Vec<Diagnostic>) {
     let request = flatten::Request {
         instance: flatten::Instance::Alone(model, file),
         overrides: Vec::new(),
@@ -162,14 +163,65 @@ fn check_model(
     if !diagnostics.iter().any(Diagnostic::is_error) {
         causality::check(&flat.system, &loaded.files, &mut diagnostics);
     }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&flat.system, &types, &loaded.files, &mut diagnostics);
-        domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
+    (flat.system, types, diagnostics)
+}
+
+/// Checks everything in a loaded text: each model on its own, each experiment.
+pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
+    let mut all = loaded.diagnostics.clone();
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let unreadable = loaded.has_errors();
+    for item in &ast.items {
+        match item {
+            Item::Model(model) => all.extend(check_model(loaded, sources, model, root, !unreadable)),
+            Item::Experiment(experiment) => {
+                let mut warnings = Vec::new();
+                let changes = Changes::default();
+                match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
+                    Ok(_) => all.extend(warnings),
+                    Err(errors) => all.extend(errors),
+                }
+            }
+            Item::Function(_) | Item::Const(_) | Item::Table(_) => {
+                let flat = flatten::flatten_item(loaded, sources, root, item);
+                let mut diagnostics = flat.diagnostics;
+                units::check(&flat.system, &loaded.files, &mut diagnostics);
+                all.extend(diagnostics);
+            }
+            Item::Fit(fit) => {
+                let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
+                all.push(error.label(fit.name.span, "reserved for the fitting of parameters"));
+            }
+            Item::Import(_) | Item::Interface(_) | Item::Device(_) | Item::Rig(_) => {}
+        }
     }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        diagnostics.extend(lints::check(&flat.system, &types, &loaded.files));
+    // What cannot be read elsewhere is missing here: say the cause.
+    if loaded.diagnostics.iter().any(|d| d.is_error() && d.span().file != root) {
+        all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
     }
-    lints::silence(&flat.system, &mut diagnostics);
+    once(all)
+}
+
+/// `whole`: the text could be read in whole; else what is proven of it would rest on gaps.
+fn check_model(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+    whole: bool,
+) -> Vec<Diagnostic> {
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, file);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        if whole {
+            domains::check(&system, &types, &loaded.files, &mut diagnostics);
+        }
+    }
+    if whole && !diagnostics.iter().any(Diagnostic::is_error) {
+        diagnostics.extend(lints::check(&system, &types, &loaded.files));
+    }
+    lints::silence(&system, &mut diagnostics);
     diagnostics
 }
 
@@ -179,6 +231,11 @@ pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
     diagnostics.sort_by_key(|diagnostic| diagnostic.span());
     let mut seen = std::collections::HashSet::new();
-    diagnostics.retain(|diagnostic| seen.insert((diagnostic.code, diagnostic.span())));
+    let mut circle = false;
+    diagnostics.retain(|diagnostic| {
+        // A circle of models is met from each of them.
+        let again = diagnostic.message.ends_with("contains itself") && std::mem::replace(&mut circle, true);
+        seen.insert((diagnostic.code, diagnostic.span())) && !again
+    });
     diagnostics
 }

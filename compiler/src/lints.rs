@@ -41,11 +41,8 @@ pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
 /// Takes out warnings that the model allows.
 pub fn silence(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     let Some(top) = system.instances.first() else { return };
-    let allowed: Vec<&str> = LINTS
-        .iter()
-        .filter(|(name, _)| top.allows.iter().any(|allow| allow == name))
-        .map(|(_, code)| *code)
-        .collect();
+    let allowed: Vec<&str> =
+        LINTS.iter().filter(|(name, _)| top.allows.iter().any(|allow| allow == name)).map(|(_, code)| *code).collect();
     diagnostics.retain(|diagnostic| diagnostic.is_error() || !allowed.contains(&diagnostic.code));
 }
 

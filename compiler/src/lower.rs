@@ -210,9 +210,8 @@ impl<'a> Plan<'a> {
         let mut shared: HashMap<String, usize> = HashMap::new();
         let mut observed_at: Vec<Result<VarId, usize>> = Vec::new();
         for one in wanted {
-            let stored = |id: &VarId| {
-                !matches!(system.var(*id).definition, Definition::Value(..)) || independent[id.0 as usize]
-            };
+            let stored =
+                |id: &VarId| !matches!(system.var(*id).definition, Definition::Value(..)) || independent[id.0 as usize];
             match system.node(one.expr) {
                 Node::Var(id) if stored(id) => observed_at.push(Ok(*id)),
                 Node::Var(id) => {
@@ -236,8 +235,19 @@ impl<'a> Plan<'a> {
         let n = states.len();
         let jacobian = if n <= MOST_JACOBIAN { n * n + n } else { 0 };
         let layout = Layout::new(
-            [params.len(), inputs.len(), n, memory, system.automata.len(), outputs.len(), n, 0, jacobian, system.blocks.len()]
-                .map(|len| len as u32),
+            [
+                params.len(),
+                inputs.len(),
+                n,
+                memory,
+                system.automata.len(),
+                outputs.len(),
+                n,
+                0,
+                jacobian,
+                system.blocks.len(),
+            ]
+            .map(|len| len as u32),
         );
         let mut places = vec![Place::Computed; system.vars.len()];
         let mut put = |vars: &[VarId], segment: abi::description::Segment, from: usize| {
@@ -352,9 +362,10 @@ impl<'a> Plan<'a> {
             if quantities.iter().any(|quantity| quantity.slot == *slot && quantity.path == one.text) {
                 continue;
             }
-            let unit = one.unit.clone().unwrap_or_else(|| {
-                self.types.nodes[one.expr.0 as usize].map_or_else(Unit::none, Unit::si)
-            });
+            let unit = one
+                .unit
+                .clone()
+                .unwrap_or_else(|| self.types.nodes[one.expr.0 as usize].map_or_else(Unit::none, Unit::si));
             quantities.push(Quantity {
                 path: one.text.clone(),
                 kind: Kind::Observed,
@@ -411,7 +422,9 @@ impl<'a> Plan<'a> {
         }
         self.description.guards = quantities
             .iter()
-            .filter(|q| !q.boolean && matches!(q.kind, Kind::State | Kind::SampledState | Kind::Output | Kind::Observed))
+            .filter(|q| {
+                !q.boolean && matches!(q.kind, Kind::State | Kind::SampledState | Kind::Output | Kind::Observed)
+            })
             .map(|q| Guard { path: q.path.clone(), slot: q.slot, range: q.range, unit: q.unit.clone() })
             .collect();
     }
@@ -423,7 +436,9 @@ impl<'a> Plan<'a> {
         }
         for id in &self.sampled {
             // The blocks due at 0 have run: the state is what they say is next.
-            let Definition::Sampled { next, .. } = self.system.var(*id).definition else { unreachable!("it is sampled") };
+            let Definition::Sampled { next, .. } = self.system.var(*id).definition else {
+                unreachable!("it is sampled")
+            };
             let value = emit.value(next);
             let value = emit.as_number(value, self.types.boolean_vars[id.0 as usize]);
             emit.build.store(self.slot(*id).expect("it is stored"), value);
@@ -637,10 +652,8 @@ impl<'a> Plan<'a> {
                 _ => {}
             }
         }
-        let segment = abi::description::Segment {
-            start: self.description.layout.roots.start,
-            len: surfaces.len() as u32,
-        };
+        let segment =
+            abi::description::Segment { start: self.description.layout.roots.start, len: surfaces.len() as u32 };
         let mut roots = Vec::new();
         for (k, (value, id)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
@@ -670,7 +683,12 @@ fn independent_params(system: &System) -> Vec<bool> {
                 let node = system.node(id);
                 free &= !matches!(
                     node,
-                    Node::Var(_) | Node::Time | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) | Node::Crossing(_)
+                    Node::Var(_)
+                        | Node::Time
+                        | Node::Rate(_)
+                        | Node::PathRate(_)
+                        | Node::InRegime(..)
+                        | Node::Crossing(_)
                 );
                 stack.extend(node.operands());
             }
@@ -706,9 +724,12 @@ impl<'a> Emit<'a> {
                 if stored && param && !self.inline_params {
                     return None; // A parameter with a slot.
                 }
+                if self.inline_params && !param {
+                    return None; // Not known before a run.
+                }
                 value_of(var, self.phase)
             }
-            Node::Rate(_) | Node::PathRate(_) => rate_of(system, node),
+            Node::Rate(_) | Node::PathRate(_) if !self.inline_params => rate_of(system, node),
             _ => None,
         }
     }
@@ -851,6 +872,7 @@ impl<'a> Emit<'a> {
         match node {
             Node::Number { value, .. } => self.build.real(value),
             Node::Bool(truth) => self.build.truth(truth),
+            Node::Time if self.inline_params => self.build.real(f64::NAN),
             Node::Time if self.phase == Phase::Start => self.build.real(0.0),
             Node::Time => self.build.load(Slot::TIME),
             Node::Var(var) => self.leaf(var),
@@ -1069,6 +1091,9 @@ impl<'a> Emit<'a> {
     }
 
     fn time(&mut self) -> Value {
+        if self.inline_params {
+            return self.build.real(f64::NAN); // Not known before a run.
+        }
         match self.phase {
             Phase::Start => self.build.real(0.0),
             Phase::Now | Phase::Tick => self.build.load(Slot::TIME),

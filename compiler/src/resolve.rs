@@ -95,8 +95,13 @@ impl Loaded {
     /// All names of a name space visible in `file`, sorted.
     pub fn visible(&self, file: FileId, space: Space) -> Vec<&str> {
         let scope = &self.scopes[file.0 as usize];
-        let mut names: Vec<&str> =
-            scope.own.keys().chain(scope.imported.keys()).filter(|key| key.0 == space).map(|key| key.1.as_str()).collect();
+        let mut names: Vec<&str> = scope
+            .own
+            .keys()
+            .chain(scope.imported.keys())
+            .filter(|key| key.0 == space)
+            .map(|key| key.1.as_str())
+            .collect();
         names.sort_unstable();
         names.dedup();
         names

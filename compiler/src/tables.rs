@@ -39,9 +39,9 @@ pub fn read(
             }
         }
         TablePoints::File(path) => {
-            let columns = columns(loaded, sources, file, path, 2, diagnostics)?;
-            x.extend(columns[0].iter().map(|value| value * x_unit.scale));
-            y.extend(columns[1].iter().map(|value| value * y_unit.scale));
+            let columns = columns(loaded, sources, file, path, &[true, true], diagnostics)?;
+            x.extend(columns[0].iter().map(|value| x_unit.to_si(*value)));
+            y.extend(columns[1].iter().map(|value| y_unit.to_si(*value)));
             for k in 0..x.len() {
                 check_order(&x[..=k], path.span, diagnostics)?;
             }
@@ -62,16 +62,18 @@ pub fn read(
     })
 }
 
-/// The first `count` columns of a file of numbers, separated by commas, semicolons, tabs or blanks. A first line that
+/// The first columns of a file of numbers, as many as `wanted` has entries; those not wanted may hold anything and are
+/// read as 0. Columns are separated by commas, semicolons, tabs or blanks. A first line that
 /// is no numbers is a heading; lines that begin with `#` are comments.
 pub fn columns(
     loaded: &Loaded,
     sources: &dyn Sources,
     file: FileId,
     path: &ast::Text,
-    count: usize,
+    wanted: &[bool],
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<Vec<f64>>> {
+    let count = wanted.len();
     let from = &loaded.files.get(file).name;
     let text = match sources.file(from, &path.text) {
         Ok((_, text)) => text,
@@ -91,7 +93,11 @@ pub fn columns(
             true => line.split([',', ';', '\t']).map(str::trim).collect(),
             false => line.split_whitespace().collect(),
         };
-        let numbers: Option<Vec<f64>> = fields.iter().map(|f| f.trim_matches('"').parse().ok().filter(|x: &f64| x.is_finite())).collect();
+        let number = |(k, field): (usize, &&str)| match wanted.get(k) {
+            Some(true) => field.trim_matches('"').parse().ok().filter(|x: &f64| x.is_finite()),
+            Some(false) | None => Some(0.0),
+        };
+        let numbers: Option<Vec<f64>> = fields.iter().enumerate().map(number).collect();
         match numbers {
             Some(numbers) if numbers.len() >= count => {
                 out.iter_mut().zip(numbers).for_each(|(column, number)| column.push(number));
@@ -102,7 +108,8 @@ pub fn columns(
                     Some(numbers) => format!("line {} has {} columns, {count} are needed", row + 1, numbers.len()),
                     None => format!("line {} has something that is no finite number", row + 1),
                 };
-                let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
+                let error =
+                    Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
                 diagnostics.push(error);
                 return None;
             }
@@ -119,7 +126,8 @@ pub fn columns(
 fn check_order(x: &[f64], span: Span, diagnostics: &mut Vec<Diagnostic>) -> Option<()> {
     match x {
         [.., a, b] if a.partial_cmp(b) != Some(std::cmp::Ordering::Less) => {
-            let error = Diagnostic::error("E0902", "the arguments of a table must increase").label(span, "not above the one before");
+            let error = Diagnostic::error("E0902", "the arguments of a table must increase")
+                .label(span, "not above the one before");
             diagnostics.push(error.help("sort the points, and keep one for each argument"));
             None
         }
@@ -137,7 +145,8 @@ fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) 
                 Some(text) => match Unit::parse(&text.text) {
                     Ok(unit) => unit,
                     Err(part) => {
-                        let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                        let error =
+                            Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
                         diagnostics.push(error);
                         return None;
                     }
@@ -156,7 +165,7 @@ fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) 
                 diagnostics.push(error);
                 return None;
             }
-            Some(value * unit.scale)
+            Some(unit.to_si(*value))
         }
         _ => {
             let error = Diagnostic::error("E0902", "points of a table are numbers").label(expr.span, "not a number");

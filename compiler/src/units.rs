@@ -30,12 +30,13 @@ const ENERGY: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 /// Checks and infers the units of a system.
 pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) -> Types {
     let mut found = Vec::new();
-    let (types, strangers) = walk(system, files, &[], &mut found);
+    let (types, mut strangers) = walk(system, files, &system.strangers, &mut found);
     if strangers.is_empty() {
         diagnostics.extend(found);
         return types;
     }
     // A straight model in a rotary place gets and gives wrong units everywhere: say the cause, not what follows.
+    strangers.extend(&system.strangers);
     let mut again = Vec::new();
     let (types, _) = walk(system, files, &strangers, &mut again);
     diagnostics.extend(found.into_iter().filter(|diagnostic| diagnostic.code == "E0108"));
@@ -246,7 +247,8 @@ impl Checker<'_> {
                     (Kind::Boolean, Kind::Boolean) => Kind::Boolean,
                     (Kind::Real(x), Kind::Real(y)) => {
                         if !self.unify(&x, &y) {
-                            let message = format!("one branch is {}, the other {}", self.described(&x), self.described(&y));
+                            let message =
+                                format!("one branch is {}, the other {}", self.described(&x), self.described(&y));
                             self.differ("E0101", message, a, &x, b, &y);
                             return Kind::Unknown;
                         }
@@ -269,7 +271,12 @@ impl Checker<'_> {
                 if let Some(term) = self.real(x)
                     && !self.unify(&term, &wanted)
                 {
-                    let message = format!("`{}` is a table over {}, not {}", table.name, self.described(&wanted), self.described(&term));
+                    let message = format!(
+                        "`{}` is a table over {}, not {}",
+                        table.name,
+                        self.described(&wanted),
+                        self.described(&term)
+                    );
                     let error = Diagnostic::error("E0101", message).label(self.system.span(x), self.shown(&term));
                     self.diagnostics.push(error);
                 }
@@ -358,9 +365,11 @@ impl Checker<'_> {
         let wanted = x.base.over(y.base);
         let unit = Unit::si(wanted);
         let owner = self.owner(a).or_else(|| self.owner(b))?;
-        let fitting = self.system.vars.iter().find(|var| {
-            var.instance == owner && var.kind == VarKind::Param && self.unit_of(var) == Some(wanted)
-        })?;
+        let fitting = self
+            .system
+            .vars
+            .iter()
+            .find(|var| var.instance == owner && var.kind == VarKind::Param && self.unit_of(var) == Some(wanted))?;
         // `Fc + vs * sign(v)`: a velocity parameter stands where its coefficient belongs.
         if let Node::Binary(BinaryOp::Multiply, p, s) = self.system.node(b)
             && let (Node::Var(p), Node::Call(Builtin::Sign, args)) = (self.system.node(*p), self.system.node(*s))
@@ -434,16 +443,16 @@ impl Checker<'_> {
                 self.condition(b, &what);
                 return Kind::Boolean;
             }
-            BinaryOp::Equal | BinaryOp::NotEqual if *self.kind(a) == Kind::Boolean && *self.kind(b) == Kind::Boolean => {
+            BinaryOp::Equal | BinaryOp::NotEqual
+                if *self.kind(a) == Kind::Boolean && *self.kind(b) == Kind::Boolean =>
+            {
                 return Kind::Boolean;
             }
             _ => {}
         }
         let (x, y) = (self.real(a), self.real(b));
-        let comparison = !matches!(
-            op,
-            BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power
-        );
+        let comparison =
+            !matches!(op, BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power);
         let (Some(x), Some(y)) = (x, y) else { return if comparison { Kind::Boolean } else { Kind::Unknown } };
         match op {
             BinaryOp::Multiply => Kind::Real(x.times(&y, Ratio::ONE)),
@@ -495,10 +504,11 @@ impl Checker<'_> {
                     self.unify(x, &none);
                     return Kind::Real(none);
                 }
-                let error = Diagnostic::error("E0105", format!("the exponent of {} must be a number", self.described(x)))
-                    .label(self.system.span(b), "not a number written here")
-                    .label(self.system.span(a), self.shown(x))
-                    .help(format!("make the base a pure number: `({} / 1 {}) ^ …`", self.text(a), self.shown(x)));
+                let error =
+                    Diagnostic::error("E0105", format!("the exponent of {} must be a number", self.described(x)))
+                        .label(self.system.span(b), "not a number written here")
+                        .label(self.system.span(a), self.shown(x))
+                        .help(format!("make the base a pure number: `({} / 1 {}) ^ …`", self.text(a), self.shown(x)));
                 self.diagnostics.push(error);
                 Kind::Unknown
             }
@@ -654,10 +664,13 @@ impl Checker<'_> {
         let warning = match self.system.node(rate) {
             Node::Number { value, .. } if text.ends_with("Hz") => {
                 let exact = three_digits(value * 2.0 * std::f64::consts::PI);
-                Diagnostic::warning("W0107", format!("{text} is {number} rad/s here, not {number} revolutions per second"))
-                    .label(angle, "an angular velocity")
-                    .label(self.system.span(rate), "a rate, without an angle")
-                    .help(format!("write `{number} rev/s` ({exact} rad/s), or `{number} rad/s` if that is what you mean"))
+                Diagnostic::warning(
+                    "W0107",
+                    format!("{text} is {number} rad/s here, not {number} revolutions per second"),
+                )
+                .label(angle, "an angular velocity")
+                .label(self.system.span(rate), "a rate, without an angle")
+                .help(format!("write `{number} rev/s` ({exact} rad/s), or `{number} rad/s` if that is what you mean"))
             }
             _ => Diagnostic::warning("W0107", "a rate meets an angular velocity")
                 .label(angle, "an angular velocity")
@@ -756,11 +769,14 @@ impl Checker<'_> {
                     self.found.push(var.instance);
                 }
                 let error = if !rotary && needs.rotary() == has {
-                    let message = format!("{name} is written for straight motion, but `{}` gets {}", var.name, angular(has));
+                    let message =
+                        format!("{name} is written for straight motion, but `{}` gets {}", var.name, angular(has));
                     Diagnostic::error("E0108", message)
                         .label(model, expects)
                         .label(self.system.span(value), angular_unit(has))
-                        .help(format!("write `rotary {name}(...)`: the same model with N -> N·m, m -> rad, kg -> kg·m^2"))
+                        .help(format!(
+                            "write `rotary {name}(...)`: the same model with N -> N·m, m -> rad, kg -> kg·m^2"
+                        ))
                 } else if rotary && has.rotary() == needs {
                     let message = format!("{name} is rotary here, but `{}` gets {}", var.name, has.describe());
                     Diagnostic::error("E0108", message)
@@ -768,8 +784,12 @@ impl Checker<'_> {
                         .label(self.system.span(value), self.shown(&found))
                         .help(format!("write `{name}(...)` without `rotary`, or give {}", angular(needs)))
                 } else {
-                    let message =
-                        format!("`{}` of {name} is {}, but gets {}", var.name, self.described(&wanted), self.described(&found));
+                    let message = format!(
+                        "`{}` of {name} is {}, but gets {}",
+                        var.name,
+                        self.described(&wanted),
+                        self.described(&found)
+                    );
                     Diagnostic::error("E0101", message)
                         .label(self.system.span(value), self.shown(&found))
                         .label(model, expects)
@@ -777,7 +797,8 @@ impl Checker<'_> {
                 self.diagnostics.push(error);
             }
             Origin::Equation(_) | Origin::Default | Origin::Override => {
-                let message = format!("`{}` is {}, but this is {}", var.name, self.described(&wanted), self.described(&found));
+                let message =
+                    format!("`{}` is {}, but this is {}", var.name, self.described(&wanted), self.described(&found));
                 let mut error = Diagnostic::error("E0101", message).label(self.system.span(value), self.shown(&found));
                 error = match unit {
                     Some((_, span)) => error.label(*span, "declared here"),
@@ -837,7 +858,8 @@ impl Checker<'_> {
         for require in &self.system.requires {
             self.condition(require.condition, "`require`");
         }
-        let transitions = self.system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
+        let transitions =
+            self.system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
         let conditions: Vec<(ExprId, &Vec<(VarId, ExprId)>, &str)> = transitions
             .map(|transition| (transition.condition, &transition.resets, "`go`"))
             .chain(self.system.events.iter().map(|event| (event.condition, &event.resets, "`when`")))
@@ -867,7 +889,9 @@ impl Checker<'_> {
                 (None, Some((dimension, known))) => {
                     let defined = match &var.definition {
                         Definition::Missing | Definition::Free => false,
-                        Definition::Value(value, _) | Definition::Held { value, .. } => *self.kind(*value) != Kind::Unknown,
+                        Definition::Value(value, _) | Definition::Held { value, .. } => {
+                            *self.kind(*value) != Kind::Unknown
+                        }
                         Definition::Continuous { rate, .. } => *self.kind(*rate) != Kind::Unknown,
                         Definition::Sampled { next, .. } => *self.kind(*next) != Kind::Unknown,
                     };
@@ -898,11 +922,14 @@ impl Checker<'_> {
                 .vars
                 .iter()
                 .zip(&units)
-                .filter(|(var, unit)| var.span.file == span.file && unit.dimension == dimension && !var.path.contains('.'))
+                .filter(|(var, unit)| {
+                    var.span.file == span.file && unit.dimension == dimension && !var.path.contains('.')
+                })
                 .map(|(var, _)| format!("`{}`", var.path))
                 .collect();
             let unit = Unit::si(dimension);
-            let error = Diagnostic::error("E0112", format!("here {} is needed, in {unit}", dimension.describe())).label(span, format!("{unit}"));
+            let error = Diagnostic::error("E0112", format!("here {} is needed, in {unit}", dimension.describe()))
+                .label(span, format!("{unit}"));
             self.diagnostics.push(match fitting.is_empty() {
                 true => error.help("no visible name has this unit"),
                 false => error.help(format!("visible names with this unit: {}", fitting.join(", "))),
@@ -913,7 +940,11 @@ impl Checker<'_> {
                 let var = self.system.var(id);
                 let error = Diagnostic::error("E0106", format!("the unit of `{}` cannot be inferred", var.name))
                     .label(var.span, "no equation says it")
-                    .help(format!("write it: `{} {} [1]` for a pure number, or another unit", var.kind.word(), var.name));
+                    .help(format!(
+                        "write it: `{} {} [1]` for a pure number, or another unit",
+                        var.kind.word(),
+                        var.name
+                    ));
                 self.diagnostics.push(error);
             }
         }
@@ -950,7 +981,8 @@ pub fn three_digits(x: f64) -> String {
     if !(-4..6).contains(&exponent) {
         let text = format!("{x:.2e}");
         let (mantissa, exponent) = text.split_once('e').expect("scientific form has an exponent");
-        let mantissa = if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
+        let mantissa =
+            if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
         return format!("{mantissa}e{exponent}");
     }
     let decimals = (2 - exponent).max(0) as usize;
@@ -990,7 +1022,11 @@ fn boolean_vars(system: &System) -> Vec<bool> {
                     Node::Binary(op, ..) => {
                         break Ok(!matches!(
                             op,
-                            BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power
+                            BinaryOp::Add
+                                | BinaryOp::Subtract
+                                | BinaryOp::Multiply
+                                | BinaryOp::Divide
+                                | BinaryOp::Power
                         ));
                     }
                     Node::If(_, a, _) => value = *a,

@@ -1,15 +1,21 @@
-//! `fric explain`: the page of an error or a warning.
+//! `fric explain`: the page of an error or a warning, or what the compiler knows of a model.
 
 use super::End;
 use crate::args::Explain;
-use crate::project;
-use crate::terminal::Terminal;
+use crate::compile::{self, Explanation, Stopwatch, Verdict};
+use crate::terminal::{Style, Terminal};
+use crate::{project, report};
+use serde_json::json;
+use std::path::Path;
 
 /// Every code has a section: `## E0101 units differ`.
 const PAGES: &str = include_str!("../../docs/errors.md");
 
 pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
-    let code = args.code.trim().to_uppercase();
+    if args.subject.ends_with(".fric") || Path::new(&args.subject).is_file() {
+        return models(args, terminal);
+    }
+    let code = args.subject.trim().to_uppercase();
     if let Some(page) = page(&code) {
         terminal.print(page);
         return End::Fine;
@@ -18,8 +24,113 @@ pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
         Some(near) => format!("did you mean {near}?"),
         None => "codes look like E0101 or W0703".into(),
     };
-    terminal.error(&format!("there is no page about `{}`; {help}", args.code));
+    terminal.error(&format!("there is no page about `{}`; {help}", args.subject));
     End::Failed
+}
+
+/// Explains models of a file.
+fn models(args: &Explain, terminal: &mut Terminal) -> End {
+    let mut watch = Stopwatch::start("read");
+    let Some(loaded) = super::load(Path::new(&args.subject), terminal, &mut watch) else { return End::Failed };
+    let all: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
+    let wanted = if args.models.is_empty() { &all } else { &args.models };
+    if wanted.is_empty() {
+        terminal.error(&format!("{} has no model", args.subject));
+        return End::Failed;
+    }
+    let mut end = End::Fine;
+    for name in wanted {
+        if !all.contains(name) {
+            let help = match project::nearest(name, all.iter().map(String::as_str)) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => format!("it has {}", all.join(", ")),
+            };
+            terminal.error(&format!("{} has no model `{name}`; {help}", args.subject));
+            end = End::Failed;
+            continue;
+        }
+        match compile::explain(&loaded, &project::Disk, name) {
+            Ok(explanation) if args.json => terminal.line(&as_json(&explanation).to_string()),
+            Ok(explanation) => tell(&explanation, terminal),
+            Err(diagnostics) => {
+                terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
+                end = End::Failed;
+            }
+        }
+    }
+    end
+}
+
+fn tell(explanation: &Explanation, terminal: &mut Terminal) {
+    terminal.line(&terminal.styled(Style::Bold, &explanation.model));
+    let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
+    let names = width(&mut explanation.quantities.iter().map(|q| q.path.chars().count()));
+    let units = width(&mut explanation.quantities.iter().map(|q| q.unit.chars().count()));
+    for q in &explanation.quantities {
+        let range = q.range.as_ref().map_or(String::new(), |range| format!("  in {range}"));
+        let doc = q.doc.as_ref().map_or(String::new(), |doc| format!("  {}", doc.lines().next().unwrap_or_default()));
+        let line = format!("  {:<6} {:<names$}  {:<units$}{range}{doc}", q.kind, q.path, q.unit);
+        terminal.line(line.trim_end());
+    }
+    terminal.line("\n  in this order:");
+    let lefts = width(&mut explanation.equations.iter().map(|(left, _)| left.chars().count()));
+    for (left, right) in &explanation.equations {
+        terminal.line(&format!("    {left:<lefts$} = {right}"));
+    }
+    if !explanation.states.is_empty() {
+        terminal.line("\n  states:");
+    }
+    for state in &explanation.states {
+        terminal.line(&format!("    {}: {}", state.path, state.words()));
+    }
+    terminal.line(&format!("\n  an instance takes {} bytes; one fixed step, with its outputs:", explanation.bytes));
+    for (method, plain, expanded, divisions) in &explanation.steps {
+        terminal.line(&format!(
+            "    {:<8} {expanded} operations ({plain} before functions are expanded), {divisions} divisions and roots",
+            method.name()
+        ));
+    }
+    if let Some(independent) = explanation.rate_independent {
+        terminal.line(match independent {
+            true => "\n  rate independent: the force depends on the path, not on how fast it is travelled",
+            false => "\n  not rate independent: the speed enters otherwise than through its sign",
+        });
+    }
+    if let Some(verdict) = &explanation.dissipation {
+        terminal.line(&format!("  dissipation: {}", dissipation(verdict)));
+    }
+    terminal.line("");
+}
+
+fn dissipation(verdict: &Verdict) -> String {
+    match verdict {
+        Verdict::Holds(points) => format!("holds at {points} samples"),
+        Verdict::Fails(point) => {
+            format!("fails: at v = {:.3e} m/s it gives F = {:.3e} N and drives the motion", point.v, point.force)
+        }
+        Verdict::NotChecked => {
+            "not checked: a model with states or regimes needs a `storage` and ranges of its states".into()
+        }
+    }
+}
+
+fn as_json(explanation: &Explanation) -> serde_json::Value {
+    json!({
+        "model": explanation.model,
+        "quantities": explanation.quantities.iter().map(|q| json!({
+            "kind": q.kind, "name": q.path, "unit": q.unit, "range": q.range, "doc": q.doc,
+        })).collect::<Vec<_>>(),
+        "equations": explanation.equations.iter().map(|(left, right)| json!({ "left": left, "right": right })).collect::<Vec<_>>(),
+        "states": explanation.states.iter().map(|state| json!({
+            "name": state.path, "how": state.words(), "fastest": state.fastest.map(|(rate, _)| rate),
+        })).collect::<Vec<_>>(),
+        "bytes": explanation.bytes,
+        "steps": explanation.steps.iter().map(|(method, plain, expanded, divisions)| json!({
+            "method": method.name(), "operations": expanded, "before_expansion": plain, "divisions": divisions,
+        })).collect::<Vec<_>>(),
+        "rate_independent": explanation.rate_independent,
+        "dissipation": explanation.dissipation.as_ref().map(dissipation),
+    })
 }
 
 /// From the heading of a code to the next heading.
