@@ -55,20 +55,39 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
     }
 }
 
-/// For each quantity: what it needs, and where it is mentioned.
+/// For each quantity, and behind them for the rate of each: what it needs, and where it is mentioned.
 type Graph = Vec<Vec<(VarId, ExprId)>>;
+
+/// The number of a rate in the graph.
+fn rate_number(system: &System, var: VarId) -> VarId {
+    VarId(system.vars.len() as u32 + var.0)
+}
+
+/// The quantity behind a number of the graph, and whether its rate is meant.
+fn behind(system: &System, id: VarId) -> (VarId, bool) {
+    match id.0.checked_sub(system.vars.len() as u32) {
+        Some(var) => (VarId(var), true),
+        None => (id, false),
+    }
+}
 
 fn graph(system: &System, phase: Phase) -> Graph {
     let mut seen = vec![u32::MAX; system.nodes.len()];
-    let edges = |(k, var): (usize, &Var)| {
+    let n = system.vars.len();
+    let edges = |k: usize| {
         let mut out = Vec::new();
-        let mut stack: Vec<ExprId> = value_of(var, phase).into_iter().collect();
+        let first = match system.vars.get(k) {
+            Some(var) => value_of(var, phase),
+            None => rate_of(system, &Node::Rate(VarId((k - n) as u32))),
+        };
+        let mut stack: Vec<ExprId> = first.into_iter().collect();
         while let Some(id) = stack.pop() {
             if std::mem::replace(&mut seen[id.0 as usize], k as u32) == k as u32 {
                 continue;
             }
             match system.node(id) {
                 Node::Var(needed) => out.push((*needed, id)),
+                Node::Rate(needed) => out.push((rate_number(system, *needed), id)),
                 node => {
                     let mut operands: Vec<ExprId> = node.operands().collect();
                     operands.extend(rate_of(system, node));
@@ -81,7 +100,7 @@ fn graph(system: &System, phase: Phase) -> Graph {
         }
         out
     };
-    system.vars.iter().enumerate().map(edges).collect()
+    (0..2 * n).map(edges).collect()
 }
 
 /// Strongly connected components with a circle in them, each sorted (Tarjan, without recursion).
@@ -177,13 +196,17 @@ fn shortest(graph: &Graph, component: &[VarId]) -> Vec<(VarId, ExprId)> {
 fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)]) -> Diagnostic {
     // Begin with the output of a part: what the user thinks of as the thing that depends on itself.
     let is_output = |id: VarId| {
+        let (id, rate) = behind(system, id);
         let var = system.var(id);
-        var.kind == VarKind::Output && var.instance != InstanceId(0)
+        !rate && var.kind == VarKind::Output && var.instance != InstanceId(0)
     };
     let first = walk.iter().position(|(id, _)| is_output(*id)).unwrap_or(0);
     let walk: Vec<(VarId, ExprId)> = walk[first..].iter().chain(&walk[..first]).copied().collect();
-    let subject = system.var(walk[0].0);
-    let called = friction_force(system, walk[0].0).unwrap_or_else(|| format!("`{}`", subject.path));
+    let path = |id: VarId| match behind(system, id) {
+        (id, false) => system.var(id).path.clone(),
+        (id, true) => format!("d{}/dt", system.var(id).path),
+    };
+    let called = friction_force(system, walk[0].0).unwrap_or_else(|| format!("`{}`", path(walk[0].0)));
     let (code, message) = match phase {
         Phase::Now => ("E0401", format!("{called} depends on itself in the same instant")),
         Phase::Tick => ("E0402", format!("{called} depends on itself within one tick")),
@@ -195,7 +218,7 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
     while k < walk.len() {
         let (from, at) = walk[k];
         let (next, next_at) = walk[(k + 1) % walk.len()];
-        let port = system.var(next);
+        let port = system.var(behind(system, next).0);
         let whole = walk.len() > 1 && k + 1 < walk.len();
         if let (true, VarKind::Input, Definition::Value(value, Origin::Argument { bind, .. })) =
             (whole, port.kind, &port.definition)
@@ -203,13 +226,13 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
             let plain = *value == next_at;
             let source = files.slice(system.span(next_at));
             let text = match plain {
-                true => format!("{} needs {}, which is {source}", system.var(from).path, port.name),
-                false => format!("{} needs {}, and that needs {source}", system.var(from).path, port.name),
+                true => format!("{} needs {}, which is {source}", path(from), port.name),
+                false => format!("{} needs {}, and that needs {source}", path(from), port.name),
             };
             steps.push((*bind, text));
             k += 2;
         } else {
-            let text = format!("{} needs {}", system.var(from).path, files.slice(system.span(at)));
+            let text = format!("{} needs {}", path(from), files.slice(system.span(at)));
             steps.push((system.span(at), text));
             k += 1;
         }
@@ -235,6 +258,10 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
 
 /// `the friction force`, if it is the output F of a model with an input v.
 fn friction_force(system: &System, id: VarId) -> Option<String> {
+    let (id, rate) = behind(system, id);
+    if rate {
+        return None;
+    }
     let var = system.var(id);
     let beside = |name: &str, kind: VarKind| {
         system.vars.iter().any(|other| other.instance == var.instance && other.name == name && other.kind == kind)
@@ -248,7 +275,7 @@ fn help(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)]) 
         Phase::Tick => "break the loop with memory: read the older value through a sampled state, `next(x) = …`".into(),
         Phase::Now => {
             let closing = walk.last().expect("a circle is not empty");
-            let var = system.var(closing.0);
+            let var = system.var(behind(system, closing.0).0);
             let whole = value_of(var, Phase::Now).map_or("", |value| files.slice(system.span(value)));
             let mention = files.slice(system.span(closing.1));
             let lines = if friction_force(system, walk[0].0).is_some() && whole.contains(mention) && whole.len() < 60 {

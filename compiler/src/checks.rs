@@ -11,10 +11,45 @@ use grammar::span::Span;
 
 /// Checks parameters against their ranges, and every `require`.
 pub fn values(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    constants(system, diagnostics);
     ranges(system, types, files, diagnostics);
     periods(system, types, diagnostics);
     resets(system, diagnostics);
     requires(system, types, files, diagnostics);
+}
+
+/// Params and `require` are over params and constants.
+fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
+    for var in system.vars.iter().filter(|var| var.kind == VarKind::Param) {
+        let Definition::Value(value, origin) = &var.definition else { continue };
+        let Some(moving) = moving(system, *value) else { continue };
+        let error =
+            Diagnostic::error("E0502", format!("`{}` is a param: it is constant while the model runs", var.name))
+                .label(system.span(moving), "changes")
+                .label(var.span, "declared here");
+        diagnostics.push(match origin {
+            Origin::Argument { .. } => error.help(format!("declare `{}` as an input of that model", var.name)),
+            _ => error.help(format!("declare `{}` with `let`", var.name)),
+        });
+    }
+    for require in &system.requires {
+        if let Some(moving) = moving(system, require.condition) {
+            let error = Diagnostic::error("E0502", "`require` is over params and constants")
+                .label(system.span(moving), "changes while the model runs");
+            diagnostics.push(
+                error.help("give a quantity that changes a range, `in 0 .. 1 m`: it is watched while the model runs"),
+            );
+        }
+    }
+}
+
+/// What in an expression changes while a model runs, if anything does.
+fn moving(system: &System, id: ExprId) -> Option<ExprId> {
+    match system.node(id) {
+        Node::Var(var) => (system.var(*var).kind != VarKind::Param).then_some(id),
+        Node::Time | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) => Some(id),
+        node => node.operands().find_map(|operand| moving(system, operand)),
+    }
 }
 
 fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
@@ -23,7 +58,7 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
     for id in system.var_ids() {
         let var = system.var(id);
         let value = match (&var.definition, var.kind) {
-            (Definition::Value(value, _), VarKind::Param) => *value,
+            (Definition::Value(value, _), VarKind::Param | VarKind::Input) => *value,
             (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => *initial,
             _ => continue,
         };
@@ -162,6 +197,9 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
                 Definition::Value(node, Origin::Override) => {
                     labels.push((system.span(*node), "set here".into()));
                     changed.push(var);
+                }
+                Definition::Value(node, _) if info.path.is_empty() && info.span.file == system.span(*node).file => {
+                    labels.push((system.span(*node), format!("the default of {}", var.name)));
                 }
                 Definition::Value(node, _) => {
                     let value = shown(evaluate(system, types, &[*node])[0], &types.units[id.0 as usize]);

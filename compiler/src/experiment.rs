@@ -96,7 +96,8 @@ pub fn read(
         let error = Diagnostic::error("E0201", format!("there is no experiment `{name}`"));
         return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
     };
-    let Some(parts) = parts(experiment, &mut diagnostics) else { return Err(diagnostics) };
+    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && !outside_of(experiment.span, d));
+    let Some(parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
     let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
     let Some(data) = data else { return Err(diagnostics) };
     let grids = grids(loaded, &parts, &mut diagnostics);
@@ -188,7 +189,7 @@ fn looks_like_instance(value: &str) -> bool {
     value.starts_with(|c: char| c.is_ascii_uppercase()) && name.trim_start().starts_with('(')
 }
 
-fn parts<'a>(experiment: &'a ast::Experiment, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
+fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
     let mut twice = |what: &str, span: Span, first: Span| {
@@ -218,6 +219,9 @@ fn parts<'a>(experiment: &'a ast::Experiment, diagnostics: &mut Vec<Diagnostic>)
         }
     }
     let Some(run) = run else {
+        if misread {
+            return None;
+        }
         let error = Diagnostic::error("E0902", format!("experiment `{}` runs nothing", experiment.name.text))
             .label(experiment.name.span, "there is no `run` in it");
         diagnostics.push(error.help("add `run Model(…) for 10 s`"));
@@ -524,7 +528,17 @@ fn variant(
             expect
         })
         .collect();
-    let mut corners: Vec<f64> = corners.into_iter().filter(|t| *t > 0.0 && *t < duration).collect();
+    let expects: Vec<plan::Expect> = expects;
+    // Instants that a measure asks for are met exactly.
+    let asked = expects.iter().flat_map(|expect| {
+        let at = expect.measures.iter().filter_map(|measure| match measure.kind {
+            MeasureKind::At(t) => Some(t),
+            _ => None,
+        });
+        at.chain([expect.after, expect.before])
+    });
+    let asked: Vec<f64> = asked.collect();
+    let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
     let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };

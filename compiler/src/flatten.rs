@@ -121,7 +121,11 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
     let observed = match item {
         Item::Function(function) => {
             let mut locals = Vec::new();
+            let mut first: HashMap<&str, Span> = HashMap::new();
             for arg in &function.args {
+                if !f.new_name(&arg.name, &mut first) {
+                    continue;
+                }
                 let unit = match &arg.unit {
                     None => Some(Unit::none()),
                     Some(unit) => f.unit(unit, false, None),
@@ -168,6 +172,8 @@ struct Flattener<'a> {
     models: Vec<ItemRef>,
     /// Wiring of slots that the present model has no port for: another model may read it.
     dropped: Vec<Arg<'a>>,
+    /// Parts whose name is taken, and reported.
+    refused_parts: Vec<Span>,
     /// Quantities whose definition was refused, and reported.
     refused: Vec<VarId>,
     data: HashMap<String, (u32, Unit)>,
@@ -273,6 +279,7 @@ impl<'a> Flattener<'a> {
             open_consts: Vec::new(),
             models: Vec::new(),
             refused: Vec::new(),
+            refused_parts: Vec::new(),
             dropped: Vec::new(),
             data: HashMap::new(),
         }
@@ -411,11 +418,10 @@ impl<'a> Flattener<'a> {
                         }
                     }
                 }
-                Statement::Part(part) => {
-                    if self.new_name(&part.name, &mut first) {
-                        self.bind(id, &part.name.text, Binding::Broken);
-                    }
-                }
+                Statement::Part(part) => match self.new_name(&part.name, &mut first) {
+                    true => self.bind(id, &part.name.text, Binding::Broken),
+                    false => self.refused_parts.push(part.name.span),
+                },
                 _ => {}
             }
         }
@@ -503,6 +509,7 @@ impl<'a> Flattener<'a> {
             span: name.span,
             instance: id,
             kind,
+            unreadable: declaration.unit.is_some() && unit.is_none() || self.misread(declaration.span),
             unit,
             shown,
             range: VarRange::default(),
@@ -516,6 +523,14 @@ impl<'a> Flattener<'a> {
     fn add_var(&mut self, var: Var) -> VarId {
         self.system.vars.push(var);
         VarId(self.system.vars.len() as u32 - 1)
+    }
+
+    /// Whether the parser complained inside of a place.
+    fn misread(&self, place: Span) -> bool {
+        self.loaded.diagnostics.iter().any(|d| {
+            let span = d.span();
+            d.is_error() && span.file == place.file && place.start <= span.start && span.end <= place.end
+        })
     }
 
     /// The span of a declared unit with its brackets.
@@ -571,6 +586,9 @@ impl<'a> Flattener<'a> {
         let env = self.env(id);
         for statement in &model.body {
             let Statement::Part(part) = statement else { continue };
+            if self.refused_parts.contains(&part.name.span) {
+                continue;
+            }
             let mine = |change: &&Change<'a>| change.path[0].name.text == part.name.text;
             let changes: Vec<Change<'a>> = changes.iter().filter(mine).cloned().collect();
             match &part.repeat {
@@ -976,12 +994,28 @@ impl<'a> Flattener<'a> {
                     let energy = self.expr(&storage.energy, &equations);
                     self.system.storages.push((id, energy));
                 }
-                Statement::Declaration(_) | Statement::Part(_) | Statement::Mode(_) | Statement::Allow(_) => {}
+                Statement::Allow(allow) => self.lint(&allow.lint),
+                Statement::Declaration(_) | Statement::Part(_) | Statement::Mode(_) => {}
             }
         }
         self.regimes(id, &equations, &mut defined, &mut rates);
         self.rates(rates);
         self.undefined(id, &defined);
+    }
+
+    /// E0204 for a lint that is none.
+    fn lint(&mut self, lint: &Name) {
+        if LINTS.iter().any(|(name, _)| *name == lint.text) {
+            return;
+        }
+        let error =
+            Diagnostic::error("E0204", format!("there is no lint `{}`", lint.text)).label(lint.span, "not known");
+        self.report(match nearest(&lint.text, LINTS.iter().map(|(name, _)| *name)) {
+            Some(near) => error.help(format!("did you mean `{near}`?")),
+            None => {
+                error.help(format!("lints are {}", LINTS.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")))
+            }
+        });
     }
 
     fn var_named(&self, id: InstanceId, name: &str) -> Option<VarId> {

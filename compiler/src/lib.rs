@@ -105,7 +105,7 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }
-        method => out.push((Function::Step, discretize::step(program, method))),
+        method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
     }
     out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
 }
@@ -174,7 +174,20 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let unreadable = loaded.has_errors();
     for item in &ast.items {
         match item {
-            Item::Model(model) => all.extend(check_model(loaded, sources, model, root, !unreadable)),
+            Item::Model(model) => {
+                let mut found = check_model(loaded, sources, model, root, !unreadable);
+                let misread = loaded.diagnostics.iter().any(|d| {
+                    let (span, place) = (d.span(), model.span);
+                    d.is_error() && span.file == root && place.start <= span.start && span.end <= place.end
+                });
+                if misread {
+                    // What could not be read is missing elsewhere: say the cause.
+                    found.retain(|d| {
+                        !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501")
+                    });
+                }
+                all.extend(found);
+            }
             Item::Experiment(experiment) => {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();

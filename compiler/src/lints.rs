@@ -9,26 +9,6 @@ use crate::units::Types;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 
-/// Name and code of every lint.
-pub const LINTS: &[(&str, &str)] = &[
-    ("unused", "W0201"),
-    ("angle", "W0107"),
-    ("dead-regime", "W0311"),
-    ("dead-transition", "W0312"),
-    ("jumps", "W0701"),
-    ("creep", "W0702"),
-    ("not-dissipative", "W0703"),
-    ("large-step", "W0704"),
-    ("chatter", "W0705"),
-    ("emulation-limit", "W0801"),
-    ("coarse-encoder", "W0802"),
-    ("coarse-speed", "W0803"),
-    ("coarse-torque", "W0804"),
-    ("bus-load", "W0805"),
-    ("dbc-unit", "W0806"),
-    ("no-drive-timeout", "W0807"),
-];
-
 /// All warnings of a model on its own.
 pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
     let mut found = Vec::new();

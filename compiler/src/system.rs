@@ -88,6 +88,8 @@ pub struct Var {
     pub kind: VarKind,
     /// Declared unit and its place.
     pub unit: Option<(Unit, Span)>,
+    /// Whether a unit is declared that could not be read: it fits everything.
+    pub unreadable: bool,
     /// Unit of the number it is given where it is declared: for display, if no unit is declared.
     pub shown: Option<Unit>,
     /// Declared range.
@@ -491,6 +493,26 @@ pub struct Table {
     /// Values.
     pub y: Vec<f64>,
 }
+
+/// Name and code of every lint.
+pub const LINTS: &[(&str, &str)] = &[
+    ("unused", "W0201"),
+    ("angle", "W0107"),
+    ("dead-regime", "W0311"),
+    ("dead-transition", "W0312"),
+    ("jumps", "W0701"),
+    ("creep", "W0702"),
+    ("not-dissipative", "W0703"),
+    ("large-step", "W0704"),
+    ("chatter", "W0705"),
+    ("emulation-limit", "W0801"),
+    ("coarse-encoder", "W0802"),
+    ("coarse-speed", "W0803"),
+    ("coarse-torque", "W0804"),
+    ("bus-load", "W0805"),
+    ("dbc-unit", "W0806"),
+    ("no-drive-timeout", "W0807"),
+];
 
 impl System {
     /// Puts a node into the arena.

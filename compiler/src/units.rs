@@ -194,7 +194,7 @@ impl Checker<'_> {
         let boolean = boolean_vars(self.system);
         for (var, boolean) in self.system.vars.iter().zip(boolean) {
             let kind = match (&var.unit, var.kind) {
-                _ if self.strangers.contains(&var.instance) => Kind::Unknown,
+                _ if var.unreadable || self.strangers.contains(&var.instance) => Kind::Unknown,
                 (Some((unit, _)), _) => Kind::Real(Term::known(unit.dimension)),
                 _ if boolean => Kind::Boolean,
                 (None, VarKind::Param) if var.shown.is_some() => {
@@ -936,7 +936,13 @@ impl Checker<'_> {
             });
         }
         if quiet {
-            for id in lost {
+            // A copy of a quantity without a unit has none for the same reason.
+            let copy = |id: &VarId| match self.system.var(*id).definition {
+                Definition::Value(value, _) => matches!(self.system.node(value), Node::Var(_)),
+                _ => false,
+            };
+            let originals = lost.iter().filter(|id| !copy(id)).count();
+            for id in lost.into_iter().filter(|id| originals == 0 || !copy(id)) {
                 let var = self.system.var(id);
                 let error = Diagnostic::error("E0106", format!("the unit of `{}` cannot be inferred", var.name))
                     .label(var.span, "no equation says it")

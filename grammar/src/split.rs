@@ -379,7 +379,7 @@ impl<'t> Source<'t> {
         }
         let (word, fresh) = (self.word(at), self.marks[at].first_on_line);
         let before = self.word(at - 1);
-        if before == "." {
+        if before == "." || (before == "rotary" && !fresh) {
             return false;
         }
         let head = DECLARERS.contains(&before) && self.kind(at - 1) == Some(TokenKind::Word);

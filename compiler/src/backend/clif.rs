@@ -6,11 +6,13 @@
 //!         again while there are iterations left and the status is 0
 //! exit:   store; return the status
 //! ```
+//! A status `if failed then detail else 0` tests `failed` in the loop; what only the detail needs is computed on the way
+//! out.
 //! Each operation becomes one instruction or a fixed few. There are no calls, no symbols and no traps.
 
 use crate::ir::{Func, Op, Type, Value, verify};
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
-use cranelift_codegen::ir::{self as clif, AbiParam, Block, BlockArg, InstBuilder, MemFlagsData, Signature, types};
+use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, Signature, types};
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
 use std::collections::HashMap;
@@ -27,7 +29,7 @@ pub fn signature(isa: &dyn TargetIsa) -> Signature {
 pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuilderContext, isa: &dyn TargetIsa) {
     target.signature = signature(isa);
     let mut b = FunctionBuilder::new(target, context);
-    let [entry, prepare, body, exit, nothing] = [(); 5].map(|()| b.create_block());
+    let [entry, prepare, body, more, failed, exit, nothing] = [(); 7].map(|()| b.create_block());
     b.append_block_params_for_function_params(entry);
     b.switch_to_block(entry);
     let &[block, pool, count] = b.block_params(entry) else { unreachable!("three parameters") };
@@ -35,9 +37,11 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
 
     b.switch_to_block(prepare);
     let mut emitter = Emitter::new(func, block, pool);
-    for i in 0..func.ops.len() {
-        if !emitter.varies[i] || matches!(func.ops[i], Op::Load(_)) {
-            emitter.operation(Value(i as u32), &mut b);
+    let ops = || (0..func.ops.len()).map(|i| Value(i as u32));
+    let (watch, late) = Watch::of(func);
+    for value in ops().filter(|value| !late[value.index()]) {
+        if !emitter.varies[value.index()] || matches!(func.op(value), Op::Load(_)) {
+            emitter.operation(value, &mut b);
         }
     }
     // The slots that an iteration hands to the next.
@@ -45,35 +49,52 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, &mut b))).collect();
     // Nothing changes from one iteration to the next: one is enough.
     let count = if carried.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
-    jump(&mut b, body, first.into_iter().chain([BlockArg::Value(count)]));
+    let first: Vec<BlockArg> = first.into_iter().chain([BlockArg::Value(count)]).collect();
+    b.ins().jump(body, &first);
 
     for (load, _) in &carried {
         emitter.values[load.index()] = Some(b.append_block_param(body, types::F64));
     }
     let left = b.append_block_param(body, types::I64);
     b.switch_to_block(body);
-    for i in 0..func.ops.len() {
-        if emitter.varies[i] && !matches!(func.ops[i], Op::Load(_)) {
-            emitter.operation(Value(i as u32), &mut b);
+    for value in ops().filter(|value| !late[value.index()] && emitter.varies[value.index()]).collect::<Vec<_>>() {
+        if !matches!(func.op(value), Op::Load(_)) {
+            emitter.operation(value, &mut b);
         }
     }
     let left = b.ins().iadd_imm_s(left, -1);
-    let mut again = left;
-    let status = match func.status {
-        Some(status) => {
-            let status = emitter.get(status, &mut b);
-            let zero = b.ins().iconst(types::I64, 0);
-            let fine = b.ins().icmp(IntCC::Equal, status, zero);
-            let more = b.ins().icmp(IntCC::NotEqual, left, zero);
-            again = b.ins().band(fine, more);
-            status
+    match watch {
+        Watch::Nothing => {
+            b.ins().jump(more, &[]);
         }
-        None => b.ins().iconst(types::I64, 0),
-    };
+        Watch::Status(status) => {
+            let status = emitter.get(status, &mut b);
+            b.ins().brif(status, failed, &[], more, &[]);
+        }
+        Watch::Failed { when, .. } => {
+            let when = emitter.get(when, &mut b);
+            b.ins().brif(when, failed, &[], more, &[]);
+        }
+    }
+    b.switch_to_block(more);
     let next: Vec<BlockArg> = carried.iter().map(|(_, store)| BlockArg::Value(emitter.get(*store, &mut b))).collect();
     let next: Vec<BlockArg> = next.into_iter().chain([BlockArg::Value(left)]).collect();
-    b.ins().brif(again, body, &next, exit, &[]);
+    let zero = b.ins().iconst(types::I64, 0);
+    b.ins().brif(left, body, &next, exit, &[BlockArg::Value(zero)]);
 
+    b.set_cold_block(failed);
+    b.switch_to_block(failed);
+    for value in ops().filter(|value| late[value.index()]) {
+        emitter.operation(value, &mut b);
+    }
+    let status = match watch {
+        Watch::Nothing => zero,
+        Watch::Status(status) => emitter.get(status, &mut b),
+        Watch::Failed { detail, .. } => emitter.get(detail, &mut b),
+    };
+    b.ins().brif(status, exit, &[BlockArg::Value(status)], more, &[]);
+
+    let status = b.append_block_param(exit, types::I64);
     b.switch_to_block(exit);
     for (slot, value) in &func.stores {
         let value = emitter.get(*value, &mut b);
@@ -88,9 +109,42 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     b.finalize(isa.frontend_config());
 }
 
-fn jump(b: &mut FunctionBuilder, to: Block, args: impl Iterator<Item = BlockArg>) {
-    let args: Vec<BlockArg> = args.collect();
-    b.ins().jump(to, &args);
+/// What ends the loop before its count.
+#[derive(Clone, Copy)]
+enum Watch {
+    Nothing,
+    /// A status that is not 0.
+    Status(Value),
+    /// A truth; the status then is `detail`.
+    Failed {
+        when: Value,
+        detail: Value,
+    },
+}
+
+impl Watch {
+    /// How to watch the status of `func`, and which operations only its detail needs.
+    fn of(func: &Func) -> (Watch, Vec<bool>) {
+        let mut late = vec![false; func.ops.len()];
+        let Some(status) = func.status else { return (Watch::Nothing, late) };
+        let (when, detail) = match func.op(status) {
+            Op::Select(when, detail, zero) if func.op(zero) == Op::Int(0) => (when, detail),
+            _ => return (Watch::Status(status), late),
+        };
+        let mut needed = vec![false; func.ops.len()];
+        needed[when.index()] = true;
+        for (_, value) in &func.stores {
+            needed[value.index()] = true;
+        }
+        for i in (0..func.ops.len()).rev() {
+            if needed[i] {
+                func.ops[i].each_operand(|operand| needed[operand.index()] = true);
+            }
+            let load = matches!(func.ops[i], Op::Load(_));
+            late[i] = !needed[i] && !load;
+        }
+        (Watch::Failed { when, detail }, late)
+    }
 }
 
 /// Bytes from the beginning of a block or pool to its `index`-th number.

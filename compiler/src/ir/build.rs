@@ -38,6 +38,12 @@ impl Build {
         self
     }
 
+    /// Number of operations so far, those that nothing needs included.
+    #[allow(clippy::len_without_is_empty)]
+    pub fn len(&self) -> usize {
+        self.ops.len()
+    }
+
     /// The operation that gives a value.
     pub fn get(&self, value: Value) -> Op {
         self.ops[value.index()]

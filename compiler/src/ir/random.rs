@@ -187,9 +187,19 @@ pub fn func(random: &mut Random, len: usize) -> Func {
     let status = (random.below(2) == 0).then(|| {
         let fit = made.of(Type::Bool);
         let failed = fit[random.below(fit.len())];
-        made.push(Op::Int(3));
+        let other = fit[random.below(fit.len())];
+        // As guards have it, a chain of which a first test decides whether it matters; its end may be 0 all the same.
         made.push(Op::Int(0));
-        made.push(Op::Select(failed, made.last(1), made.last(0)));
+        let zero = made.last(0);
+        made.push(Op::Int(3));
+        made.push(Op::Select(other, made.last(0), zero));
+        made.push(Op::Int(5));
+        let slot = Op::Load(layout.states.slot(random.below(4)));
+        made.push(slot);
+        let x = made.of(Type::Real)[0];
+        made.push(Op::Less(made.last(0), x));
+        made.push(Op::Select(made.last(0), made.last(2), made.last(3)));
+        made.push(Op::Select(failed, made.last(0), zero));
         made.last(0)
     });
     Func { name: "random".into(), ops: made.ops, stores, status }
