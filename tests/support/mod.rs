@@ -144,23 +144,30 @@ pub fn run(
         );
         results.push(result);
     }
-    for method in Method::ALL.into_iter().filter(|method| *method != Method::Adaptive) {
-        agree(loaded, sources, experiment, method)?;
-    }
+    agree(loaded, sources, experiment)?;
     Ok(results)
 }
 
-/// A hundred steps of a method on both back ends, every slot compared.
+/// A hundred of its steps, else of 1 ms, with each fixed method on both back ends, every slot compared.
+///
+/// # Errors
+/// What is wrong with the experiment.
 #[track_caller]
-fn agree(loaded: &mut Loaded, sources: &Texts, experiment: &str, method: Method) -> Result<(), Vec<Diagnostic>> {
-    let changes = Changes { method: Some(method), step: Some(1e-3), ..Changes::default() };
-    for (machine, interpreted) in both(loaded, sources, experiment, changes)? {
-        let (mut a, mut b) = (machine.instance, interpreted.instance);
-        let statuses = [a.start(1e-3), b.start(1e-3)];
-        same(&a, &b, statuses, experiment, method);
-        for _ in 0..10 {
-            let statuses = [a.advance(10), b.advance(10)];
+pub fn agree(loaded: &mut Loaded, sources: &Texts, experiment: &str) -> Result<(), Vec<Diagnostic>> {
+    let own = both(loaded, sources, experiment, Changes::default())?
+        .first()
+        .map_or(0.0, |(case, _)| case.experiment.solver.step);
+    let step = if own > 0.0 { own } else { 1e-3 };
+    for method in Method::ALL.into_iter().filter(|method| *method != Method::Adaptive) {
+        let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+        for (machine, interpreted) in both(loaded, sources, experiment, changes)? {
+            let (mut a, mut b) = (machine.instance, interpreted.instance);
+            let statuses = [a.start(step), b.start(step)];
             same(&a, &b, statuses, experiment, method);
+            for _ in 0..10 {
+                let statuses = [a.advance(10), b.advance(10)];
+                same(&a, &b, statuses, experiment, method);
+            }
         }
     }
     Ok(())
