@@ -107,7 +107,8 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
         }
         Op::Neg(_) => of(0).iter().map(|(k, d)| (*k, (-at(*d)).value)).collect(),
         Op::Abs(a) => of(0).iter().map(|(k, d)| (*k, at(a).below(0.0).choose(-at(*d), at(*d)).value)).collect(),
-        Op::Sqrt(_) => chain(&|| 0.5 / y),
+        // At 0 the slope is infinite: 0, so that nothing but numbers travels on.
+        Op::Sqrt(_) => chain(&|| y.above(0.0).choose(0.5 / y, 0.0)),
         Op::Fma(a, b, _) => {
             let product = both(&|| at(b), &|| at(a));
             merge(&product, of(2), |a, b| Some(sum(build, a, b)))
@@ -137,13 +138,13 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
             match function {
                 // of y and x: (x dy − y dx)/(x² + y²)
                 Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
-                // a^b: b a^(b−1) da + a^b log a db; at a = 0 the second is 0.
+                // a^b: b a^(b−1) da + a^b log a db. At a = 0 the first is 1 for b = 1 and else 0, also where it is
+                // infinite, and the second is 0: nothing but numbers travels on.
                 Binary::Pow => {
                     let less = |b: Real<'a>| at(build.borrow_mut().binary(Binary::Pow, a.value, b.value));
                     let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
-                    // Where b is 0 the power is 1, whatever a is.
-                    let zero = |b: Real<'a>| b.is(0.0);
-                    both(&|| zero(b).choose(0.0, b * less(b - 1.0)), &|| a.above(0.0).choose(y * log(), 0.0))
+                    let at_zero = || b.is(1.0).choose(1.0, 0.0);
+                    both(&|| a.is(0.0).choose(at_zero(), b * less(b - 1.0)), &|| a.above(0.0).choose(y * log(), 0.0))
                 }
                 // At the origin the direction is undefined: 0.
                 Binary::Hypot => {

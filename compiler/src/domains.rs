@@ -5,6 +5,7 @@
 //! the conditions of branches are facts. Two forms carry friction: `exp(−x²)` lies in (0, 1], and `a + (b − a)·k` with
 //! k in [0, 1] lies between a and b.
 
+use crate::causality::rate_of;
 use crate::interval::Interval;
 use crate::source::Files;
 use crate::system::*;
@@ -258,6 +259,12 @@ impl<'a> Prover<'a> {
         match system.node(id) {
             Node::Number { value, .. } => Interval::point(*value),
             Node::Time => Interval { low: 0.0, above_low: false, ..Interval::ALL },
+            Node::Rate(var) if !self.open.contains(var) => {
+                self.open.push(*var);
+                let found = rate_of(system, system.node(id)).map_or(Interval::ALL, |rate| self.interval(rate));
+                self.open.pop();
+                found
+            }
             Node::Var(var) => self.var(*var),
             Node::Negate(a) => self.interval(*a).negate(),
             Node::Fits { value, .. } => self.interval(*value),

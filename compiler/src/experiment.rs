@@ -50,6 +50,8 @@ pub struct Variant {
 pub const DEFAULT_TOL: f64 = 1e-6;
 /// The step of a fixed method that was chosen without one, in s.
 pub const DEFAULT_STEP: f64 = 1e-5;
+/// Most fixed steps of a run.
+const MOST_STEPS: f64 = 1e12;
 /// Most combinations of the sweeps of one experiment.
 pub const MOST_VARIANTS: usize = 100_000;
 
@@ -483,6 +485,14 @@ fn variant(
     if solver.method != Method::Adaptive {
         let at = step.map(|at| system.span(nodes[at]));
         checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+        if duration / solver.step > MOST_STEPS {
+            let steps = units::three_digits(duration / solver.step);
+            let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
+                .label(parts.run.span, "so long a run with such short steps");
+            reader
+                .diagnostics
+                .push(error.help("run a shorter time or take longer steps: a trillion of them is the limit"));
+        }
     }
     let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
     for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {

@@ -95,9 +95,6 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
     }
     match method {
         Method::Adaptive => {
-            if program.description.layout.jacobian.len > 0 {
-                out.push((Function::Jacobian, derive::jacobian(program)));
-            }
             out.push((Function::Derivatives, program.derivatives.clone()));
             if program.description.layout.jacobian.len > 0 {
                 out.push((Function::Jacobian, derive::jacobian(program)));
@@ -244,10 +241,13 @@ pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
     diagnostics.sort_by_key(|diagnostic| diagnostic.span());
     let mut seen = std::collections::HashSet::new();
-    let mut circle = false;
+    let mut circles = std::collections::HashSet::new();
     diagnostics.retain(|diagnostic| {
-        // A circle of models is met from each of them.
-        let again = diagnostic.message.ends_with("contains itself") && std::mem::replace(&mut circle, true);
+        // A circle is met from each of its members.
+        let circle = ["contains itself", "calls itself", "is defined by itself"]
+            .into_iter()
+            .find(|end| diagnostic.message.ends_with(end));
+        let again = circle.is_some_and(|circle| !circles.insert(circle));
         seen.insert((diagnostic.code, diagnostic.span())) && !again
     });
     diagnostics

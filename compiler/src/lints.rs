@@ -21,8 +21,13 @@ pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
 /// Takes out warnings that the model allows.
 pub fn silence(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     let Some(top) = system.instances.first() else { return };
-    let allowed: Vec<&str> =
-        LINTS.iter().filter(|(name, _)| top.allows.iter().any(|allow| allow == name)).map(|(_, code)| *code).collect();
+    // What a part allows of its physics, with a reason, the whole need not allow again.
+    let by_parts = |name: &str| system.instances.iter().any(|part| part.allows.iter().any(|allow| allow == name));
+    let allowed: Vec<&str> = LINTS
+        .iter()
+        .filter(|(name, code)| top.allows.iter().any(|a| a == name) || (code.starts_with("W07") && by_parts(name)))
+        .map(|(_, code)| *code)
+        .collect();
     diagnostics.retain(|diagnostic| diagnostic.is_error() || !allowed.contains(&diagnostic.code));
 }
 

@@ -4,7 +4,7 @@
 //! are no units, and names serve only printing.
 
 use crate::causality::{Phase, rate_of, value_of};
-use crate::ir::build::Build;
+use crate::ir::build::{Build, Env};
 use crate::ir::{Binary, Func, Unary, Value};
 use crate::program::Program;
 use crate::system::*;
@@ -546,8 +546,6 @@ impl<'a> Plan<'a> {
             let was_false = emit.build.equal(before, zero);
             let fires = emit.build.and(condition, was_false);
             note(&mut emit, fires, &event.resets);
-            let held = emit.number(condition);
-            emit.build.store(*slot, held);
         }
         for var in order {
             let slot = self.slot(var).expect("a state is stored");
@@ -557,6 +555,24 @@ impl<'a> Plan<'a> {
                 value = emit.build.select(*fires, *reset, value);
             }
             emit.build.store(slot, value);
+        }
+        // What the next instant is compared with is what this one holds after its resets.
+        let changes = emit.build.finish();
+        let memory = self.memory();
+        let (mut both, mut env) = (Build::new("transitions").with_pool(self.description.pool.clone()), Env::new());
+        both.inline(&changes, &mut env);
+        both.inline(&memory, &mut env);
+        both.store_env(&env, |_| true);
+        both.finish()
+    }
+
+    /// Remembers the sides of crossings and whether events hold.
+    fn memory(&self) -> Func {
+        let mut emit = Emit::new(self, "memory", Phase::Now);
+        for (event, slot) in self.system.events.iter().zip(&self.events) {
+            let condition = emit.value(event.condition);
+            let held = emit.number(condition);
+            emit.build.store(*slot, held);
         }
         for (crossing, slot) in self.system.crossings.iter().zip(&self.crossings) {
             let difference = emit.value(crossing.difference);

@@ -1,0 +1,571 @@
+//! Expressions: names become quantities, functions are expanded in place, numbers become SI.
+
+use super::*;
+
+impl<'a> Flattener<'a> {
+    /// E0204
+    pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
+        let tree = self.tree(id);
+        let model = tree.model;
+        let error = Diagnostic::error("E0204", format!("there is no `{}` in {}", name.text, model.name.text))
+            .label(name.span, "not declared");
+        let all = declarations(model).map(|d| d.name.text.as_str());
+        let parts = model.body.iter().filter_map(|s| match s {
+            Statement::Part(part) => Some(part.name.text.as_str()),
+            Statement::Mode(mode) => Some(mode.name.text.as_str()),
+            _ => None,
+        });
+        let consts = self.loaded.visible(tree.file, Space::Const);
+        self.unknowns += 1;
+        let near = match self.unknowns <= MOST_SUGGESTIONS {
+            true => nearest(&name.text, all.chain(parts).chain(consts)),
+            false => None,
+        };
+        let error = match near {
+            Some(near) => match declarations(model).find(|d| d.name.text == near) {
+                Some(d) => error.help(format!("did you mean `{near}` ({})?", self.described(d))),
+                None => error.help(format!("did you mean `{near}`?")),
+            },
+            None if name.text == "time" => error.help("time is `t`"),
+            None => error.help(format!("declare it, for example `param {} = …` or `let {} = …`", name.text, name.text)),
+        };
+        self.report(error);
+    }
+
+    /// `param, N/m, line 4`
+    pub(super) fn described(&self, declaration: &ast::Declaration) -> String {
+        let unit = declaration.unit.as_ref().or(match &declaration.value {
+            Some(Expr { kind: ExprKind::Number { unit, .. }, .. }) => unit.as_ref(),
+            _ => None,
+        });
+        let unit = unit.map_or(String::new(), |unit| format!("{}, ", unit.text));
+        format!("{}, {unit}line {}", declaration.kind.word(), self.loaded.files.line(declaration.name.span))
+    }
+
+    pub(super) fn error(&mut self, span: Span) -> ExprId {
+        self.system.push(Node::Error, span)
+    }
+
+    /// Reads an expression.
+    pub(super) fn expr(&mut self, expr: &'a Expr, env: &Env) -> ExprId {
+        // Long sums and products lean to the left: walk down without recursion.
+        let mut spine: Vec<(&'a Expr, BinaryOp, Span, &'a Expr)> = Vec::new();
+        let mut first = expr;
+        while let ExprKind::Binary(op, op_span, left, right) = &first.kind {
+            spine.push((first, *op, *op_span, right));
+            first = left;
+        }
+        let mut value = self.operand(first, env);
+        while let Some((whole, op, _, right)) = spine.pop() {
+            let right = self.expr(right, env);
+            value = self.binary(op, value, right, whole.span, env);
+        }
+        value
+    }
+
+    pub(super) fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span, env: &Env) -> ExprId {
+        let node = match op {
+            BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls if !env.instants => {
+                let error = Diagnostic::error("E0308", format!("`{}` is an instant, not a value", op.text()))
+                    .label(span, "true at one instant only")
+                    .help("it belongs in `go … when …` and `when …`; for a value compare with `<` or `>`");
+                self.report(error);
+                Node::Error
+            }
+            BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls => {
+                let difference = self.system.push(Node::Binary(BinaryOp::Subtract, a, b), span);
+                self.system.crossings.push(Crossing { kind: op, difference });
+                Node::Crossing(self.system.crossings.len() as u32 - 1)
+            }
+            op => Node::Binary(op, a, b),
+        };
+        self.system.push(node, span)
+    }
+
+    pub(super) fn operand(&mut self, expr: &'a Expr, env: &Env) -> ExprId {
+        let span = expr.span;
+        let node = match &expr.kind {
+            ExprKind::Number { value, unit } => return self.number(*value, unit.as_ref(), span, env),
+            ExprKind::Path(path) => return self.path(path, env),
+            ExprKind::Derivative { of, along } => return self.derivative(of, along, span, env),
+            ExprKind::Call { function, args } => return self.call(function, args, span, env),
+            ExprKind::Unary(UnaryOp::Negate, a) => Node::Negate(self.expr(a, env)),
+            ExprKind::Unary(UnaryOp::Not, a) => Node::Not(self.expr(a, env)),
+            ExprKind::If(c, a, b) => Node::If(self.expr(c, env), self.expr(a, env), self.expr(b, env)),
+            ExprKind::Hole => Node::Hole,
+            ExprKind::Error => Node::Error,
+            ExprKind::Binary(..) => return self.expr(expr, env),
+        };
+        self.system.push(node, span)
+    }
+
+    pub(super) fn number(&mut self, value: f64, unit: Option<&'a ast::UnitText>, span: Span, env: &Env) -> ExprId {
+        let node = match unit {
+            None if value == 0.0 => zero(),
+            None => Node::Number { value, dimension: Some(Dimension::NONE), angle: Angle::Silent },
+            Some(text) => match Unit::parse(&text.text) {
+                Err(part) => {
+                    self.report(unknown_unit(text, &part));
+                    Node::Error
+                }
+                Ok(unit) => {
+                    let value = unit.to_si(value);
+                    if env.rotary {
+                        if unit.angle == Angle::Angle {
+                            self.not_rotary(env.instance, span, "speaks of an angle already");
+                        } else if env.equation && unit.dimension.rotary() != unit.dimension {
+                            self.not_rotary(env.instance, span, "a constant with a straight unit inside an equation");
+                        }
+                    }
+                    let dimension = if env.rotary { unit.dimension.rotary() } else { unit.dimension };
+                    Node::Number { value, dimension: Some(dimension), angle: unit.angle }
+                }
+            },
+        };
+        self.system.push(node, span)
+    }
+
+    pub(super) fn path(&mut self, path: &'a ast::Path, env: &Env) -> ExprId {
+        let head = &path.segments[0];
+        if let Some(name) = path.single() {
+            if let Some((_, node)) = env.locals.iter().rev().find(|(local, _)| *local == name.text) {
+                return *node;
+            }
+            let fixed = match name.text.as_str() {
+                "t" => Some(Node::Time),
+                "pi" => Some(Node::Number {
+                    value: std::f64::consts::PI,
+                    dimension: Some(Dimension::NONE),
+                    angle: Angle::Silent,
+                }),
+                "inf" => Some(Node::Number { value: f64::INFINITY, dimension: None, angle: Angle::Silent }),
+                "true" => Some(Node::Bool(true)),
+                "false" => Some(Node::Bool(false)),
+                _ => None,
+            };
+            if let Some(node) = fixed {
+                return self.system.push(node, path.span);
+            }
+        }
+        if head.name.text == "data" && env.instance.is_none_or(|_| env.outside) && path.segments.len() == 2 {
+            return self.recording(path);
+        }
+        if let Some(id) = env.instance
+            && let Some(binding) = self.tree(id).names.get(head.name.text.as_str()).cloned()
+        {
+            return self.through(id, binding, path, env);
+        }
+        if path.segments.len() == 1 && head.index.is_none() {
+            if let Some(node) = self.constant(&head.name, env) {
+                return node;
+            }
+        }
+        match env.instance {
+            Some(id) => self.unknown(id, &head.name),
+            None => {
+                let visible = self.loaded.visible(env.file, Space::Const);
+                let error = Diagnostic::error("E0204", format!("there is no `{}` here", head.name.text))
+                    .label(head.name.span, "not declared");
+                let error = match nearest(&head.name.text, visible) {
+                    Some(near) => error.help(format!("did you mean `{near}`?")),
+                    None => error.help("constants, functions and `t` can be used here"),
+                };
+                self.report(error);
+            }
+        }
+        self.error(path.span)
+    }
+
+    pub(super) fn recording(&mut self, path: &'a ast::Path) -> ExprId {
+        let column = &path.segments[1].name;
+        match self.data.get(&column.text) {
+            Some((table, _)) => {
+                let table = *table;
+                let time = self.system.push(Node::Time, path.span);
+                self.system.push(Node::Table(table, time), path.span)
+            }
+            None => {
+                let mut names: Vec<&String> = self.data.keys().collect();
+                names.sort_unstable();
+                let error = Diagnostic::error("E0903", format!("there is no column `{}`", column.text))
+                    .label(column.span, "not in the recording");
+                let error = match nearest(&column.text, names.iter().map(|name| name.as_str())) {
+                    Some(near) => error.help(format!("did you mean `data.{near}`?")),
+                    None => error.help("columns are named in `data \"file.csv\" (t [s], x [mm])`"),
+                };
+                self.report(error);
+                self.error(path.span)
+            }
+        }
+    }
+
+    /// Follows a path from a name of an instance down its parts.
+    pub(super) fn through(&mut self, id: InstanceId, binding: Binding, path: &'a ast::Path, env: &Env) -> ExprId {
+        let (mut id, mut binding) = (id, binding);
+        for k in 0..path.segments.len() {
+            let segment = &path.segments[k];
+            let last = k + 1 == path.segments.len();
+            let part = match (&binding, segment.index) {
+                (Binding::Part(part), None) => *part,
+                (Binding::Parts(parts, first), Some(index)) => {
+                    match usize::try_from(i64::from(index) - first).ok().and_then(|i| parts.get(i)) {
+                        Some(part) => *part,
+                        None => {
+                            let last = first + parts.len() as i64 - 1;
+                            let name = &segment.name.text;
+                            let error = Diagnostic::error("E0204", format!("there is no `{name}[{index}]`"))
+                                .label(path.span, format!("`{name}` goes from {first} to {last}"));
+                            self.report(error);
+                            return self.error(path.span);
+                        }
+                    }
+                }
+                (Binding::Parts(..), None) => {
+                    let name = &segment.name.text;
+                    let error = Diagnostic::error("E0204", format!("`{name}` is several parts"))
+                        .label(path.span, "which one?")
+                        .help(format!("write `{name}[1].…` for one, or `sum({name}.…)`, `min(…)`, `max(…)` over all"));
+                    self.report(error);
+                    return self.error(path.span);
+                }
+                (_, Some(_)) => {
+                    let error = Diagnostic::error("E0204", format!("`{}` is no array of parts", segment.name.text))
+                        .label(path.span, "it has no index");
+                    self.report(error);
+                    return self.error(path.span);
+                }
+                (Binding::Var(var), None) if last => return self.variable(*var, k > 0, path, env),
+                (Binding::Regime(automaton, regime), None) if last => {
+                    let node = Node::InRegime(*automaton, *regime);
+                    return self.system.push(node, path.span);
+                }
+                (Binding::Broken, None) => return self.error(path.span),
+                (_, None) => {
+                    let error = Diagnostic::error("E0204", format!("`{}` has no parts", segment.name.text))
+                        .label(path.span, "nothing can follow the dot");
+                    self.report(error);
+                    return self.error(path.span);
+                }
+            };
+            if last {
+                let name = &segment.name.text;
+                let error = Diagnostic::error("E0204", format!("`{name}` is a part, not a quantity"))
+                    .label(path.span, "which quantity of it?")
+                    .help(format!("write `{name}.` and the name of one of its outputs, states or params"));
+                self.report(error);
+                return self.error(path.span);
+            }
+            let next = &path.segments[k + 1].name;
+            match self.tree(part).names.get(next.text.as_str()).cloned() {
+                Some(next) => (id, binding) = (part, next),
+                None => {
+                    self.unknown(part, next);
+                    return self.error(path.span);
+                }
+            }
+        }
+        unreachable!("path of instance {id:?} ended without a quantity")
+    }
+
+    pub(super) fn variable(&mut self, var: VarId, from_outside: bool, path: &'a ast::Path, env: &Env) -> ExprId {
+        let declared = self.system.var(var);
+        if from_outside && declared.kind == VarKind::Let && !env.outside {
+            let model = &self.system.instance(declared.instance).model;
+            let error = Diagnostic::error("E0208", format!("`{}` is private to {model}", declared.name))
+                .label(path.span, "a `let` cannot be read from outside")
+                .label(declared.span, "declared here")
+                .help(format!("make it an output: `output {}`", declared.name));
+            self.report(error);
+            return self.error(path.span);
+        }
+        self.system.push(Node::Var(var), path.span)
+    }
+
+    pub(super) fn constant(&mut self, name: &'a Name, env: &Env) -> Option<ExprId> {
+        match self.loaded.find(env.file, Space::Const, &name.text) {
+            Lookup::Found(item, Item::Const(constant)) => {
+                if let Some(&node) = self.consts.get(&(item, env.rotary)) {
+                    return Some(node);
+                }
+                if self.open_consts.contains(&item) {
+                    let error = Diagnostic::error("E0211", format!("`{}` is defined by itself", name.text))
+                        .label(name.span, "used in its own value");
+                    self.report(error);
+                    return Some(self.error(name.span));
+                }
+                self.open_consts.push(item);
+                let inner = Env { rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
+                let mut value = self.expr(&constant.value, &inner);
+                if let Some(unit) = &constant.unit
+                    && let Some(unit) = self.unit(unit, env.rotary, env.instance)
+                {
+                    let role = Role::Result { function: name.text.clone() };
+                    value =
+                        self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
+                }
+                self.open_consts.pop();
+                self.consts.insert((item, env.rotary), value);
+                Some(value)
+            }
+            Lookup::Ambiguous(a, b) => {
+                self.ambiguous(name, a, b);
+                Some(self.error(name.span))
+            }
+            _ => None,
+        }
+    }
+
+    pub(super) fn derivative(&mut self, of: &'a Name, along: &'a Name, span: Span, env: &Env) -> ExprId {
+        let var = env.instance.and_then(|id| self.var_named(id, &of.text));
+        let path = env.instance.and_then(|id| self.var_named(id, &along.text));
+        let node = match (var, path) {
+            (Some(var), _) if along.text == "t" => Node::Rate(var),
+            (Some(var), Some(_)) => Node::PathRate(var),
+            _ => {
+                let error =
+                    Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
+                        .label(span, "not a state of this model")
+                        .help("to watch a derivative, give the model an output for it");
+                self.report(error);
+                Node::Error
+            }
+        };
+        self.system.push(node, span)
+    }
+
+    pub(super) fn call(&mut self, function: &'a Name, args: &'a [Expr], span: Span, env: &Env) -> ExprId {
+        if let ("sum" | "min" | "max", [Expr { kind: ExprKind::Path(path), .. }]) = (function.text.as_str(), args)
+            && let Some(folded) = self.fold(function, path, span, env)
+        {
+            return folded;
+        }
+        if env.outside
+            && let Some((measure, wanted)) = MeasureName::named(&function.text)
+            && args.len() == wanted
+        {
+            let value = self.expr(&args[0], env);
+            let second = args.get(1).map(|arg| self.expr(arg, env));
+            return self.system.push(Node::Measure(measure, value, second), span);
+        }
+        match self.loaded.find(env.file, Space::Function, &function.text) {
+            Lookup::Found(item, Item::Function(f)) => return self.expand(item, f, function, args, span, env),
+            Lookup::Found(item, Item::Table(table)) => return self.table(item, table, function, args, span, env),
+            Lookup::Found(..) => {}
+            Lookup::Ambiguous(a, b) => {
+                self.ambiguous(function, a, b);
+                return self.error(span);
+            }
+            Lookup::Missing => {}
+        }
+        let values: Vec<ExprId> = args.iter().map(|arg| self.expr(arg, env)).collect();
+        match Builtin::named(&function.text) {
+            Some((builtin, wanted)) if wanted == values.len() => self.builtin(builtin, values, span),
+            Some((_, wanted)) => {
+                self.wrong_count(function, wanted, args.len());
+                self.error(span)
+            }
+            None if function.text == "delay" => {
+                let error = Diagnostic::error("E0905", "`delay` is not available yet").label(function.span, "reserved");
+                self.report(error.help("a first-order lag comes close: `dy/dt = (x - y) / T`"));
+                self.error(span)
+            }
+            None if MeasureName::named(&function.text).is_some() => {
+                let error =
+                    Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
+                        .label(function.span, "needs the whole course of a quantity")
+                        .help(format!("write `expect {}(…) < …` in an experiment", function.text));
+                self.report(error);
+                self.error(span)
+            }
+            None => {
+                self.unknown_function(function, env);
+                self.error(span)
+            }
+        }
+    }
+
+    pub(super) fn builtin(&mut self, builtin: Builtin, values: Vec<ExprId>, span: Span) -> ExprId {
+        match builtin {
+            Builtin::Step | Builtin::Ramp => self.system.corners.push(values[0]),
+            Builtin::Pulse => {
+                let end = self.system.push(Node::Binary(BinaryOp::Add, values[0], values[1]), span);
+                self.system.corners.extend([values[0], end]);
+            }
+            _ => {}
+        }
+        self.system.push(Node::Call(builtin, values.into()), span)
+    }
+
+    pub(super) fn wrong_count(&mut self, function: &Name, wanted: usize, got: usize) {
+        let plural = if wanted == 1 { "" } else { "s" };
+        let error =
+            Diagnostic::error("E0207", format!("`{}` takes {wanted} argument{plural}, not {got}", function.text))
+                .label(function.span, format!("{got} given"));
+        self.report(error);
+    }
+
+    pub(super) fn unknown_function(&mut self, function: &Name, env: &Env) {
+        let mut error = Diagnostic::error("E0204", format!("there is no function `{}`", function.text))
+            .label(function.span, "not declared");
+        let loaded = self.loaded;
+        let mut known = loaded.visible(env.file, Space::Function);
+        for name in Builtin::names() {
+            known.push(name);
+        }
+        let help = match function.text.as_str() {
+            "der" | "diff" | "ddt" => Some("a derivative is written `dz/dt`".to_string()),
+            "sgn" | "signum" => Some("write `sign(…)`".into()),
+            "ln" => Some("write `log(…)`: the natural logarithm".into()),
+            "pow" => Some("write `a ^ b`".into()),
+            "sat" | "limit" | "saturate" => Some("write `clamp(x, low, high)`".into()),
+            "fabs" => Some("write `abs(…)`".into()),
+            name => nearest(name, known).map(|near| format!("did you mean `{near}`?")),
+        };
+        if let Some(help) = help.or_else(|| self.module_with(&function.text).map(|m| format!("add `import {m}`"))) {
+            error = error.help(help);
+        }
+        self.report(error);
+    }
+
+    /// `sum(el.f)`: folds an array of parts in the order of the index. Nothing if the path has no array.
+    pub(super) fn fold(&mut self, function: &'a Name, path: &'a ast::Path, span: Span, env: &Env) -> Option<ExprId> {
+        let id = env.instance?;
+        let mut binding = self.tree(id).names.get(path.segments[0].name.text.as_str())?.clone();
+        let mut at = 0;
+        let parts = loop {
+            let segment = &path.segments[at];
+            match (&binding, segment.index) {
+                (Binding::Broken, _) => return Some(self.error(span)),
+                (Binding::Parts(parts, _), None) => break parts.clone(),
+                (Binding::Parts(parts, first), Some(index)) => {
+                    let part = *parts.get(usize::try_from(i64::from(index) - first).ok()?)?;
+                    at += 1;
+                    binding = self.tree(part).names.get(path.segments.get(at)?.name.text.as_str())?.clone();
+                }
+                (Binding::Part(part), None) => {
+                    at += 1;
+                    binding = self.tree(*part).names.get(path.segments.get(at)?.name.text.as_str())?.clone();
+                }
+                _ => return None,
+            }
+        };
+        let rest: Vec<&ast::Segment> = path.segments[at + 1..].iter().collect();
+        let mut values = Vec::new();
+        for part in parts.iter() {
+            let mut instance = *part;
+            for (k, segment) in rest.iter().enumerate() {
+                match self.tree(instance).names.get(segment.name.text.as_str()).cloned() {
+                    Some(Binding::Part(inner)) if k + 1 < rest.len() => instance = inner,
+                    Some(Binding::Var(var)) if k + 1 == rest.len() => values.push(self.variable(var, true, path, env)),
+                    Some(Binding::Regime(automaton, regime)) if k + 1 == rest.len() => {
+                        values.push(self.system.push(Node::InRegime(automaton, regime), path.span));
+                    }
+                    _ => {
+                        self.unknown(instance, &segment.name);
+                        return Some(self.error(span));
+                    }
+                }
+            }
+        }
+        let mut all = values.into_iter();
+        let mut result = all.next()?;
+        for value in all {
+            let node = match function.text.as_str() {
+                "sum" => Node::Binary(BinaryOp::Add, result, value),
+                "min" => Node::Call(Builtin::Min, [result, value].into()),
+                _ => Node::Call(Builtin::Max, [result, value].into()),
+            };
+            result = self.system.push(node, span);
+        }
+        Some(result)
+    }
+
+    /// A function of the text, expanded in place.
+    pub(super) fn expand(
+        &mut self,
+        item: ItemRef,
+        function: &'a ast::Function,
+        name: &'a Name,
+        args: &'a [Expr],
+        span: Span,
+        env: &Env,
+    ) -> ExprId {
+        let values: Vec<ExprId> = args.iter().map(|expr| self.expr(expr, env)).collect();
+        let key = (item, values.clone(), env.rotary, env.equation);
+        if let Some(&known) = self.expansions.get(&key) {
+            return known;
+        }
+        let mut locals = Vec::new();
+        for ((arg, expr), value) in function.args.iter().zip(args).zip(values) {
+            let dimension = match &arg.unit {
+                None => Some(Dimension::NONE),
+                Some(unit) => self.unit(unit, env.rotary, env.instance).map(|unit| unit.dimension),
+            };
+            let value = match dimension {
+                Some(dimension) => {
+                    let role = Role::Argument { function: function.name.text.clone(), name: arg.name.text.clone() };
+                    self.system.push(Node::Fits { value, dimension, role }, expr.span)
+                }
+                None => value,
+            };
+            locals.push((arg.name.text.clone(), value));
+        }
+        if function.args.len() != args.len() {
+            self.wrong_count(name, function.args.len(), args.len());
+            return self.error(span);
+        }
+        if self.functions.contains(&item) || self.functions.len() >= DEEPEST {
+            let error = match self.functions.contains(&item) {
+                true => Diagnostic::error("E0211", format!("`{}` calls itself", function.name.text))
+                    .label(function.name.span, "directly or by others")
+                    .help("functions are not recursive: a step must take a bounded time"),
+                false => Diagnostic::error("E0211", format!("functions are nested more than {DEEPEST} deep"))
+                    .label(function.name.span, "called from so deep")
+                    .help("write some of them out"),
+            };
+            self.report(error);
+            return self.error(span);
+        }
+        self.functions.push(item);
+        let inner = Env { locals: Rc::new(locals), rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
+        let body = self.expr(&function.body, &inner);
+        self.functions.pop();
+        let result = match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance)) {
+            Some(unit) => {
+                let role = Role::Result { function: function.name.text.clone() };
+                self.system.push(Node::Fits { value: body, dimension: unit.dimension, role }, span)
+            }
+            None => body,
+        };
+        self.expansions.insert(key, result);
+        result
+    }
+
+    pub(super) fn table(
+        &mut self,
+        item: ItemRef,
+        table: &'a ast::Table,
+        name: &'a Name,
+        args: &'a [Expr],
+        span: Span,
+        env: &Env,
+    ) -> ExprId {
+        let [arg] = args else {
+            self.wrong_count(name, 1, args.len());
+            return self.error(span);
+        };
+        let x = self.expr(arg, env);
+        if !self.tables.contains_key(&item) {
+            let made = crate::tables::read(self.loaded, self.sources, item.file, table, &mut self.diagnostics);
+            let number = made.map(|table| {
+                self.system.tables.push(table);
+                self.system.tables.len() as u32 - 1
+            });
+            self.tables.insert(item, number);
+        }
+        match self.tables[&item] {
+            Some(number) => self.system.push(Node::Table(number, x), span),
+            None => self.error(span),
+        }
+    }
+}

@@ -1,0 +1,688 @@
+//! The tree of instances: models made of models, arguments, slots, and what every name means.
+
+use super::*;
+
+impl<'a> Flattener<'a> {
+    /// An instance as written, at the top.
+    pub(super) fn written(
+        &mut self,
+        instance: &'a ast::Instance,
+        env: &Env,
+        overrides: Vec<Change<'a>>,
+    ) -> Option<InstanceId> {
+        let (item, model) = self.model(env.file, &instance.model)?;
+        let made = Making {
+            path: String::new(),
+            rotary: instance.rotary,
+            span: instance.model.span,
+            args: args_of(&instance.args, env),
+            overrides,
+        };
+        Some(self.instantiate(model, item.file, made, false))
+    }
+
+    /// The model of this name, or a report.
+    pub(super) fn model(&mut self, file: FileId, name: &Name) -> Option<(ItemRef, &'a ast::Model)> {
+        let loaded = self.loaded;
+        match loaded.find(file, Space::Type, &name.text) {
+            Lookup::Found(item, Item::Model(model)) => return Some((item, model)),
+            Lookup::Found(_, item) => {
+                let what = match item {
+                    Item::Interface(_) => "an interface: it has no equations",
+                    _ => "a device: it stands in a rig",
+                };
+                let error =
+                    Diagnostic::error("E0201", format!("`{}` is not a model", name.text)).label(name.span, what);
+                self.report(error.help("name a model that fits it"));
+            }
+            Lookup::Ambiguous(a, b) => self.ambiguous(name, a, b),
+            Lookup::Missing => {
+                let models = loaded.visible(file, Space::Type);
+                let near = nearest(&name.text, models.iter().copied().filter(|m| self.is_model(file, m)));
+                let mut error = Diagnostic::error("E0201", format!("there is no model `{}`", name.text))
+                    .label(name.span, "not declared and not imported");
+                if let Some(near) = near {
+                    error = error.help(format!("did you mean `{near}`?"));
+                } else if let Some(module) = self.module_with(&name.text) {
+                    error = error.help(format!("add `import {module}`"));
+                } else {
+                    error = error.help("declare it in this file, or import the file or library module that has it");
+                }
+                self.report(error);
+            }
+        }
+        None
+    }
+
+    pub(super) fn is_model(&self, file: FileId, name: &str) -> bool {
+        matches!(self.loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Model(_)))
+    }
+
+    /// The library module that has an item of this name.
+    pub(super) fn module_with(&self, name: &str) -> Option<String> {
+        let head = |text: &str| {
+            ["model", "fn", "table", "const", "interface"].iter().any(|word| {
+                text.lines().any(|line| {
+                    line.strip_prefix(word)
+                        .and_then(|rest| rest.trim_start().strip_prefix(name))
+                        .is_some_and(|rest| !rest.starts_with(|c: char| c.is_ascii_alphanumeric() || c == '_'))
+                })
+            })
+        };
+        let modules = self.sources.modules();
+        modules.into_iter().find(|m| self.sources.library(m).unwrap_or_default().iter().any(|(_, text)| head(text)))
+    }
+
+    pub(super) fn ambiguous(&mut self, name: &Name, a: ItemRef, b: ItemRef) {
+        let file = |item: ItemRef| self.loaded.files.get(item.file).name.clone();
+        let error = Diagnostic::error("E0202", format!("two imports define `{}`", name.text))
+            .label(name.span, format!("in {} and in {}", file(a), file(b)))
+            .help("import only one of them, or declare it in this file");
+        self.report(error);
+    }
+
+    pub(super) fn instantiate(
+        &mut self,
+        model: &'a ast::Model,
+        file: FileId,
+        made: Making<'a>,
+        alone: bool,
+    ) -> InstanceId {
+        let id = InstanceId(self.system.instances.len() as u32);
+        let allows = model.body.iter().filter_map(|s| match s {
+            Statement::Allow(allow) => Some(allow.lint.text.clone()),
+            _ => None,
+        });
+        self.system.instances.push(InstanceInfo {
+            path: made.path.clone(),
+            model: model.name.text.clone(),
+            rotary: made.rotary,
+            span: made.span,
+            allows: allows.collect(),
+        });
+        let mut args = made.args;
+        let mut deeper: Vec<Change<'a>> = Vec::new();
+        for change in made.overrides {
+            match change.path {
+                [only] if only.index.is_none() => {
+                    args.retain(|arg| arg.name != only.name.text);
+                    let value = match change.value {
+                        OverrideValue::Expr(expr) => ArgValue::Expr(expr),
+                        OverrideValue::Instance(instance) => ArgValue::Instance(instance),
+                    };
+                    let env = change.env.clone();
+                    args.push(Arg { name: &only.name.text, span: change.span, value, env, overriding: true });
+                }
+                _ => deeper.push(change),
+            }
+        }
+        self.instances.push(Tree { model, file, names: HashMap::new(), args, alone, locals: Rc::default() });
+        self.declare(id);
+        self.parts(id, deeper);
+        self.check_arguments(id);
+        id
+    }
+
+    pub(super) fn tree(&self, id: InstanceId) -> &Tree<'a> {
+        &self.instances[id.0 as usize]
+    }
+
+    /// Declares the quantities and regimes of an instance.
+    pub(super) fn declare(&mut self, id: InstanceId) {
+        let model = self.tree(id).model;
+        let mut first: HashMap<&'a str, Span> = HashMap::new();
+        for statement in &model.body {
+            match statement {
+                Statement::Declaration(declaration) => self.declaration(id, declaration, &mut first),
+                Statement::Every(every) => {
+                    for statement in &every.body {
+                        if let ast::EveryStatement::Declaration(declaration) = statement {
+                            self.declaration(id, declaration, &mut first);
+                        }
+                    }
+                }
+                Statement::Part(part) => match self.new_name(&part.name, &mut first) {
+                    true => self.bind(id, &part.name.text, Binding::Broken),
+                    false => self.refused_parts.push(part.name.span),
+                },
+                _ => {}
+            }
+        }
+        let modes: Vec<&'a ast::Mode> = modes(model).collect();
+        if modes.is_empty() {
+            return;
+        }
+        let automaton = AutomatonId(self.system.automata.len() as u32);
+        let initial: Vec<usize> = (0..modes.len()).filter(|&k| modes[k].initial.is_some()).collect();
+        match initial.as_slice() {
+            [_] => {}
+            [] => {
+                let error = Diagnostic::error("E0310", "no regime is the one to start in")
+                    .label(modes[0].head, "the first of them")
+                    .help(format!("write `mode {} initial {{`", modes[0].name.text));
+                self.report(error);
+            }
+            [a, b, ..] => {
+                let error = Diagnostic::error("E0310", "two regimes are marked `initial`")
+                    .label(modes[*b].head, "again here")
+                    .label(modes[*a].head, "first here")
+                    .help("a model starts in one regime: remove one `initial`");
+                self.report(error);
+            }
+        }
+        let mut regimes = Vec::new();
+        for (k, mode) in modes.iter().enumerate() {
+            regimes.push(Regime { name: mode.name.text.clone(), span: mode.head, transitions: Vec::new() });
+            if self.new_name(&mode.name, &mut first) {
+                self.bind(id, &mode.name.text, Binding::Regime(automaton, k as u32));
+            }
+        }
+        let initial = initial.first().copied().unwrap_or(0) as u32;
+        self.system.automata.push(Automaton { instance: id, regimes, initial });
+    }
+
+    /// Whether the name may be declared here.
+    pub(super) fn new_name(&mut self, name: &'a Name, first: &mut HashMap<&'a str, Span>) -> bool {
+        if RESERVED.contains(&name.text.as_str()) {
+            self.report(reserved(name));
+            return false;
+        }
+        match first.get(name.text.as_str()) {
+            Some(&span) => {
+                self.report(declared_twice(name, span));
+                false
+            }
+            None => {
+                first.insert(&name.text, name.span);
+                true
+            }
+        }
+    }
+
+    pub(super) fn bind(&mut self, id: InstanceId, name: &'a str, binding: Binding) {
+        self.instances[id.0 as usize].names.insert(name, binding);
+    }
+
+    pub(super) fn declaration(
+        &mut self,
+        id: InstanceId,
+        declaration: &'a ast::Declaration,
+        first: &mut HashMap<&'a str, Span>,
+    ) {
+        let name = &declaration.name;
+        if !self.new_name(name, first) {
+            return;
+        }
+        let kind = match declaration.kind {
+            DeclarationKind::Param => VarKind::Param,
+            DeclarationKind::Input => VarKind::Input,
+            DeclarationKind::Output => VarKind::Output,
+            DeclarationKind::State => VarKind::State,
+            DeclarationKind::Let => VarKind::Let,
+        };
+        let rotary = self.system.instance(id).rotary;
+        let unit = declaration
+            .unit
+            .as_ref()
+            .and_then(|unit| Some((self.unit(unit, rotary, Some(id))?, self.bracketed(unit.span))));
+        let shown = match &declaration.value {
+            Some(Expr { kind: ExprKind::Number { unit: Some(unit), .. }, .. }) => Unit::parse(&unit.text).ok(),
+            _ => None,
+        };
+        let shown = if rotary { shown.map(|unit| unit.rotary()) } else { shown };
+        let path = joined(&self.system.instance(id).path, &name.text);
+        let var = self.add_var(Var {
+            path,
+            name: name.text.clone(),
+            span: name.span,
+            instance: id,
+            kind,
+            unreadable: declaration.unit.is_some() && unit.is_none() || self.misread(declaration.span),
+            unit,
+            shown,
+            range: VarRange::default(),
+            range_span: None,
+            definition: Definition::Missing,
+            doc: declaration.doc.clone(),
+        });
+        self.bind(id, &name.text, Binding::Var(var));
+    }
+
+    pub(super) fn add_var(&mut self, var: Var) -> VarId {
+        self.system.vars.push(var);
+        VarId(self.system.vars.len() as u32 - 1)
+    }
+
+    /// Whether the parser complained inside of a place.
+    pub(super) fn misread(&self, place: Span) -> bool {
+        self.loaded.diagnostics.iter().any(|d| {
+            let span = d.span();
+            d.is_error() && span.file == place.file && place.start <= span.start && span.end <= place.end
+        })
+    }
+
+    /// The span of a declared unit with its brackets.
+    pub(super) fn bracketed(&self, span: Span) -> Span {
+        let text = self.loaded.files.get(span.file).text.as_bytes();
+        let (before, behind) = ((span.start as usize).wrapping_sub(1), span.end as usize);
+        match (text.get(before), text.get(behind)) {
+            (Some(b'['), Some(b']')) => Span::new(span.file, before, behind + 1),
+            _ => span,
+        }
+    }
+
+    /// The span of a bound with its operator: `>= 0`.
+    pub(super) fn with_operator(&self, span: Span) -> Span {
+        let before = &self.loaded.files.get(span.file).text[..span.start as usize];
+        let operator = before.trim_end().trim_end_matches(['<', '>', '=']);
+        Span::new(span.file, operator.len(), span.end as usize)
+    }
+
+    /// A unit as written, mapped for a rotary instance; or a report.
+    pub(super) fn unit(&mut self, unit: &ast::UnitText, rotary: bool, owner: Option<InstanceId>) -> Option<Unit> {
+        match Unit::parse(&unit.text) {
+            Ok(parsed) => {
+                if rotary && parsed.angle == Angle::Angle {
+                    self.not_rotary(owner, unit.span, "speaks of an angle already");
+                    return None;
+                }
+                Some(if rotary { parsed.rotary() } else { parsed })
+            }
+            Err(part) => {
+                self.report(unknown_unit(unit, &part));
+                None
+            }
+        }
+    }
+
+    pub(super) fn not_rotary(&mut self, owner: Option<InstanceId>, span: Span, why: &str) {
+        if let Some(id) = owner {
+            if self.system.strangers.contains(&id) {
+                return;
+            }
+            self.system.strangers.push(id);
+        }
+        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(
+            "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin",
+        );
+        self.report(error);
+    }
+
+    /// Makes the parts of an instance.
+    pub(super) fn parts(&mut self, id: InstanceId, changes: Vec<Change<'a>>) {
+        let model = self.tree(id).model;
+        let env = self.env(id);
+        for statement in &model.body {
+            let Statement::Part(part) = statement else { continue };
+            if self.refused_parts.contains(&part.name.span) {
+                continue;
+            }
+            let mine = |change: &&Change<'a>| change.path[0].name.text == part.name.text;
+            let changes: Vec<Change<'a>> = changes.iter().filter(mine).cloned().collect();
+            match &part.repeat {
+                None => {
+                    let changes = changes.into_iter().map(|c| Change { path: &c.path[1..], ..c }).collect();
+                    if let Some(made) = self.part(id, part, &env, String::new(), changes) {
+                        self.bind(id, &part.name.text, Binding::Part(made));
+                    }
+                }
+                Some(repeat) => self.repeated(id, part, repeat, &env, changes),
+            }
+        }
+        for change in &changes {
+            let head = &change.path[0].name;
+            if !matches!(self.tree(id).names.get(head.text.as_str()), Some(Binding::Part(_) | Binding::Parts(..))) {
+                self.unknown_part(id, head);
+            }
+        }
+    }
+
+    pub(super) fn unknown_part(&mut self, id: InstanceId, name: &Name) {
+        let model = self.tree(id).model;
+        let parts = model.body.iter().filter_map(|s| match s {
+            Statement::Part(part) => Some(part.name.text.as_str()),
+            _ => None,
+        });
+        let mut error = Diagnostic::error("E0204", format!("{} has no part `{}`", model.name.text, name.text))
+            .label(name.span, "not a part");
+        if let Some(near) = nearest(&name.text, parts) {
+            error = error.help(format!("did you mean `{near}`?"));
+        }
+        self.report(error);
+    }
+
+    pub(super) fn repeated(
+        &mut self,
+        id: InstanceId,
+        part: &'a ast::Part,
+        repeat: &'a ast::Repeat,
+        env: &Env,
+        changes: Vec<Change<'a>>,
+    ) {
+        // Read as expressions too, so that what they mention counts as read.
+        self.expr(&repeat.first, env);
+        self.expr(&repeat.last, env);
+        let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
+        let (Some(first), Some(last)) = bounds else { return };
+        if last < first || (last - first) as usize >= MOST_VARS {
+            let error =
+                Diagnostic::error("E0502", format!("`{}` cannot repeat from {first} to {last}", part.name.text))
+                    .label(repeat.span, "this range")
+                    .help(format!(
+                        "the last index is at least the first, and there are at most {MOST_VARS} quantities"
+                    ));
+            self.report(error);
+            return;
+        }
+        let mut made = Vec::new();
+        for i in first..=last {
+            let index = self.system.push(
+                Node::Number { value: i as f64, dimension: Some(Dimension::NONE), angle: Angle::Silent },
+                repeat.index.span,
+            );
+            let mut locals = (*env.locals).clone();
+            locals.push((repeat.index.text.clone(), index));
+            let env = Env { locals: Rc::new(locals), ..env.clone() };
+            let chosen = |change: &&Change<'a>| change.path[0].index.is_none_or(|index| i64::from(index) == i);
+            let changes = changes.iter().filter(chosen).map(|c| Change { path: &c.path[1..], ..c.clone() }).collect();
+            match self.part(id, part, &env, format!("[{i}]"), changes) {
+                Some(part) => made.push(part),
+                None => return,
+            }
+            if self.system.vars.len() > MOST_VARS {
+                let error = Diagnostic::error("E0502", format!("more than {MOST_VARS} quantities"))
+                    .label(repeat.span, "made here")
+                    .help("a program of this size is refused; use fewer elements");
+                self.report(error);
+                return;
+            }
+        }
+        self.bind(id, &part.name.text, Binding::Parts(Rc::new(made), first));
+    }
+
+    /// Makes one part, with another model in a slot if a change or an argument says so.
+    pub(super) fn part(
+        &mut self,
+        id: InstanceId,
+        part: &'a ast::Part,
+        env: &Env,
+        index: String,
+        mut changes: Vec<Change<'a>>,
+    ) -> Option<InstanceId> {
+        let path = joined(&self.system.instance(id).path, &format!("{}{index}", part.name.text));
+        let mut chosen: (&'a ast::Instance, Env) = (&part.instance, env.clone());
+        let mut replaced = false;
+        let argument = self.tree(id).args.iter().find(|arg| arg.name == part.name.text).cloned();
+        if let Some(arg) = argument {
+            match arg.value {
+                ArgValue::Instance(instance) => {
+                    if part.slot.is_none() {
+                        let owner = &self.tree(id).model.name.text;
+                        let error =
+                            Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
+                                .label(arg.span, "another model cannot be put here")
+                                .label(part.name.span, "declared without an interface")
+                                .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
+                        self.report(error);
+                    } else {
+                        chosen = (instance, arg.env);
+                        replaced = true;
+                    }
+                }
+                ArgValue::Expr(_) => {
+                    let error = Diagnostic::error("E0205", format!("`{}` is a part: it takes a model", part.name.text))
+                        .label(arg.span, "a value")
+                        .help(format!("write `{} = Model(…)`", part.name.text));
+                    self.report(error);
+                }
+            }
+        }
+        changes.retain(|change| !change.path.is_empty());
+        let (instance, instance_env) = chosen;
+        let (item, model) = self.model(instance_env.file, &instance.model)?;
+        if self.models.contains(&item) || self.models.len() >= DEEPEST {
+            let error = Diagnostic::error("E0211", format!("{} contains itself", model.name.text))
+                .label(instance.model.span, "here it is made again")
+                .help("a part cannot contain the model that it belongs to");
+            self.report(error);
+            return None;
+        }
+        let parent_rotary = self.system.instance(id).rotary;
+        let rotary = instance.rotary || instance_env.rotary;
+        if replaced && parent_rotary && !rotary {
+            let error = Diagnostic::error("E0108", format!("{} is straight, but the slot is rotary", model.name.text))
+                .label(instance.model.span, "a straight model")
+                .help(format!("write `rotary {}(…)`", model.name.text));
+            self.report(error);
+        }
+        let mut args = args_of(&instance.args, &instance_env);
+        if let Some(slot) = &part.slot {
+            let wiring = args_of(&part.instance.args, env);
+            let file = self.tree(id).file;
+            let slot_rotary = slot.rotary || parent_rotary;
+            let ports = self.interface(file, slot)?;
+            self.check_fit(model, item.file, instance, rotary, ports, slot, slot_rotary);
+            let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
+            let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
+            if replaced {
+                let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
+                args.extend(wiring.into_iter().filter(|arg| port(arg.name) && !given.contains(&arg.name)));
+            }
+            // A slot drops its wiring for a model that lacks an optional port.
+            let (kept, dropped) = args.into_iter().partition(|arg| !port(arg.name) || has(arg.name));
+            args = kept;
+            self.dropped.extend::<Vec<_>>(dropped);
+        }
+        self.models.push(item);
+        let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
+        let made = self.instantiate(model, item.file, made, false);
+        self.models.pop();
+        Some(made)
+    }
+
+    pub(super) fn interface(&mut self, file: FileId, slot: &'a ast::SlotType) -> Option<&'a ast::Interface> {
+        let loaded = self.loaded;
+        match loaded.find(file, Space::Type, &slot.interface.text) {
+            Lookup::Found(_, Item::Interface(interface)) => return Some(interface),
+            Lookup::Ambiguous(a, b) => self.ambiguous(&slot.interface, a, b),
+            Lookup::Found(..) | Lookup::Missing => {
+                let mut error = Diagnostic::error("E0201", format!("there is no interface `{}`", slot.interface.text))
+                    .label(slot.interface.span, "not declared and not imported");
+                let names = loaded.visible(file, Space::Type);
+                let interface =
+                    |name: &&str| matches!(loaded.find(file, Space::Type, name), Lookup::Found(_, Item::Interface(_)));
+                if let Some(near) = nearest(&slot.interface.text, names.into_iter().filter(interface)) {
+                    error = error.help(format!("did you mean `{near}`?"));
+                } else if let Some(module) = self.module_with(&slot.interface.text) {
+                    error = error.help(format!("add `import {module}`"));
+                }
+                self.report(error);
+            }
+        }
+        None
+    }
+
+    /// Whether a model has the ports of an interface.
+    #[allow(clippy::too_many_arguments)]
+    pub(super) fn check_fit(
+        &mut self,
+        model: &'a ast::Model,
+        _model_file: FileId,
+        instance: &'a ast::Instance,
+        rotary: bool,
+        interface: &'a ast::Interface,
+        slot: &'a ast::SlotType,
+        slot_rotary: bool,
+    ) {
+        for port in &interface.ports {
+            let found = declarations(model).find(|d| d.name.text == port.name.text);
+            let dimension = |unit: &Option<ast::UnitText>, rotary: bool| {
+                let unit = Unit::parse(&unit.as_ref()?.text).ok()?;
+                Some(if rotary { unit.dimension.rotary() } else { unit.dimension })
+            };
+            let wanted = port.unit.as_ref().map_or(String::new(), |unit| format!(" [{}]", unit.text));
+            let wanted = format!("{} {}{wanted}", port.kind.word(), port.name.text);
+            let name = &model.name.text;
+            let problem = match found {
+                None if port.value.is_some() => continue,
+                None => format!("it has no `{wanted}`"),
+                Some(d) if d.kind != port.kind => {
+                    format!("its `{}` is {} `{}`", d.name.text, article(d.kind.word()), d.kind.word())
+                }
+                Some(d) => match (dimension(&d.unit, rotary), dimension(&port.unit, slot_rotary)) {
+                    (Some(has), Some(needs)) if has != needs => {
+                        if has.rotary() == needs || needs.rotary() == has {
+                            let (model_is, help) = if slot_rotary {
+                                ("straight", format!("write `rotary {name}(…)`"))
+                            } else {
+                                ("rotary", format!("write `{name}(…)` without `rotary`"))
+                            };
+                            let error =
+                                Diagnostic::error("E0108", format!("{name} is {model_is} here, the slot is not"))
+                                    .label(
+                                        instance.model.span,
+                                        format!("its `{}` is in {}", d.name.text, Unit::si(has)),
+                                    )
+                                    .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
+                            self.report(error.help(help));
+                            return;
+                        }
+                        format!("its `{}` is {}, not {}", d.name.text, has.describe(), needs.describe())
+                    }
+                    _ => continue,
+                },
+            };
+            let error = Diagnostic::error("E0206", format!("{name} does not fit {}", interface.name.text))
+                .label(instance.model.span, problem)
+                .label(slot.interface.span, format!("asks for `{wanted}`"))
+                .help(format!(
+                    "a model fits {} when it has its ports with these units; add `{wanted}`",
+                    interface.name.text
+                ));
+            self.report(error);
+            return;
+        }
+    }
+
+    /// Every argument must name a port, parameter or slot.
+    pub(super) fn check_arguments(&mut self, id: InstanceId) {
+        let tree = self.tree(id);
+        let model = tree.model;
+        let mut seen: HashMap<&str, Span> = HashMap::new();
+        let mut errors = Vec::new();
+        for arg in &tree.args {
+            if let Some(first) = seen.insert(arg.name, arg.span) {
+                let name = Name { text: arg.name.into(), span: arg.span };
+                errors.push(
+                    Diagnostic::error("E0205", format!("`{}` is given twice", name.text))
+                        .label(arg.span, "again here")
+                        .label(first, "first here")
+                        .help("remove one of them"),
+                );
+                continue;
+            }
+            let declared = declarations(model).find(|d| d.name.text == arg.name);
+            let part = model.body.iter().any(|s| matches!(s, Statement::Part(part) if part.name.text == arg.name));
+            let message = match declared {
+                _ if part => continue,
+                Some(d) if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input) => match arg.value {
+                    ArgValue::Expr(_) => continue,
+                    ArgValue::Instance(_) => {
+                        format!("`{}` of {} takes a value, not a model", arg.name, model.name.text)
+                    }
+                },
+                Some(d) => {
+                    let kind = d.kind.word();
+                    format!("`{}` is {} {kind} of {}: it cannot be given", arg.name, article(kind), model.name.text)
+                }
+                None => format!("{} has no `{}`", model.name.text, arg.name),
+            };
+            let mut error = Diagnostic::error("E0205", message).label(arg.span, "no such argument");
+            let takes: Vec<&str> = declarations(model)
+                .filter(|d| matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input))
+                .map(|d| d.name.text.as_str())
+                .collect();
+            error = match nearest(arg.name, takes.iter().copied()) {
+                Some(near) => error.help(format!("did you mean `{near}`?")),
+                None if takes.is_empty() => error.help(format!("{} takes no arguments", model.name.text)),
+                None => error.help(format!("{} takes {}", model.name.text, takes.join(", "))),
+            };
+            errors.push(error);
+        }
+        self.diagnostics.extend(errors);
+    }
+
+    pub(super) fn env(&self, id: InstanceId) -> Env {
+        let tree = self.tree(id);
+        Env {
+            file: tree.file,
+            instance: Some(id),
+            rotary: self.system.instance(id).rotary,
+            locals: tree.locals.clone(),
+            outside: false,
+            equation: false,
+            instants: false,
+        }
+    }
+
+    /// A whole number known before anything is compiled: a bound of a repetition.
+    pub(super) fn whole(&mut self, expr: &'a Expr, env: &Env) -> Option<i64> {
+        match self.early(expr, env, 0) {
+            Some(value) if value.fract() == 0.0 && value.abs() < 1e9 => Some(value as i64),
+            _ => {
+                let error = Diagnostic::error("E0502", "a repetition needs whole numbers that are known here")
+                    .label(expr.span, "not a whole number, or not constant")
+                    .help("write a number, a constant or a param, as in `[i in 1 .. 4]`");
+                self.report(error);
+                None
+            }
+        }
+    }
+
+    /// Value of simple arithmetic over numbers, constants and parameters.
+    pub(super) fn early(&self, expr: &'a Expr, env: &Env, depth: usize) -> Option<f64> {
+        if depth > DEEPEST {
+            return None;
+        }
+        let value = |e: &'a Expr| self.early(e, env, depth + 1);
+        match &expr.kind {
+            ExprKind::Number { value, unit: None } => Some(*value),
+            ExprKind::Unary(UnaryOp::Negate, a) => Some(-value(a)?),
+            ExprKind::Binary(op, _, a, b) => {
+                let (a, b) = (value(a)?, value(b)?);
+                match op {
+                    BinaryOp::Add => Some(a + b),
+                    BinaryOp::Subtract => Some(a - b),
+                    BinaryOp::Multiply => Some(a * b),
+                    BinaryOp::Divide => Some(a / b),
+                    _ => None,
+                }
+            }
+            ExprKind::Path(path) => {
+                let name = path.single()?.text.as_str();
+                if let Some((_, node)) = env.locals.iter().find(|(local, _)| local == name) {
+                    return match self.system.node(*node) {
+                        Node::Number { value, .. } => Some(*value),
+                        _ => None,
+                    };
+                }
+                if let Some(id) = env.instance {
+                    let tree = self.tree(id);
+                    if let Some(declaration) = declarations(tree.model).find(|d| d.name.text == name) {
+                        if let Some(arg) = tree.args.iter().find(|arg| arg.name == name) {
+                            let ArgValue::Expr(expr) = arg.value else { return None };
+                            return self.early(expr, &arg.env, depth + 1);
+                        }
+                        let parameter = declaration.kind == DeclarationKind::Param;
+                        return self.early(declaration.value.as_ref().filter(|_| parameter)?, env, depth + 1);
+                    }
+                }
+                match self.loaded.find(env.file, Space::Const, name) {
+                    Lookup::Found(item, Item::Const(c)) => self.early(&c.value, &Env::file(item.file), depth + 1),
+                    _ => None,
+                }
+            }
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,392 @@
+//! Makes one flat [`System`] of an instance with all its parts.
+//!
+//! First every name of the whole tree is declared, then every expression is read, so that order never matters.
+//! Checks what concerns names: unknown ones, arguments, slots, and that each quantity is defined exactly once.
+
+mod equations;
+mod expressions;
+mod instances;
+
+use crate::names::nearest;
+use crate::resolve::{ItemRef, Loaded, Lookup, RESERVED, Space, declared_twice, reserved};
+use crate::source::Sources;
+use crate::system::*;
+use abi::unit::{Angle, Dimension, Unit};
+use grammar::ast::{self, BinaryOp, DeclarationKind, Expr, ExprKind, Item, Name, Statement, Target, UnaryOp};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+use std::collections::HashMap;
+use std::rc::Rc;
+
+/// Most quantities of one instance with all its parts.
+pub const MOST_VARS: usize = 200_000;
+/// For so many unknown names a suggestion is looked for; the rest is hardly read.
+const MOST_SUGGESTIONS: usize = 50;
+/// Deepest nesting of parts in parts, and of functions in functions.
+const DEEPEST: usize = 64;
+
+/// What is made from: a model with arguments, as an experiment or a check asks for it.
+pub struct Request<'a> {
+    /// The model, or nothing for a model on its own with its inputs free.
+    pub instance: Instance<'a>,
+    /// Changes from outside, by path: they win over what the text says.
+    pub overrides: Vec<Override<'a>>,
+    /// Expressions over the names of the instance that are wanted as quantities: plots and expectations.
+    pub observed: Vec<&'a Expr>,
+    /// Recordings that may be read as `data.NAME`: the number of the table.
+    pub data: Vec<(String, Table, Unit)>,
+}
+
+/// The instance of a [`Request`].
+pub enum Instance<'a> {
+    /// As written in a `run`; arguments are read in the scope of the file.
+    Written(&'a ast::Instance, FileId),
+    /// A model on its own: inputs come from outside, parameters without a default stay open.
+    Alone(&'a ast::Model, FileId),
+}
+
+/// A change from outside: `fr.Fs = 2 N`, `fr = LuGre()`.
+#[derive(Clone)]
+pub struct Override<'a> {
+    /// The path.
+    pub path: &'a ast::Path,
+    /// The value, read in the scope of the file.
+    pub value: OverrideValue<'a>,
+    /// The file.
+    pub file: FileId,
+}
+
+/// The value of an [`Override`].
+#[derive(Clone, Copy)]
+pub enum OverrideValue<'a> {
+    /// A value.
+    Expr(&'a Expr),
+    /// A model for a slot.
+    Instance(&'a ast::Instance),
+}
+
+/// The flat system, the observed expressions in it, and what is wrong.
+pub struct Flat {
+    /// The system; complete only if there are no errors.
+    pub system: System,
+    /// One node for each observed expression.
+    pub observed: Vec<ExprId>,
+    /// What is wrong.
+    pub diagnostics: Vec<Diagnostic>,
+}
+
+/// Flattens an instance.
+pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flat {
+    let mut f = Flattener::new(loaded, sources);
+    for (name, table, unit) in &request.data {
+        let number = f.system.tables.len() as u32;
+        f.system.tables.push(table.clone());
+        f.data.insert(name.clone(), (number, unit.clone()));
+    }
+    let overrides: Vec<Change> = request
+        .overrides
+        .iter()
+        .map(|o| Change { path: &o.path.segments, span: o.path.span, value: o.value, env: Env::file(o.file) })
+        .collect();
+    match &request.instance {
+        Instance::Written(instance, file) => {
+            let env = Env::file(*file);
+            f.written(instance, &env, overrides);
+        }
+        Instance::Alone(model, file) => {
+            let made =
+                Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
+            f.instantiate(model, *file, made, true);
+        }
+    }
+    for index in 0..f.instances.len() {
+        f.define(InstanceId(index as u32));
+    }
+    for arg in std::mem::take(&mut f.dropped) {
+        if let ArgValue::Expr(expr) = arg.value {
+            f.expr(expr, &arg.env);
+        }
+    }
+    let observed = match f.instances.first().map(|top| top.file) {
+        Some(_) => {
+            let file = match &request.instance {
+                Instance::Written(_, file) | Instance::Alone(_, file) => *file,
+            };
+            let env = Env { instance: Some(InstanceId(0)), outside: true, ..Env::file(file) };
+            request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
+        }
+        None => Vec::new(),
+    };
+    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+}
+
+/// Reads a function, constant or table on its own: a function's arguments come from outside.
+pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
+    let mut f = Flattener::new(loaded, sources);
+    let env = Env::file(file);
+    let observed = match item {
+        Item::Function(function) => {
+            let mut locals = Vec::new();
+            let mut first: HashMap<&str, Span> = HashMap::new();
+            for arg in &function.args {
+                if !f.new_name(&arg.name, &mut first) {
+                    continue;
+                }
+                let unit = match &arg.unit {
+                    None => Some(Unit::none()),
+                    Some(unit) => f.unit(unit, false, None),
+                };
+                let Some(unit) = unit else { continue };
+                let argument = Node::Number { value: f64::NAN, dimension: Some(unit.dimension), angle: unit.angle };
+                locals.push((arg.name.text.clone(), f.system.push(argument, arg.name.span)));
+            }
+            if let Lookup::Found(item, _) = loaded.find(file, Space::Function, &function.name.text) {
+                f.functions.push(item);
+            }
+            let value = f.expr(&function.body, &Env { locals: Rc::new(locals), ..env });
+            match function.unit.as_ref().and_then(|unit| f.unit(unit, false, None)) {
+                Some(unit) => {
+                    let role = Role::Result { function: function.name.text.clone() };
+                    vec![f.system.push(Node::Fits { value, dimension: unit.dimension, role }, function.body.span)]
+                }
+                None => vec![value],
+            }
+        }
+        Item::Const(constant) => f.constant(&constant.name, &env).into_iter().collect(),
+        Item::Table(table) => {
+            crate::tables::read(loaded, sources, file, table, &mut f.diagnostics);
+            Vec::new()
+        }
+        _ => Vec::new(),
+    };
+    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+}
+
+struct Flattener<'a> {
+    loaded: &'a Loaded,
+    sources: &'a dyn Sources,
+    system: System,
+    diagnostics: Vec<Diagnostic>,
+    /// Runs along with `system.instances`.
+    instances: Vec<Tree<'a>>,
+    /// Expansions by function, arguments and place, so that the same call of the same values is made once.
+    expansions: HashMap<(ItemRef, Vec<ExprId>, bool, bool), ExprId>,
+    /// Functions being expanded: to find circles.
+    functions: Vec<ItemRef>,
+    tables: HashMap<ItemRef, Option<u32>>,
+    consts: HashMap<(ItemRef, bool), ExprId>,
+    open_consts: Vec<ItemRef>,
+    /// Models being instantiated: to find circles.
+    models: Vec<ItemRef>,
+    /// Unknown names reported so far: suggestions are made for the first of them only.
+    unknowns: usize,
+    /// Wiring of slots that the present model has no port for: another model may read it.
+    dropped: Vec<Arg<'a>>,
+    /// Parts whose name is taken, and reported.
+    refused_parts: Vec<Span>,
+    /// Quantities whose definition was refused, and reported.
+    refused: Vec<VarId>,
+    data: HashMap<String, (u32, Unit)>,
+}
+
+/// What is known of an instance besides [`InstanceInfo`].
+struct Tree<'a> {
+    model: &'a ast::Model,
+    file: FileId,
+    names: HashMap<&'a str, Binding>,
+    args: Vec<Arg<'a>>,
+    alone: bool,
+    locals: Locals,
+}
+
+/// What a name of an instance means.
+#[derive(Clone)]
+enum Binding {
+    Var(VarId),
+    Part(InstanceId),
+    Parts(Rc<Vec<InstanceId>>, i64),
+    Regime(AutomatonId, u32),
+    /// Declared, but not usable: reported.
+    Broken,
+}
+
+type Locals = Rc<Vec<(String, ExprId)>>;
+
+/// Where an expression is read.
+#[derive(Clone)]
+struct Env {
+    file: FileId,
+    instance: Option<InstanceId>,
+    rotary: bool,
+    locals: Locals,
+    /// Read from outside the model, by an experiment: lets are visible, measures are allowed.
+    outside: bool,
+    /// In an equation rather than a declaration: E0109 looks there.
+    equation: bool,
+    /// In the condition of a transition or event: crossings may stand there.
+    instants: bool,
+}
+
+impl Env {
+    fn file(file: FileId) -> Env {
+        Env {
+            file,
+            instance: None,
+            rotary: false,
+            locals: Rc::default(),
+            outside: false,
+            equation: false,
+            instants: false,
+        }
+    }
+}
+
+/// An argument of an instance.
+#[derive(Clone)]
+struct Arg<'a> {
+    name: &'a str,
+    span: Span,
+    value: ArgValue<'a>,
+    env: Env,
+    overriding: bool,
+}
+
+#[derive(Clone, Copy)]
+enum ArgValue<'a> {
+    Expr(&'a Expr),
+    Instance(&'a ast::Instance),
+}
+
+/// A change from outside on its way down the tree.
+#[derive(Clone)]
+struct Change<'a> {
+    path: &'a [ast::Segment],
+    span: Span,
+    value: OverrideValue<'a>,
+    env: Env,
+}
+
+/// How an instance is made.
+struct Making<'a> {
+    path: String,
+    rotary: bool,
+    span: Span,
+    args: Vec<Arg<'a>>,
+    overrides: Vec<Change<'a>>,
+}
+
+impl<'a> Flattener<'a> {
+    fn new(loaded: &'a Loaded, sources: &'a dyn Sources) -> Flattener<'a> {
+        Flattener {
+            loaded,
+            sources,
+            system: System::default(),
+            diagnostics: Vec::new(),
+            instances: Vec::new(),
+            expansions: HashMap::new(),
+            functions: Vec::new(),
+            tables: HashMap::new(),
+            consts: HashMap::new(),
+            open_consts: Vec::new(),
+            models: Vec::new(),
+            refused: Vec::new(),
+            unknowns: 0,
+            refused_parts: Vec::new(),
+            dropped: Vec::new(),
+            data: HashMap::new(),
+        }
+    }
+
+    fn report(&mut self, diagnostic: Diagnostic) {
+        self.diagnostics.push(diagnostic);
+    }
+}
+
+/// The beginning of an equation: enough to know it by, `F = clamp` of `F = clamp(F_ext, -Fs, Fs)`.
+fn head(equation: &ast::Equation) -> Span {
+    let mut first = &equation.value;
+    while let ExprKind::Binary(_, _, left, _) = &first.kind {
+        first = left;
+    }
+    let end = match &first.kind {
+        ExprKind::Call { function, .. } => function.span,
+        _ => first.span,
+    };
+    equation.target.span().to(end)
+}
+
+/// How an equation gives its quantity a value.
+enum Wanted {
+    Value,
+    Rate { along: Option<(VarId, Span)> },
+    Next,
+}
+
+/// The right side of a derivative equation.
+struct Rate {
+    value: ExprId,
+    along: Option<(VarId, Span)>,
+    span: Span,
+}
+
+fn zero() -> Node {
+    Node::Number { value: 0.0, dimension: None, angle: Angle::Silent }
+}
+
+fn joined(path: &str, name: &str) -> String {
+    if path.is_empty() { name.to_string() } else { format!("{path}.{name}") }
+}
+
+fn article(word: &str) -> &'static str {
+    if word.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" }
+}
+
+fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
+    let known = [
+        "m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A",
+        "V",
+    ];
+    let error =
+        Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
+    match nearest(part, known) {
+        Some(near) => error.help(format!("did you mean `{near}`?")),
+        None => error
+            .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
+    }
+}
+
+fn args_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Arg<'a>> {
+    let arg = |bind: &'a ast::Bind| Arg {
+        name: &bind.name.text,
+        span: bind.span,
+        value: match &bind.value {
+            ast::BindValue::Expr(expr) => ArgValue::Expr(expr),
+            ast::BindValue::Instance(instance) => ArgValue::Instance(instance),
+        },
+        env: env.clone(),
+        overriding: false,
+    };
+    args.iter().map(arg).collect()
+}
+
+/// All declarations of a model, those inside `every` included.
+fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
+    model.body.iter().flat_map(|statement| {
+        let (one, many): (Option<&ast::Declaration>, &[ast::EveryStatement]) = match statement {
+            Statement::Declaration(declaration) => (Some(declaration), &[]),
+            Statement::Every(every) => (None, &every.body),
+            _ => (None, &[]),
+        };
+        one.into_iter().chain(many.iter().filter_map(|statement| match statement {
+            ast::EveryStatement::Declaration(declaration) => Some(declaration),
+            ast::EveryStatement::Equation(_) => None,
+        }))
+    })
+}
+
+fn modes(model: &ast::Model) -> impl Iterator<Item = &ast::Mode> {
+    model.body.iter().filter_map(|statement| match statement {
+        Statement::Mode(mode) => Some(mode),
+        _ => None,
+    })
+}
