@@ -1,0 +1,592 @@
+//! The language, case by case: `tests/lang/*.fric`.
+//!
+//! A file holds many cases, each under its name: `--- symptom check ---` is a text that is only looked at,
+//! `--- symptom run ---` one whose experiments must also hold, on every back end with the same bits. Behind the text
+//! stands what is expected:
+//!
+//! ```text
+//! //~ ok                                           nothing is wrong, every `expect` holds
+//! //~ 2:18 E0101 cannot add a force and a velocity place, code, message
+//! //~ fails NAME: `F` is not a number at 0 s       an experiment that stops, or what it expects and does not get
+//! ```
+//!
+//! `+++ other.fric` begins a further text of the case, which the first may import. `BLESS=1 cargo test --test lang`
+//! writes what is found over what is expected: read that difference as carefully as code. `pending.fric` holds what is
+//! known to be wrong, with what it should be; a case there that comes right must move to its place.
+
+mod support;
+
+use std::collections::HashSet;
+use std::fmt::Write;
+use std::fs;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+use support::{Texts, checked, line, root, run};
+
+/// One case of a file.
+struct LangCase {
+    name: String,
+    runs: bool,
+    /// The text itself.
+    text: String,
+    /// Further texts by name.
+    others: Vec<(String, String)>,
+    expected: Vec<String>,
+}
+
+/// Everything before the first case, and the cases.
+fn cases(text: &str) -> (String, Vec<LangCase>) {
+    let mut intro = String::new();
+    let mut cases: Vec<LangCase> = Vec::new();
+    for line in text.split_inclusive('\n') {
+        if let Some(head) = line.trim_end().strip_prefix("--- ") {
+            let words: Vec<&str> = head.split(' ').collect();
+            let [name, kind @ ("check" | "run"), "---"] = words[..] else { panic!("not a heading: {line}") };
+            let case = LangCase {
+                name: name.into(),
+                runs: kind == "run",
+                text: String::new(),
+                others: Vec::new(),
+                expected: Vec::new(),
+            };
+            cases.push(case);
+            continue;
+        }
+        let Some(case) = cases.last_mut() else {
+            intro.push_str(line);
+            continue;
+        };
+        if let Some(name) = line.strip_prefix("+++ ") {
+            case.others.push((name.trim().into(), String::new()));
+        } else if let Some(expected) = line.strip_prefix("//~ ") {
+            case.expected.push(expected.trim_end().into());
+        } else if let Some((_, other)) = case.others.last_mut() {
+            other.push_str(line);
+        } else {
+            assert!(case.expected.is_empty() || line.trim().is_empty(), "{}: text behind what is expected", case.name);
+            case.text.push_str(line);
+        }
+    }
+    for case in &mut cases {
+        let text = case.others.last_mut().map_or(&mut case.text, |(_, text)| text);
+        text.truncate(text.trim_end().len());
+        text.push('\n');
+    }
+    (intro, cases)
+}
+
+/// What there is to say about a case.
+fn found(case: &LangCase) -> Vec<String> {
+    let mut sources = Texts(case.others.clone());
+    sources.0.push(("case.fric".into(), case.text.clone()));
+    let (mut loaded, diagnostics) = checked("case.fric", &case.text, &sources);
+    let mut out: Vec<String> = diagnostics.iter().map(|diagnostic| line(&loaded, diagnostic)).collect();
+    if case.runs && !diagnostics.iter().any(|diagnostic| diagnostic.is_error()) {
+        let experiments = loaded.experiments();
+        assert!(!experiments.is_empty(), "no experiment to run");
+        for experiment in experiments {
+            let name = experiment.name;
+            assert!(experiment.has_expect, "{name} expects nothing");
+            match run(&mut loaded, &sources, &name) {
+                Err(errors) => out.extend(errors.iter().map(|error| format!("fails {name}: {}", line(&loaded, error)))),
+                Ok(results) => {
+                    for result in results {
+                        out.extend(failures(&result).into_iter().map(|failure| format!("fails {name}: {failure}")));
+                    }
+                }
+            }
+        }
+    }
+    if out.is_empty() {
+        out.push("ok".into());
+    }
+    out
+}
+
+/// Why a run did not hold; nothing if it did.
+fn failures(result: &Result<runtime::engine::Outcome, runtime::engine::Failure>) -> Vec<String> {
+    match result {
+        Ok(outcome) => outcome.verdicts.iter().filter(|v| !v.holds).map(|v| v.text.clone()).collect(),
+        Err(failure) => vec![failure.to_string()],
+    }
+}
+
+/// Whether what was found is what is expected. An expectation without a message, or without a column, leaves that
+/// open; so does `…` at its end.
+fn fits(expected: &[String], found: &[String]) -> bool {
+    let one = |(expected, found): (&String, &String)| {
+        if expected == found {
+            return true;
+        }
+        if let Some(begin) = expected.strip_suffix('…') {
+            return found.starts_with(begin);
+        }
+        let (Some((place, code)), Some((at, rest))) = (expected.split_once(' '), found.split_once(' ')) else {
+            return false;
+        };
+        let placed = place == at || at.strip_prefix(place).is_some_and(|rest| rest.starts_with(':'));
+        placed && code.len() == 5 && rest.starts_with(code)
+    };
+    expected.len() == found.len() && expected.iter().zip(found).all(one)
+}
+
+fn path(file: &str) -> PathBuf {
+    root().join("tests/lang").join(file)
+}
+
+fn check_file(file: &str) {
+    let text = fs::read_to_string(path(file)).unwrap();
+    let (intro, cases) = cases(&text);
+    let (mut wrong, mut names, mut blessed) = (String::new(), HashSet::new(), intro);
+    for case in &cases {
+        assert!(names.insert(case.name.clone()), "{file}: two cases are called {}", case.name);
+        let found = catch_unwind(AssertUnwindSafe(|| found(case))).unwrap_or_else(|panic| {
+            let words = panic.downcast_ref::<String>().cloned();
+            vec![format!(
+                "panics: {}",
+                words.or(panic.downcast_ref::<&str>().map(|text| text.to_string())).unwrap_or_default()
+            )]
+        });
+        if !fits(&case.expected, &found) {
+            let (expected, found) = (case.expected.join("\n    "), found.join("\n    "));
+            writeln!(wrong, "{file}: {}\n  expected\n    {expected}\n  found\n    {found}", case.name).unwrap();
+        }
+        let kind = if case.runs { "run" } else { "check" };
+        write!(blessed, "--- {} {kind} ---\n{}", case.name, case.text).unwrap();
+        for (name, text) in &case.others {
+            write!(blessed, "+++ {name}\n{text}").unwrap();
+        }
+        let open = fits(&case.expected, &found) && case.expected.iter().any(|line| line.ends_with('…'));
+        for line in if open { &case.expected } else { &found } {
+            writeln!(blessed, "//~ {line}").unwrap();
+        }
+        blessed.push('\n');
+    }
+    if std::env::var_os("BLESS").is_some() {
+        fs::write(path(file), format!("{}\n", blessed.trim_end())).unwrap();
+    }
+    assert!(wrong.is_empty(), "\n{wrong}");
+}
+
+macro_rules! files {
+    ($($name:ident)*) => {
+        $(#[test] fn $name() { check_file(concat!(stringify!($name), ".fric")) })*
+
+        #[test]
+        fn every_file_of_cases_is_run() {
+            let known = [$(concat!(stringify!($name), ".fric"),)* "pending.fric"];
+            for (path, _) in support::texts_below(&root().join("tests/lang")) {
+                let name = path.file_name().unwrap().to_str().unwrap();
+                assert!(known.contains(&name), "{name} is in no list");
+            }
+        }
+    };
+}
+
+files! { units derivatives sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
+
+/// What is known to be wrong, and says so when it comes right.
+#[test]
+fn pending_cases_still_wait() {
+    let Ok(text) = fs::read_to_string(path("pending.fric")) else { return };
+    let (_, cases) = cases(&text);
+    let right: Vec<&str> = cases
+        .iter()
+        .filter(|case| catch_unwind(AssertUnwindSafe(|| found(case))).is_ok_and(|found| fits(&case.expected, &found)))
+        .map(|case| case.name.as_str())
+        .collect();
+    assert!(right.is_empty(), "came right, move them to their files: {}", right.join(", "));
+}
+
+/// SplitMix64: chance with a seed that is printed.
+struct Chance(u64);
+
+impl Chance {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n.max(1) as u64) as usize
+    }
+
+    fn of<'a, T>(&mut self, all: &'a [T]) -> &'a T {
+        &all[self.below(all.len())]
+    }
+}
+
+/// How many of them: as many as the variable says, else `usual`.
+fn count(variable: &str, usual: u64) -> u64 {
+    std::env::var(variable).ok().and_then(|text| text.parse().ok()).unwrap_or(usual)
+}
+
+/// Texts to begin with: the library, the examples, every case, every golden mistake.
+fn corpus() -> Vec<String> {
+    let mut out = Vec::new();
+    for folder in ["stdlib-models", "examples", "tests/errors"] {
+        out.extend(support::texts_below(&root().join(folder)).into_iter().map(|(_, text)| text));
+    }
+    for (_, text) in support::texts_below(&root().join("tests/lang")) {
+        out.extend(cases(&text).1.into_iter().map(|case| case.text));
+    }
+    out
+}
+
+/// Words that a mutation puts in.
+const WORDS: &[&str] = &[
+    "model",
+    "param",
+    "input",
+    "output",
+    "state",
+    "let",
+    "require",
+    "storage",
+    "allow",
+    "part",
+    "every",
+    "when",
+    "mode",
+    "initial",
+    "go",
+    "next",
+    "reset",
+    "if",
+    "then",
+    "else",
+    "and",
+    "or",
+    "not",
+    "in",
+    "crosses",
+    "rises",
+    "falls",
+    "import",
+    "const",
+    "fn",
+    "table",
+    "interface",
+    "experiment",
+    "fit",
+    "device",
+    "rig",
+    "run",
+    "solver",
+    "sweep",
+    "data",
+    "plot",
+    "expect",
+    "rotary",
+    "linear",
+    "sum",
+    "t",
+    "pi",
+    "inf",
+    "true",
+    "dx/dt",
+    "dz/dt",
+    "dx/ds",
+    "M",
+    "x",
+    "v",
+    "0",
+    "1",
+    "2",
+    "1e9",
+    "0x10",
+    "m",
+    "N",
+    "N·m",
+    "[m]",
+    "[m/s]",
+    "%",
+    "(",
+    ")",
+    "[",
+    "]",
+    "{",
+    "}",
+    "=",
+    "==",
+    "..",
+    ",",
+    ":",
+    "+",
+    "-",
+    "*",
+    "/",
+    "^",
+    "<",
+    ">=",
+    "~=",
+    "+-",
+    ".",
+    "\"",
+    "//",
+    "///",
+    "\n",
+    "\r\n",
+    "\t",
+    "\u{feff}",
+    "é",
+    "🙂",
+    "?",
+    ";",
+];
+
+/// A text with one or two changes: something cut out, doubled, moved, replaced or put in.
+fn mutated(corpus: &[String], chance: &mut Chance) -> String {
+    let mut text = chance.of(corpus).clone();
+    for _ in 0..1 + chance.below(2) {
+        let mut places: Vec<usize> =
+            grammar::tokens::tokens(&text).iter().flat_map(|token| [token.start, token.end]).collect();
+        places.dedup();
+        if places.len() < 2 {
+            places = vec![0, text.len()];
+        }
+        let i = chance.below(places.len() - 1);
+        let j = (i + 1 + chance.below(6)).min(places.len() - 1);
+        let (start, end) = (places[i], places[j]);
+        match chance.below(8) {
+            0 => text.replace_range(start..end, ""),
+            1 => text.insert_str(end, &text[start..end].to_string()),
+            2 => text.replace_range(start..end, chance.of::<&str>(WORDS)),
+            3 => text.insert_str(start, &format!(" {} ", chance.of(WORDS))),
+            4 => text.truncate(start),
+            5 => {
+                let other = chance.of(corpus);
+                let tokens = grammar::tokens::tokens(other);
+                if !tokens.is_empty() {
+                    let first = chance.below(tokens.len());
+                    let last = (first + chance.below(12)).min(tokens.len() - 1);
+                    text.insert_str(start, &other[tokens[first].start..tokens[last].end]);
+                }
+            }
+            6 => {
+                let moved = text[start..end].to_string();
+                text.replace_range(start..end, "");
+                let to = *chance.of(&places);
+                text.insert_str(if to <= start { to } else { start }, &moved);
+            }
+            _ => {
+                let k = chance.below(places.len() - 1);
+                let word = text[places[k]..places[k + 1]].to_string();
+                text.replace_range(start..end, &word);
+            }
+        }
+    }
+    text
+}
+
+/// Whatever happens to a text: no panic, no endless work, every error with its code and its place, and what can be
+/// formatted stays as it is when formatted again.
+#[test]
+fn mutated_texts_are_read_formatted_and_checked() {
+    let total = count("FRIC_MUTATIONS", 1_000);
+    let first = count("FRIC_SEED", 0);
+    let corpus = corpus();
+    let at = Arc::new(AtomicU64::new(first));
+    let progress = at.clone();
+    let worker = thread::Builder::new().stack_size(8 << 20).spawn(move || {
+        let sources = Texts::default();
+        let mut clean = 0;
+        for seed in first..first + total {
+            progress.store(seed, Ordering::Relaxed);
+            let text = mutated(&corpus, &mut Chance(seed));
+            let tried = catch_unwind(AssertUnwindSafe(|| {
+                let (_, found) = checked("text.fric", &text, &sources);
+                if let Ok(formatted) = grammar::format::format(&text, 100) {
+                    let again = grammar::format::format(&formatted, 100);
+                    assert_eq!(again.as_deref(), Ok(formatted.as_str()), "formatted twice");
+                }
+                found.is_empty()
+            }));
+            match tried {
+                Ok(fine) => clean += u64::from(fine),
+                Err(_) => panic!("seed {seed} (FRIC_SEED={seed} FRIC_MUTATIONS=1):\n{text}"),
+            }
+        }
+        clean
+    });
+    let worker = worker.unwrap();
+    let (mut seed, mut since) = (first, Instant::now());
+    while !worker.is_finished() {
+        thread::sleep(Duration::from_millis(20));
+        let now = at.load(Ordering::Relaxed);
+        if now != seed {
+            (seed, since) = (now, Instant::now());
+        }
+        assert!(
+            since.elapsed() < Duration::from_secs(60),
+            "seed {seed} never ends (FRIC_SEED={seed} FRIC_MUTATIONS=1)"
+        );
+    }
+    let clean = worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+    println!("{total} texts, {clean} of them without a word to say");
+    assert!(total < 100 || clean * 200 > total, "only {clean} of {total} were fine: mutations are too wild");
+}
+
+/// A pure number over the names, safe to divide by where it is divided by.
+fn expression(chance: &mut Chance, names: &[String], depth: usize) -> String {
+    if depth == 0 || chance.below(6) == 0 {
+        return match chance.below(4) {
+            0 => format!("{}", (chance.below(400) as f64 - 200.0) / 16.0),
+            1 => "t / 1 s".into(),
+            _ => chance.of(names).clone(),
+        };
+    }
+    let mut inner = || format!("({})", expression(chance, names, depth - 1));
+    let (a, b, c) = (inner(), inner(), inner());
+    match chance.below(18) {
+        0 => format!("{a} + {b}"),
+        1 => format!("{a} - {b}"),
+        2 => format!("{a} * {b}"),
+        3 => format!("{a} / (1 + {b}^2)"),
+        4 => format!("-{a}"),
+        5 => format!("abs{a}"),
+        6 => format!("sign{a}"),
+        7 => format!("sin{a}"),
+        8 => format!("cos{a}"),
+        9 => format!("tanh{a}"),
+        10 => format!("exp(-abs{a})"),
+        11 => format!("log(1 + abs{a})"),
+        12 => format!("sqrt(abs{a})"),
+        13 => format!("min({a}, {b})"),
+        14 => format!("clamp({a}, -1, 2)"),
+        15 => format!("floor{a}"),
+        16 => format!("atan2({a}, 1 + {b}^2)"),
+        _ => format!("if {a} < {b} then {c} else {a}"),
+    }
+}
+
+/// A model that means nothing and uses everything, with an experiment.
+fn program(chance: &mut Chance) -> String {
+    let mut names: Vec<String> = Vec::new();
+    let mut text = String::from("model M {\n");
+    for k in 0..1 + chance.below(3) {
+        writeln!(text, "  param p{k} = {}", (chance.below(64) as f64 - 32.0) / 8.0).unwrap();
+        names.push(format!("p{k}"));
+    }
+    let states = 1 + chance.below(4);
+    for k in 0..states {
+        writeln!(text, "  state x{k} [1] = {}", (chance.below(64) as f64 - 32.0) / 16.0).unwrap();
+        names.push(format!("x{k}"));
+    }
+    writeln!(text, "  state n [1] = 1").unwrap();
+    names.push("n".into());
+    for k in 0..chance.below(5) {
+        let value = expression(chance, &names, 3);
+        writeln!(text, "  let a{k} [1] = {value}").unwrap();
+        names.push(format!("a{k}"));
+    }
+    let modes = chance.below(2) == 1;
+    for k in 0..states {
+        if !(modes && k == 0) {
+            writeln!(text, "  dx{k}/dt = (tanh({}) - x{k}) / 1 s", expression(chance, &names, 4)).unwrap();
+        }
+    }
+    writeln!(text, "  every {} ms {{ next(n) = tanh({}) }}", 1 + chance.below(4), expression(chance, &names, 3))
+        .unwrap();
+    if modes {
+        for (name, other, word) in [("one", "two", " initial"), ("two", "one", "")] {
+            let (rate, condition) = (expression(chance, &names, 3), expression(chance, &names, 2));
+            writeln!(text, "  mode {name}{word} {{").unwrap();
+            writeln!(text, "    dx0/dt = tanh({rate}) / 1 s").unwrap();
+            writeln!(text, "    go {other} when ({condition}) > x0 {{ reset(x0) = x0 / 2 }}").unwrap();
+            writeln!(text, "  }}").unwrap();
+        }
+    }
+    let (crossing, event) = (expression(chance, &names, 2), expression(chance, &names, 2));
+    writeln!(text, "  when ({crossing}) crosses 0.5 {{ reset(x{}) = tanh({event}) }}", states - 1).unwrap();
+    writeln!(text, "  output y [1] = {}", expression(chance, &names, 4)).unwrap();
+    text + "}\n\nexperiment e {\n  run M() for 0.1 s\n  solver rk4 step 1 ms\n  expect final(y) < inf\n}\n"
+}
+
+/// Programs without meaning, on both back ends with every fixed method.
+#[test]
+fn generated_programs_have_the_same_bits_everywhere() {
+    let first = count("FRIC_SEED", 0);
+    for seed in first..first + count("FRIC_PROGRAMS", 20) {
+        let text = program(&mut Chance(seed));
+        let tried = catch_unwind(AssertUnwindSafe(|| {
+            let sources = Texts::default();
+            let (mut loaded, found) = checked("text.fric", &text, &sources);
+            let errors: Vec<String> = found.iter().filter(|d| d.is_error()).map(|d| line(&loaded, d)).collect();
+            assert!(errors.is_empty(), "{errors:?}");
+            support::agree(&mut loaded, &sources, "e").unwrap();
+        }));
+        assert!(tried.is_ok(), "seed {seed} (FRIC_SEED={seed} FRIC_PROGRAMS=1):\n{text}");
+    }
+}
+
+/// What people and machines do to texts: each is answered, none with a panic.
+#[test]
+fn odd_texts_are_answered() {
+    let model = |value: &str| format!("model M {{\n  output y [1] = {value}\n}}\n");
+    let repeated =
+        |left: &str, middle: &str, right: &str, n: usize| format!("{}{middle}{}", left.repeat(n), right.repeat(n));
+    let fine: &[(&str, String)] = &[
+        ("nothing", String::new()),
+        ("blanks", " \n\t\n".into()),
+        ("a byte order mark", format!("\u{feff}{}", model("1"))),
+        ("lines of Windows", model("1").replace('\n', "\r\n")),
+        ("tabs", model("1").replace("  ", "\t")),
+        ("no line end", model("1").trim_end().into()),
+        ("comments in other scripts", model("1 /// Ж 🙂 é")),
+        ("200 brackets", model(&repeated("(", "1", ")", 200))),
+        ("60 calls", model(&repeated("abs(", "1", ")", 60))),
+        ("60 conditions", model(&repeated("if t > 1 s then 1 else ", "1", "", 60))),
+        ("500 terms", model(&repeated("1 + ", "1", "", 500))),
+        ("a chain of lets", format!("model M {{\n{}  let a2000 = 1\n  output y = a0\n}}\n", (0..2000).map(|k| format!("  let a{k} = a{} + 1\n", k + 1)).collect::<String>())),
+        ("lets that double", format!("model M {{\n{}  let a40 = 1\n  output y = a0\n}}\n", (0..40).map(|k| format!("  let a{k} = a{0} + a{0}\n", k + 1)).collect::<String>())),
+        ("1,000 parts", "model E { param k = 1  output y [1] = k }\nmodel M {\n  part e[i in 1 .. 1000] = E(k = i)\n  output y [1] = sum(e.y)\n}\n".into()),
+        ("200 models", (0..200).map(|k| format!("model M{k} {{ output y [1] = {k} }}\n")).collect()),
+    ];
+    for (what, text) in fine {
+        let (loaded, found) = checked("odd.fric", text, &Texts::default());
+        let found: Vec<String> = found.iter().map(|diagnostic| line(&loaded, diagnostic)).collect();
+        assert!(found.is_empty(), "{what}: {found:?}");
+    }
+    let wrong: &[(&str, String, &str)] = &[
+        ("100,000 brackets", "(".repeat(100_000), "E0001"),
+        ("100,000 braces", "{".repeat(100_000), "E0002"),
+        ("brackets in a model", format!("model M {{ let a = {}", "[".repeat(10_000)), "E0002"),
+        ("brackets too deep", model(&repeated("(", "1", ")", 5000)), "E0001"),
+        ("conditions too deep", model(&repeated("if true then ", "1", " else 2", 3000)), "E0001"),
+        ("conditions in a chain", model(&repeated("if t > 1 s then 1 else ", "1", "", 3000)), "E0001"),
+        ("signs", model(&repeated("-", "1", "", 3000)), "E0001"),
+        ("powers", model(&repeated("2^", "1", "", 3000)), "E0001"),
+        ("calls", model(&repeated("abs(", "1", ")", 3000)), "E0001"),
+        ("a number too large", model(&"1".repeat(10_000)), "E0001"),
+        ("an exponent too large", model("1e999"), "E0001"),
+        ("a long name", model(&"a".repeat(100_000)), "E0204"),
+        ("a long path", model(&format!("{}b", "a.".repeat(10_000))), "E0204"),
+        (
+            "a circle of 2,000 lets",
+            format!(
+                "model M {{\n{}  output y = a0\n}}\n",
+                (0..2000).map(|k| format!("  let a{k} = a{} + 1\n", (k + 1) % 2000)).collect::<String>()
+            ),
+            "E0401",
+        ),
+        ("other scripts", "модель M { }\n".into(), "E0002"),
+        ("a control character", model("\u{1b} 1"), "E0001"),
+        ("half a model", "model M {\n  output y [1] = ".into(), "E0002"),
+    ];
+    for (what, text, code) in wrong {
+        let (loaded, found) = checked("odd.fric", text, &Texts::default());
+        let lines: Vec<String> = found.iter().map(|diagnostic| line(&loaded, diagnostic)).collect();
+        let short: Vec<String> = lines.iter().map(|line| line.chars().take(100).collect()).collect();
+        assert!(found.iter().any(|diagnostic| diagnostic.code == *code), "{what}: {short:?}");
+        assert!(found.len() <= 2, "{what}: {short:?}");
+        assert!(!grammar::format::format(text, 100).is_ok_and(|text| text.is_empty()), "{what}");
+    }
+}
