@@ -1,6 +1,9 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, load};
+pub use compiler::experiment::Ports;
+pub use compiler::linearise::{Linear, Matrices};
+pub use compiler::vary::{Alone, Varying};
+pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, linear, load, varying};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

@@ -104,6 +104,23 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     evaluate_in(&plan, exprs)
 }
 
+/// The function that computes expressions from the parameters in a block, as at the start; and the size of the block, in
+/// whose last slots their values are.
+pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
+    let mut pool = crate::math::POOL.to_vec();
+    let tables = place_tables(system, &mut pool);
+    let mut plan = Plan::new(system, types, &[], tables);
+    plan.description.pool = Arc::from(pool);
+    let mut emit = Emit::new(&plan, "formulas", Phase::Start);
+    let from = plan.description.layout.size();
+    for (k, expr) in exprs.iter().enumerate() {
+        let value = emit.value(*expr);
+        let value = if types.boolean[expr.0 as usize] { emit.number(value) } else { value };
+        emit.build.store(Slot((from + k) as u32), value);
+    }
+    (crate::math::expand(&emit.build.finish()), from + exprs.len())
+}
+
 fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     if exprs.is_empty() {
         return Vec::new();
@@ -210,9 +227,8 @@ impl<'a> Plan<'a> {
         let mut shared: HashMap<String, usize> = HashMap::new();
         let mut observed_at: Vec<Result<VarId, usize>> = Vec::new();
         for one in wanted {
-            let stored = |id: &VarId| {
-                !matches!(system.var(*id).definition, Definition::Value(..)) || independent[id.0 as usize]
-            };
+            let stored =
+                |id: &VarId| !matches!(system.var(*id).definition, Definition::Value(..)) || independent[id.0 as usize];
             match system.node(one.expr) {
                 Node::Var(id) if stored(id) => observed_at.push(Ok(*id)),
                 Node::Var(id) => {
@@ -236,8 +252,19 @@ impl<'a> Plan<'a> {
         let n = states.len();
         let jacobian = if n <= MOST_JACOBIAN { n * n + n } else { 0 };
         let layout = Layout::new(
-            [params.len(), inputs.len(), n, memory, system.automata.len(), outputs.len(), n, 0, jacobian, system.blocks.len()]
-                .map(|len| len as u32),
+            [
+                params.len(),
+                inputs.len(),
+                n,
+                memory,
+                system.automata.len(),
+                outputs.len(),
+                n,
+                0,
+                jacobian,
+                system.blocks.len(),
+            ]
+            .map(|len| len as u32),
         );
         let mut places = vec![Place::Computed; system.vars.len()];
         let mut put = |vars: &[VarId], segment: abi::description::Segment, from: usize| {
@@ -352,9 +379,10 @@ impl<'a> Plan<'a> {
             if quantities.iter().any(|quantity| quantity.slot == *slot && quantity.path == one.text) {
                 continue;
             }
-            let unit = one.unit.clone().unwrap_or_else(|| {
-                self.types.nodes[one.expr.0 as usize].map_or_else(Unit::none, Unit::si)
-            });
+            let unit = one
+                .unit
+                .clone()
+                .unwrap_or_else(|| self.types.nodes[one.expr.0 as usize].map_or_else(Unit::none, Unit::si));
             quantities.push(Quantity {
                 path: one.text.clone(),
                 kind: Kind::Observed,
@@ -411,7 +439,9 @@ impl<'a> Plan<'a> {
         }
         self.description.guards = quantities
             .iter()
-            .filter(|q| !q.boolean && matches!(q.kind, Kind::State | Kind::SampledState | Kind::Output | Kind::Observed))
+            .filter(|q| {
+                !q.boolean && matches!(q.kind, Kind::State | Kind::SampledState | Kind::Output | Kind::Observed)
+            })
             .map(|q| Guard { path: q.path.clone(), slot: q.slot, range: q.range, unit: q.unit.clone() })
             .collect();
     }
@@ -423,7 +453,9 @@ impl<'a> Plan<'a> {
         }
         for id in &self.sampled {
             // The blocks due at 0 have run: the state is what they say is next.
-            let Definition::Sampled { next, .. } = self.system.var(*id).definition else { unreachable!("it is sampled") };
+            let Definition::Sampled { next, .. } = self.system.var(*id).definition else {
+                unreachable!("it is sampled")
+            };
             let value = emit.value(next);
             let value = emit.as_number(value, self.types.boolean_vars[id.0 as usize]);
             emit.build.store(self.slot(*id).expect("it is stored"), value);
@@ -637,10 +669,8 @@ impl<'a> Plan<'a> {
                 _ => {}
             }
         }
-        let segment = abi::description::Segment {
-            start: self.description.layout.roots.start,
-            len: surfaces.len() as u32,
-        };
+        let segment =
+            abi::description::Segment { start: self.description.layout.roots.start, len: surfaces.len() as u32 };
         let mut roots = Vec::new();
         for (k, (value, id)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
@@ -670,7 +700,12 @@ fn independent_params(system: &System) -> Vec<bool> {
                 let node = system.node(id);
                 free &= !matches!(
                     node,
-                    Node::Var(_) | Node::Time | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) | Node::Crossing(_)
+                    Node::Var(_)
+                        | Node::Time
+                        | Node::Rate(_)
+                        | Node::PathRate(_)
+                        | Node::InRegime(..)
+                        | Node::Crossing(_)
                 );
                 stack.extend(node.operands());
             }

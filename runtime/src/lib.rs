@@ -17,5 +17,7 @@ mod solver;
 pub mod engine;
 pub mod sweep;
 
+pub mod modes;
+
 #[cfg(test)]
 mod models;

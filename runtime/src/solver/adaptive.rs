@@ -196,6 +196,9 @@ impl<'a> Adaptive<'a> {
 
     fn go(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
         self.show_here()?;
+        while self.observer.probe.next().is_some_and(|instant| instant <= 0.0) {
+            self.probe()?;
+        }
         self.restart();
         self.h = self.first_step();
         while self.t < self.duration {
@@ -208,6 +211,9 @@ impl<'a> Adaptive<'a> {
         let status = self.system.instance.call(Function::Outputs);
         check_status(self.system.instance, status)?;
         check_finite(self.system.instance)?;
+        while self.observer.probe.next().is_some_and(|instant| instant <= self.duration) {
+            self.probe()?;
+        }
         if self.observer.only_last() {
             self.observer.see(self.system.instance)?;
         }
@@ -584,6 +590,12 @@ impl<'a> Adaptive<'a> {
 
     /// Shows the course of the step from where it was shown last to θ, whose point is said to be at `time`.
     fn show_until(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
+        while let Some(instant) = self.observer.probe.next().filter(|instant| *instant <= time) {
+            let at = ((instant - self.step.t) / self.step.h).clamp(0.0, theta);
+            self.step.at(at, &mut self.shown.x);
+            self.system.place(instant, &self.shown.x);
+            self.probe()?;
+        }
         if self.shown.slots.is_empty() || theta <= self.shown.theta {
             return Ok(());
         }
@@ -600,6 +612,14 @@ impl<'a> Adaptive<'a> {
             self.shown.rows.copy_within(width..2 * width, 0);
             self.shown.theta = end;
         }
+        Ok(())
+    }
+
+    /// Keeps what is wanted at the instant in the block.
+    fn probe(&mut self) -> Result<(), Stop> {
+        let status = self.system.instance.call(Function::Outputs);
+        check_status(self.system.instance, status)?;
+        self.observer.probe.take(self.system.instance.block());
         Ok(())
     }
 
