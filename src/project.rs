@@ -134,6 +134,22 @@ pub fn texts_in(folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
+/// The files a command is given, each folder replaced by the texts in it.
+///
+/// # Errors
+/// The folder that cannot be read, and why.
+pub fn expanded(paths: &[PathBuf]) -> Result<Vec<PathBuf>, (PathBuf, io::Error)> {
+    let mut files = Vec::new();
+    for path in paths {
+        if path.is_dir() {
+            files.extend(texts_in(path).map_err(|error| (path.clone(), error))?);
+        } else {
+            files.push(path.clone());
+        }
+    }
+    Ok(files)
+}
+
 /// Makes the folder a file is to lie in.
 ///
 /// # Errors

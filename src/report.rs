@@ -7,12 +7,13 @@
 
 use crate::compile::SourceFile;
 use grammar::diagnostic::{Diagnostic, Label, Severity};
-use grammar::span::Span;
+use grammar::span::{FileId, Span};
 use miette::{
     GraphicalReportHandler, GraphicalTheme, LabeledSpan, MietteError, MietteSpanContents, SourceCode, SourceSpan,
     SpanContents, ThemeCharacters, ThemeStyles,
 };
 use serde_json::{Value, json};
+use std::collections::HashMap;
 use std::fmt;
 
 /// At most this many are shown of one file; the rest are counted.
@@ -50,10 +51,11 @@ pub fn full(files: &[SourceFile], diagnostics: &[Diagnostic], colour: bool) -> S
 
 /// One line each: `file:line:column: E0101 message`.
 pub fn short(files: &[SourceFile], diagnostics: &[Diagnostic]) -> String {
+    let mut places = Places::new(files);
     let mut out = String::new();
     for diagnostic in by_file(diagnostics).into_iter().flatten() {
-        if let Some(label) = diagnostic.labels.first() {
-            out += &format!("{}: ", place(files, label.span));
+        if let Some(place) = diagnostic.labels.first().and_then(|label| places.of(label.span)) {
+            out += &format!("{place}: ");
         }
         out += &format!("{} {}\n", diagnostic.code, diagnostic.message);
     }
@@ -62,14 +64,14 @@ pub fn short(files: &[SourceFile], diagnostics: &[Diagnostic]) -> String {
 
 /// `file:line:column` of a place; empty if the file is not known.
 pub fn place(files: &[SourceFile], span: Span) -> String {
-    let label = Label { span, text: String::new() };
-    Place::of(files, &label).map_or(String::new(), |place| format!("{}:{}:{}", place.file, place.line, place.column))
+    Places::new(files).of(span).map_or(String::new(), |place| place.to_string())
 }
 
 /// All of them as a JSON array. Lines and columns count from 1, columns in characters; offsets are bytes.
 pub fn json(files: &[SourceFile], diagnostics: &[Diagnostic]) -> Value {
-    let label = |label: &Label| {
-        let place = Place::of(files, label);
+    let mut places = Places::new(files);
+    let mut label = |label: &Label| {
+        let place = places.of(label.span);
         let end = place.as_ref().map(|place| place.end);
         json!({
             "file": place.as_ref().map(|place| place.file),
@@ -87,7 +89,7 @@ pub fn json(files: &[SourceFile], diagnostics: &[Diagnostic]) -> Value {
             "code": diagnostic.code,
             "severity": severity_word(diagnostic.severity),
             "message": diagnostic.message,
-            "labels": diagnostic.labels.iter().map(label).collect::<Vec<_>>(),
+            "labels": diagnostic.labels.iter().map(&mut label).collect::<Vec<_>>(),
             "help": diagnostic.help,
         })
     };
@@ -117,21 +119,52 @@ struct Place<'a> {
     end: (usize, usize),
 }
 
-impl<'a> Place<'a> {
-    fn of(files: &'a [SourceFile], label: &Label) -> Option<Place<'a>> {
-        let file = files.get(label.span.file.0 as usize)?;
-        let (line, column) = line_and_column(&file.text, label.span.start as usize);
-        let end = line_and_column(&file.text, label.span.end as usize);
-        Some(Place { file: &file.name, line, column, end })
+impl fmt::Display for Place<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}:{}:{}", self.file, self.line, self.column)
     }
 }
 
-/// Line and column of a byte, from 1, the column in characters. A byte order mark is no character.
-fn line_and_column(text: &str, offset: usize) -> (usize, usize) {
-    let before = &text[..floor_boundary(text, offset)];
-    let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
-    let line = before.bytes().filter(|byte| *byte == b'\n').count() + 1;
-    (line, before[line_start..].chars().filter(|c| *c != BYTE_ORDER_MARK).count() + 1)
+/// The places of many labels: each text is looked through once.
+struct Places<'a> {
+    files: &'a [SourceFile],
+    lines: HashMap<FileId, Lines<'a>>,
+}
+
+impl<'a> Places<'a> {
+    fn new(files: &'a [SourceFile]) -> Places<'a> {
+        Places { files, lines: HashMap::new() }
+    }
+
+    fn of(&mut self, span: Span) -> Option<Place<'a>> {
+        let file = self.files.get(span.file.0 as usize)?;
+        let lines = self.lines.entry(span.file).or_insert_with(|| Lines::new(&file.text));
+        let (line, column) = lines.place(span.start as usize);
+        Some(Place { file: &file.name, line, column, end: lines.place(span.end as usize) })
+    }
+}
+
+/// Where the lines of a text begin.
+struct Lines<'a> {
+    text: &'a str,
+    starts: Vec<usize>,
+    ascii: bool,
+}
+
+impl<'a> Lines<'a> {
+    fn new(text: &'a str) -> Lines<'a> {
+        let starts = std::iter::once(0).chain(text.match_indices('\n').map(|(at, _)| at + 1)).collect();
+        Lines { text, starts, ascii: text.is_ascii() }
+    }
+
+    /// Line and column of a byte, from 1, the column in characters. A byte order mark is no character.
+    fn place(&self, offset: usize) -> (usize, usize) {
+        let offset = floor_boundary(self.text, offset);
+        let line = self.starts.partition_point(|start| *start <= offset);
+        let before = &self.text[self.starts[line - 1]..offset];
+        let column = if self.ascii { before.len() } else { before.chars().filter(|c| *c != BYTE_ORDER_MARK).count() };
+        (line, column + 1)
+    }
 }
 
 const BYTE_ORDER_MARK: char = '\u{feff}';
@@ -267,17 +300,18 @@ impl Excerpt {
         let from = text[..first].rfind('\n').map_or(0, |newline| newline + 1);
         let to = text[last..].find('\n').map_or(text.len(), |newline| last + newline);
 
+        let lines = Lines::new(text);
         let mut excerpt = Excerpt {
             name: printable(&file.name),
             text: String::new(),
-            first_line: text[..from].bytes().filter(|byte| *byte == b'\n').count(),
+            first_line: lines.place(from).0 - 1,
             labels: labels
                 .iter()
                 .zip(&spans)
                 .map(|(label, span)| ExcerptLabel {
                     start: 0,
                     end: 0,
-                    column: line_and_column(text, span.0).1 - 1,
+                    column: lines.place(span.0).1 - 1,
                     text: printable(&label.text),
                 })
                 .collect(),

@@ -13,6 +13,7 @@ model Contact {
   param  Fc = 1 N        in > 0
   param  vt = 10 mm/s    in > 0
   output F [N] = Fc * tanh(v / vt)
+  allow  creep "it need not hold a load"
 }
 
 model Pull {
@@ -260,6 +261,7 @@ fn a_new_folder_holds_a_model_that_passes() {
     folder.check(&["new", "mine"], 0, "fric run mine/model.fric");
     folder.check(&["test", "mine"], 0, "1 passed, 0 failed");
     folder.check(&["fmt", "--check", "mine/model.fric"], 0, "");
+    folder.check(&["check", "mine/model.fric"], 0, "0 errors, 0 warnings");
     folder.check(&["new", "mine"], 1, "mine is not empty; nothing was changed");
 }
 

@@ -12,6 +12,8 @@ use grammar::span::Span;
 /// Checks parameters against their ranges, and every `require`.
 pub fn values(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     ranges(system, types, files, diagnostics);
+    periods(system, types, diagnostics);
+    resets(system, diagnostics);
     requires(system, types, files, diagnostics);
 }
 
@@ -75,6 +77,58 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
 fn shown(x: f64, unit: &Unit) -> String {
     let number = three_digits(unit.from_si(x));
     if unit.text.is_empty() { number } else { format!("{number} {unit}") }
+}
+
+/// Periods are positive and known before a run.
+fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
+    let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
+    for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
+        let open = mentioned(system, *expr).iter().any(|id| {
+            system.var(*id).kind == VarKind::Param && matches!(system.var(*id).definition, Definition::Free)
+        });
+        if value > 0.0 && value.is_finite() || open {
+            continue;
+        }
+        let what = if value.is_nan() { "not constant".to_string() } else { format!("{} s", three_digits(value)) };
+        let error = Diagnostic::error("E0502", "a period must be positive and known before the run")
+            .label(system.span(*expr), what)
+            .help("write a time or a param, such as `every 1 ms`");
+        diagnostics.push(error);
+    }
+}
+
+/// E0701: with fixed steps every period is a whole number of them.
+pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>, diagnostics: &mut Vec<Diagnostic>) {
+    let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
+    for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
+        let ratio = value / step;
+        if (ratio - ratio.round()).abs() <= 1e-9 * ratio && ratio.round() >= 1.0 {
+            continue;
+        }
+        let second = Unit::parse("s").expect("the second is known");
+        let (period, step) = (shown(value, &second), shown(step, &second));
+        let mut error = Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"))
+            .label(system.span(*expr), format!("{} steps", three_digits(ratio)));
+        if let Some(at) = at {
+            error = error.label(at, "the step");
+        }
+        diagnostics.push(error.help("ticks fall on whole steps: change one of them so that it divides the other"));
+    }
+}
+
+/// `reset` sets a continuous state.
+fn resets(system: &System, diagnostics: &mut Vec<Diagnostic>) {
+    let transitions = system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
+    let all = transitions.flat_map(|t| &t.resets).chain(system.events.iter().flat_map(|event| &event.resets));
+    for (var, value) in all {
+        let var = system.var(*var);
+        if matches!(var.definition, Definition::Sampled { .. }) {
+            let error = Diagnostic::error("E0307", format!("`{}` is a sampled state: it cannot be reset", var.name))
+                .label(system.span(*value), "`reset` sets a continuous state")
+                .label(var.span, "changes at ticks only");
+            diagnostics.push(error.help(format!("let `next({})` say so, with a condition", var.name)));
+        }
+    }
 }
 
 fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {

@@ -141,7 +141,9 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
                 Binary::Pow => {
                     let less = |b: Real<'a>| at(build.borrow_mut().binary(Binary::Pow, a.value, b.value));
                     let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
-                    both(&|| b * less(b - 1.0), &|| a.above(0.0).choose(y * log(), 0.0))
+                    // Where b is 0 the power is 1, whatever a is.
+                    let zero = |b: Real<'a>| b.is(0.0);
+                    both(&|| zero(b).choose(0.0, b * less(b - 1.0)), &|| a.above(0.0).choose(y * log(), 0.0))
                 }
                 // At the origin the direction is undefined: 0.
                 Binary::Hypot => {

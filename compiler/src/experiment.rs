@@ -88,6 +88,7 @@ pub const MOST_VARIANTS: usize = 100_000;
 
 /// The parts of an experiment's tree.
 struct Parts<'a> {
+    span: Span,
     run: &'a ast::Run,
     solver: Option<&'a ast::Solver>,
     sweeps: Vec<&'a ast::Sweep>,
@@ -283,7 +284,7 @@ fn parts<'a>(experiment: &'a ast::Experiment, diagnostics: &mut Vec<Diagnostic>)
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Parts { run, solver, sweeps, data, plots, expects })
+    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects })
 }
 
 /// Columns of a recording as tables over time.
@@ -294,7 +295,8 @@ fn recording(
     data: &ast::Data,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<(String, Table, Unit)>> {
-    let values = columns(loaded, sources, root, &data.file, data.columns.len(), diagnostics)?;
+    let wanted: Vec<bool> = data.columns.iter().map(|column| column.name.text != "_").collect();
+    let values = columns(loaded, sources, root, &data.file, &wanted, diagnostics)?;
     let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
         let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
         diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
@@ -505,15 +507,17 @@ fn variant(
     let ports = ports.unwrap_or_default();
     on_stage("check");
     let types = units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
+    if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
         causality::check(&system, &loaded.files, &mut diagnostics);
     }
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
     }
-    if diagnostics.iter().any(Diagnostic::is_error) {
+    // What is wrong with the experiment alone does not hide what else is wrong with it.
+    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103") {
         return Err(diagnostics);
     }
+    diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
     let (places, vary) = (Vec::new(), &given.vary[..]);
     let mut reader =
         Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
@@ -537,6 +541,10 @@ fn variant(
         },
     };
     let solver = reader.solver(parts, given, step.map(|at| nodes[at]), tol.map(|at| nodes[at]));
+    if solver.method != Method::Adaptive {
+        let at = step.map(|at| system.span(nodes[at]));
+        checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+    }
     let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
     for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {
         let shows = plot.shows.iter().zip(shows).map(|(show, at)| reader.show(show, nodes[*at])).collect();
@@ -595,6 +603,12 @@ fn variant(
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
     Ok(Variant { label, system, types, program, experiment, places, ports })
+}
+
+/// Whether what is said concerns something outside of a place.
+fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
+    let span = diagnostic.span();
+    span.file != place.file || span.start < place.start || span.end > place.end
 }
 
 /// The text of a surface from the place that stands for it.

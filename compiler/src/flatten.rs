@@ -71,19 +71,7 @@ pub struct Flat {
 
 /// Flattens an instance.
 pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flat {
-    let mut f = Flattener {
-        loaded,
-        sources,
-        system: System::default(),
-        diagnostics: Vec::new(),
-        instances: Vec::new(),
-        functions: Vec::new(),
-        tables: HashMap::new(),
-        consts: HashMap::new(),
-        open_consts: Vec::new(),
-        models: Vec::new(),
-        data: HashMap::new(),
-    };
+    let mut f = Flattener::new(loaded, sources);
     for (name, table, unit) in &request.data {
         let number = f.system.tables.len() as u32;
         f.system.tables.push(table.clone());
@@ -107,6 +95,11 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
     for index in 0..f.instances.len() {
         f.define(InstanceId(index as u32));
     }
+    for arg in std::mem::take(&mut f.dropped) {
+        if let ArgValue::Expr(expr) = arg.value {
+            f.expr(expr, &arg.env);
+        }
+    }
     let observed = match f.instances.first().map(|top| top.file) {
         Some(_) => {
             let file = match &request.instance {
@@ -116,6 +109,44 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
         }
         None => Vec::new(),
+    };
+    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+}
+
+/// Reads a function, constant or table on its own: a function's arguments come from outside.
+pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
+    let mut f = Flattener::new(loaded, sources);
+    let env = Env::file(file);
+    let observed = match item {
+        Item::Function(function) => {
+            let mut locals = Vec::new();
+            for arg in &function.args {
+                let unit = match &arg.unit {
+                    None => Some(Unit::none()),
+                    Some(unit) => f.unit(unit, false, None),
+                };
+                let Some(unit) = unit else { continue };
+                let argument = Node::Number { value: f64::NAN, dimension: Some(unit.dimension), angle: unit.angle };
+                locals.push((arg.name.text.clone(), f.system.push(argument, arg.name.span)));
+            }
+            if let Lookup::Found(item, _) = loaded.find(file, Space::Function, &function.name.text) {
+                f.functions.push(item);
+            }
+            let value = f.expr(&function.body, &Env { locals: Rc::new(locals), ..env });
+            match function.unit.as_ref().and_then(|unit| f.unit(unit, false, None)) {
+                Some(unit) => {
+                    let role = Role::Result { function: function.name.text.clone() };
+                    vec![f.system.push(Node::Fits { value, dimension: unit.dimension, role }, function.body.span)]
+                }
+                None => vec![value],
+            }
+        }
+        Item::Const(constant) => f.constant(&constant.name, &env).into_iter().collect(),
+        Item::Table(table) => {
+            crate::tables::read(loaded, sources, file, table, &mut f.diagnostics);
+            Vec::new()
+        }
+        _ => Vec::new(),
     };
     Flat { system: f.system, observed, diagnostics: f.diagnostics }
 }
@@ -134,6 +165,10 @@ struct Flattener<'a> {
     open_consts: Vec<ItemRef>,
     /// Models being instantiated: to find circles.
     models: Vec<ItemRef>,
+    /// Wiring of slots that the present model has no port for: another model may read it.
+    dropped: Vec<Arg<'a>>,
+    /// Quantities whose definition was refused, and reported.
+    refused: Vec<VarId>,
     data: HashMap<String, (u32, Unit)>,
 }
 
@@ -171,11 +206,13 @@ struct Env {
     outside: bool,
     /// In an equation rather than a declaration: E0109 looks there.
     equation: bool,
+    /// In the condition of a transition or event: crossings may stand there.
+    instants: bool,
 }
 
 impl Env {
     fn file(file: FileId) -> Env {
-        Env { file, instance: None, rotary: false, locals: Rc::default(), outside: false, equation: false }
+        Env { file, instance: None, rotary: false, locals: Rc::default(), outside: false, equation: false, instants: false }
     }
 }
 
@@ -214,6 +251,24 @@ struct Making<'a> {
 }
 
 impl<'a> Flattener<'a> {
+    fn new(loaded: &'a Loaded, sources: &'a dyn Sources) -> Flattener<'a> {
+        Flattener {
+            loaded,
+            sources,
+            system: System::default(),
+            diagnostics: Vec::new(),
+            instances: Vec::new(),
+            functions: Vec::new(),
+            tables: HashMap::new(),
+            consts: HashMap::new(),
+            open_consts: Vec::new(),
+            models: Vec::new(),
+            refused: Vec::new(),
+            dropped: Vec::new(),
+            data: HashMap::new(),
+        }
+    }
+
     fn report(&mut self, diagnostic: Diagnostic) {
         self.diagnostics.push(diagnostic);
     }
@@ -422,7 +477,7 @@ impl<'a> Flattener<'a> {
             DeclarationKind::Let => VarKind::Let,
         };
         let rotary = self.system.instance(id).rotary;
-        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary)?, self.bracketed(unit.span))));
+        let unit = declaration.unit.as_ref().and_then(|unit| Some((self.unit(unit, rotary, Some(id))?, self.bracketed(unit.span))));
         let shown = match &declaration.value {
             Some(Expr { kind: ExprKind::Number { unit: Some(unit), .. }, .. }) => Unit::parse(&unit.text).ok(),
             _ => None,
@@ -468,11 +523,11 @@ impl<'a> Flattener<'a> {
     }
 
     /// A unit as written, mapped for a rotary instance; or a report.
-    fn unit(&mut self, unit: &ast::UnitText, rotary: bool) -> Option<Unit> {
+    fn unit(&mut self, unit: &ast::UnitText, rotary: bool, owner: Option<InstanceId>) -> Option<Unit> {
         match Unit::parse(&unit.text) {
             Ok(parsed) => {
                 if rotary && parsed.angle == Angle::Angle {
-                    self.not_rotary(unit.span, "speaks of an angle already");
+                    self.not_rotary(owner, unit.span, "speaks of an angle already");
                     return None;
                 }
                 Some(if rotary { parsed.rotary() } else { parsed })
@@ -484,7 +539,13 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    fn not_rotary(&mut self, span: Span, why: &str) {
+    fn not_rotary(&mut self, owner: Option<InstanceId>, span: Span, why: &str) {
+        if let Some(id) = owner {
+            if self.system.strangers.contains(&id) {
+                return;
+            }
+            self.system.strangers.push(id);
+        }
         let error = Diagnostic::error("E0109", "this model cannot be made rotary")
             .label(span, why)
             .help("`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin");
@@ -539,6 +600,9 @@ impl<'a> Flattener<'a> {
         env: &Env,
         changes: Vec<Change<'a>>,
     ) {
+        // Read as expressions too, so that what they mention counts as read.
+        self.expr(&repeat.first, env);
+        self.expr(&repeat.last, env);
         let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
         let (Some(first), Some(last)) = bounds else { return };
         if last < first || (last - first) as usize >= MOST_VARS {
@@ -644,7 +708,9 @@ impl<'a> Flattener<'a> {
                 args.extend(wiring.into_iter().filter(|arg| port(arg.name) && !given.contains(&arg.name)));
             }
             // A slot drops its wiring for a model that lacks an optional port.
-            args.retain(|arg| !port(arg.name) || has(arg.name));
+            let (kept, dropped) = args.into_iter().partition(|arg| !port(arg.name) || has(arg.name));
+            args = kept;
+            self.dropped.extend::<Vec<_>>(dropped);
         }
         self.models.push(item);
         let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
@@ -782,6 +848,7 @@ impl<'a> Flattener<'a> {
             locals: tree.locals.clone(),
             outside: false,
             equation: false,
+            instants: false,
         }
     }
 
@@ -864,7 +931,7 @@ impl<'a> Flattener<'a> {
                 Statement::Equation(equation) => self.equation(id, equation, &equations, &mut defined, &mut rates),
                 Statement::Every(every) => self.every(id, every, &equations, &mut defined),
                 Statement::When(when) => {
-                    let condition = self.expr(&when.condition, &equations);
+                    let condition = self.expr(&when.condition, &Env { instants: true, ..equations.clone() });
                     let resets = self.resets(id, &when.resets, &equations);
                     self.system.events.push(Event { instance: id, condition, resets, span: when.span });
                 }
@@ -1012,6 +1079,7 @@ impl<'a> Flattener<'a> {
             }
             Wanted::Rate { along } => rates.push((var, Rate { value, along, span: equation.target.span() })),
             Wanted::Next => {
+                self.refused.push(var);
                 let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                     .label(equation.target.span(), "when is the next tick?")
                     .help(format!("write `every Ts {{ next({}) = … }}`", equation.target.name().text));
@@ -1039,6 +1107,22 @@ impl<'a> Flattener<'a> {
         };
         let kind = self.system.var(var).kind;
         let declared = self.system.var(var).span;
+        let wanted = self.wanted(id, target, var, kind, declared);
+        if wanted.is_none() {
+            self.refused.push(var);
+        }
+        wanted
+    }
+
+    fn wanted(
+        &mut self,
+        id: InstanceId,
+        target: &'a Target,
+        var: VarId,
+        kind: VarKind,
+        declared: Span,
+    ) -> Option<(VarId, Wanted)> {
+        let name = target.name();
         match (target, kind) {
             (Target::Name(_), VarKind::Output | VarKind::Let) => Some((var, Wanted::Value)),
             (Target::Next { .. }, VarKind::State) => Some((var, Wanted::Next)),
@@ -1150,6 +1234,7 @@ impl<'a> Flattener<'a> {
                             }
                         }
                         Wanted::Rate { .. } => {
+                            self.refused.push(var);
                             let name = &equation.target.name().text;
                             let error = Diagnostic::error("E0308", "a derivative does not belong inside `every`")
                                 .label(span, "sampled code changes at ticks only")
@@ -1214,6 +1299,7 @@ impl<'a> Flattener<'a> {
                     Wanted::Value => None,
                     Wanted::Rate { along } => Some(along),
                     Wanted::Next => {
+                        self.refused.push(var);
                         let error = Diagnostic::error("E0308", "`next` belongs inside an `every` block")
                             .label(span, "a regime is continuous")
                             .help("write an `every` block beside the regimes; a regime's name can be used in it as a condition");
@@ -1293,7 +1379,7 @@ impl<'a> Flattener<'a> {
     fn transitions(&mut self, id: InstanceId, mode: &'a ast::Mode, modes: &[&'a ast::Mode], env: &Env) -> Vec<Transition> {
         let mut out = Vec::new();
         for go in &mode.transitions {
-            let condition = self.expr(&go.condition, env);
+            let condition = self.expr(&go.condition, &Env { instants: true, ..env.clone() });
             let resets = self.resets(id, &go.resets, env);
             match modes.iter().position(|other| other.name.text == go.target.text) {
                 Some(target) => out.push(Transition { target: target as u32, condition, resets, span: go.span }),
@@ -1350,7 +1436,8 @@ impl<'a> Flattener<'a> {
                 .help("one of them must change along time: `ds/dt = …`");
             self.report(error);
             for (var, rate) in waiting {
-                self.set_rate(var, rate.value, None, rate.span);
+                let unknown = self.system.push(Node::Error, rate.span);
+                self.set_rate(var, unknown, None, rate.span);
             }
         }
     }
@@ -1434,7 +1521,7 @@ impl<'a> Flattener<'a> {
         for declaration in declarations(model) {
             let Some(var) = self.var_named(id, &declaration.name.text) else { continue };
             let span = declaration.name.span;
-            if defined.contains_key(&var) || self.system.var(var).span != span {
+            if defined.contains_key(&var) || self.refused.contains(&var) || self.system.var(var).span != span {
                 continue;
             }
             let name = &declaration.name.text;
@@ -1509,13 +1596,20 @@ impl<'a> Flattener<'a> {
         let mut value = self.operand(first, env);
         while let Some((whole, op, _, right)) = spine.pop() {
             let right = self.expr(right, env);
-            value = self.binary(op, value, right, whole.span);
+            value = self.binary(op, value, right, whole.span, env);
         }
         value
     }
 
-    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span) -> ExprId {
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span, env: &Env) -> ExprId {
         let node = match op {
+            BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls if !env.instants => {
+                let error = Diagnostic::error("E0308", format!("`{}` is an instant, not a value", op.text()))
+                    .label(span, "true at one instant only")
+                    .help("it belongs in `go … when …` and `when …`; for a value compare with `<` or `>`");
+                self.report(error);
+                Node::Error
+            }
             BinaryOp::Crosses | BinaryOp::Rises | BinaryOp::Falls => {
                 let difference = self.system.push(Node::Binary(BinaryOp::Subtract, a, b), span);
                 self.system.crossings.push(Crossing { kind: op, difference });
@@ -1556,9 +1650,9 @@ impl<'a> Flattener<'a> {
                     let value = value * unit.scale;
                     if env.rotary {
                         if unit.angle == Angle::Angle {
-                            self.not_rotary(span, "speaks of an angle already");
+                            self.not_rotary(env.instance, span, "speaks of an angle already");
                         } else if env.equation && unit.dimension.rotary() != unit.dimension {
-                            self.not_rotary(span, "a constant with a straight unit inside an equation");
+                            self.not_rotary(env.instance, span, "a constant with a straight unit inside an equation");
                         }
                     }
                     let dimension = if env.rotary { unit.dimension.rotary() } else { unit.dimension };
@@ -1741,7 +1835,7 @@ impl<'a> Flattener<'a> {
                 let inner = Env { rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
                 let mut value = self.expr(&constant.value, &inner);
                 if let Some(unit) = &constant.unit
-                    && let Some(unit) = self.unit(unit, env.rotary)
+                    && let Some(unit) = self.unit(unit, env.rotary, env.instance)
                 {
                     let role = Role::Result { function: name.text.clone() };
                     value = self.system.push(Node::Fits { value, dimension: unit.dimension, role }, constant.value.span);
@@ -1875,6 +1969,7 @@ impl<'a> Flattener<'a> {
         let parts = loop {
             let segment = &path.segments[at];
             match (&binding, segment.index) {
+                (Binding::Broken, _) => return Some(self.error(span)),
                 (Binding::Parts(parts, _), None) => break parts.clone(),
                 (Binding::Parts(parts, first), Some(index)) => {
                     let part = *parts.get(usize::try_from(i64::from(index) - first).ok()?)?;
@@ -1934,7 +2029,7 @@ impl<'a> Flattener<'a> {
             let value = self.expr(expr, env);
             let dimension = match &arg.unit {
                 None => Some(Dimension::NONE),
-                Some(unit) => self.unit(unit, env.rotary).map(|unit| unit.dimension),
+                Some(unit) => self.unit(unit, env.rotary, env.instance).map(|unit| unit.dimension),
             };
             let value = match dimension {
                 Some(dimension) => {
@@ -1965,7 +2060,7 @@ impl<'a> Flattener<'a> {
         };
         let body = self.expr(&function.body, &inner);
         self.functions.pop();
-        match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary)) {
+        match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance)) {
             Some(unit) => {
                 let role = Role::Result { function: function.name.text.clone() };
                 self.system.push(Node::Fits { value: body, dimension: unit.dimension, role }, span)

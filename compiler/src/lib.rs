@@ -220,9 +220,10 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let mut all = loaded.diagnostics.clone();
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
+    let unreadable = loaded.has_errors();
     for item in &ast.items {
         match item {
-            Item::Model(model) => all.extend(check_model(loaded, sources, model, root)),
+            Item::Model(model) => all.extend(check_model(loaded, sources, model, root, !unreadable)),
             Item::Experiment(experiment) => {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();
@@ -231,13 +232,34 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     Err(errors) => all.extend(errors),
                 }
             }
-            _ => {}
+            Item::Function(_) | Item::Const(_) | Item::Table(_) => {
+                let flat = flatten::flatten_item(loaded, sources, root, item);
+                let mut diagnostics = flat.diagnostics;
+                units::check(&flat.system, &loaded.files, &mut diagnostics);
+                all.extend(diagnostics);
+            }
+            Item::Fit(fit) => {
+                let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
+                all.push(error.label(fit.name.span, "reserved for the fitting of parameters"));
+            }
+            Item::Import(_) | Item::Interface(_) | Item::Device(_) | Item::Rig(_) => {}
         }
+    }
+    // What cannot be read elsewhere is missing here: say the cause.
+    if loaded.diagnostics.iter().any(|d| d.is_error() && d.span().file != root) {
+        all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
     }
     once(all)
 }
 
-fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model, file: FileId) -> Vec<Diagnostic> {
+/// `whole`: the text could be read in whole; else what is proven of it would rest on gaps.
+fn check_model(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+    whole: bool,
+) -> Vec<Diagnostic> {
     let request = flatten::Request {
         instance: flatten::Instance::Alone(model, file),
         overrides: Vec::new(),
@@ -252,9 +274,11 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     }
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&flat.system, &types, &loaded.files, &mut diagnostics);
-        domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
+        if whole {
+            domains::check(&flat.system, &types, &loaded.files, &mut diagnostics);
+        }
     }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
+    if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(lints::check(&flat.system, &types, &loaded.files));
     }
     lints::silence(&flat.system, &mut diagnostics);
@@ -267,6 +291,11 @@ pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
     diagnostics.sort_by_key(|diagnostic| diagnostic.span());
     let mut seen = std::collections::HashSet::new();
-    diagnostics.retain(|diagnostic| seen.insert((diagnostic.code, diagnostic.span())));
+    let mut circle = false;
+    diagnostics.retain(|diagnostic| {
+        // A circle of models is met from each of them.
+        let again = diagnostic.message.ends_with("contains itself") && std::mem::replace(&mut circle, true);
+        seen.insert((diagnostic.code, diagnostic.span())) && !again
+    });
     diagnostics
 }

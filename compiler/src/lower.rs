@@ -741,9 +741,12 @@ impl<'a> Emit<'a> {
                 if stored && param && !self.inline_params {
                     return None; // A parameter with a slot.
                 }
+                if self.inline_params && !param {
+                    return None; // Not known before a run.
+                }
                 value_of(var, self.phase)
             }
-            Node::Rate(_) | Node::PathRate(_) => rate_of(system, node),
+            Node::Rate(_) | Node::PathRate(_) if !self.inline_params => rate_of(system, node),
             _ => None,
         }
     }
@@ -886,6 +889,7 @@ impl<'a> Emit<'a> {
         match node {
             Node::Number { value, .. } => self.build.real(value),
             Node::Bool(truth) => self.build.truth(truth),
+            Node::Time if self.inline_params => self.build.real(f64::NAN),
             Node::Time if self.phase == Phase::Start => self.build.real(0.0),
             Node::Time => self.build.load(Slot::TIME),
             Node::Var(var) => self.leaf(var),
@@ -1104,6 +1108,9 @@ impl<'a> Emit<'a> {
     }
 
     fn time(&mut self) -> Value {
+        if self.inline_params {
+            return self.build.real(f64::NAN); // Not known before a run.
+        }
         match self.phase {
             Phase::Start => self.build.real(0.0),
             Phase::Now | Phase::Tick => self.build.load(Slot::TIME),

@@ -54,6 +54,8 @@ pub struct System {
     pub tables: Vec<Table>,
     /// Instants at which a signal has a corner.
     pub corners: Vec<ExprId>,
+    /// Instances that cannot be made rotary: reported, and their units fit everything.
+    pub strangers: Vec<InstanceId>,
 }
 
 /// An instance of a model.
@@ -196,7 +198,14 @@ pub enum Origin {
 #[derive(Clone, PartialEq, Debug)]
 pub enum Node {
     /// A number in SI. Without a dimension it fits any: 0 and inf.
-    Number { value: f64, dimension: Option<Dimension>, angle: Angle },
+    Number {
+        /// In SI.
+        value: f64,
+        /// None: fits any.
+        dimension: Option<Dimension>,
+        /// As written.
+        angle: Angle,
+    },
     /// `true`, `false`
     Bool(bool),
     /// `t`
@@ -224,7 +233,14 @@ pub enum Node {
     /// A crossing of this number.
     Crossing(u32),
     /// A value that must have this dimension: an argument or result of a function.
-    Fits { value: ExprId, dimension: Dimension, role: Role },
+    Fits {
+        /// The value, handed on.
+        value: ExprId,
+        /// What it must have.
+        dimension: Dimension,
+        /// Why.
+        role: Role,
+    },
     /// A measure over the course of a value; only in expectations.
     Measure(MeasureName, ExprId, Option<ExprId>),
     /// `?`
@@ -237,9 +253,17 @@ pub enum Node {
 #[derive(Clone, PartialEq, Debug)]
 pub enum Role {
     /// Argument `name` of `function`.
-    Argument { function: String, name: String },
+    Argument {
+        /// The function.
+        function: String,
+        /// The argument.
+        name: String,
+    },
     /// Result of `function`.
-    Result { function: String },
+    Result {
+        /// The function or constant.
+        function: String,
+    },
 }
 
 /// Built-in functions and signals.

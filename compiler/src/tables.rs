@@ -39,7 +39,7 @@ pub fn read(
             }
         }
         TablePoints::File(path) => {
-            let columns = columns(loaded, sources, file, path, 2, diagnostics)?;
+            let columns = columns(loaded, sources, file, path, &[true, true], diagnostics)?;
             x.extend(columns[0].iter().map(|value| value * x_unit.scale));
             y.extend(columns[1].iter().map(|value| value * y_unit.scale));
             for k in 0..x.len() {
@@ -62,16 +62,18 @@ pub fn read(
     })
 }
 
-/// The first `count` columns of a file of numbers, separated by commas, semicolons, tabs or blanks. A first line that
+/// The first columns of a file of numbers, as many as `wanted` has entries; those not wanted may hold anything and are
+/// read as 0. Columns are separated by commas, semicolons, tabs or blanks. A first line that
 /// is no numbers is a heading; lines that begin with `#` are comments.
 pub fn columns(
     loaded: &Loaded,
     sources: &dyn Sources,
     file: FileId,
     path: &ast::Text,
-    count: usize,
+    wanted: &[bool],
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<Vec<f64>>> {
+    let count = wanted.len();
     let from = &loaded.files.get(file).name;
     let text = match sources.file(from, &path.text) {
         Ok((_, text)) => text,
@@ -91,7 +93,11 @@ pub fn columns(
             true => line.split([',', ';', '\t']).map(str::trim).collect(),
             false => line.split_whitespace().collect(),
         };
-        let numbers: Option<Vec<f64>> = fields.iter().map(|f| f.trim_matches('"').parse().ok().filter(|x: &f64| x.is_finite())).collect();
+        let number = |(k, field): (usize, &&str)| match wanted.get(k) {
+            Some(true) => field.trim_matches('"').parse().ok().filter(|x: &f64| x.is_finite()),
+            Some(false) | None => Some(0.0),
+        };
+        let numbers: Option<Vec<f64>> = fields.iter().enumerate().map(number).collect();
         match numbers {
             Some(numbers) if numbers.len() >= count => {
                 out.iter_mut().zip(numbers).for_each(|(column, number)| column.push(number));

@@ -30,12 +30,13 @@ const ENERGY: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 /// Checks and infers the units of a system.
 pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) -> Types {
     let mut found = Vec::new();
-    let (types, strangers) = walk(system, files, &[], &mut found);
+    let (types, mut strangers) = walk(system, files, &system.strangers, &mut found);
     if strangers.is_empty() {
         diagnostics.extend(found);
         return types;
     }
     // A straight model in a rotary place gets and gives wrong units everywhere: say the cause, not what follows.
+    strangers.extend(&system.strangers);
     let mut again = Vec::new();
     let (types, _) = walk(system, files, &strangers, &mut again);
     diagnostics.extend(found.into_iter().filter(|diagnostic| diagnostic.code == "E0108"));

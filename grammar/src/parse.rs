@@ -427,6 +427,7 @@ impl<'t> Reader<'t> {
                 let name = self.name(children.one());
                 let arg = self.argument(children.one());
                 let unit = self.maybe_unit(&mut children);
+                children.one(); // `linear` or `smooth`
                 let points = match children.maybe(Rule::string) {
                     Some(file) => TablePoints::File(self.string(file)),
                     None => TablePoints::Listed(

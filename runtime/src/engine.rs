@@ -1,7 +1,7 @@
 //! Runs one experiment: steps the model, shows each point to measures and recording, and tells how it ended.
 //!
 //! In: an [`Instance`] and an [`Experiment`]. Out: an [`Outcome`], or a [`Failure`] that names quantity, value and
-//! instant. Fixed steps are in the model's own code; adaptive ones in [`solver`](crate::solver). Reads no clock and
+//! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
 use crate::observe::{Observer, Probe, check_finite, check_status};
@@ -19,14 +19,18 @@ const BATCH: u64 = 4096;
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
 ///
-/// `watch` sees the fraction done, from 0 to 1, every few thousand steps and may end the run.
+/// A fixed step is the model's own `Step`, taken as often as fits the duration. An adaptive run needs `Derivatives`, and
+/// uses `Jacobian`, `Roots`, `Transitions` and `Tick` where the model has them; `corners` are met exactly.
+/// `watch` sees the fraction done, from 0 to 1, every few thousand fixed or few dozen adaptive steps, and may end the
+/// run.
 ///
 /// # Errors
-/// A guard that fired, a quantity that is not finite, or the caller's wish to stop; each with the recording so far.
+/// A guard that fired, a quantity that is not finite, chattering, steps that are too short or too many, or the caller's
+/// wish to stop; each with instant, cause and the recording so far.
 ///
 /// # Panics
-/// If a fixed step or the duration is not a positive number, or a slot of the plan lies outside the block: such a
-/// plan is the mistake of whoever made it.
+/// If a fixed step is not positive, a tolerance does not lie between 0 and 1, the duration is negative, or a slot of the
+/// plan lies outside the block: such a plan is the mistake of whoever made it.
 pub fn run(
     instance: Instance,
     experiment: &Experiment,
@@ -220,6 +224,7 @@ mod tests {
         let instance = models::oscillator();
         let mut experiment = fixed(10.0, 1e-3);
         experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+        experiment.expects[0].before = experiment.duration;
         let batched = go(instance.clone(), &experiment).unwrap();
         experiment.plots.push(plot(&instance, &["x"]));
         let single = go(instance, &experiment).unwrap();

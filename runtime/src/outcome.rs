@@ -173,7 +173,7 @@ impl fmt::Display for Failure {
             }
             Cause::TooManySteps { steps, path } => write!(
                 f,
-                "{steps} steps were tried and the run is only at {time}: `{path}` keeps them short; loosen `tol`, or take a fixed step"
+                "{steps} steps were tried and the run is only at {time}: `{path}` keeps them short; another `tol` may suit it better, or a fixed step"
             ),
             Cause::NoDerivatives => write!(f, "the model offers no derivatives: give a `solver` with a step"),
             Cause::Stopped => write!(f, "stopped at {time}"),

@@ -12,7 +12,14 @@ use std::path::Path;
 pub fn check(args: &Check, terminal: &mut Terminal) -> End {
     let mut all = Vec::new();
     let (mut errors, mut warnings, mut unread) = (0, 0, 0);
-    for path in &args.files {
+    let files = match project::expanded(&args.files) {
+        Ok(files) => files,
+        Err((path, error)) => {
+            terminal.error(&format!("cannot read {}: {error}", path.display()));
+            return End::Failed;
+        }
+    };
+    for path in &files {
         let Some((loaded, found)) = found_in(path, terminal) else {
             unread += 1;
             continue;
@@ -35,7 +42,7 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
         let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
         terminal.line(&format!(
             "{}: {}, {}",
-            counted(args.files.len() - unread, "file"),
+            counted(files.len() - unread, "file"),
             counted(errors, "error"),
             counted(warnings, "warning")
         ));

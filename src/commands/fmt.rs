@@ -10,7 +10,14 @@ use std::sync::Arc;
 
 pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
-    for path in &args.files {
+    let files = match project::expanded(&args.files) {
+        Ok(files) => files,
+        Err((path, error)) => {
+            terminal.error(&format!("cannot read {}: {error}", path.display()));
+            return End::Failed;
+        }
+    };
+    for path in &files {
         let input = path == Path::new("-");
         let name = if input { "standard input".into() } else { path.display().to_string() };
         let read = if input { project::read_input() } else { project::read(path) };

@@ -1,5 +1,4 @@
 use super::*;
-use grammar::span::FileId;
 use std::sync::Arc;
 
 fn file(name: &str, text: &str) -> SourceFile {
@@ -280,4 +279,15 @@ fn json_has_every_place() {
         [Diagnostic::warning("W0201", "`c` is never read").label(at(&files, 0, 2, "c"), "here").help("remove it")];
     let expected = r#"[{"code":"W0201","severity":"warning","message":"`c` is never read","labels":[{"file":"a.fric","line":2,"column":4,"end_line":2,"end_column":5,"start":6,"end":7,"text":"here"}],"help":"remove it"}]"#;
     assert_eq!(json(&files, &all).to_string(), expected);
+}
+
+#[test]
+fn twenty_thousand_mistakes_are_told_without_delay() {
+    let files = [file("a.fric", &"x;".repeat(20_000))];
+    let all: Vec<Diagnostic> = (0..20_000)
+        .map(|i| Diagnostic::error("E0001", "odd").label(Span::new(FileId(0), 2 * i, 2 * i + 1), ""))
+        .collect();
+    assert!(short(&files, &all).ends_with("\na.fric:1:39999: E0001 odd\n"));
+    assert_eq!(json(&files, &all).as_array().unwrap().len(), 20_000);
+    assert_eq!(full(&files, &all, false).lines().last(), Some("… and 19990 more in a.fric"));
 }

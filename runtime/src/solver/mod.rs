@@ -2,8 +2,8 @@
 //!
 //! In: a model that offers derivatives, and if it can its Jacobian, switching surfaces, transitions and sampled
 //! blocks. Out: its points, shown to an observer. [`linear`] solves the small systems, [`rosenbrock`] and
-//! [`explicit`] make one [`Step`](step::Step) each, [`surfaces`] finds where one crosses a switching surface, and
-//! [`adaptive`] chooses and joins steps.
+//! [`explicit`] make one [`Step`](step::Step) each, [`surfaces`] finds where one crosses a switching surface,
+//! [`points`] shows it, and [`adaptive`] chooses and joins steps.
 
 pub(crate) mod linear;
 pub(crate) mod step;
@@ -11,6 +11,7 @@ pub(crate) mod step;
 pub(crate) mod explicit;
 pub(crate) mod rosenbrock;
 
+pub(crate) mod points;
 pub(crate) mod surfaces;
 
 pub(crate) mod adaptive;

@@ -514,6 +514,83 @@ fn what_blows_up_is_named() {
     println!("{failure}");
 }
 
+/// The mass with LuGre friction under a position controller that runs a thousand times a second.
+#[test]
+fn a_sampled_controller_costs_a_step_a_tick() {
+    let instance = Model::new("Sampled")
+        .state("x", "m")
+        .state("v", "m/s")
+        .state("z", "um")
+        .root("v < 0")
+        .memory(2)
+        .every(1e-3)
+        .body(Function::Start, |_| {})
+        .body(Function::Derivatives, |m| {
+            let (v, z) = (m.x(1), m.x(2));
+            let g = 1.0 + 0.5 * (-(v / 1e-3) * (v / 1e-3)).exp();
+            let dz = v - 1e5 * v.abs() / g * z;
+            m.set_dx(0, v);
+            m.set_dx(1, m.memory(0) - 1e5 * z - 1e5f64.sqrt() * dz - 0.4 * v);
+            m.set_dx(2, dz);
+        })
+        .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+        .body(Function::Tick, |m| {
+            let i = m.memory(1) + 1e-3 * 4.0 * (1.0 - m.x(0));
+            m.set_memory(1, i);
+            m.set_memory(0, 3.0 * (1.0 - m.x(0)) + i - 6.0 * m.x(1));
+        })
+        .build();
+    let mut experiment = adaptive(10.0, 1e-6);
+    experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+    let outcome = go(&instance, &experiment).unwrap();
+    assert_eq!(outcome.work.ticks, 10_000);
+    assert!(outcome.work.steps + outcome.work.rejected < 10_500, "{}", outcome.work);
+    // Overshoots about as far as with the continuous controller.
+    assert!((value(&outcome, 0) - 1.5).abs() < 0.01, "{}", value(&outcome, 0));
+}
+
+/// Pulls with random parameters over several decades each: all end, and no bristle bends beyond what it holds.
+#[test]
+fn any_bristle_can_be_pulled() {
+    for seed in 0..20u64 {
+        let mut state = seed;
+        let mut between = |low: f64, high: f64| {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            low * (high / low).powf((state >> 11) as f64 / (1u64 << 53) as f64)
+        };
+        between(1.0, 2.0);
+        let (mass, spring, pull) = (between(0.1, 10.0), between(0.5, 200.0), between(1e-3, 1.0));
+        let (sliding, rest, slow) = (between(0.1, 10.0), between(1.0, 2.0), between(1e-4, 1e-2));
+        let (stiffness, viscous) = (between(1e3, 1e7), between(0.01, 10.0));
+        let damping = (stiffness * mass).sqrt() * between(0.01, 2.0);
+        let level = move |v: f64| sliding * (1.0 + (rest - 1.0) * (-(v / slow) * (v / slow)).exp());
+        let instance = Model::new("Random")
+            .state("x", "m")
+            .state("v", "m/s")
+            .state("z", "um")
+            .root("v < 0")
+            .body(Function::Start, |_| {})
+            .body(Function::Derivatives, move |m| {
+                let (x, v, z) = (m.x(0), m.x(1), m.x(2));
+                let dz = v - stiffness * v.abs() / level(v) * z;
+                m.set_dx(0, v);
+                m.set_dx(1, (spring * (pull * m.t() - x) - stiffness * z - damping * dz - viscous * v) / mass);
+                m.set_dx(2, dz);
+            })
+            .body(Function::Roots, |m| m.set_root(0, m.x(1)))
+            .build();
+        let duration = 3.0 * sliding * rest / (spring * pull);
+        let mut experiment = adaptive(duration, 1e-6);
+        experiment.expects.push(reading(&instance, MeasureKind::Max, "z"));
+        experiment.expects.push(reading(&instance, MeasureKind::Min, "z"));
+        let outcome = go(&instance, &experiment).unwrap_or_else(|failure| panic!("seed {seed}: {failure}"));
+        let reach = value(&outcome, 0).max(-value(&outcome, 1));
+        // At rest the speed is far below its tolerance of 1e-6 m/s, which bends the bristle a little too far.
+        let bound = 1.01 * sliding * rest / stiffness;
+        assert!(reach < bound, "seed {seed}: {reach} m, beyond {bound} m");
+    }
+}
+
 /// What a run costs: `cargo test --release -p runtime -- --ignored --nocapture adaptive_steps_cost`.
 #[test]
 #[ignore = "prints times, judges nothing"]

@@ -1,0 +1,51 @@
+/* The PID servo with LuGre friction as one would write it by hand: what generated code is measured against.
+   States: position, velocity, bristle deflection, integral part, filtered measurement. */
+#include <math.h>
+#include <stdint.h>
+
+typedef struct {
+    double r, m, sigma0, sigma1, sigma2, Fc, Fs, vs, Kp, Ti, Td, N, Tt, u_max;
+} Params;
+
+static inline void derivatives(const Params *p, const double x[5], double dx[5]) {
+    double e = p->r - x[0];
+    double raw = p->Kp * e + x[3] - p->Kp * p->N * (x[0] - x[4]);
+    double u = raw < -p->u_max ? -p->u_max : raw > p->u_max ? p->u_max : raw;
+    double ratio = x[1] / p->vs;
+    double g = p->Fc + (p->Fs - p->Fc) * exp(-(ratio * ratio));
+    double dz = x[1] - p->sigma0 * fabs(x[1]) / g * x[2];
+    double F = p->sigma0 * x[2] + p->sigma1 * dz + p->sigma2 * x[1];
+    dx[0] = x[1];
+    dx[1] = (u - F) / p->m;
+    dx[2] = dz;
+    dx[3] = p->Kp / p->Ti * e + (u - raw) / p->Tt;
+    dx[4] = p->N / p->Td * (x[0] - x[4]);
+}
+
+void euler(double *state, const Params *params, double h, uint64_t count) {
+    Params p = *params;
+    double x[5], dx[5];
+    for (int i = 0; i < 5; i++) x[i] = state[i];
+    for (uint64_t n = 0; n < count; n++) {
+        derivatives(&p, x, dx);
+        for (int i = 0; i < 5; i++) x[i] += h * dx[i];
+    }
+    for (int i = 0; i < 5; i++) state[i] = x[i];
+}
+
+void rk4(double *state, const Params *params, double h, uint64_t count) {
+    Params p = *params;
+    double x[5], y[5], k1[5], k2[5], k3[5], k4[5];
+    for (int i = 0; i < 5; i++) x[i] = state[i];
+    for (uint64_t n = 0; n < count; n++) {
+        derivatives(&p, x, k1);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k1[i];
+        derivatives(&p, y, k2);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h / 2 * k2[i];
+        derivatives(&p, y, k3);
+        for (int i = 0; i < 5; i++) y[i] = x[i] + h * k3[i];
+        derivatives(&p, y, k4);
+        for (int i = 0; i < 5; i++) x[i] += h / 6 * (k1[i] + 2 * (k2[i] + k3[i]) + k4[i]);
+    }
+    for (int i = 0; i < 5; i++) state[i] = x[i];
+}

@@ -1,0 +1,136 @@
+//! Time of one step of the PID servo with LuGre friction, at 10 µs: generated code, the interpreter, and C written by
+//! hand with `gcc -O3 -march=native`, side by side in one run. Ratios are medians over interleaved rounds.
+
+use abi::description::Guard;
+use abi::plan::Method;
+use abi::unit::Unit;
+use abi::{Code, Description, Function, Layout, Slot};
+use compiler::backend::interp::Interpreter;
+use compiler::backend::jit::compile;
+use compiler::discretize::step;
+use compiler::ir::Unary;
+use compiler::ir::build::Build;
+use compiler::ir::expr::{Real, Shared};
+use compiler::math::{POOL, expand};
+use compiler::program::Program;
+use std::path::Path;
+use std::process::Command;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// r, m, σ0, σ1, σ2, Fc, Fs, vs, Kp, Ti, Td, N, Tt, u_max
+const PARAMS: [f64; 14] = [1.0, 1.0, 1e5, 316.0, 0.4, 1.0, 1.5, 1e-3, 3.0, 0.75, 2.0, 200.0, 0.5, 20.0];
+/// Step in s.
+const H: f64 = 1e-5;
+
+/// The servo; `watched`: with the guards that a model read from text has.
+fn servo(watched: bool) -> Program {
+    let layout = Layout::new([14, 0, 5, 0, 0, 1, 5, 0, 30, 0]);
+    let func = |name: &str| {
+        let build = Shared::new(Build::new(name));
+        let load = |slot| Real::new(&build, build.borrow_mut().load(slot));
+        let p = |k| load(layout.params.slot(k));
+        let x = |k| load(layout.states.slot(k));
+        let e = p(0) - x(0);
+        let raw = p(8) * e + x(3) - p(8) * p(11) * (x(0) - x(4));
+        let (low, high) = (-p(13), p(13));
+        let clamped = build.borrow_mut().clamp(raw.value, low.value, high.value);
+        let u = Real::new(&build, clamped);
+        let ratio = x(1) / p(7);
+        let g = p(5) + (p(6) - p(5)) * (-(ratio * ratio)).of(Unary::Exp);
+        let dz = x(1) - p(2) * x(1).abs() / g * x(2);
+        let force = p(2) * x(2) + p(3) * dz + p(4) * x(1);
+        let rates = [x(1), (u - force) / p(1), dz, p(8) / p(9) * e + (u - raw) / p(12), p(11) / p(10) * (x(0) - x(4))];
+        let (rates, output) = (rates.map(|rate| rate.value), e.value);
+        let mut build = build.into_inner();
+        match name {
+            "outputs" => build.store(layout.outputs.slot(0), output),
+            _ => rates.iter().enumerate().for_each(|(k, rate)| build.store(layout.derivatives.slot(k), *rate)),
+        }
+        build.finish()
+    };
+    let (outputs, derivatives) = (func("outputs"), func("derivatives"));
+    let guard = |slot, range| Guard { path: String::new(), slot, range, unit: Unit::none() };
+    let open = (f64::NEG_INFINITY, f64::INFINITY);
+    let ranges = [open, open, (-15e-6, 15e-6), open, open];
+    let mut guards: Vec<Guard> =
+        ranges.into_iter().enumerate().map(|(k, range)| guard(layout.states.slot(k), range)).collect();
+    guards.push(guard(layout.outputs.slot(0), open));
+    guards.truncate(if watched { guards.len() } else { 0 });
+    let description = Description { layout, guards, pool: POOL.as_slice().into(), ..Description::default() };
+    Program { description, params: PARAMS.to_vec(), outputs, derivatives, ..Program::default() }
+}
+
+type Hand = unsafe extern "C" fn(state: *mut f64, params: *const f64, h: f64, count: u64);
+
+fn main() {
+    let library = build_c();
+    println!("PID servo with LuGre, {} µs, one instance; below 1 is faster than gcc -O3 -march=native", H * 1e6);
+    for (method, name) in [(Method::Euler, "euler"), (Method::Rk4, "rk4")] {
+        // SAFETY: the library was just built from a source with functions of this name and type.
+        let hand = unsafe { library.get::<Hand>(name.as_bytes()) }.expect("the function is in the source");
+        let layout = servo(false).description.layout;
+        let start = || {
+            let mut block = vec![0.0; layout.size()];
+            block[Slot::STEP.index()] = H;
+            block[layout.params.range()].copy_from_slice(&PARAMS);
+            block
+        };
+        let [plain, watched] = [false, true].map(|watched| {
+            let funcs = [(Function::Step, expand(&step(&servo(watched), method)))];
+            let begun = Instant::now();
+            let (machine, stats) = compile(&funcs, &layout, POOL.len()).expect("this processor can");
+            let (_, operations, bytes) = stats.functions[0];
+            println!("  {name}: {operations} operations, {bytes} bytes, compiled in {:.2} ms", ms(begun));
+            (Code::Machine(machine), Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL.len()))))
+        });
+        let count = 1_000_000 / if method == Method::Rk4 { 4 } else { 1 };
+        let mut blocks = [start(), start(), start()];
+        let mut state = [0.0; 5];
+        let mut times = [const { Vec::new() }; 4];
+        for _ in 0..21 {
+            let mut time = |k: usize, n: u64, run: &mut dyn FnMut()| {
+                let begun = Instant::now();
+                run();
+                times[k].push(begun.elapsed().as_secs_f64() / n as f64 * 1e9);
+            };
+            // SAFETY: five states and fourteen parameters, as the source declares.
+            time(0, count, &mut || unsafe { hand(state.as_mut_ptr(), PARAMS.as_ptr(), H, count) });
+            time(1, count, &mut || assert_eq!(plain.0.call(Function::Step, &mut blocks[0], &POOL, count), 0));
+            time(2, count, &mut || assert_eq!(watched.0.call(Function::Step, &mut blocks[1], &POOL, count), 0));
+            time(3, count / 50, &mut || {
+                assert_eq!(watched.1.call(Function::Step, &mut blocks[2], &POOL, count / 50), 0);
+            });
+        }
+        let [gcc, plain, watched, interpreted] = times.map(median);
+        println!("  {name}: gcc {gcc:.1} ns a step");
+        println!("  {name}: machine code                  {plain:7.1} ns, ratio {:.3}", plain / gcc);
+        println!("  {name}: machine code with guards      {watched:7.1} ns, ratio {:.3}", watched / gcc);
+        println!("  {name}: interpreter with guards       {interpreted:7.1} ns, ratio {:.1}", interpreted / gcc);
+        let x = blocks[0][layout.states.slot(0).index()];
+        println!("  {name}: position at the end {x:.12} m, of gcc {:.12} m", state[0]);
+    }
+}
+
+fn build_c() -> libloading::Library {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../benches/servo.c");
+    let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("servo.so");
+    let built = Command::new("gcc")
+        .args(["-O3", "-march=native", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic", "-o"])
+        .arg(&library)
+        .arg(&source)
+        .arg("-lm")
+        .status();
+    assert!(built.expect("gcc runs").success(), "{} builds", source.display());
+    // SAFETY: the library runs no code when it is loaded.
+    unsafe { libloading::Library::new(&library) }.expect("the library loads")
+}
+
+fn median(mut times: Vec<f64>) -> f64 {
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}
+
+fn ms(begun: Instant) -> f64 {
+    begun.elapsed().as_secs_f64() * 1e3
+}
