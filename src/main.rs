@@ -9,12 +9,14 @@ mod args;
 mod commands;
 mod compile;
 mod figure;
+mod matrices;
 mod plot;
 mod project;
 mod report;
 mod results;
 mod terminal;
 mod value;
+mod vary;
 
 use clap::Parser;
 use commands::End;

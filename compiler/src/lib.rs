@@ -25,7 +25,9 @@ pub mod domains;
 pub mod friction;
 pub mod lints;
 pub mod explain;
+pub mod linearise;
 pub mod experiment;
+pub mod vary;
 
 pub use experiment::Changes;
 pub use resolve::{ExperimentInfo, Loaded, load};
@@ -77,6 +79,96 @@ pub fn compile(
     on_stage("code");
     let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
     Ok(cases)
+}
+
+/// Compiles an experiment once for many runs under other values of the parameters in `options.changes.vary`: one for
+/// each combination of its own sweeps.
+///
+/// # Errors
+/// Everything that is wrong with the experiment and the models it runs.
+pub fn varying(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Vec<vary::Varying>, Vec<Diagnostic>> {
+    let paths = &options.changes.vary;
+    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
+    let one = |variant: experiment::Variant| {
+        // What is described keeps its ranges; the code of a fixed step loses those that change.
+        let mut coded = variant.program.clone();
+        coded.description.guards = vary::in_code(&variant, paths);
+        let functions = functions(&coded, variant.experiment.solver.method);
+        let (code, notes) = code(&functions, &coded.description, options.interpret);
+        vary::Varying::new(variant, paths, &loaded.files, code, notes)
+    };
+    Ok(variants.into_iter().map(one).collect())
+}
+
+/// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
+/// experiment's sweeps counts.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn linear(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<linearise::Linear, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let model = ast.items.iter().find_map(|item| match item {
+        Item::Model(model) if model.name.text == name => Some(model),
+        _ => None,
+    });
+    let Some(model) = model else {
+        let variants = experiment::read(loaded, sources, name, &options.changes, warnings, &mut |_| ())?;
+        let variant = variants.into_iter().next().expect("there is at least one combination");
+        let mut functions = functions(&variant.program, variant.experiment.solver.method);
+        if !functions.iter().any(|(function, _)| *function == Function::Derivatives) {
+            functions.push((Function::Derivatives, math::expand(&variant.program.derivatives)));
+        }
+        let (code, _) = code(&functions, &variant.program.description, options.interpret);
+        let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
+        return Ok(linearise::Linear::new(&variant.program, instance, Some(variant.experiment), &variant.ports));
+    };
+    let overrides = experiment::overrides(loaded, &options.changes, warnings);
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, root),
+        overrides: overrides.iter().map(|change| change.override_in(root)).collect(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    let ports = options.changes.ports.clone().unwrap_or_default();
+    let opened = linearise::open(&mut system, &ports, &mut diagnostics);
+    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        causality::check(&system, &loaded.files, &mut diagnostics);
+    }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    warnings.extend(diagnostics);
+    let wanted: Vec<lower::Wanted> = opened
+        .outputs
+        .iter()
+        .map(|(path, expr)| lower::Wanted { expr: *expr, text: path.clone(), unit: None })
+        .collect();
+    let lower::Lowered { program, observed } = lower::lower(&system, &types, &wanted);
+    let slot = |path: &str| program.description.quantity(path).map(|quantity| quantity.slot);
+    let inputs = opened.inputs.iter().filter_map(|(path, moved)| Some((path.clone(), slot(moved)?)));
+    let outputs = opened.outputs.iter().zip(observed).map(|((path, _), slot)| (path.clone(), slot));
+    let ports = (inputs.collect(), outputs.collect());
+    let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
+    let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    Ok(linearise::Linear::new(&program, instance, None, &ports))
 }
 
 fn case(variant: experiment::Variant, interpret: bool) -> Case {

@@ -104,6 +104,23 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     evaluate_in(&plan, exprs)
 }
 
+/// The function that computes expressions from the parameters in a block, as at the start; and the size of the block, in
+/// whose last slots their values are.
+pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
+    let mut pool = crate::math::POOL.to_vec();
+    let tables = place_tables(system, &mut pool);
+    let mut plan = Plan::new(system, types, &[], tables);
+    plan.description.pool = Arc::from(pool);
+    let mut emit = Emit::new(&plan, "formulas", Phase::Start);
+    let from = plan.description.layout.size();
+    for (k, expr) in exprs.iter().enumerate() {
+        let value = emit.value(*expr);
+        let value = if types.boolean[expr.0 as usize] { emit.number(value) } else { value };
+        emit.build.store(Slot((from + k) as u32), value);
+    }
+    (crate::math::expand(&emit.build.finish()), from + exprs.len())
+}
+
 fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     if exprs.is_empty() {
         return Vec::new();
