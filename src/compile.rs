@@ -1,6 +1,8 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, load};
+pub use compiler::friction::Verdict as Dissipation;
+pub use compiler::resolve::{Lookup, Space};
+pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, load};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.
