@@ -39,6 +39,10 @@ pub enum Command {
     Fmt(Fmt),
     /// Say what an error or warning means, with an example
     Explain(Explain),
+    /// Put a friction model through the standard battery and write a report
+    Characterise(Characterise),
+    /// Put several friction models through the battery, on shared axes
+    Compare(Compare),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -49,7 +53,9 @@ pub enum Command {
     /// Print the manual page of fric, or of one of its commands
     Man {
         /// Such as run
-        #[arg(value_parser = ["run", "test", "sweep", "linearise", "check", "fmt", "explain", "new", "completions"])]
+        #[arg(value_parser = [
+            "run", "test", "sweep", "linearise", "check", "fmt", "explain", "characterise", "compare", "new", "completions",
+        ])]
         command: Option<String>,
     },
 }
@@ -247,6 +253,40 @@ pub struct Explain {
     /// Models of the file to explain; all if none is named
     pub models: Vec<String>,
     /// One JSON object per model
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `fric characterise`
+#[derive(clap::Args, Debug)]
+pub struct Characterise {
+    /// A model of the library with arguments, `LuGre(vd = 10 mm/s)`, or a .fric file
+    #[arg(value_name = "MODEL|FILE", value_hint = ValueHint::FilePath)]
+    pub what: String,
+    /// Models of the file, with arguments; all that fit if none is named
+    #[arg(value_name = "MODEL")]
+    pub models: Vec<String>,
+    /// Change a parameter: `Fs=2N`
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Folder for the report, the battery and the tables [default: out/MODEL]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+    /// Print one JSON object a line for each model instead of words
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `fric compare`
+#[derive(clap::Args, Debug)]
+pub struct Compare {
+    /// Models of the library with arguments, or .fric files
+    #[arg(required = true, value_name = "MODEL|FILE", value_hint = ValueHint::FilePath)]
+    pub models: Vec<String>,
+    /// Folder for the page [default: out/compare]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+    /// Print one JSON object a line for each model instead of words
     #[arg(long)]
     pub json: bool,
 }

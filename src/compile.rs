@@ -4,9 +4,10 @@ pub use compiler::experiment::Ports;
 pub use compiler::explain::Explanation;
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices};
+pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, explain, linear, load, varying,
+    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, linear, load, varying,
 };
 use std::time::Instant;
 

@@ -6,8 +6,10 @@
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
 
 mod args;
+mod characterise;
 mod commands;
 mod compile;
+mod equations;
 mod figure;
 mod matrices;
 mod plot;

@@ -77,7 +77,8 @@ pub fn compile(
 ) -> Result<Vec<Case>, Vec<Diagnostic>> {
     let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
     on_stage("code");
-    let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
+    let mut made = None;
+    let cases = variants.into_iter().map(|variant| case(variant, options.interpret, &mut made)).collect();
     Ok(cases)
 }
 
@@ -171,10 +172,39 @@ pub fn linear(
     Ok(linearise::Linear::new(&program, instance, None, &ports))
 }
 
-fn case(variant: experiment::Variant, interpret: bool) -> Case {
+/// Code of the last case, and what it was made from.
+struct Made {
+    functions: Vec<(Function, ir::Func)>,
+    layout: abi::description::Layout,
+    pool: Arc<[f64]>,
+    code: Code,
+    notes: Vec<String>,
+}
+
+impl Made {
+    /// Whether the code of a program with these functions is the same. Numbers are compared by their bits.
+    fn fits(&self, functions: &[(Function, ir::Func)], description: &abi::Description) -> bool {
+        let bits = |pool: &[f64]| pool.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
+        self.layout == description.layout
+            && bits(&self.pool) == bits(&description.pool)
+            && self.functions.len() == functions.len()
+            && self.functions.iter().zip(functions).all(|(a, b)| a == b)
+    }
+}
+
+/// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
+fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
     let program = &variant.program;
     let functions = functions(program, variant.experiment.solver.method);
-    let (code, notes) = code(&functions, &program.description, interpret);
+    let (code, notes) = match made {
+        Some(made) if made.fits(&functions, &program.description) => (made.code.clone(), made.notes.clone()),
+        _ => {
+            let (code, notes) = code(&functions, &program.description, interpret);
+            let (layout, pool) = (program.description.layout.clone(), program.description.pool.clone());
+            *made = Some(Made { functions, layout, pool, code: code.clone(), notes: notes.clone() });
+            (code, notes)
+        }
+    };
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     Case { label: variant.label, instance, experiment: variant.experiment, notes }
 }
@@ -214,6 +244,47 @@ pub fn code(
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
         Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
     }
+}
+
+/// Whether a friction model dissipates, with the parameters that the arguments of an instance give it. None for what
+/// does not fit `Friction`, or has a part or input that stays open.
+pub fn dissipation(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    instance: &grammar::ast::Instance,
+    file: FileId,
+) -> Option<friction::Verdict> {
+    use grammar::ast;
+    let resolve::Lookup::Found(item, Item::Model(model)) =
+        loaded.find(file, resolve::Space::Type, &instance.model.text)
+    else {
+        return None;
+    };
+    let path = |bind: &ast::Bind| ast::Path {
+        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
+        span: bind.name.span,
+    };
+    let paths: Vec<ast::Path> = instance.args.iter().map(path).collect();
+    let given = paths.iter().zip(&instance.args).map(|(path, bind)| {
+        let value = match &bind.value {
+            ast::BindValue::Expr(expr) => flatten::OverrideValue::Expr(expr),
+            ast::BindValue::Instance(instance) => flatten::OverrideValue::Instance(instance),
+        };
+        flatten::Override { path, value, file }
+    });
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, item.file),
+        overrides: given.collect(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flat = flatten::flatten(loaded, sources, &request);
+    let mut diagnostics = flat.diagnostics;
+    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return None;
+    }
+    friction::dissipation(&flat.system, &types)
 }
 
 /// Explains a model of a loaded text, on its own.

@@ -1,5 +1,6 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod characterise;
 mod check;
 mod cross;
 mod explain;
@@ -43,6 +44,8 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),
+        Command::Characterise(args) => characterise::characterise(args, terminal),
+        Command::Compare(args) => characterise::compare(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();

@@ -460,7 +460,7 @@ impl Table {
             Panel {
                 x: self.columns[x].axis.clone(),
                 y: self.columns[y].axis.clone(),
-                curves: vec![Curve { name: String::new(), points, boolean: false }],
+                curves: vec![Curve { name: String::new(), points, boolean: false, marks: true }],
                 bands: Vec::new(),
             }
         };
@@ -479,13 +479,13 @@ fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
         columns.push(plain("case", ColumnKind::Case));
     }
     for vary in vary {
-        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone() };
+        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone(), logarithmic: false };
         columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Varied });
     }
     let first = &cases[0];
     for (k, expect) in first.experiment.expects[..first.expects()].iter().enumerate() {
         for (j, Measure { text, unit, .. }) in expect.measures.iter().enumerate() {
-            let axis = Axis { name: text.clone(), unit: unit.text.clone() };
+            let axis = Axis { name: text.clone(), unit: unit.text.clone(), logarithmic: false };
             columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Measure(k, j) });
         }
         columns.push(plain(&expect.text, ColumnKind::Verdict(k)));
