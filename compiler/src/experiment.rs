@@ -578,6 +578,9 @@ fn variant(
     if diagnostics.iter().any(Diagnostic::is_error) {
         return Err(diagnostics);
     }
+    if loaded.has_errors() {
+        return Err(Vec::new()); // What could not be read has been reported, and left gaps.
+    }
     warnings.extend(diagnostics);
     on_stage("lower");
     let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);

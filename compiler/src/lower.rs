@@ -5,7 +5,7 @@
 
 use crate::causality::{Phase, rate_of, value_of};
 use crate::ir::build::{Build, Env};
-use crate::ir::{Binary, Func, Unary, Value};
+use crate::ir::{Binary, Func, Type, Unary, Value};
 use crate::program::Program;
 use crate::system::*;
 use crate::units::Types;
@@ -824,6 +824,23 @@ impl<'a> Emit<'a> {
         self.nodes[id.0 as usize].expect("operands are computed first")
     }
 
+    fn types_of(&self, a: ExprId, b: ExprId) -> (Type, Type) {
+        (self.build.type_of(self.got(a)), self.build.type_of(self.got(b)))
+    }
+
+    /// An operand as a condition. Where a text has mistakes, constants are evaluated all the same: what is wrong there
+    /// is neither true nor a number.
+    fn condition(&mut self, id: ExprId) -> Value {
+        let value = self.got(id);
+        if self.build.type_of(value) == Type::Bool { value } else { self.truth(value) }
+    }
+
+    /// An operand as a quantity; see [`condition`](Self::condition).
+    fn quantity(&mut self, id: ExprId) -> Value {
+        let value = self.got(id);
+        if self.build.type_of(value) == Type::Bool { self.number(value) } else { value }
+    }
+
     /// The value of a quantity that is computed: at a tick, a held one is renewed only if its block is due.
     fn handed_on(&mut self, node: &Node, behind: ExprId) -> Value {
         let value = self.got(behind);
@@ -931,17 +948,26 @@ impl<'a> Emit<'a> {
                 self.build.real(f64::NAN)
             }
             Node::Negate(a) => {
-                let a = self.got(a);
+                let a = self.quantity(a);
                 self.build.neg(a)
             }
             Node::Not(a) => {
-                let a = self.got(a);
+                let a = self.condition(a);
                 self.build.not(a)
             }
             Node::Fits { value, .. } => self.got(value),
             Node::If(c, a, b) => {
-                let (c, a, b) = (self.got(c), self.got(a), self.got(b));
-                self.build.select(c, a, b)
+                let c = self.condition(c);
+                match self.types_of(a, b) {
+                    (Type::Bool, Type::Bool) => {
+                        let (a, b) = (self.got(a), self.got(b));
+                        self.build.select(c, a, b)
+                    }
+                    _ => {
+                        let (a, b) = (self.quantity(a), self.quantity(b));
+                        self.build.select(c, a, b)
+                    }
+                }
             }
             Node::InRegime(automaton, regime) => {
                 let number = self.build.real(f64::from(regime));
@@ -954,7 +980,7 @@ impl<'a> Emit<'a> {
             }
             Node::Crossing(k) => self.crossing(k as usize),
             Node::Table(k, x) => {
-                let x = self.got(x);
+                let x = self.quantity(x);
                 self.table(k as usize, x)
             }
             Node::Binary(op, a, b) => {
@@ -963,11 +989,15 @@ impl<'a> Emit<'a> {
                     _ if op == BinaryOp::Power => crate::units::literal(self.plan.system, b),
                     _ => None,
                 };
-                let (a, b) = (self.got(a), self.got(b));
+                let (a, b) = match op {
+                    BinaryOp::And | BinaryOp::Or => (self.condition(a), self.condition(b)),
+                    BinaryOp::Equal | BinaryOp::NotEqual if boolean => (self.condition(a), self.condition(b)),
+                    _ => (self.quantity(a), self.quantity(b)),
+                };
                 self.binary(op, a, b, boolean, exponent)
             }
             Node::Call(builtin, args) => {
-                let args: Vec<Value> = args.iter().map(|arg| self.got(*arg)).collect();
+                let args: Vec<Value> = args.iter().map(|arg| self.quantity(*arg)).collect();
                 self.call(builtin, &args)
             }
         }
