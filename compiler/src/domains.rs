@@ -295,14 +295,14 @@ impl<'a> Prover<'a> {
                     return between;
                 }
                 let (x, y) = (self.interval(a), self.interval(b));
-                x.add(y)
+                x.plus(y)
             }
             BinaryOp::Subtract => {
                 if self.same(a, b) {
                     return Interval::point(0.0);
                 }
                 let (x, y) = (self.interval(a), self.interval(b));
-                let mut out = x.add(y.negate());
+                let mut out = x.plus(y.negate());
                 for k in 0..self.relations.len() {
                     let (large, small, strict) = self.relations[k];
                     let positive = Interval { low: 0.0, above_low: strict, ..Interval::ALL };

@@ -61,6 +61,9 @@ pub enum Place {
     Second(usize, usize),
 }
 
+/// Inputs and outputs by path, with the slots of their values.
+pub type PortSlots = (Vec<(String, Slot)>, Vec<(String, Slot)>);
+
 /// One combination of an experiment's sweeps, lowered.
 pub struct Variant {
     /// `fr = LuGre()`; empty without a sweep.
@@ -76,7 +79,7 @@ pub struct Variant {
     /// Numbers of the plan that follow from expressions.
     pub places: Vec<(Place, ExprId)>,
     /// Inputs of a linearisation, each with the slot along which it moves; and its outputs.
-    pub ports: (Vec<(String, Slot)>, Vec<(String, Slot)>),
+    pub ports: PortSlots,
 }
 
 /// The default of an adaptive run.

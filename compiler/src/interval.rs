@@ -94,7 +94,7 @@ impl Interval {
     }
 
     /// a + b
-    pub fn add(self, other: Interval) -> Interval {
+    pub fn plus(self, other: Interval) -> Interval {
         Interval {
             low: self.low + other.low,
             high: self.high + other.high,
@@ -248,9 +248,9 @@ mod tests {
         assert!(!positive.has_zero() && not_negative.has_zero());
         assert!(!positive.multiply(positive).has_zero());
         assert!(!positive.divide(positive).has_zero());
-        assert!(!positive.add(not_negative).has_zero());
+        assert!(!positive.plus(not_negative).has_zero());
         assert!(positive.multiply(not_negative).has_zero());
-        let bell = Interval::ALL.square().negate().rising(f64::cbrt, (f64::NEG_INFINITY, f64::INFINITY));
+        let bell = Interval::ALL.square().negate().rising(|x| x, (f64::NEG_INFINITY, f64::INFINITY));
         assert_eq!((bell.high, bell.below_high), (0.0, false));
     }
 

@@ -6,7 +6,7 @@
 
 use crate::backend::interp::run_once;
 use crate::derive;
-use crate::experiment::Ports;
+use crate::experiment::{PortSlots, Ports};
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
@@ -138,12 +138,7 @@ pub struct Matrices {
 
 impl Linear {
     /// Of a program and its ports.
-    pub fn new(
-        program: &Program,
-        instance: Instance,
-        experiment: Option<Experiment>,
-        ports: &(Vec<(String, Slot)>, Vec<(String, Slot)>),
-    ) -> Linear {
+    pub fn new(program: &Program, instance: Instance, experiment: Option<Experiment>, ports: &PortSlots) -> Linear {
         let description: &Arc<Description> = instance.description();
         let layout = &description.layout;
         let at = |slot: Slot| description.quantities.iter().find(|quantity| quantity.slot == slot).cloned();

@@ -47,7 +47,7 @@ fn unused(system: &System, found: &mut Vec<Diagnostic>) {
         let word = var.kind.word();
         let warning = Diagnostic::warning("W0201", format!("{word} `{}` is never read", var.name))
             .label(var.span, "declared, but nothing uses it")
-            .help(format!("use it or remove it; to keep it: `allow unused \"...\"`"));
+            .help("use it or remove it; to keep it: `allow unused \"...\"`");
         found.push(warning);
     }
 }

@@ -860,9 +860,10 @@ impl Checker<'_> {
         }
         let transitions =
             self.system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
-        let conditions: Vec<(ExprId, &Vec<(VarId, ExprId)>, &str)> = transitions
-            .map(|transition| (transition.condition, &transition.resets, "`go`"))
-            .chain(self.system.events.iter().map(|event| (event.condition, &event.resets, "`when`")))
+        type Resets<'r> = &'r [(VarId, ExprId)];
+        let conditions: Vec<(ExprId, Resets, &str)> = transitions
+            .map(|transition| (transition.condition, transition.resets.as_slice(), "`go`"))
+            .chain(self.system.events.iter().map(|event| (event.condition, event.resets.as_slice(), "`when`")))
             .collect();
         for (condition, resets, what) in conditions {
             self.condition(condition, what);
@@ -983,7 +984,9 @@ pub fn three_digits(x: f64) -> String {
     if x == 0.0 || !x.is_finite() {
         return format!("{x}");
     }
-    let exponent = x.abs().log10().floor() as i32;
+    // The exponent as the scientific form has it.
+    let scientific = format!("{x:e}");
+    let exponent: i32 = scientific.split_once('e').and_then(|(_, e)| e.parse().ok()).unwrap_or(0);
     if !(-4..6).contains(&exponent) {
         let text = format!("{x:.2e}");
         let (mantissa, exponent) = text.split_once('e').expect("scientific form has an exponent");

@@ -401,7 +401,7 @@ impl<'a> Flattener<'a> {
         /// One definition in one regime.
         struct InMode {
             var: VarId,
-            along: Option<Option<(VarId, Span)>>,
+            along: Option<Along>,
             value: ExprId,
             span: Span,
             statement: Span,
@@ -486,7 +486,7 @@ impl<'a> Flattener<'a> {
             if !self.once(var, span, defined) {
                 continue;
             }
-            let ones: Vec<(Option<Option<(VarId, Span)>>, ExprId)> = by_mode
+            let ones: Vec<(Option<Along>, ExprId)> = by_mode
                 .iter()
                 .map(|here| here.iter().find(|one| one.var == var).map(|one| (one.along, one.value)).expect("complete"))
                 .collect();

@@ -155,10 +155,10 @@ impl<'a> Flattener<'a> {
         {
             return self.through(id, binding, path, env);
         }
-        if path.segments.len() == 1 && head.index.is_none() {
-            if let Some(node) = self.constant(&head.name, env) {
-                return node;
-            }
+        if let Some(name) = path.single()
+            && let Some(node) = self.constant(name, env)
+        {
+            return node;
         }
         match env.instance {
             Some(id) => self.unknown(id, &head.name),

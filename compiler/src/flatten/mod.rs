@@ -318,14 +318,17 @@ fn head(equation: &ast::Equation) -> Span {
 /// How an equation gives its quantity a value.
 enum Wanted {
     Value,
-    Rate { along: Option<(VarId, Span)> },
+    Rate { along: Along },
     Next,
 }
+
+/// What a derivative is taken along: time, or a state named at a place.
+type Along = Option<(VarId, Span)>;
 
 /// The right side of a derivative equation.
 struct Rate {
     value: ExprId,
-    along: Option<(VarId, Span)>,
+    along: Along,
     span: Span,
 }
 

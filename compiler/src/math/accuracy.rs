@@ -1,5 +1,6 @@
 //! How far the elementary functions are from the correctly rounded result, measured; and their edges.
 
+use super::two_to;
 use super::{POOL, expand};
 use crate::backend::jit::compile;
 use crate::ir::build::Build;
@@ -64,7 +65,7 @@ impl Range {
             Range::Within(lo, hi) => random.within(lo, hi),
             Range::Powers(lo, hi) => {
                 let exponent = lo + random.below((hi - lo) as usize) as i32;
-                let size = random.within(1.0, 2.0) * 2f64.powi(exponent / 2) * 2f64.powi(exponent - exponent / 2);
+                let size = random.within(1.0, 2.0) * two_to(exponent / 2) * two_to(exponent - exponent / 2);
                 if random.below(2) == 0 { size } else { -size }
             }
             Range::Any => f64::from_bits(random.bits()),

@@ -3,6 +3,7 @@
 //! One reduction for all: x = k ln2/64 + r with |r| ≤ ln2/128, and e^x = 2^(k/64) e^r with 2^(k/64) from a table of
 //! 64 numbers and e^r − 1 a polynomial of degree 5.
 
+use super::two_to;
 use super::{polynomial, tables, two_sum};
 use crate::ir::expr::{Int, Real};
 
@@ -71,7 +72,7 @@ impl<'a> Parts<'a> {
         // Near overflow and underflow the scale is taken nearer to 1 and the rest multiplied afterwards.
         let large = x.above(0.0);
         let nearer = scale + large.choose_int(-1009 << 52, 1022 << 52);
-        let rest = large.choose(2f64.powi(1009), 2f64.powi(-1022));
+        let rest = large.choose(two_to(1009), two_to(-1022));
         let edge = Parts { scale: nearer, ..self }.normal() * rest;
         let beyond = x.above(745.0).choose(f64::INFINITY, x.below(-746.0).choose(0.0, edge));
         x.abs().below(707.0).choose(normal, beyond)
@@ -101,7 +102,7 @@ pub fn exp(x: Real) -> Real {
 pub fn expm1(x: Real) -> Real {
     let (high, low) = Parts::exact(x, None).less_one();
     let large = x.above(700.0).choose(exp(x), x.below(-50.0).choose(-1.0, high + low));
-    x.abs().below(2f64.powi(-54)).choose(x, large)
+    x.abs().below(two_to(-54)).choose(x, large)
 }
 
 /// (e^a − e^−a)/2 of a = |x|, by t + t/(t + 1) with t = e^a − 1, which loses nothing near 0. Within 2 ulp.
@@ -112,7 +113,7 @@ pub fn sinh(x: Real) -> Real {
     let near = 0.5 * (t + t / (t + 1.0));
     let size = a.above(40.0).choose(Parts::of(a).scaled(a, -1), near);
     let odd = x.below(0.0).choose(-size, size);
-    a.below(2f64.powi(-28)).choose(x, odd)
+    a.below(two_to(-28)).choose(x, odd)
 }
 
 /// e^a/2 + 1/(4 · e^a/2) of a = |x|. Within 1 ulp.
@@ -134,5 +135,5 @@ pub fn tanh(x: Real) -> Real {
     let rest = (-q).fma(sum, t) + (-q).fma(sum_low + t_low, t_low);
     let size = inverse.fma(rest, q);
     let odd = x.below(0.0).choose(-size, size);
-    a.below(2f64.powi(-28)).choose(x, odd)
+    a.below(two_to(-28)).choose(x, odd)
 }

@@ -4,6 +4,7 @@
 //! bits, so that r is exact near 1, and log x = k ln2 + log c + log(1 + r).
 
 use super::exponential::Parts;
+use super::two_to;
 use super::{polynomial, tables, two_sum};
 use crate::ir::expr::{Int, Real, Truth};
 
@@ -60,7 +61,7 @@ impl<'a> Reduced<'a> {
 /// A subnormal x times 2^52, and what that adds to k.
 fn normal<'a>(x: Real<'a>) -> (Real<'a>, Real<'a>) {
     let subnormal: Truth = x.below(f64::MIN_POSITIVE);
-    (subnormal.choose(x * 2f64.powi(52), x), subnormal.choose(-52.0, 0.0))
+    (subnormal.choose(x * two_to(52), x), subnormal.choose(-52.0, 0.0))
 }
 
 /// k ln2 + log c + log(1 + r), from r that lacks `r_low`.
@@ -91,7 +92,7 @@ pub fn log1p(x: Real) -> Real {
     let value = sum(reduced.k.real(), &reduced, r);
     let edge = x.is(-1.0).choose(f64::NEG_INFINITY, x.is(f64::INFINITY).choose(f64::INFINITY, f64::NAN));
     let inside = (x.above(-1.0) & x.below(f64::INFINITY)).choose(value, edge);
-    x.abs().below(2f64.powi(-54)).choose(x, inside)
+    x.abs().below(two_to(-54)).choose(x, inside)
 }
 
 /// e^(y log x), the logarithm with 68 bits: within 0.52 ulp, and as IEEE 754 defines it at the edges.

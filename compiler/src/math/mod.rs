@@ -23,6 +23,12 @@ pub fn pool() -> &'static [f64] {
     &POOL
 }
 
+/// 2^n for −1022 ≤ n ≤ 1023, exact.
+const fn two_to(n: i32) -> f64 {
+    assert!(n >= -1022 && n <= 1023);
+    f64::from_bits(((n + 1023) as u64) << 52)
+}
+
 /// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
@@ -100,9 +106,9 @@ fn hypot<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     let (x, y) = (x.abs(), y.abs());
     let less = y.below(x);
     let (large, small) = (less.choose(x, y), less.choose(y, x));
-    let (huge, tiny) = (large.above(2f64.powi(500)), large.below(2f64.powi(-450)));
-    let scale = huge.choose(2f64.powi(-600), tiny.choose(2f64.powi(600), 1.0));
-    let back = huge.choose(2f64.powi(600), tiny.choose(2f64.powi(-600), 1.0));
+    let (huge, tiny) = (large.above(two_to(500)), large.below(two_to(-450)));
+    let scale = huge.choose(two_to(-600), tiny.choose(two_to(600), 1.0));
+    let back = huge.choose(two_to(600), tiny.choose(two_to(-600), 1.0));
     let (large, small) = (large * scale, small * scale);
     let (a, b) = (large * large, small * small);
     let (a_low, b_low) = (large.fma(large, -a), small.fma(small, -b));

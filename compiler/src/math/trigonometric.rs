@@ -1,6 +1,7 @@
 //! sin, cos, tan, and their inverses.
 
 use super::exponential::ROUND;
+use super::two_to;
 use super::{polynomial, tables, two_sum};
 use crate::ir::expr::{Int, Real};
 
@@ -92,7 +93,7 @@ pub fn sin(x: Real) -> Real {
     let reduced = Reduced::of(x);
     let size = reduced.odd().choose(reduced.cos, reduced.sin);
     let value = (reduced.quarters & 2).is(2).choose(-size, size);
-    let near = x.abs().below(2f64.powi(-27)).choose(x, value);
+    let near = x.abs().below(two_to(-27)).choose(x, value);
     // 0 · x is NaN for infinite x.
     x.abs().below(LIMIT).choose(near, 0.0 * x)
 }
@@ -110,7 +111,7 @@ pub fn tan(x: Real) -> Real {
     let reduced = Reduced::of(x);
     let odd = reduced.odd();
     let value = odd.choose(-reduced.cos, reduced.sin) / odd.choose(reduced.sin, reduced.cos);
-    let near = x.abs().below(2f64.powi(-27)).choose(x, value);
+    let near = x.abs().below(two_to(-27)).choose(x, value);
     x.abs().below(LIMIT).choose(near, 0.0 * x)
 }
 
@@ -158,7 +159,7 @@ fn atan_quotient<'a>(y: Real<'a>, x: Real<'a>) -> Real<'a> {
 /// Within 0.9 ulp; ±π/2 at ±inf.
 pub fn atan(x: Real) -> Real {
     // From 2^66 on it is π/2.
-    let a = x.abs().at_most(2f64.powi(66));
+    let a = x.abs().at_most(two_to(66));
     atan_quotient(a, a.constant(1.0)).with_sign(x)
 }
 
@@ -170,9 +171,9 @@ pub fn atan2<'a>(y: Real<'a>, x: Real<'a>) -> Real<'a> {
     let (fy, fx) = (ix.choose(0.0, ay), iy.choose(0.0, ax));
     let (fy, fx) = (iy.choose(1.0, fy), ix.choose(1.0, fx));
     // Both large: their sum would overflow. Both tiny: their products would lose bits.
-    let large = fy.above(2f64.powi(1000)) | fx.above(2f64.powi(1000));
-    let tiny = fy.below(2f64.powi(-900)) & fx.below(2f64.powi(-900));
-    let scale = large.choose(0.25, tiny.choose(2f64.powi(120), 1.0));
+    let large = fy.above(two_to(1000)) | fx.above(two_to(1000));
+    let tiny = fy.below(two_to(-900)) & fx.below(two_to(-900));
+    let scale = large.choose(0.25, tiny.choose(two_to(120), 1.0));
     let (fy, fx) = (fy * scale, fx * scale);
     let quotient = fy.is(0.0).choose(0.0, atan_quotient(fy, fx));
     let left = x.bits().below(0);
