@@ -4,6 +4,7 @@
 //! usage and not a failed run.
 
 use crate::value;
+use crate::vary::{self, Vary};
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
@@ -28,12 +29,20 @@ pub enum Command {
     Run(Run),
     /// Run every experiment that has an `expect`; last line: `N passed, N failed`
     Test(Test),
+    /// Run an experiment many times under other parameters: grids and Monte Carlo
+    Sweep(Sweep),
+    /// A, B, C, D and the modes of a model or an experiment at a point
+    Linearise(Linearise),
     /// Find mistakes without running anything
     Check(Check),
     /// Rewrite files in the one canonical layout
     Fmt(Fmt),
     /// Say what an error or warning means, with an example
     Explain(Explain),
+    /// Put a friction model through the standard battery and write a report
+    Characterise(Characterise),
+    /// Put several friction models through the battery, on shared axes
+    Compare(Compare),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -44,7 +53,9 @@ pub enum Command {
     /// Print the manual page of fric, or of one of its commands
     Man {
         /// Such as run
-        #[arg(value_parser = ["run", "test", "check", "fmt", "explain", "new", "completions"])]
+        #[arg(value_parser = [
+            "run", "test", "sweep", "linearise", "check", "fmt", "explain", "characterise", "compare", "new", "completions",
+        ])]
         command: Option<String>,
     },
 }
@@ -84,6 +95,9 @@ pub struct Run {
     /// Print one JSON object a line for each run instead of words and plots
     #[arg(long)]
     pub json: bool,
+    /// Repeat it with another solver and say how far apart the two are
+    #[arg(long)]
+    pub cross: bool,
     /// Print failures only
     #[arg(long, short, conflicts_with = "json")]
     pub quiet: bool,
@@ -98,12 +112,108 @@ pub struct Test {
     /// Texts, or folders to look through for them
     #[arg(required = true, value_name = "FILE|DIR", value_hint = ValueHint::AnyPath)]
     pub paths: Vec<PathBuf>,
+    /// Repeat each with another solver: what is expected must hold there too
+    #[arg(long)]
+    pub cross: bool,
     /// Print failures and the last line only
     #[arg(long, short)]
     pub quiet: bool,
     /// Interpret instead of making machine code: slow, for comparison
     #[arg(long)]
     pub interpret: bool,
+}
+
+/// `fric sweep`
+#[derive(clap::Args, Debug)]
+pub struct Sweep {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The experiment in it to run
+    pub experiment: String,
+    /// What changes: 'fr.Fs = 1 N .. 2 N by 0.1 N', 'm = 1 kg, 2 kg', 'fr.vs ~ lognormal(1 mm/s, 0.2)', also normal, uniform
+    #[arg(long, value_name = "CHANGE", required = true, value_parser = vary::parse)]
+    pub vary: Vec<Vary>,
+    /// Draws of the distributions, at each point of the grids [default: 100]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
+    pub runs: Option<u64>,
+    /// From which all that is random follows
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// The table to write: .csv
+    #[arg(long, value_name = "FILE", default_value = "sweep.csv", value_hint = ValueHint::FilePath, value_parser = table)]
+    pub out: PathBuf,
+    /// Go on with a table that was not finished
+    #[arg(long)]
+    pub resume: bool,
+    /// Do one of N parts; the tables of all parts one behind the other are that of the whole
+    #[arg(long, value_name = "I/N", value_parser = shard)]
+    pub shard: Option<(u64, u64)>,
+    /// Threads [default: one for each core]
+    #[arg(long, value_name = "N", value_parser = threads)]
+    pub threads: Option<usize>,
+    /// Draw measures over a parameter: .svg or .png
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = picture)]
+    pub plot: Option<PathBuf>,
+    /// Which measure to draw, as written: 'period(x)' [default: all]
+    #[arg(long, value_name = "MEASURE", requires = "plot")]
+    pub show: Option<String>,
+    /// Over which parameter to draw [default: the first]
+    #[arg(long, value_name = "PATH", requires = "plot")]
+    pub against: Option<String>,
+    /// Change a parameter or a slot for all runs: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Relative tolerance of an adaptive run, such as 1e-8
+    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
+    pub tol: Option<f64>,
+    /// Simulated time, such as 20s
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+    /// Print nothing but errors
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Interpret instead of making machine code: slow, for comparison
+    #[arg(long)]
+    pub interpret: bool,
+}
+
+/// `fric linearise`
+#[derive(clap::Args, Debug)]
+pub struct Linearise {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// A model, with its inputs free, or an experiment
+    #[arg(value_name = "MODEL|EXPERIMENT")]
+    pub name: String,
+    /// States, free inputs, parameters and regimes at the point: 'v=0.1m/s,fr.z=2um,fr=stick'
+    #[arg(long, value_name = "PATH=VALUE,…", value_delimiter = ',', value_parser = setting)]
+    pub at: Vec<(String, String)>,
+    /// Time; of an experiment: where its run is then [default: the start]
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub time: Option<f64>,
+    /// Inputs, also of parts [default: those of the whole]
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    pub inputs: Vec<String>,
+    /// Outputs, or other quantities [default: the outputs of the whole]
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    pub outputs: Vec<String>,
+    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Print a JSON object
+    #[arg(long)]
+    pub json: bool,
+    /// Write A, B, C, D to a file: .npz, .mat or .json
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
+    pub out: Option<PathBuf>,
 }
 
 /// `fric check`
@@ -143,6 +253,40 @@ pub struct Explain {
     /// Models of the file to explain; all if none is named
     pub models: Vec<String>,
     /// One JSON object per model
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `fric characterise`
+#[derive(clap::Args, Debug)]
+pub struct Characterise {
+    /// A model of the library with arguments, `LuGre(vd = 10 mm/s)`, or a .fric file
+    #[arg(value_name = "MODEL|FILE", value_hint = ValueHint::FilePath)]
+    pub what: String,
+    /// Models of the file, with arguments; all that fit if none is named
+    #[arg(value_name = "MODEL")]
+    pub models: Vec<String>,
+    /// Change a parameter: `Fs=2N`
+    #[arg(long = "set", value_name = "NAME=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Folder for the report, the battery and the tables [default: out/MODEL]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+    /// Print one JSON object a line for each model instead of words
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `fric compare`
+#[derive(clap::Args, Debug)]
+pub struct Compare {
+    /// Models of the library with arguments, or .fric files
+    #[arg(required = true, value_name = "MODEL|FILE", value_hint = ValueHint::FilePath)]
+    pub models: Vec<String>,
+    /// Folder for the page [default: out/compare]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+    /// Print one JSON object a line for each model instead of words
     #[arg(long)]
     pub json: bool,
 }
@@ -187,6 +331,21 @@ fn tolerance(text: &str) -> Result<f64, String> {
     }
 }
 
+fn threads(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(threads) if (1..=1024).contains(&threads) => Ok(threads),
+        _ => Err("a number from 1 to 1024 is needed".into()),
+    }
+}
+
+fn matrices(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some("npz" | "mat" | "json") => Ok(path),
+        _ => Err("the name ends in .npz (NumPy), .mat (MATLAB) or .json".into()),
+    }
+}
+
 fn picture(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|extension| extension.to_str()) {
@@ -195,10 +354,35 @@ fn picture(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+/// `2/8`: the second of eight.
+fn shard(text: &str) -> Result<(u64, u64), String> {
+    let read = text.split_once('/').and_then(|(i, n)| Some((i.trim().parse().ok()?, n.trim().parse().ok()?)));
+    match read {
+        Some((i, n)) if (1..=n).contains(&i) => Ok((i, n)),
+        Some(_) | None => Err("write it as I/N, from 1/N to N/N".into()),
+    }
+}
+
+/// A name of a table.
+fn table(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|extension| extension.to_str()) {
+        Some("csv") => Ok(path),
+        Some("parquet") => Err("results are written as CSV; Parquet is not available yet".into()),
+        _ => Err("the name of a table ends in .csv".into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use clap::CommandFactory;
+
+    #[test]
+    fn shards_are_counted_from_one() {
+        assert_eq!(shard("2/8"), Ok((2, 8)));
+        assert!(shard("0/8").is_err() && shard("9/8").is_err() && shard("3").is_err() && shard("1/0").is_err());
+    }
 
     #[test]
     fn the_tree_is_sound() {

@@ -1,8 +1,14 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+pub use compiler::experiment::Ports;
 pub use compiler::explain::Explanation;
 pub use compiler::friction::Verdict;
-pub use compiler::{Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, explain, load};
+pub use compiler::linearise::{Linear, Matrices};
+pub use compiler::resolve::{Lookup, Space};
+pub use compiler::vary::{Alone, Varying};
+pub use compiler::{
+    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, linear, load, varying,
+};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

@@ -20,8 +20,8 @@ pub fn figure(title: &str, subtitle: &str, plots: &[Plot], cases: &[Recorded]) -
 
 fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
     let x = match &plot.against {
-        Some(series) => Axis { name: series.label.clone(), unit: series.unit.text.clone() },
-        None => Axis { name: "t".into(), unit: "s".into() },
+        Some(series) => Axis { name: series.label.clone(), unit: series.unit.text.clone(), ..Axis::default() },
+        None => Axis { name: "t".into(), unit: "s".into(), ..Axis::default() },
     };
     // A truth value against another quantity is a curve like any other: it has no time to shade.
     let as_curve = |series: &&Series| !series.boolean || plot.against.is_some();
@@ -51,6 +51,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
             },
             points: points(recording, series, plot.against.as_ref()),
             boolean: series.boolean && plot.against.is_none(),
+            marks: false,
         };
         // What no case changes, such as a reference, is drawn once.
         let (common, own): (Vec<&Series>, Vec<&Series>) =
@@ -59,7 +60,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
         let own = cases.iter().flat_map(|case| own.iter().map(move |series| curve(case, series)));
         Panel {
             x: x.clone(),
-            y: Axis { name: names.join(", "), unit: group[0].unit.text.clone() },
+            y: Axis { name: names.join(", "), unit: group[0].unit.text.clone(), ..Axis::default() },
             curves: own.chain(common).collect(),
             bands: bands.clone(),
         }

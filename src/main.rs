@@ -6,15 +6,19 @@
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
 
 mod args;
+mod characterise;
 mod commands;
 mod compile;
+mod equations;
 mod figure;
+mod matrices;
 mod plot;
 mod project;
 mod report;
 mod results;
 mod terminal;
 mod value;
+mod vary;
 
 use clap::Parser;
 use commands::End;

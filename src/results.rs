@@ -93,7 +93,7 @@ pub fn parts(description: &Description) -> usize {
 }
 
 /// A number of JSON, or `"inf"`, `"-inf"`, `"nan"`.
-fn number(value: f64) -> Value {
+pub fn number(value: f64) -> Value {
     match serde_json::Number::from_f64(value) {
         Some(number) => Value::Number(number),
         None if value.is_nan() => json!("nan"),

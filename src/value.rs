@@ -20,9 +20,13 @@ pub fn parse(text: &str) -> Result<(f64, Unit), String> {
         "" => Unit::none(),
         unit => Unit::parse(unit).map_err(|part| format!("`{part}` is not a known unit"))?,
     };
+    Ok((si(value, &unit), unit))
+}
+
+/// The value in SI of a number in a unit.
+pub fn si(value: f64, unit: &Unit) -> f64 {
     // 1e-6 is no double, 1e6 is: dividing gives the double nearest to what was written.
-    let si = if unit.scale < 1.0 { value / (1.0 / unit.scale) } else { value * unit.scale };
-    Ok((si, unit))
+    if unit.scale < 1.0 { value / (1.0 / unit.scale) } else { value * unit.scale }
 }
 
 /// A value in SI, shown in a unit with so many significant digits: `3.30679 m`.

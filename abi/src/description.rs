@@ -183,6 +183,8 @@ pub struct Guard {
 pub struct Root {
     /// The condition as written, with its part: `fr: v < -v_hold`.
     pub text: String,
+    /// Whether a transition or an event depends on it, rather than a branch only.
+    pub decides: bool,
 }
 
 /// All that is known of a compiled model besides its code.

@@ -11,6 +11,7 @@ use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
 use crate::{causality, checks};
+use abi::Slot;
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -30,6 +31,34 @@ pub struct Changes {
     pub tol: Option<f64>,
     /// Another duration, in s.
     pub duration: Option<f64>,
+    /// Paths of parameters that will change from run to run without compiling again.
+    pub vary: Vec<String>,
+    /// What is needed besides to linearise.
+    pub ports: Option<Ports>,
+}
+
+/// Inputs and outputs of a linearisation, by path. Where none are named, those of the whole.
+#[derive(Clone, Debug, Default)]
+pub struct Ports {
+    /// Inputs.
+    pub inputs: Vec<String>,
+    /// Outputs, or any other quantity.
+    pub outputs: Vec<String>,
+}
+
+/// A number of a plan that was computed from an expression.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Place {
+    /// Simulated time.
+    Duration,
+    /// Fixed step.
+    Step,
+    /// Start of the window of this expectation.
+    After(usize),
+    /// End of the window of this expectation.
+    Before(usize),
+    /// Second argument of this measure of this expectation.
+    Second(usize, usize),
 }
 
 /// One combination of an experiment's sweeps, lowered.
@@ -44,6 +73,10 @@ pub struct Variant {
     pub program: crate::program::Program,
     /// What to run.
     pub experiment: plan::Experiment,
+    /// Numbers of the plan that follow from expressions.
+    pub places: Vec<(Place, ExprId)>,
+    /// Inputs of a linearisation, each with the slot along which it moves; and its outputs.
+    pub ports: (Vec<(String, Slot)>, Vec<(String, Slot)>),
 }
 
 /// The default of an adaptive run.
@@ -136,6 +169,8 @@ struct Given {
     step: Option<f64>,
     tol: Option<f64>,
     duration: Option<f64>,
+    vary: Vec<String>,
+    ports: Option<Ports>,
 }
 
 /// `PATH = VALUE`
@@ -143,6 +178,31 @@ struct Set {
     path: ast::Path,
     expr: Option<Expr>,
     instance: Option<ast::Instance>,
+}
+
+/// Changes of values from outside, read.
+pub struct Overrides(Vec<Set>);
+
+impl Overrides {
+    /// One by one.
+    pub fn iter(&self) -> impl Iterator<Item = ChangeOf<'_>> {
+        self.0.iter().map(|set| ChangeOf(Given::change(set)))
+    }
+}
+
+/// One of them.
+pub struct ChangeOf<'a>(Change<'a>);
+
+impl<'a> ChangeOf<'a> {
+    /// As flattening takes it; its value is read in the scope of this file.
+    pub fn override_in(&self, file: FileId) -> Override<'a> {
+        Override { path: self.0.path, value: self.0.value, file }
+    }
+}
+
+/// Reads changes of values from outside.
+pub fn overrides(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Overrides {
+    Overrides(Given::read(loaded, changes, diagnostics).set)
 }
 
 impl Given {
@@ -171,8 +231,8 @@ impl Given {
                 }
             }
         }
-        let &Changes { method, step, tol, duration, .. } = changes;
-        Given { set, method, step, tol, duration }
+        let Changes { method, step, tol, duration, vary, ports, .. } = changes.clone();
+        Given { set, method, step, tol, duration, vary, ports }
     }
 
     fn change(set: &Set) -> Change<'_> {
@@ -448,7 +508,9 @@ fn variant(
         Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
-    let (system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
+    let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
+    let ports = given.ports.as_ref().map(|ports| crate::linearise::open(&mut system, ports, &mut diagnostics));
+    let ports = ports.unwrap_or_default();
     on_stage("check");
     let types = units::check(&system, &loaded.files, &mut diagnostics);
     if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
@@ -464,12 +526,17 @@ fn variant(
         return Err(diagnostics);
     }
     diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
-    let mut reader = Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new() };
+    let (places, vary) = (Vec::new(), &given.vary[..]);
+    let mut reader =
+        Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
 
     let corners = evaluate(&system, &types, &system.corners);
     let duration = match (given.duration, duration) {
         (Some(duration), _) => duration,
-        (None, Some(at)) => reader.time(nodes[at], "the duration"),
+        (None, Some(at)) => {
+            reader.places.push((Place::Duration, nodes[at]));
+            reader.time(nodes[at], "the duration")
+        }
         (None, None) => match data.first().and_then(|(_, table, _)| table.x.last()) {
             Some(end) => *end,
             None => {
@@ -501,10 +568,13 @@ fn variant(
         series_at.push((shows, against));
     }
     let mut expects_at = Vec::new();
-    for (expect, at) in parts.expects.iter().zip(&expects) {
+    for (k, (expect, at)) in parts.expects.iter().zip(&expects).enumerate() {
+        reader.expect = k;
         expects_at.push(reader.expect(expect, at, &nodes, duration));
     }
+    let ports_at: Vec<usize> = ports.outputs.iter().map(|(_, node)| reader.want(*node, None)).collect();
     let (wanted, diagnostics) = (std::mem::take(&mut reader.wanted), std::mem::take(&mut reader.diagnostics));
+    let places = std::mem::take(&mut reader.places);
     if diagnostics.iter().any(Diagnostic::is_error) {
         return Err(diagnostics);
     }
@@ -552,7 +622,13 @@ fn variant(
     corners.sort_by(f64::total_cmp);
     corners.dedup();
     let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };
-    Ok(Variant { label, system, types, program, experiment })
+    let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
+        let quantity = program.description.quantity(moved)?;
+        Some((path.clone(), quantity.slot))
+    });
+    let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
+    let ports = (inputs.collect(), outputs.collect());
+    Ok(Variant { label, system, types, program, experiment, places, ports })
 }
 
 /// Whether what is said concerns something outside of a place.
@@ -579,9 +655,19 @@ struct Reader<'a> {
     types: &'a Types,
     diagnostics: Vec<Diagnostic>,
     wanted: Vec<Wanted>,
+    places: Vec<(Place, ExprId)>,
+    /// Parameters that will change.
+    vary: &'a [String],
+    /// Number of the expectation that is read.
+    expect: usize,
 }
 
 impl Reader<'_> {
+    /// Whether the value changes with a parameter that does.
+    fn varies(&self, expr: ExprId) -> bool {
+        !self.vary.is_empty() && depends(self.system, expr, &|var| self.vary.contains(&var.path))
+    }
+
     fn constant(&self, expr: ExprId) -> f64 {
         literal(self.system, expr).unwrap_or_else(|| evaluate(self.system, self.types, &[expr])[0])
     }
@@ -630,6 +716,9 @@ impl Reader<'_> {
             method
         });
         let method = given.method.or(written).unwrap_or(Method::Adaptive);
+        if let (None, Some(step)) = (given.step, step) {
+            self.places.push((Place::Step, step));
+        }
         let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
@@ -743,6 +832,9 @@ impl Reader<'_> {
                 }
             }
         };
+        for (at, place) in [(at.after, Place::After(self.expect)), (at.before, Place::Before(self.expect))] {
+            self.places.extend(at.map(|at| (place, nodes[at])));
+        }
         let mut edge = |at: Option<usize>, default: f64| match at {
             Some(at) if self.constant(nodes[at]) == 0.0 => 0.0,
             Some(at) => self.time(nodes[at], "a window"),
@@ -776,6 +868,10 @@ impl Reader<'_> {
             if let Some(value) = literal(self.system, id) {
                 return Some(Formula::Number(value));
             }
+            if self.varies(id) {
+                // It is constant in a run, but not the same in each.
+                return Some(self.measure(id, id, MeasureKind::Final, measures));
+            }
             let value = self.constant(id);
             if !value.is_nan() {
                 return Some(Formula::Number(value));
@@ -792,6 +888,9 @@ impl Reader<'_> {
         };
         match node {
             Node::Measure(name, value, second) => {
+                if let Some(second) = second {
+                    self.places.push((Place::Second(self.expect, measures.len()), second));
+                }
                 let second = second.map(|second| self.constant(second));
                 let kind = match name {
                     MeasureName::Min => MeasureKind::Min,
@@ -875,6 +974,31 @@ impl Reader<'_> {
         let node = self.system.node(id);
         matches!(node, Node::Measure(..)) || node.operands().any(|operand| self.measured(operand))
     }
+}
+
+/// Whether an expression depends on a quantity for which `of` is true.
+pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool {
+    let mut seen = std::collections::HashSet::new();
+    let mut stack = vec![expr];
+    while let Some(id) = stack.pop() {
+        if !seen.insert(id) {
+            continue;
+        }
+        if let Node::Var(var) = system.node(id) {
+            let var = system.var(*var);
+            if of(var) {
+                return true;
+            }
+            match var.definition {
+                Definition::Value(value, _) | Definition::Held { value, .. } => stack.push(value),
+                Definition::Continuous { initial, rate, .. } => stack.extend([initial, rate]),
+                Definition::Sampled { initial, next, .. } => stack.extend([initial, next]),
+                Definition::Missing | Definition::Free => {}
+            }
+        }
+        stack.extend(system.node(id).operands());
+    }
+    false
 }
 
 fn compare(op: BinaryOp, a: Formula, b: Formula) -> Formula {

@@ -25,7 +25,9 @@ pub mod domains;
 pub mod friction;
 pub mod lints;
 pub mod explain;
+pub mod linearise;
 pub mod experiment;
+pub mod vary;
 
 pub use experiment::Changes;
 pub use resolve::{ExperimentInfo, Loaded, load};
@@ -75,14 +77,134 @@ pub fn compile(
 ) -> Result<Vec<Case>, Vec<Diagnostic>> {
     let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, on_stage)?;
     on_stage("code");
-    let cases = variants.into_iter().map(|variant| case(variant, options.interpret)).collect();
+    let mut made = None;
+    let cases = variants.into_iter().map(|variant| case(variant, options.interpret, &mut made)).collect();
     Ok(cases)
 }
 
-fn case(variant: experiment::Variant, interpret: bool) -> Case {
+/// Compiles an experiment once for many runs under other values of the parameters in `options.changes.vary`: one for
+/// each combination of its own sweeps.
+///
+/// # Errors
+/// Everything that is wrong with the experiment and the models it runs.
+pub fn varying(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Vec<vary::Varying>, Vec<Diagnostic>> {
+    let paths = &options.changes.vary;
+    let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
+    let one = |variant: experiment::Variant| {
+        // What is described keeps its ranges; the code of a fixed step loses those that change.
+        let mut coded = variant.program.clone();
+        coded.description.guards = vary::in_code(&variant, paths);
+        let functions = functions(&coded, variant.experiment.solver.method);
+        let (code, notes) = code(&functions, &coded.description, options.interpret);
+        vary::Varying::new(variant, paths, &loaded.files, code, notes)
+    };
+    Ok(variants.into_iter().map(one).collect())
+}
+
+/// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
+/// experiment's sweeps counts.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn linear(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<linearise::Linear, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let model = ast.items.iter().find_map(|item| match item {
+        Item::Model(model) if model.name.text == name => Some(model),
+        _ => None,
+    });
+    let Some(model) = model else {
+        let variants = experiment::read(loaded, sources, name, &options.changes, warnings, &mut |_| ())?;
+        let variant = variants.into_iter().next().expect("there is at least one combination");
+        let mut functions = functions(&variant.program, variant.experiment.solver.method);
+        if !functions.iter().any(|(function, _)| *function == Function::Derivatives) {
+            functions.push((Function::Derivatives, math::expand(&variant.program.derivatives)));
+        }
+        let (code, _) = code(&functions, &variant.program.description, options.interpret);
+        let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
+        return Ok(linearise::Linear::new(&variant.program, instance, Some(variant.experiment), &variant.ports));
+    };
+    let overrides = experiment::overrides(loaded, &options.changes, warnings);
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, root),
+        overrides: overrides.iter().map(|change| change.override_in(root)).collect(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    let ports = options.changes.ports.clone().unwrap_or_default();
+    let opened = linearise::open(&mut system, &ports, &mut diagnostics);
+    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        causality::check(&system, &loaded.files, &mut diagnostics);
+    }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    warnings.extend(diagnostics);
+    let wanted: Vec<lower::Wanted> = opened
+        .outputs
+        .iter()
+        .map(|(path, expr)| lower::Wanted { expr: *expr, text: path.clone(), unit: None })
+        .collect();
+    let lower::Lowered { program, observed } = lower::lower(&system, &types, &wanted);
+    let slot = |path: &str| program.description.quantity(path).map(|quantity| quantity.slot);
+    let inputs = opened.inputs.iter().filter_map(|(path, moved)| Some((path.clone(), slot(moved)?)));
+    let outputs = opened.outputs.iter().zip(observed).map(|((path, _), slot)| (path.clone(), slot));
+    let ports = (inputs.collect(), outputs.collect());
+    let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
+    let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    Ok(linearise::Linear::new(&program, instance, None, &ports))
+}
+
+/// Code of the last case, and what it was made from.
+struct Made {
+    functions: Vec<(Function, ir::Func)>,
+    layout: abi::description::Layout,
+    pool: Arc<[f64]>,
+    code: Code,
+    notes: Vec<String>,
+}
+
+impl Made {
+    /// Whether the code of a program with these functions is the same. Numbers are compared by their bits.
+    fn fits(&self, functions: &[(Function, ir::Func)], description: &abi::Description) -> bool {
+        let bits = |pool: &[f64]| pool.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
+        self.layout == description.layout
+            && bits(&self.pool) == bits(&description.pool)
+            && self.functions.len() == functions.len()
+            && self.functions.iter().zip(functions).all(|(a, b)| a == b)
+    }
+}
+
+/// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
+fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
     let program = &variant.program;
     let functions = functions(program, variant.experiment.solver.method);
-    let (code, notes) = code(&functions, &program.description, interpret);
+    let (code, notes) = match made {
+        Some(made) if made.fits(&functions, &program.description) => (made.code.clone(), made.notes.clone()),
+        _ => {
+            let (code, notes) = code(&functions, &program.description, interpret);
+            let (layout, pool) = (program.description.layout.clone(), program.description.pool.clone());
+            *made = Some(Made { functions, layout, pool, code: code.clone(), notes: notes.clone() });
+            (code, notes)
+        }
+    };
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     Case { label: variant.label, instance, experiment: variant.experiment, notes }
 }
@@ -122,6 +244,47 @@ pub fn code(
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
         Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
     }
+}
+
+/// Whether a friction model dissipates, with the parameters that the arguments of an instance give it. None for what
+/// does not fit `Friction`, or has a part or input that stays open.
+pub fn dissipation(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    instance: &grammar::ast::Instance,
+    file: FileId,
+) -> Option<friction::Verdict> {
+    use grammar::ast;
+    let resolve::Lookup::Found(item, Item::Model(model)) =
+        loaded.find(file, resolve::Space::Type, &instance.model.text)
+    else {
+        return None;
+    };
+    let path = |bind: &ast::Bind| ast::Path {
+        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
+        span: bind.name.span,
+    };
+    let paths: Vec<ast::Path> = instance.args.iter().map(path).collect();
+    let given = paths.iter().zip(&instance.args).map(|(path, bind)| {
+        let value = match &bind.value {
+            ast::BindValue::Expr(expr) => flatten::OverrideValue::Expr(expr),
+            ast::BindValue::Instance(instance) => flatten::OverrideValue::Instance(instance),
+        };
+        flatten::Override { path, value, file }
+    });
+    let request = flatten::Request {
+        instance: flatten::Instance::Alone(model, item.file),
+        overrides: given.collect(),
+        observed: Vec::new(),
+        data: Vec::new(),
+    };
+    let flat = flatten::flatten(loaded, sources, &request);
+    let mut diagnostics = flat.diagnostics;
+    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return None;
+    }
+    friction::dissipation(&flat.system, &types)
 }
 
 /// Explains a model of a loaded text, on its own.

@@ -12,7 +12,7 @@ use crate::units::Types;
 use abi::description::{Automaton, Description, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 /// Where the value of a quantity lies while a model runs.
@@ -102,6 +102,23 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);
     evaluate_in(&plan, exprs)
+}
+
+/// The function that computes expressions from the parameters in a block, as at the start; and the size of the block, in
+/// whose last slots their values are.
+pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
+    let mut pool = crate::math::POOL.to_vec();
+    let tables = place_tables(system, &mut pool);
+    let mut plan = Plan::new(system, types, &[], tables);
+    plan.description.pool = Arc::from(pool);
+    let mut emit = Emit::new(&plan, "formulas", Phase::Start);
+    let from = plan.description.layout.size();
+    for (k, expr) in exprs.iter().enumerate() {
+        let value = emit.value(*expr);
+        let value = if types.boolean[expr.0 as usize] { emit.number(value) } else { value };
+        emit.build.store(Slot((from + k) as u32), value);
+    }
+    (crate::math::expand(&emit.build.finish()), from + exprs.len())
 }
 
 fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
@@ -583,16 +600,18 @@ impl<'a> Plan<'a> {
 
     /// Surfaces on which a branch of what moves the states changes, or a transition or event happens.
     fn roots(&self, mut emit: Emit) -> (Func, Vec<Root>) {
+        // Conditions first: a surface that a branch shares with a condition counts as the condition's.
         let mut from: Vec<ExprId> = Vec::new();
+        for automaton in &self.system.automata {
+            from.extend(automaton.regimes.iter().flat_map(|regime| &regime.transitions).map(|t| t.condition));
+        }
+        from.extend(self.system.events.iter().map(|event| event.condition));
+        let deciding = self.comparisons(&from);
         for id in &self.states {
             if let Definition::Continuous { rate, .. } = self.system.var(*id).definition {
                 from.push(rate);
             }
         }
-        for automaton in &self.system.automata {
-            from.extend(automaton.regimes.iter().flat_map(|regime| &regime.transitions).map(|t| t.condition));
-        }
-        from.extend(self.system.events.iter().map(|event| event.condition));
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
@@ -673,9 +692,25 @@ impl<'a> Plan<'a> {
         let mut roots = Vec::new();
         for (k, (value, id)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
-            roots.push(Root { text: self.root_text(*id) });
+            roots.push(Root { text: self.root_text(*id), decides: deciding.contains(id) });
         }
         (emit.build.finish(), roots)
+    }
+
+    /// The comparisons and crossings that conditions are joined of.
+    fn comparisons(&self, conditions: &[ExprId]) -> HashSet<ExprId> {
+        let mut out = HashSet::new();
+        let mut stack = conditions.to_vec();
+        while let Some(id) = stack.pop() {
+            match self.system.node(id) {
+                Node::Binary(BinaryOp::And | BinaryOp::Or, a, b) => stack.extend([*a, *b]),
+                Node::Not(a) => stack.push(*a),
+                _ => {
+                    out.insert(id);
+                }
+            }
+        }
+        out
     }
 
     /// A short name of a surface; the caller knows the text.

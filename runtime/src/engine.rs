@@ -4,9 +4,10 @@
 //! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
-use crate::observe::{Observer, check_finite, check_status};
+use crate::observe::{Observer, Probe, check_finite, check_status};
 use crate::outcome::Stop;
 pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
+use crate::record::Recording;
 use crate::show;
 use crate::solver::adaptive;
 use abi::description::Kind;
@@ -35,17 +36,31 @@ pub fn run(
     experiment: &Experiment,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> Result<Outcome, Failure> {
-    let duration = experiment.duration;
-    assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
     let mut run = Run::new(instance, experiment);
-    let result = match experiment.solver.method {
-        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => run.fixed(watch),
-        Method::Adaptive => adaptive::run(&mut run.instance, experiment, &mut run.observer, &mut run.work, watch),
-    };
-    match result {
+    match run.go(watch) {
         Ok(()) => Ok(run.outcome()),
         Err(stop) => Err(Failure { cause: stop.cause, time: stop.time, recording: run.observer.recorder.recording() }),
     }
+}
+
+/// Values of `slots` at instants in s, ascending, row by row: the rows up to where the run came, and how it ended. An
+/// adaptive run is read between its steps; of fixed steps the one nearest counts. Nothing is measured or recorded.
+///
+/// # Panics
+/// As [`run`].
+pub fn sample(
+    instance: Instance,
+    experiment: &Experiment,
+    instants: &[f64],
+    slots: &[Slot],
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> (Vec<f64>, Result<(), Failure>) {
+    let bare = Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() };
+    let mut run = Run::new(instance, &bare);
+    run.observer.probe = Probe::new(instants, slots);
+    let result = run.go(watch);
+    let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
+    (run.observer.probe.values(), result.map_err(failed))
 }
 
 /// A run under way.
@@ -63,6 +78,17 @@ impl<'a> Run<'a> {
         Run { instance, experiment, observer, work: Work::default(), notes: Vec::new() }
     }
 
+    fn go(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+        let duration = self.experiment.duration;
+        assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
+        match self.experiment.solver.method {
+            Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => self.fixed(watch),
+            Method::Adaptive => {
+                adaptive::run(&mut self.instance, self.experiment, &mut self.observer, &mut self.work, watch)
+            }
+        }
+    }
+
     /// A whole number of fixed steps.
     fn fixed(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
         let step = self.experiment.solver.step;
@@ -72,16 +98,17 @@ impl<'a> Run<'a> {
         if (end - self.experiment.duration).abs() > 1e-9 * self.experiment.duration {
             self.notes.push(format!("The run ends at {}, after a whole number of steps.", show::time(end)));
         }
-        let each = !self.observer.only_last();
+        let each = !self.observer.only_last() || self.observer.probe.next().is_some();
         let status = self.instance.start(step);
         check_status(&self.instance, status)?;
         check_finite(&self.instance)?;
         self.observer.see(&self.instance)?;
+        self.probe(step);
         let mut saved = self.instance.block().to_vec();
         while self.work.steps < total {
             let count = BATCH.min(total - self.work.steps);
             saved.copy_from_slice(self.instance.block());
-            let status = if each { self.seen_steps(count)? } else { self.instance.advance(count) };
+            let status = if each { self.seen_steps(step, count)? } else { self.instance.advance(count) };
             // In a batch, what was not finite may have become so many steps ago, and may be why a guard fired.
             if check_finite(&self.instance).is_err() {
                 self.instance.block_mut().copy_from_slice(&saved);
@@ -106,15 +133,24 @@ impl<'a> Run<'a> {
     }
 
     /// Steps one by one, each shown; returns the first status that is not 0.
-    fn seen_steps(&mut self, count: u64) -> Result<u64, Stop> {
+    fn seen_steps(&mut self, step: f64, count: u64) -> Result<u64, Stop> {
         for _ in 0..count {
             let status = self.instance.advance(1);
             self.observer.see(&self.instance)?;
+            self.probe(step);
             if status != 0 {
                 return Ok(status);
             }
         }
         Ok(0)
+    }
+
+    /// Keeps what is wanted at an instant that this step is nearest to.
+    fn probe(&mut self, step: f64) {
+        let time = self.instance.get(Slot::TIME);
+        while self.observer.probe.next().is_some_and(|instant| instant < time + 0.5 * step) {
+            self.observer.probe.take(self.instance.block());
+        }
     }
 
     /// Repeats the last batch step by step up to where a state or output is not finite.

@@ -19,5 +19,7 @@ mod solver;
 pub mod engine;
 pub mod sweep;
 
+pub mod modes;
+
 #[cfg(test)]
 mod models;

@@ -178,7 +178,7 @@ impl Model {
             ticks: ticks.collect(),
             automata: automata.collect(),
             guards,
-            roots: self.roots.iter().map(|text| Root { text: (*text).into() }).collect(),
+            roots: self.roots.iter().map(|text| Root { text: (*text).into(), decides: true }).collect(),
             pool: Arc::new([]),
             layout,
         };

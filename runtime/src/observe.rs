@@ -16,6 +16,38 @@ pub(crate) struct Observer {
     pub(crate) recorder: Recorder,
     /// Slots that are read; each must be finite.
     slots: Vec<Slot>,
+    /// Values that are wanted at given instants.
+    pub(crate) probe: Probe,
+}
+
+/// Values of some slots at given instants, ascending.
+#[derive(Default)]
+pub(crate) struct Probe {
+    instants: Vec<f64>,
+    slots: Vec<Slot>,
+    /// Row by row, one for each instant passed.
+    values: Vec<f64>,
+}
+
+impl Probe {
+    pub(crate) fn new(instants: &[f64], slots: &[Slot]) -> Probe {
+        Probe { instants: instants.to_vec(), slots: slots.to_vec(), values: Vec::new() }
+    }
+
+    /// The next instant, in s.
+    pub(crate) fn next(&self) -> Option<f64> {
+        let row = if self.slots.is_empty() { return None } else { self.values.len() / self.slots.len() };
+        self.instants.get(row).copied()
+    }
+
+    /// The values at that instant.
+    pub(crate) fn take(&mut self, block: &[f64]) {
+        self.values.extend(self.slots.iter().map(|slot| block[slot.index()]));
+    }
+
+    pub(crate) fn values(self) -> Vec<f64> {
+        self.values
+    }
 }
 
 impl Observer {
@@ -30,7 +62,7 @@ impl Observer {
         let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
         slots.sort();
         slots.dedup();
-        Observer { expectations, recorder, slots }
+        Observer { expectations, recorder, slots, probe: Probe::default() }
     }
 
     /// Whether only the last point of a run matters.

@@ -1,13 +1,17 @@
 //! Runs many experiments on all cores.
 //!
-//! In: cases. Out: what became of each, in the order of the cases. Every case runs alone on one thread, so the
+//! In: cases, or numbers of runs. Out: what became of each, in their order. Every run is alone on one thread, so the
 //! results have the same bits for any number of threads.
 
 use crate::engine::{self, Continue, Failure, Outcome};
 use abi::Instance;
 use abi::plan::Experiment;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Condvar, Mutex};
+use std::time::Duration;
 
 /// One run of a sweep.
 #[derive(Clone)]
@@ -45,9 +49,114 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
     cases.par_iter().with_max_len(1).map(run).collect()
 }
 
+/// Results that wait for an earlier one, at most, for each thread.
+const WAITING: u64 = 64;
+
+/// Does `job` for each number of a range on `threads` threads and hands the results to `take` one by one in their order,
+/// as soon as they are there. Memory is bounded: nobody runs far ahead of the slowest. Ends early where `take` says so,
+/// or where a job gives nothing because it was stopped.
+pub fn ordered<T: Send>(
+    numbers: Range<u64>,
+    threads: usize,
+    job: &(dyn Fn(u64) -> Option<T> + Sync),
+    take: &mut dyn FnMut(u64, T) -> Continue,
+) {
+    struct Desk<T> {
+        next: u64,
+        taken: u64,
+        waiting: BTreeMap<u64, Option<T>>,
+        closed: bool,
+    }
+    let desk = Mutex::new(Desk { next: numbers.start, taken: numbers.start, waiting: BTreeMap::new(), closed: false });
+    let (room, news) = (Condvar::new(), Condvar::new());
+    let most = WAITING * threads.max(1) as u64;
+    let work = || {
+        loop {
+            let number = {
+                let mut desk = desk.lock().expect("nobody panics at the desk");
+                while desk.next >= desk.taken + most && !desk.closed {
+                    desk = room.wait(desk).expect("nobody panics at the desk");
+                }
+                if desk.closed || desk.next >= numbers.end {
+                    return;
+                }
+                desk.next += 1;
+                desk.next - 1
+            };
+            let result = job(number);
+            desk.lock().expect("nobody panics at the desk").waiting.insert(number, result);
+            news.notify_one();
+        }
+    };
+    std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(work)).collect();
+        let mut number = numbers.start;
+        while number < numbers.end {
+            let result = {
+                let mut desk = desk.lock().expect("nobody panics at the desk");
+                loop {
+                    if let Some(result) = desk.waiting.remove(&number) {
+                        desk.taken = number + 1;
+                        break result;
+                    }
+                    // A worker that panicked brings no more news: its panic is handed on by the scope.
+                    if workers.iter().any(|worker| worker.is_finished()) && desk.next < numbers.end {
+                        break None;
+                    }
+                    desk = news.wait_timeout(desk, Duration::from_millis(200)).expect("nobody panics at the desk").0;
+                }
+            };
+            room.notify_all();
+            let Some(result) = result else { break };
+            if take(number, result).is_break() {
+                break;
+            }
+            number += 1;
+        }
+        desk.lock().expect("nobody panics at the desk").closed = true;
+        room.notify_all();
+    });
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn results_come_in_order_whatever_the_threads() {
+        for threads in [1, 2, 5] {
+            let mut seen = Vec::new();
+            let job = |n: u64| {
+                // The first ones take longest.
+                (0..(1000 - n) * 20).for_each(|k| {
+                    std::hint::black_box(k);
+                });
+                Some(n * n)
+            };
+            ordered(3..1000, threads, &job, &mut |n, square| {
+                seen.push((n, square));
+                Continue::Continue(())
+            });
+            assert!(seen.iter().copied().eq((3..1000).map(|n| (n, n * n))), "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn what_is_done_is_kept_when_somebody_stops() {
+        let mut seen = 0;
+        ordered(0..1_000_000, 3, &Some, &mut |n, _| {
+            seen = n + 1;
+            if n == 500 { Continue::Break(()) } else { Continue::Continue(()) }
+        });
+        assert_eq!(seen, 501);
+        let mut seen = 0;
+        ordered(0..1_000_000, 3, &|n| (n < 700).then_some(n), &mut |n, _| {
+            seen = n + 1;
+            Continue::Continue(())
+        });
+        assert_eq!(seen, 700);
+        ordered(5..5, 2, &Some, &mut |_, _| unreachable!("there is nothing to do"));
+    }
     use crate::engine::Cause;
     use crate::models::{Model, fixed, plot, reading};
     use abi::Function;

@@ -1,10 +1,14 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod characterise;
 mod check;
+mod cross;
 mod explain;
 mod fmt;
+mod linearise;
 mod new;
 mod run;
+mod sweep;
 mod test;
 
 use crate::args::{Args, Command};
@@ -15,7 +19,7 @@ use clap::CommandFactory;
 use grammar::diagnostic::Diagnostic;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::{Continue, Failure, Outcome};
-use runtime::sweep;
+use runtime::sweep as runs;
 use std::path::Path;
 use std::time::Instant;
 
@@ -35,9 +39,13 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
     match &args.command {
         Command::Run(run) => run::run(run, terminal),
         Command::Test(test) => test::test(test, terminal),
+        Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
+        Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),
+        Command::Characterise(args) => characterise::characterise(args, terminal),
+        Command::Compare(args) => characterise::compare(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();
@@ -114,6 +122,11 @@ fn compiled(
     Ok((cases?, stages))
 }
 
+/// Reports what is wrong with a text.
+fn reported(loaded: &Loaded, diagnostics: &[Diagnostic], terminal: &Terminal) {
+    terminal.report(&report::full(&loaded.files.0, diagnostics, terminal.error_colour()));
+}
+
 /// Runs the cases of an experiment, with a bar on a terminal if it takes a while.
 fn done(cases: Vec<Case>, stages: Stages, quiet: bool) -> Done {
     let bar = ProgressBar::with_draw_target(
@@ -131,15 +144,15 @@ fn done(cases: Vec<Case>, stages: Stages, quiet: bool) -> Done {
         }
         Continue::Continue(())
     };
-    let runs: Vec<sweep::Case> = cases
+    let all: Vec<runs::Case> = cases
         .iter()
-        .map(|case| sweep::Case {
+        .map(|case| runs::Case {
             label: case.label.clone(),
             instance: case.instance.clone(),
             experiment: case.experiment.clone(),
         })
         .collect();
-    let results = sweep::run(&runs, &watch);
+    let results = runs::run(&all, &watch);
     let wall = begin.elapsed().as_secs_f64();
     bar.finish_and_clear();
     Done { cases, results, wall, stages }

@@ -1,5 +1,6 @@
 //! `fric run`: compiles experiments, runs them, shows and writes what they did.
 
+use super::cross::{Crossed, cross};
 use super::{Done, End, compiled, done, load};
 use crate::args::Run;
 use crate::compile::{Changes, Loaded, Options, Stages, Stopwatch};
@@ -35,6 +36,7 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         step: args.step,
         tol: args.tol,
         duration: args.duration,
+        ..Changes::default()
     };
     let options = Options { changes, interpret: args.interpret };
     let mut end = End::Fine;
@@ -97,11 +99,16 @@ fn experiment(
     }
 
     let done = done(cases, stages, !talking);
+    let crossed: Option<Vec<Crossed>> = match args.cross {
+        true => cross(loaded, name, options, &done.cases, terminal),
+        false => Some(Vec::new()),
+    };
+    let mut passed = crossed.as_ref().is_some_and(|all| all.iter().all(Crossed::passed));
+    let crossed = crossed.unwrap_or_default();
     let drawn = drawn(name, &done);
     // Files come first: when the reader of our words has gone, they are there all the same.
     let written = write(args, name, &done, drawn.as_ref());
-    let mut passed = true;
-    for (case, result) in done.cases.iter().zip(&done.results) {
+    for (k, (case, result)) in done.cases.iter().zip(&done.results).enumerate() {
         let ran = Ran {
             file: &file,
             experiment: &case.experiment,
@@ -114,13 +121,21 @@ fn experiment(
         };
         passed &= ran.passed();
         if args.json {
-            terminal.line(&ran.json().to_string());
+            let mut object = ran.json();
+            if let Some(crossed) = crossed.get(k) {
+                object["cross"] = crossed.json();
+            }
+            terminal.line(&object.to_string());
         }
     }
     if talking {
         tell(&done, drawn.as_ref(), terminal);
+        crossed.iter().for_each(|crossed| terminal.print(&crossed.words(terminal, "  ")));
     } else if args.quiet {
         complain(name, &done, terminal);
+        for crossed in crossed.iter().filter(|crossed| !crossed.passed()) {
+            terminal.report(&crossed.words(terminal, "  "));
+        }
     }
     for (case, result) in done.cases.iter().zip(&done.results) {
         if let Err(failure) = result {

@@ -1,5 +1,6 @@
 //! `fric test`: runs every experiment that expects something.
 
+use super::cross::{Crossed, cross};
 use super::{End, compiled, done, load};
 use crate::args::Test;
 use crate::compile::{Loaded, Options, Stages, Stopwatch};
@@ -68,7 +69,12 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, ter
         return false;
     };
     let done = done(cases, stages, args.quiet);
-    let passed = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));
+    let held = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));
+    let crossed = match args.cross && held {
+        true => cross(loaded, name, &options, &done.cases, terminal),
+        false => Some(Vec::new()),
+    };
+    let passed = held && crossed.as_ref().is_some_and(|all| all.iter().all(Crossed::passed));
     if !(passed && args.quiet) {
         terminal.line(&line(terminal, passed, name, &duration(done.wall)));
     }
@@ -82,6 +88,9 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, ter
             }
             Err(failure) => terminal.line(&format!("          {label}{failure}")),
         }
+    }
+    for crossed in crossed.iter().flatten().filter(|crossed| !args.quiet || !crossed.passed()) {
+        terminal.print(&crossed.words(terminal, "          "));
     }
     passed
 }

@@ -18,6 +18,7 @@ pub fn terminal(figure: &Figure, width: usize, colour: bool) -> String {
 }
 
 fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
+    let panel = &*panel.placed();
     let Some((xs, ys)) = panel.bounds() else {
         return format!("  {}: nothing finite to draw\n", panel.y.title());
     };
@@ -27,7 +28,7 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
         Scale::new(0.0, 1.0, 1)
     } else {
         let (low, high) = padded(ys, 0.03);
-        Scale::new(low, high, rows.div_ceil(3))
+        panel.y.scale(low, high, rows.div_ceil(3))
     };
     let names = panel.curves.len() > 1;
     let right = if names {
@@ -39,7 +40,7 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
     let left = y_axis.ticks.iter().map(|tick| tick.label.chars().count()).chain(band_names).max().unwrap_or(0);
     let left = left.clamp(4, NAME) + 2;
     let columns = width.saturating_sub(left + 2 + right).clamp(20, 160);
-    let x_axis = Scale::new(xs.0, xs.1, columns / 10);
+    let x_axis = panel.x.scale(xs.0, xs.1, columns / 10);
 
     let mut canvas = Canvas::new(columns, rows);
     let (dots_x, dots_y) = ((columns * 2) as f64, (rows * 4) as f64);

@@ -10,8 +10,9 @@ mod svg;
 
 pub use braille::terminal;
 pub use png::png;
-pub use svg::svg;
+pub use svg::{inline, svg};
 
+use scale::Scale;
 use std::borrow::Cow;
 
 /// Panels one above the other under one title.
@@ -45,6 +46,8 @@ pub struct Axis {
     pub name: String,
     /// Such as `mm/s`; empty for a pure number.
     pub unit: String,
+    /// In powers of ten; what is not positive leaves a gap.
+    pub logarithmic: bool,
 }
 
 /// Points joined by straight lines, in the order given; a point that is not finite leaves a gap.
@@ -56,6 +59,8 @@ pub struct Curve {
     pub points: Vec<(f64, f64)>,
     /// Only the values 0 and 1, held between points.
     pub boolean: bool,
+    /// Each point is a measured one and gets a mark.
+    pub marks: bool,
 }
 
 /// Where something is true.
@@ -68,6 +73,21 @@ pub struct Band {
 }
 
 impl Axis {
+    /// The scale for values between `from` and `to`, which are exponents on a logarithmic axis.
+    fn scale(&self, from: f64, to: f64, count: usize) -> Scale {
+        if self.logarithmic { Scale::decades(from, to, count) } else { Scale::new(from, to, count) }
+    }
+
+    /// Where a value is drawn: at its exponent on a logarithmic axis.
+    #[expect(clippy::disallowed_methods, reason = "a picture, not a result")]
+    fn place(&self, value: f64) -> f64 {
+        match self.logarithmic {
+            true if value > 0.0 => value.log10(),
+            true => f64::NAN,
+            false => value,
+        }
+    }
+
     /// `name [unit]`.
     pub fn title(&self) -> String {
         match (self.name.as_str(), self.unit.as_str()) {
@@ -120,6 +140,18 @@ impl Curve {
 }
 
 impl Panel {
+    /// The panel with the points of its curves where they are drawn.
+    fn placed(&self) -> Cow<'_, Panel> {
+        if !self.x.logarithmic && !self.y.logarithmic {
+            return Cow::Borrowed(self);
+        }
+        let mut panel = self.clone();
+        for point in panel.curves.iter_mut().flat_map(|curve| &mut curve.points) {
+            *point = (self.x.place(point.0), self.y.place(point.1));
+        }
+        Cow::Owned(panel)
+    }
+
     /// Least and greatest finite x and y of all curves, or none if nothing is finite.
     fn bounds(&self) -> Option<((f64, f64), (f64, f64))> {
         let points = self.curves.iter().flat_map(|curve| &curve.points);

@@ -68,6 +68,36 @@ impl Scale {
         Scale { from, to, ticks, note }
     }
 
+    /// A logarithmic axis between two exponents of ten: ticks at powers of ten, and at 2 and 5 where there are few.
+    pub fn decades(from: f64, to: f64, count: usize) -> Scale {
+        /// Decimal logarithms of 2 and 5.
+        const BETWEEN: [(&str, f64); 2] = [("2", 0.301_029_995_663_981_2), ("5", 0.698_970_004_336_018_8)];
+        let (from, to) = opened(from, to);
+        let (first, last) = (from.floor() as i32, to.ceil() as i32);
+        let every = ((last - first).max(1) as usize).div_ceil(count.max(1)) as i32;
+        let few = to - from < 2.0;
+        let mut ticks = Vec::new();
+        for exponent in first..=last {
+            if exponent % every == 0 {
+                let label = match exponent {
+                    -2..4 => format!("{}", ten_to(exponent)),
+                    exponent => format!("10{}", raised(exponent)),
+                };
+                ticks.push(Tick { at: f64::from(exponent), label });
+            }
+            for (digit, part) in BETWEEN.iter().filter(|_| few) {
+                let label = match exponent {
+                    0 => (*digit).into(),
+                    -2..4 => format!("{}", digit.parse::<f64>().expect("a digit") * ten_to(exponent)),
+                    exponent => format!("{digit}·10{}", raised(exponent)),
+                };
+                ticks.push(Tick { at: f64::from(exponent) + part, label });
+            }
+        }
+        ticks.retain(|tick| tick.at >= from - 1e-9 && tick.at <= to + 1e-9);
+        Scale { from, to, ticks, note: String::new() }
+    }
+
     /// Position of a value, 0 at the lower end and 1 at the upper one.
     pub fn position(&self, value: f64) -> f64 {
         // Halved, so that the difference of huge ends stays finite.
@@ -147,6 +177,16 @@ mod tests {
         assert_eq!(labels(-1.5, 1.5, 4).0, ["-1", "0", "1"]);
         assert_eq!(labels(0.0, 0.0153, 4).0, ["0", "0.005", "0.010", "0.015"]);
         assert_eq!(labels(0.0, 99999.0, 2).0, ["0", "50000"]);
+    }
+
+    #[test]
+    fn decades_are_powers_of_ten() {
+        let labels = |from: f64, to: f64, count: usize| {
+            Scale::decades(from, to, count).ticks.into_iter().map(|tick| tick.label).collect::<Vec<_>>()
+        };
+        assert_eq!(labels(-6.0, 0.0, 8), ["10⁻⁶", "10⁻⁵", "10⁻⁴", "10⁻³", "0.01", "0.1", "1"]);
+        assert_eq!(labels(-0.05, 1.05, 8), ["1", "2", "5", "10"]);
+        assert_eq!(labels(-1.5, -0.5, 4), ["0.05", "0.1", "0.2"]);
     }
 
     #[test]

@@ -26,6 +26,11 @@ const DASHES: [&str; 3] = ["", "7 4", "2 3"];
 
 /// The figure as text.
 pub fn svg(figure: &Figure) -> String {
+    inline(figure, WIDTH, "axes")
+}
+
+/// The figure as text, `wide` px wide, for a page that holds several: `id` sets its names apart from theirs.
+pub fn inline(figure: &Figure, wide: f64, id: &str) -> String {
     let mut body = String::new();
     let mut y = 18.0;
     if !figure.title.is_empty() {
@@ -42,17 +47,19 @@ pub fn svg(figure: &Figure) -> String {
     }
     if !figure.subtitle.is_empty() {
         y += 12.0;
-        let shown = fitted(&figure.subtitle, WIDTH - LEFT - RIGHT, 12.5);
+        let shown = fitted(&figure.subtitle, wide - LEFT - RIGHT, 12.5);
         text(&mut body, LEFT, y, "start", &format!("font-size=\"12.5\" fill=\"{FAINT}\""), &shown);
         y += 8.0;
     }
     y += 8.0;
     for (number, panel) in figure.panels.iter().enumerate() {
-        y = draw_panel(&mut body, panel, number, y, height(panel, figure.panels.len())) + GAP;
+        let id = format!("{id}{number}");
+        let tall = (height(panel, figure.panels.len()) * (wide / WIDTH).sqrt()).round();
+        y = draw_panel(&mut body, &panel.placed(), &id, y, (wide, tall)) + GAP;
     }
     let title = escaped(&figure.title);
     format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{WIDTH}\" height=\"{y:.0}\" viewBox=\"0 0 {WIDTH} {y:.0}\" \
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{wide}\" height=\"{y:.0}\" viewBox=\"0 0 {wide} {y:.0}\" \
          role=\"img\" font-family=\"Roboto, 'Helvetica Neue', Arial, sans-serif\" font-size=\"{TEXT}\">\n\
          <title>{title}</title>\n<rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n{body}</svg>\n"
     )
@@ -74,38 +81,39 @@ fn is_boolean(panel: &Panel) -> bool {
     !panel.curves.is_empty() && panel.curves.iter().all(|curve| curve.boolean)
 }
 
-/// Draws a panel whose top is at `top`; returns its bottom.
-fn draw_panel(out: &mut String, panel: &Panel, number: usize, top: f64, height: f64) -> f64 {
-    let top = legend(out, panel, top) + 8.0;
-    let (width, bottom) = (WIDTH - LEFT - RIGHT, top + height);
+/// Draws a panel whose top is at `top`; returns its bottom. Its size is the width of the figure and the height of its
+/// axes.
+fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height): (f64, f64)) -> f64 {
+    let top = legend(out, panel, top, wide) + 8.0;
+    let (width, bottom) = (wide - LEFT - RIGHT, top + height);
     let bounds = panel.bounds();
     let (xs, ys) = bounds.unwrap_or(((0.0, 1.0), (0.0, 1.0)));
     let running = panel.curves.iter().all(|curve| curve.points.windows(2).all(|pair| pair[0].0 <= pair[1].0));
     // Time fills the width; a loop in the plane keeps clear of the frame.
     let xs = if running { xs } else { padded(xs, 0.04) };
-    let x_axis = Scale::new(xs.0, xs.1, 8);
+    let x_axis = panel.x.scale(xs.0, xs.1, (width / 90.0) as usize);
     let y_axis = if is_boolean(panel) {
         let mut axis = Scale::new(-0.15, 1.15, 2);
         axis.ticks.retain(|tick| tick.at == 0.0 || tick.at == 1.0);
         axis
     } else {
         let (low, high) = padded(ys, 0.06);
-        Scale::new(low, high, (height / 38.0) as usize)
+        panel.y.scale(low, high, (height / 38.0) as usize)
     };
     let px = |value: f64| LEFT + width * x_axis.position(value);
     let py = |value: f64| bottom - height * y_axis.position(value);
 
     let _ = writeln!(
         out,
-        "<clipPath id=\"axes{number}\"><rect x=\"{LEFT}\" y=\"{top:.1}\" width=\"{width}\" height=\"{height}\"/></clipPath>"
+        "<clipPath id=\"{id}\"><rect x=\"{LEFT}\" y=\"{top:.1}\" width=\"{width}\" height=\"{height}\"/></clipPath>"
     );
     for (band, shade) in panel.bands.iter().zip(SHADES.iter().cycle()) {
         for &(from, to) in &merged(&band.stretches, (xs.1 - xs.0) / width) {
             let (from, to) = (px(from).max(LEFT), px(to).min(LEFT + width));
-            let wide = (to - from).max(0.5);
+            let breadth = (to - from).max(0.5);
             let _ = writeln!(
                 out,
-                "<rect x=\"{from:.1}\" y=\"{top:.1}\" width=\"{wide:.1}\" height=\"{height}\" fill=\"{shade}\"/>"
+                "<rect x=\"{from:.1}\" y=\"{top:.1}\" width=\"{breadth:.1}\" height=\"{height}\" fill=\"{shade}\"/>"
             );
         }
     }
@@ -127,17 +135,22 @@ fn draw_panel(out: &mut String, panel: &Panel, number: usize, top: f64, height: 
         text(out, LEFT - 9.0, y + 4.5, "end", &format!("fill=\"{INK}\""), &label);
     }
     let _ = writeln!(out, "<path d=\"{grid}\" stroke=\"{GRID}\" fill=\"none\"/>");
-    if y_axis.from < 0.0 && y_axis.to > 0.0 && !is_boolean(panel) {
+    if y_axis.from < 0.0 && y_axis.to > 0.0 && !is_boolean(panel) && !panel.y.logarithmic {
         let y = py(0.0);
         let _ = writeln!(out, "<path d=\"M{LEFT} {y:.1}H{:.1}\" stroke=\"#a8b0b9\" fill=\"none\"/>", LEFT + width);
     }
 
     let _ = writeln!(
         out,
-        "<g clip-path=\"url(#axes{number})\" fill=\"none\" stroke-width=\"1.7\" stroke-linejoin=\"round\" \
+        "<g clip-path=\"url(#{id})\" fill=\"none\" stroke-width=\"1.7\" stroke-linejoin=\"round\" \
          stroke-linecap=\"round\">"
     );
     for (i, curve) in panel.curves.iter().enumerate() {
+        for &(x, y) in curve.points.iter().filter(|(x, y)| curve.marks && x.is_finite() && y.is_finite()) {
+            let colour = PALETTE[i % PALETTE.len()];
+            let _ =
+                writeln!(out, "<circle cx=\"{}\" cy=\"{}\" r=\"3\" fill=\"{colour}\"/>", tenth(px(x)), tenth(py(y)));
+        }
         let path = path(curve, px, py, width, height);
         if !path.is_empty() {
             let _ = writeln!(out, "<path d=\"{path}\" {}/>", stroke(i));
@@ -178,7 +191,7 @@ fn draw_panel(out: &mut String, panel: &Panel, number: usize, top: f64, height: 
 }
 
 /// Names of curves and bands, where there are several; returns the bottom.
-fn legend(out: &mut String, panel: &Panel, top: f64) -> f64 {
+fn legend(out: &mut String, panel: &Panel, top: f64, wide: f64) -> f64 {
     if panel.curves.len() + panel.bands.len() < 2 {
         return top + 4.0;
     }
@@ -187,9 +200,9 @@ fn legend(out: &mut String, panel: &Panel, top: f64) -> f64 {
     let (mut x, mut y) = (LEFT, top + 14.0);
     let mut shade = SHADES.iter().cycle();
     for (name, curve) in curves.chain(bands) {
-        let name = fitted(name, WIDTH - LEFT - RIGHT - 40.0, TEXT);
-        let wide = 30.0 + text_width(&name, TEXT);
-        if x > LEFT && x + wide > WIDTH - RIGHT {
+        let name = fitted(name, wide - LEFT - RIGHT - 40.0, TEXT);
+        let taken = 30.0 + text_width(&name, TEXT);
+        if x > LEFT && x + taken > wide - RIGHT {
             x = LEFT;
             y += ROW;
         }
@@ -207,7 +220,7 @@ fn legend(out: &mut String, panel: &Panel, top: f64) -> f64 {
             ),
         };
         text(out, x + 28.0, y, "start", &format!("fill=\"{INK}\""), &name);
-        x += wide + 18.0;
+        x += taken + 18.0;
     }
     y + 4.0
 }

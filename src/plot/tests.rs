@@ -1,12 +1,12 @@
 use super::*;
 
 fn axis(name: &str, unit: &str) -> Axis {
-    Axis { name: name.into(), unit: unit.into() }
+    Axis { name: name.into(), unit: unit.into(), ..Axis::default() }
 }
 
 fn curve(name: &str, from: f64, to: f64, n: usize, f: impl Fn(f64) -> f64) -> Curve {
     let points = (0..=n).map(|i| from + (to - from) * i as f64 / n as f64).map(|t| (t, f(t))).collect();
-    Curve { name: name.into(), points, boolean: false }
+    Curve { name: name.into(), points, ..Curve::default() }
 }
 
 /// A stick-slip sawtooth, its friction force, and a loop in the plane.
@@ -43,7 +43,7 @@ fn stick_slip() -> Figure {
                 curves: vec![Curve {
                     name: "fr.z".into(),
                     points: (0..3000).map(|i| i as f64 * 0.01).map(|a| (1e-6 * a.cos() * a, 14e-6 * a.sin())).collect(),
-                    boolean: false,
+                    ..Curve::default()
                 }],
                 bands: vec![],
             },

@@ -85,6 +85,8 @@ struct Adaptive<'a> {
     rejected: bool,
     /// The next step is no longer than this, for a surface is just ahead.
     creep: f64,
+    /// Steps for which none is made again to end at a condition: it may fall just short of it, and must not try for ever.
+    aimed: u8,
     /// States beside a crossing, and four slopes around it.
     beside: Vec<f64>,
     slopes: Vec<f64>,
@@ -145,6 +147,7 @@ impl<'a> Adaptive<'a> {
             last: None,
             rejected: false,
             creep: f64::INFINITY,
+            aimed: 0,
             beside: vec![0.0; n],
             slopes: vec![0.0; 4 * n],
             surfaces: Surfaces::new(&system, 1e-12 * experiment.duration),
@@ -373,18 +376,20 @@ impl<'a> Adaptive<'a> {
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
-            if from == 0.0 && self.shorten(crossing, jump) {
+            // A surface left at the very start needs no other step.
+            if from == 0.0 && crossing.near > 0.0 && (self.end_at(crossing) || self.shorten(crossing, jump)) {
                 self.surfaces.again();
                 return Ok(());
             }
             if self.acts(crossing, jump > 0.0)? {
-                self.creep = f64::INFINITY;
+                (self.creep, self.aimed) = (f64::INFINITY, 0);
                 return self.guard();
             }
             self.surfaces.pass(true);
             from = crossing.far;
         }
         self.fresh = false;
+        self.aimed = self.aimed.saturating_sub(1);
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
         self.points.until(&mut self.system, &self.step, 1.0, reached)?;
@@ -394,6 +399,29 @@ impl<'a> Adaptive<'a> {
         self.slope_known = true;
         self.jacobian_known = false;
         self.guard()
+    }
+
+    /// A condition is decided by the last bit of the states: where one may change, the step is made again so that it
+    /// ends there, and no stage has looked behind it.
+    fn end_at(&mut self, crossing: Crossing) -> bool {
+        let roots = &self.system.instance.description().roots;
+        let decides = self.surfaces.changed().any(|surface| roots[surface].decides);
+        let (h, width) = (self.step.h, (crossing.far - crossing.near) * self.step.h);
+        let shorter = crossing.far * h;
+        if self.aimed > 0 || !decides || shorter + 8.0 * width >= h || shorter < 64.0 * f64::EPSILON * self.t {
+            return false;
+        }
+        (self.h, self.creep, self.aimed) = (shorter, f64::INFINITY, 2);
+        self.again();
+        true
+    }
+
+    /// Takes a step back that is made again.
+    fn again(&mut self) {
+        self.last = None;
+        self.work.steps -= 1;
+        self.work.stiff_steps -= u64::from(self.was_stiff);
+        self.work.rejected += 1;
     }
 
     /// Stages behind a surface at which derivatives jump or bend spoil a step, though its error seems small. Where that
@@ -420,10 +448,7 @@ impl<'a> Adaptive<'a> {
             return false;
         }
         (self.h, self.creep) = (shorter, creep);
-        self.last = None;
-        self.work.steps -= 1;
-        self.work.stiff_steps -= u64::from(self.was_stiff);
-        self.work.rejected += 1;
+        self.again();
         true
     }
 
@@ -586,7 +611,9 @@ impl<'a> Adaptive<'a> {
         let left = description.guards.iter().position(|guard| {
             let (low, high) = guard.range;
             let width = high - low;
-            let slack = |bound: f64| 1e-6 * if width.is_finite() { width } else { bound.abs() };
+            // What error control may be off by is no way out of a range.
+            let share = (10.0 * self.tol).max(1e-6);
+            let slack = |bound: f64| share * if width.is_finite() { width } else { bound.abs() };
             let value = self.system.instance.get(guard.slot);
             let above = low == f64::NEG_INFINITY || value >= low - slack(low);
             let below = high == f64::INFINITY || value <= high + slack(high);

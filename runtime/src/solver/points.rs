@@ -59,6 +59,11 @@ impl<'a> Points<'a> {
 
     /// Shows the present point as it is: at the start, behind an event.
     pub(crate) fn here(&mut self, system: &mut System, t: f64, x: &[f64]) -> Result<(), Stop> {
+        // Those at the start. An event comes behind those before it.
+        while self.observer.probe.next().is_some_and(|instant| instant <= t) {
+            system.place(t, x);
+            self.probe(system)?;
+        }
         if self.slots.is_empty() {
             return Ok(());
         }
@@ -75,11 +80,19 @@ impl<'a> Points<'a> {
 
     /// The outputs of the end are in the block; they are shown if nothing else was.
     pub(crate) fn end(&mut self, system: &System) -> Result<(), Stop> {
+        while self.observer.probe.next().is_some_and(|instant| instant <= self.duration) {
+            self.observer.probe.take(system.instance.block());
+        }
         if self.observer.only_last() { self.observer.see(system.instance) } else { Ok(()) }
     }
 
     /// Shows the course of the step from where it was shown last to θ, whose point is said to be at `time`.
     pub(crate) fn until(&mut self, system: &mut System, step: &Step, theta: f64, time: f64) -> Result<(), Stop> {
+        while let Some(instant) = self.observer.probe.next().filter(|instant| *instant <= time) {
+            step.at(((instant - step.t) / step.h).clamp(0.0, theta), &mut self.x);
+            system.place(instant, &self.x);
+            self.probe(system)?;
+        }
         if self.slots.is_empty() || theta <= self.theta {
             return Ok(());
         }
@@ -96,6 +109,14 @@ impl<'a> Points<'a> {
             self.rows.copy_within(width..2 * width, 0);
             self.theta = end;
         }
+        Ok(())
+    }
+
+    /// Keeps what is wanted at the instant in the block.
+    fn probe(&mut self, system: &mut System) -> Result<(), Stop> {
+        let status = system.instance.call(Function::Outputs);
+        check_status(system.instance, status)?;
+        self.observer.probe.take(system.instance.block());
         Ok(())
     }
 

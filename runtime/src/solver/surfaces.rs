@@ -18,6 +18,8 @@ pub(crate) struct Crossing {
 pub(crate) struct Surfaces {
     /// −1 or 1; 0 where the model has been on the surface since the last restart.
     sides: Vec<f64>,
+    /// Whether a transition or an event depends on the surface: then leaving it, too, is a crossing.
+    decides: Vec<bool>,
     /// Values at the end of the last step, or where the search stands within this one.
     here: Vec<f64>,
     /// θ of the points to look at, ascending.
@@ -41,6 +43,7 @@ impl Surfaces {
         let zeros = || vec![0.0; system.surfaces()];
         Surfaces {
             sides: zeros(),
+            decides: system.instance.description().roots.iter().map(|root| root.decides).collect(),
             here: zeros(),
             nodes: Vec::new(),
             values: Vec::new(),
@@ -152,7 +155,7 @@ impl Surfaces {
 
     /// The surfaces crossed by the last bracket.
     pub(crate) fn changed(&self) -> impl Iterator<Item = usize> {
-        (0..self.sides.len()).filter(|&i| self.sides[i] * self.far[i] < 0.0)
+        (0..self.sides.len()).filter(|&i| self.crosses(i, self.far[i]))
     }
 
     /// Goes on behind the last bracket, on the new sides.
@@ -166,7 +169,12 @@ impl Surfaces {
     }
 
     fn crossed(&self, g: &[f64]) -> bool {
-        self.sides.iter().zip(g).any(|(side, g)| side * g < 0.0)
+        g.iter().enumerate().any(|(i, g)| self.crosses(i, *g))
+    }
+
+    /// Whether surface i has been crossed where its value is g.
+    fn crosses(&self, i: usize, g: f64) -> bool {
+        self.sides[i] * g < 0.0 || (self.decides[i] && self.sides[i] == 0.0 && g != 0.0 && !g.is_nan())
     }
 
     /// Narrows a bracket around the first crossing by secants aimed half a width beside the zero, now on the one side,

@@ -1,0 +1,329 @@
+//! Runs of one compiled experiment under other parameters.
+//!
+//! In: an experiment that was read with the paths of the parameters that will change. Out: for given values an instance
+//! and a plan, or what the values break. What of a plan follows from parameters is computed anew: duration, windows,
+//! corners, declared ranges and whatever `require` demands. Only code is made once.
+
+use crate::backend::interp::run_once;
+use crate::experiment::{Place, Variant, depends};
+use crate::ir::build::Build;
+use crate::ir::{Func, Unary};
+use crate::lower::formulas;
+use crate::source::Files;
+use crate::system::*;
+use abi::description::{Guard, Kind, Quantity};
+use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method};
+use abi::table::Code;
+use abi::unit::Unit;
+use abi::{Description, Instance, Slot};
+use std::sync::Arc;
+
+/// A compiled experiment with parameters that change from run to run.
+pub struct Varying {
+    /// What sets this combination of the experiment's own sweeps apart.
+    pub label: String,
+    /// The plan with the parameters as written.
+    pub experiment: Experiment,
+    /// What the user should know.
+    pub notes: Vec<String>,
+    description: Arc<Description>,
+    params: Vec<f64>,
+    code: Code,
+    formulas: Func,
+    size: usize,
+    /// What the values of the formulas are for, in their order.
+    uses: Vec<Use>,
+    /// Expectations of the experiment; those behind them watch ranges.
+    expects: usize,
+}
+
+/// What a value is for.
+enum Use {
+    Plan(Place),
+    Corner,
+    /// A bound of a quantity: its number in the description; upper or not.
+    Bound(usize, bool),
+    /// A parameter with its bounds, which are the next values: path, unit, lower and upper, strict or not.
+    Range {
+        path: String,
+        unit: Unit,
+        low: Option<bool>,
+        high: Option<bool>,
+    },
+    /// What a range consists of.
+    Limit,
+    /// What must not be 0, and what to say if it is.
+    Require(String),
+}
+
+/// What a run needs.
+pub struct Fitted {
+    /// With its parameters.
+    pub instance: Instance,
+    /// Its plan.
+    pub experiment: Experiment,
+}
+
+impl Varying {
+    /// From what was read, and its code.
+    pub fn new(variant: Variant, vary: &[String], files: &Files, code: Code, notes: Vec<String>) -> Varying {
+        let Variant { label, system, types, program, mut experiment, places, .. } = variant;
+        let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
+        let (mut exprs, mut uses) = (Vec::new(), Vec::new());
+        for (place, expr) in places {
+            if varies(expr) {
+                exprs.push(expr);
+                uses.push(Use::Plan(place));
+            }
+        }
+        if system.corners.iter().any(|corner| varies(*corner)) {
+            exprs.extend(&system.corners);
+            uses.extend(system.corners.iter().map(|_| Use::Corner));
+        }
+        for (k, quantity) in program.description.quantities.iter().enumerate() {
+            let Some(var) = system.vars.iter().find(|var| var.path == quantity.path) else { continue };
+            for (bound, high) in [(var.range.low, false), (var.range.high, true)] {
+                if let Some((bound, _)) = bound.filter(|(bound, _)| varies(*bound)) {
+                    exprs.push(bound);
+                    uses.push(Use::Bound(k, high));
+                }
+            }
+        }
+        for (var, unit) in system.vars.iter().zip(&types.units) {
+            let value = match (&var.definition, var.kind) {
+                (Definition::Value(value, _), VarKind::Param) => *value,
+                (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => *initial,
+                _ => continue,
+            };
+            let bounds = [var.range.low, var.range.high];
+            let touched = vary.contains(&var.path) || varies(value);
+            if bounds.iter().all(Option::is_none) || !(touched || bounds.iter().flatten().any(|(b, _)| varies(*b))) {
+                continue;
+            }
+            exprs.push(value);
+            let [low, high] = bounds.map(|bound| bound.map(|(_, strict)| strict));
+            uses.push(Use::Range { path: var.path.clone(), unit: unit.clone(), low, high });
+            for (bound, _) in bounds.into_iter().flatten() {
+                exprs.push(bound);
+                uses.push(Use::Limit);
+            }
+        }
+        for require in system.requires.iter().filter(|require| varies(require.condition)) {
+            exprs.push(require.condition);
+            let owner = &system.instance(require.instance).path;
+            let owner = if owner.is_empty() { String::new() } else { format!("{owner}: ") };
+            let condition = || format!("requires {}", files.slice(require.span));
+            uses.push(Use::Require(format!("{owner}{}", require.message.clone().unwrap_or_else(condition))));
+        }
+        let (formulas, size) = formulas(&system, &types, &exprs);
+        let expects = experiment.expects.len();
+        experiment.plots.clear();
+        if experiment.solver.method != Method::Adaptive {
+            // The code of a fixed step holds ranges as they are written: `in_code` took out those that change.
+            let guarded = uses.iter().filter_map(|one| match one {
+                Use::Bound(k, _) => Some(&program.description.quantities[*k]),
+                _ => None,
+            });
+            let mut watched: Vec<&Quantity> = guarded.filter(|quantity| quantity.kind != Kind::Param).collect();
+            watched.dedup_by_key(|quantity| quantity.slot);
+            experiment.expects.extend(watched.into_iter().map(|quantity| extremes(quantity, experiment.duration)));
+        }
+        Varying {
+            label,
+            experiment,
+            notes,
+            description: Arc::new(program.description),
+            params: program.params,
+            code,
+            formulas,
+            size,
+            uses,
+            expects,
+        }
+    }
+
+    /// The parameter of this path, if a run can be given another value for it.
+    pub fn param(&self, path: &str) -> Option<&Quantity> {
+        let found = self.description.quantity(path)?;
+        (found.kind == Kind::Param && self.description.layout.params.contains(found.slot)).then_some(found)
+    }
+
+    /// Number of expectations of the experiment; verdicts behind these are of ranges, see [`Varying::left`].
+    pub fn expects(&self) -> usize {
+        self.expects
+    }
+
+    /// An instance and a plan with these values in SI.
+    ///
+    /// # Errors
+    /// What the values break, in words.
+    pub fn fit(&self, values: &[(Slot, f64)]) -> Result<Fitted, String> {
+        let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
+        for (slot, value) in values {
+            instance.set(*slot, *value);
+        }
+        let mut experiment = self.experiment.clone();
+        if self.uses.is_empty() {
+            return Ok(Fitted { instance, experiment });
+        }
+        let mut block = vec![0.0; self.size];
+        let params = self.description.layout.params.range();
+        block[params.clone()].copy_from_slice(&instance.block()[params]);
+        run_once(&self.formulas, &mut block, &self.description.pool);
+        let numbers = &block[self.size - self.uses.len()..];
+        let duration = experiment.duration;
+        let mut corners: Option<Vec<f64>> = None;
+        let mut description: Option<Description> = None;
+        for (k, (one, number)) in self.uses.iter().zip(numbers).enumerate() {
+            let number = *number;
+            match one {
+                Use::Plan(place) => set(&mut experiment, *place, number)?,
+                Use::Corner => corners.get_or_insert_default().push(number),
+                Use::Bound(k, high) => {
+                    let description = description.get_or_insert_with(|| (*self.description).clone());
+                    let quantity = &mut description.quantities[*k];
+                    if *high {
+                        quantity.range.1 = number
+                    } else {
+                        quantity.range.0 = number
+                    }
+                    let (slot, range) = (quantity.slot, quantity.range);
+                    let guard = description.guards.iter_mut().find(|guard| guard.slot == slot);
+                    if let Some(guard) = guard {
+                        guard.range = range;
+                    }
+                }
+                Use::Range { path, unit, low, high } => {
+                    let shown = |x: f64| {
+                        let shown = format!("{}", unit.from_si(x));
+                        if unit.text.is_empty() { shown } else { format!("{shown} {unit}") }
+                    };
+                    let below = low.map(|strict| (numbers[k + 1], strict));
+                    let above = high.map(|strict| (numbers[k + 1 + usize::from(low.is_some())], strict));
+                    if let Some((bound, strict)) = below.filter(|(b, strict)| number < *b || *strict && number == *b) {
+                        let word = if strict { "above" } else { "at least" };
+                        return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
+                    }
+                    if let Some((bound, strict)) = above.filter(|(b, strict)| number > *b || *strict && number == *b) {
+                        let word = if strict { "below" } else { "at most" };
+                        return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
+                    }
+                }
+                Use::Limit => {}
+                Use::Require(text) if number == 0.0 => return Err(text.clone()),
+                Use::Require(_) => {}
+            }
+        }
+        if experiment.duration != duration {
+            // What was open at the end stays open; no window goes beyond the run.
+            for expect in &mut experiment.expects {
+                let open = expect.before == duration;
+                expect.before = if open { experiment.duration } else { expect.before.min(experiment.duration) };
+            }
+        }
+        if let Some(mut corners) = corners {
+            corners.retain(|t| *t > 0.0 && *t < experiment.duration);
+            corners.sort_by(f64::total_cmp);
+            corners.dedup();
+            experiment.corners = corners;
+        }
+        if let Some(description) = description {
+            let block = instance.block()[self.description.layout.params.range()].to_vec();
+            instance = Instance::new(Arc::new(description), self.code.clone(), &block);
+        }
+        Ok(Fitted { instance, experiment })
+    }
+
+    /// Of a run with fixed steps: the range that was left, from the readings of the expectations behind those of the
+    /// experiment, in words.
+    pub fn left(&self, fitted: &Arc<Description>, readings: &[(f64, f64)]) -> Option<String> {
+        let watched = &self.experiment.expects[self.expects..];
+        watched.iter().zip(readings).find_map(|(expect, (least, most))| {
+            let quantity = fitted.quantities.iter().find(|quantity| quantity.path == expect.text)?;
+            let (low, high) = quantity.range;
+            let slack = 1e-6 * if (high - low).is_finite() { high - low } else { low.abs().min(high.abs()) };
+            let shown = |x: f64| format!("{} {}", quantity.unit.from_si(x), quantity.unit);
+            let value = if *least < low - slack { *least } else { *most };
+            let out = *least < low - slack || *most > high + slack;
+            out.then(|| {
+                format!("`{}` left its range {} .. {}: {}", quantity.path, shown(low), shown(high), shown(value))
+            })
+        })
+    }
+}
+
+/// One elementary function by itself: for whoever needs, outside a model, what every machine computes alike.
+pub struct Alone(Func);
+
+impl Alone {
+    /// e^x
+    pub fn exp() -> Alone {
+        Alone::of(Unary::Exp)
+    }
+
+    /// The natural logarithm.
+    pub fn log() -> Alone {
+        Alone::of(Unary::Log)
+    }
+
+    fn of(function: Unary) -> Alone {
+        let mut build = Build::new("alone");
+        let x = build.load(Slot(0));
+        let y = build.unary(function, x);
+        build.store(Slot(0), y);
+        Alone(crate::math::expand(&build.finish()))
+    }
+
+    /// Its value.
+    pub fn at(&self, x: f64) -> f64 {
+        let mut block = [x];
+        run_once(&self.0, &mut block, crate::math::pool());
+        block[0]
+    }
+}
+
+/// The guards as the code of a fixed step may know them: those whose range changes watch only that numbers are finite.
+pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
+    let system = &variant.system;
+    let varies = |bound: Option<(ExprId, bool)>| {
+        bound.is_some_and(|(bound, _)| depends(system, bound, &|var| vary.contains(&var.path)))
+    };
+    let known = |guard: &Guard| {
+        let var = system.vars.iter().find(|var| var.path == guard.path);
+        let changes = var.is_some_and(|var| varies(var.range.low) || varies(var.range.high));
+        let range = if changes { (f64::NEG_INFINITY, f64::INFINITY) } else { guard.range };
+        Guard { range, ..guard.clone() }
+    };
+    variant.program.description.guards.iter().map(known).collect()
+}
+
+/// An expectation that only reads the least and the greatest value.
+fn extremes(quantity: &Quantity, duration: f64) -> Expect {
+    let measure =
+        |kind| Measure { text: quantity.path.clone(), kind, slot: quantity.slot, unit: quantity.unit.clone() };
+    Expect {
+        text: quantity.path.clone(),
+        measures: vec![measure(MeasureKind::Min), measure(MeasureKind::Max)],
+        condition: Formula::Number(1.0),
+        after: 0.0,
+        before: duration,
+    }
+}
+
+fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), String> {
+    let positive = |what: &str| match number > 0.0 && number.is_finite() {
+        true => Ok(number),
+        false => Err(format!("{what} must be positive, not {number} s")),
+    };
+    match place {
+        Place::Duration => experiment.duration = positive("the duration")?,
+        Place::Step => experiment.solver.step = positive("the step")?,
+        Place::After(k) => experiment.expects[k].after = number,
+        Place::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
+        Place::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
+            MeasureKind::At(second) | MeasureKind::Settling(second) => *second = number,
+            kind => unreachable!("{kind:?} has no second argument"),
+        },
+    }
+    Ok(())
+}

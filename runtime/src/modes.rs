@@ -1,0 +1,125 @@
+//! Eigenvalues of a linear system, as an engineer reads them. The only file besides the solvers that knows nalgebra.
+//!
+//! In: a square matrix, row by row. Out: its modes, slowest first.
+
+use nalgebra::linalg::Schur;
+use nalgebra::{Complex, DMatrix};
+
+/// One eigenvalue; of a pair of conjugates the one above the real axis.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Mode {
+    /// Real part in 1/s.
+    pub real: f64,
+    /// Imaginary part in rad/s, not negative.
+    pub imaginary: f64,
+}
+
+impl Mode {
+    /// Natural frequency: its absolute value, in rad/s.
+    pub fn frequency(self) -> f64 {
+        // Scaled, so that nothing overflows.
+        let (large, small) = (self.real.abs().max(self.imaginary), self.real.abs().min(self.imaginary));
+        if large > 0.0 { large * (1.0 + (small / large) * (small / large)).sqrt() } else { 0.0 }
+    }
+
+    /// Damping ratio: 1 for what dies away without swinging, below 0 for what grows; none of an integrator.
+    pub fn damping(self) -> Option<f64> {
+        let frequency = self.frequency();
+        (frequency > 0.0).then(|| -self.real / frequency)
+    }
+}
+
+/// The modes of dx/dt = A x; none if the eigenvalues cannot be found, as where an entry is not finite.
+pub fn modes(n: usize, a: &[f64]) -> Option<Vec<Mode>> {
+    assert_eq!(a.len(), n * n, "a matrix of {n} rows");
+    if !a.iter().all(|entry| entry.is_finite()) {
+        return None;
+    }
+    if n == 0 {
+        return Some(Vec::new());
+    }
+    let mut scaled = a.to_vec();
+    balance(n, &mut scaled);
+    let size = scaled.iter().fold(0.0f64, |size, entry| size.max(entry.abs()));
+    let matrix = DMatrix::from_row_slice(n, n, &scaled);
+    // What is below the rounding of the largest entries is noise of the reduction.
+    let schur = Schur::try_new(matrix, f64::EPSILON, 10_000)?;
+    let eigenvalues: Vec<Complex<f64>> = schur.complex_eigenvalues().iter().copied().collect();
+    let noise = 1e-15 * size;
+    let clean = |x: f64| if x.abs() <= noise { 0.0 } else { x };
+    let mut modes: Vec<Mode> = eigenvalues
+        .into_iter()
+        .map(|value| Mode { real: clean(value.re), imaginary: clean(value.im) })
+        .filter(|mode| mode.imaginary >= 0.0)
+        .collect();
+    modes.sort_by(|a, b| a.frequency().total_cmp(&b.frequency()));
+    Some(modes)
+}
+
+/// Scales rows and columns by powers of two until they are of one size: a similarity that costs no bit.
+/// Source: Parlett, Reinsch, Numer. Math. 13 (1969).
+fn balance(n: usize, a: &mut [f64]) {
+    for _ in 0..100 {
+        let mut done = true;
+        for i in 0..n {
+            let others = || (0..n).filter(|j| *j != i);
+            let mut column: f64 = others().map(|j| a[j * n + i].abs()).sum();
+            let row: f64 = others().map(|j| a[i * n + j].abs()).sum();
+            if column == 0.0 || row == 0.0 {
+                continue;
+            }
+            let (before, mut factor) = (column + row, 1.0);
+            while column < 0.5 * row {
+                (column, factor) = (4.0 * column, 2.0 * factor);
+            }
+            while column > 2.0 * row {
+                (column, factor) = (0.25 * column, 0.5 * factor);
+            }
+            if (column + row) / factor < 0.95 * before {
+                done = false;
+                (0..n).for_each(|j| a[i * n + j] /= factor);
+                (0..n).for_each(|j| a[j * n + i] *= factor);
+            }
+        }
+        if done {
+            return;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mass_on_a_spring_has_its_frequency_and_damping() {
+        // d²x/dt² = −ω² x − 2 ζ ω dx/dt with ω = 100 rad/s, ζ = 0.2
+        let found = modes(2, &[0.0, 1.0, -1e4, -40.0]).unwrap();
+        assert_eq!(found.len(), 1);
+        assert!((found[0].frequency() - 100.0).abs() < 1e-10, "{found:?}");
+        assert!((found[0].damping().unwrap() - 0.2).abs() < 1e-12, "{found:?}");
+    }
+
+    #[test]
+    fn integrators_and_fast_modes_stand_side_by_side() {
+        // x' = v, v' = −1e8 v: of very different size.
+        let found = modes(2, &[0.0, 1.0, 0.0, -1e8]).unwrap();
+        assert_eq!(found[0], Mode { real: 0.0, imaginary: 0.0 });
+        assert_eq!(found[0].damping(), None);
+        assert!((found[1].real / -1e8 - 1.0).abs() < 1e-12 && found[1].damping() == Some(1.0));
+    }
+
+    #[test]
+    fn bad_scales_do_not_blur_small_eigenvalues() {
+        // Similar to diag(−1, −2, −3) by scales of 1e6: the products of a triangular matrix.
+        let found = modes(3, &[-1.0, 1e6, 1e12, 0.0, -2.0, 1e6, 0.0, 0.0, -3.0]).unwrap();
+        let real: Vec<f64> = found.iter().map(|mode| mode.real).collect();
+        assert!(real.iter().zip([-1.0, -2.0, -3.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{real:?}");
+    }
+
+    #[test]
+    fn what_is_not_finite_has_no_modes() {
+        assert_eq!(modes(1, &[f64::NAN]), None);
+        assert_eq!(modes(0, &[]), Some(Vec::new()));
+    }
+}

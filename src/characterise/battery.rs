@@ -1,0 +1,599 @@
+//! The battery as text: experiments over the benches of the library, with the slot filled by the model under test.
+//!
+//! In: a [`Subject`] and the [`Scales`] measured so far. Out: a text. Numbers in it are in SI and have four digits at
+//! most, so that it can be read and changed.
+
+use super::subject::{External, Subject};
+use crate::value::significant;
+use std::fmt::Write;
+
+/// What is measured before the battery is laid out. SI; straight or rotary.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Scales {
+    /// Force at a fast steady speed.
+    pub f_ref: f64,
+    /// Mass on the benches that have one: a power of ten that makes forces move it at about 1 m/s².
+    pub mass: f64,
+    /// Break-away force of a slow ramp.
+    pub f_b: f64,
+    /// Travel at the break-away.
+    pub x_b: f64,
+    /// Least force of sliding after the peak.
+    pub f_c: f64,
+    /// Speed at which the excess over `f_c` has fallen to 1/e; else a hundredth of the greatest speed.
+    pub v_s: f64,
+    /// Speed that counts as sliding.
+    pub v_slip: f64,
+    /// Greatest speed of the grid.
+    pub v_max: f64,
+}
+
+/// Names of units.
+#[derive(Clone, Copy, Debug)]
+#[allow(missing_docs)]
+pub struct Units {
+    pub force: &'static str,
+    pub length: &'static str,
+    pub speed: &'static str,
+    pub mass: &'static str,
+    pub stiffness: &'static str,
+    pub damping: &'static str,
+    pub rate: &'static str,
+    bench: &'static str,
+}
+
+const STRAIGHT: Units = Units {
+    force: "N",
+    length: "m",
+    speed: "m/s",
+    mass: "kg",
+    stiffness: "N/m",
+    damping: "N·s/m",
+    rate: "N/s",
+    bench: "",
+};
+const ROTARY: Units = Units {
+    force: "N·m",
+    length: "rad",
+    speed: "rad/s",
+    mass: "kg·m^2",
+    stiffness: "N·m/rad",
+    damping: "N·m·s/rad",
+    rate: "N·m/s",
+    bench: "rotary ",
+};
+
+impl Units {
+    /// Those of straight or rotary motion.
+    pub fn of(rotary: bool) -> Units {
+        if rotary { ROTARY } else { STRAIGHT }
+    }
+}
+
+/// One experiment of the battery.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// Name of the experiment.
+    pub name: String,
+    doc: String,
+    run: String,
+    /// In s.
+    duration: f64,
+    solver: Option<String>,
+    sweep: Option<String>,
+    plots: Vec<String>,
+    expects: Vec<String>,
+    /// Greatest fixed step in s of a model that chatters.
+    longest: f64,
+}
+
+impl Entry {
+    fn new(name: impl Into<String>, doc: impl Into<String>, run: String, duration: f64) -> Entry {
+        Entry {
+            name: name.into(),
+            doc: doc.into(),
+            run,
+            duration,
+            solver: None,
+            sweep: None,
+            plots: Vec::new(),
+            expects: Vec::new(),
+            longest: 1e-3,
+        }
+    }
+
+    fn plot(mut self, plot: impl Into<String>) -> Entry {
+        self.plots.push(plot.into());
+        self
+    }
+
+    fn expect(mut self, expect: String) -> Entry {
+        self.expects.push(expect);
+        self
+    }
+
+    fn solver(mut self, solver: impl Into<String>) -> Entry {
+        self.solver = Some(solver.into());
+        self
+    }
+
+    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it.
+    pub fn step_fixed(&mut self) {
+        let wanted = (self.duration / 1e5).clamp(1e-5, self.longest);
+        let step = [1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5].into_iter().find(|step| *step <= wanted * 1.000001);
+        self.solver = Some(format!("expo step {} s", n(step.unwrap_or(1e-5))));
+        // Whole steps.
+        let step = step.unwrap_or(1e-5);
+        self.duration = (self.duration / step).ceil() * step;
+    }
+
+    /// Whether it steps adaptively.
+    pub fn adaptive(&self) -> bool {
+        self.solver.as_ref().is_none_or(|solver| solver.starts_with("adaptive"))
+    }
+
+    fn text(&self) -> String {
+        let mut text = format!(
+            "/// {}\nexperiment {} {{\n  run    {} for {} s\n",
+            self.doc,
+            self.name,
+            self.run,
+            n(self.duration)
+        );
+        if let Some(solver) = &self.solver {
+            let _ = writeln!(text, "  solver {solver}");
+        }
+        if let Some(sweep) = &self.sweep {
+            let _ = writeln!(text, "  sweep  {sweep}");
+        }
+        for plot in &self.plots {
+            let _ = writeln!(text, "  plot   {plot}");
+        }
+        for expect in &self.expects {
+            let _ = writeln!(text, "  expect {expect}");
+        }
+        text + "}\n"
+    }
+}
+
+/// The whole text.
+pub fn text(imports: &str, head: &str, entries: &[Entry]) -> String {
+    let entries: Vec<String> = entries.iter().map(Entry::text).collect();
+    format!("{imports}\n{head}\n{}", entries.join("\n"))
+}
+
+/// Four digits are enough for a number that was measured only to lay out an experiment.
+pub fn n(x: f64) -> String {
+    significant(x, 6)
+}
+
+/// Rounded to two digits.
+pub fn round(x: f64) -> f64 {
+    significant(x, 2).parse().expect("a printed number reads back")
+}
+
+/// The text of a model under test, and what to fill slots with.
+pub struct Layout<'a> {
+    subject: &'a Subject,
+    /// Units of the model.
+    pub units: Units,
+    scales: Scales,
+}
+
+impl<'a> Layout<'a> {
+    /// With the scales known so far.
+    pub fn new(subject: &'a Subject, scales: Scales) -> Layout<'a> {
+        Layout { subject, units: Units::of(subject.rotary), scales }
+    }
+
+    /// What fills the slot of a bench that has no force of its own.
+    fn moved(&self) -> String {
+        match self.subject.external {
+            External::Required => self.subject.instance.with(&[("F_ext", "0")]),
+            External::Absent | External::Optional => self.subject.instance.to_string(),
+        }
+    }
+
+    /// What fills the slot of a bench with a mass.
+    fn pushed(&self) -> String {
+        self.subject.instance.to_string()
+    }
+
+    fn force_bench(&self, u: &str, more: &str) -> String {
+        let Units { bench, mass, .. } = self.units;
+        format!("{bench}ForceBench(u = {u}, m = {} {mass}{more}, fr = {})", n(self.scales.mass), self.pushed())
+    }
+
+    fn speed_bench(&self, v: &str) -> String {
+        format!("{}SpeedBench(v = {v}, fr = {})", self.units.bench, self.moved())
+    }
+
+    /// Models that the experiments share.
+    pub fn head(&self) -> String {
+        let Units { speed, force, damping, length, .. } = self.units;
+        let mut text = format!(
+            "/// The contact at one speed, as a parameter: a sweep over it is one program.\n\
+             model Sliding {{\n  param  speed = 0 {speed}\n  part   bench = {}\n  output F [{force}] = bench.F\n\
+             \x20 output x [{length}] = bench.x\n}}\n",
+            self.speed_bench("speed")
+        );
+        if self.scales.f_b > 0.0 {
+            let d = round(0.01 * self.scales.f_b / self.scales.v_s);
+            let _ = write!(
+                text,
+                "\n/// A mass with a little damping from outside, so that what is seen is the contact\n\
+                 /// and not the ringing of a mass on a spring without loss.\n\
+                 model Damped {{\n  input  u [{force}]\n  param  d = {} {damping}\n  part   bench = {}\n\
+                 \x20 output F [{force}] = bench.F\n  output x [{length}] = bench.x\n  output v [{speed}] = bench.v\n}}\n",
+                n(d),
+                self.force_bench("u - d * bench.v", "")
+            );
+        }
+        text
+    }
+
+    fn show_force(&self) -> String {
+        format!("F [{}]", self.units.force)
+    }
+
+    /// How hard the contact resists a fast speed: to know what size of force to push with.
+    pub fn scale_sliding(&self) -> Entry {
+        let run = format!("Sliding(speed = {} {})", n(0.1 * self.scales.v_max), self.units.speed);
+        Entry::new("scale_sliding", "The size of the force, from sliding fast.", run, 20.0).plot(self.show_force())
+    }
+
+    /// The force and the travel at which it lets go, for a ramp of `f_ref` a second.
+    pub fn scale_break_away(&self, times: f64) -> Entry {
+        let Units { force, rate, length, speed, .. } = self.units;
+        let rate_ref = round(self.scales.f_ref * times);
+        let u = format!("ramp(0 s, 0 {force}, {} {rate})", n(rate_ref));
+        Entry::new(
+            "scale_break_away",
+            "Break-away force and presliding travel, from a slow ramp.",
+            self.force_bench(&u, ""),
+            6.0,
+        )
+        .plot(format!("F [{force}]"))
+        .plot(format!("x [{length}]"))
+        .plot(format!("v [{speed}]"))
+    }
+
+    /// Steady friction against velocity: a sweep for each decade, both directions.
+    pub fn steady(&self) -> Vec<Entry> {
+        const GRID: [f64; 8] = [1.0, 1.3, 1.8, 2.4, 3.2, 4.2, 5.6, 7.5];
+        let Units { speed, .. } = self.units;
+        let decade = |k: i32| {
+            let low = self.scales.v_max * power(-k);
+            let grid = if k == 0 { &GRID[..1] } else { &GRID[..] };
+            let speeds = grid.iter().flat_map(|g| [g * low, -g * low]).map(|v| format!("{} {speed}", n(v)));
+            let speeds: Vec<String> = speeds.collect();
+            let travel = (200.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
+            let mut entry = Entry::new(
+                format!("steady_{}", 7 - k),
+                format!("Steady friction from {} {speed} on, both directions.", n(low)),
+                "Sliding()".into(),
+                round(travel / low + 5.0),
+            );
+            entry.sweep = Some(format!("speed = {}", speeds.join(", ")));
+            entry.plot(self.show_force())
+        };
+        (0..=6).rev().map(decade).collect()
+    }
+
+    /// Rates of the break-away ramps: three decades.
+    pub fn rates(&self) -> Vec<f64> {
+        let unit = power_near(self.scales.f_ref);
+        [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|rate| rate * unit).to_vec()
+    }
+
+    /// Frequencies of the lag loops in Hz.
+    pub fn lag_frequencies(&self) -> [f64; 3] {
+        let middle =
+            if self.scales.x_b > 1e-4 * self.scales.v_s { self.scales.v_s / self.scales.x_b / 60.0 } else { 1.0 };
+        let middle = power_near(middle.clamp(0.1, 10.0));
+        [0.1 * middle, middle, 10.0 * middle]
+    }
+
+    /// Speeds of the far end of the spring.
+    pub fn pull_speeds(&self) -> Vec<f64> {
+        let unit = power_near(self.scales.f_b / self.scales.mass * 0.07);
+        [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0].map(|speed| speed * 10.0 * unit).to_vec()
+    }
+
+    /// Amplitudes of the cycles whose loss is measured.
+    pub fn amplitudes(&self) -> Vec<f64> {
+        let unit = self.path();
+        [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0].map(|x| x * unit).to_vec()
+    }
+
+    /// A path on which memory of the path shows.
+    pub fn path(&self) -> f64 {
+        round(self.scales.x_b.max(1e-3 * self.scales.v_s))
+    }
+
+    /// The steps of the step-size sweep in s.
+    pub fn steps(&self) -> [f64; 6] {
+        [1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4]
+    }
+
+    /// Speed of the cycles on a path.
+    pub fn cycle_speed(&self) -> f64 {
+        round(0.1 * self.scales.v_s)
+    }
+
+    /// Everything after the scales and the steady curve.
+    pub fn rest(&self) -> Vec<Entry> {
+        let mut entries = Vec::new();
+        let Units { force, length, speed, rate, stiffness, mass, .. } = self.units;
+        let s = &self.scales;
+        let (f_b, m) = (s.f_b, s.mass);
+        let motion = |entry: Entry| {
+            entry.plot(format!("F [{force}]")).plot(format!("x [{length}]")).plot(format!("v [{speed}]"))
+        };
+
+        for (i, r) in self.rates().into_iter().enumerate() {
+            let u = format!("ramp(0 s, 0 {force}, {} {rate})", n(r));
+            let duration = round(1.3 * f_b / r + 2.0 * root(2.0 * m * s.v_slip / r));
+            entries.push(motion(Entry::new(
+                format!("break_away_{}", i + 1),
+                format!("Pushed by a force that rises at {} {rate}.", n(r)),
+                self.force_bench(&u, ""),
+                duration,
+            )));
+        }
+
+        for (name, part) in [("small", 0.3), ("large", 0.95)] {
+            let (a, r) = (round_down(part * f_b), round(0.2 * f_b));
+            let at = |stops: &[f64]| triangle(stops, r, force, rate);
+            let (u, duration) = match name {
+                "small" => at(&[0.0, a, -a, a]),
+                _ => at(&[0.0, a, -a, 0.5 * a, 0.0, a]),
+            };
+            entries.push(
+                motion(Entry::new(
+                    format!("presliding_{name}"),
+                    format!("To {} % of the break-away force and back, slowly.", n(part * 100.0)),
+                    format!("Damped(u = {u})"),
+                    duration,
+                ))
+                .solver("adaptive tol 1e-8"),
+            );
+        }
+
+        for (i, f) in self.lag_frequencies().into_iter().enumerate() {
+            let v = format!("{} {speed} + sine({} {speed}, {} Hz)", n(1.5 * s.v_s), n(s.v_s), n(f));
+            let run_in = 200.0 * s.x_b / (1.5 * s.v_s);
+            let cycles = (run_in * f).ceil() + 2.0;
+            entries.push(
+                Entry::new(
+                    format!("lag_{}", i + 1),
+                    format!("A speed that rises and falls at {} Hz and keeps its sign.", n(f)),
+                    self.speed_bench(&v),
+                    cycles / f,
+                )
+                .plot(format!("F [{force}]"))
+                .plot(format!("v [{speed}]")),
+            );
+        }
+
+        let v = self.cycle_speed();
+        let run = (60.0 * s.x_b).max(20.0 * self.path());
+        let turn = round(run / v);
+        entries.push(
+            Entry::new(
+                "reversal",
+                "From rest at a slow speed, and then back.",
+                self.speed_bench(&format!("{} {speed} - step({} s, {} {speed})", n(v), n(turn), n(2.0 * v))),
+                2.0 * turn,
+            )
+            .plot(format!("F [{force}]"))
+            .plot(format!("x [{length}]")),
+        );
+
+        let path = 3.0 * self.path();
+        for (i, times) in [0.1, 1.0, 10.0].into_iter().enumerate() {
+            let v = v * times;
+            let f = v / (2.0 * std::f64::consts::PI * path);
+            let f = round(f);
+            entries.push(
+                Entry::new(
+                    format!("rate_{}", i + 1),
+                    format!("The same path at {} times the speed.", n(times)),
+                    self.speed_bench(&format!("sine({} {speed}, {} Hz)", n(v), n(f))),
+                    2.0 / f,
+                )
+                .plot(format!("F [{force}]"))
+                .plot(format!("x [{length}]")),
+            );
+        }
+
+        for (i, x) in self.amplitudes().into_iter().enumerate() {
+            let f = round(v / (2.0 * std::f64::consts::PI * x));
+            entries.push(
+                Entry::new(
+                    format!("energy_{}", i + 1),
+                    format!("Loss of a cycle of {} {length} to either side.", n(x)),
+                    self.speed_bench(&format!("sine({} {speed}, {} Hz)", n(2.0 * std::f64::consts::PI * f * x), n(f))),
+                    3.0 / f,
+                )
+                .plot(format!("F [{force}]"))
+                .plot(format!("x [{length}]"))
+                .expect(format!("integral(F * v) >= 0 J after {} s", n(2.0 / f))),
+            );
+        }
+
+        for seed in 0..6_u32 {
+            let part = |k: u32| {
+                // A spread of speeds over two decades from a fixed rule: the same motions everywhere.
+                let turn = f64::from((seed * 7 + k * 5 + 3) % 11) / 10.0;
+                round(0.3 * s.v_s * (1.0 + 99.0 * turn * turn * turn))
+            };
+            let v = format!(
+                "sine({} {speed}, 1 Hz) + sine({} {speed}, 2 Hz) - sine({} {speed}, 5 Hz)",
+                n(part(0)),
+                n(part(1)),
+                n(part(2))
+            );
+            entries.push(
+                Entry::new(
+                    format!("closed_path_{}", seed + 1),
+                    "An irregular motion on a closed path: its second round takes no energy out of the contact.",
+                    self.speed_bench(&v),
+                    2.0,
+                )
+                .plot(format!("F [{force}]"))
+                .plot(format!("v [{speed}]"))
+                .expect("integral(F * v) >= 0 J after 1 s".into()),
+            );
+        }
+
+        let k = 2.0 * m;
+        let frequency = root(k / m);
+        for (i, vp) in self.pull_speeds().into_iter().enumerate() {
+            let loading = f_b / (k * vp);
+            let duration = round(3.0 * loading + 40.0 / frequency);
+            entries.push(motion(Entry::new(
+                format!("stick_slip_{}", i + 1),
+                format!("Pulled at {} {speed} through a spring of {} {stiffness}.", n(vp), n(k)),
+                format!(
+                    "{}SpringBench(m = {} {mass}, k = {} {stiffness}, vp = {} {speed}, fr = {})",
+                    self.units.bench,
+                    n(m),
+                    n(k),
+                    n(vp),
+                    self.pushed()
+                ),
+                duration,
+            )));
+        }
+
+        let v0 = round(s.f_c.max(0.1 * f_b) / m);
+        entries.push(motion(Entry::new(
+            "coast_down",
+            format!("Thrown at {} {speed}, left alone.", n(v0)),
+            self.force_bench(&format!("0 {force}"), &format!(", v_start = {} {speed}", n(v0))),
+            2.0,
+        )));
+
+        // A load that the contact carries, if it can carry any.
+        let load = if s.f_c > 0.01 * f_b { s.f_c } else { f_b };
+        entries.push(
+            motion(Entry::new(
+                "drift",
+                "A constant load with a small oscillation, both below break-away.",
+                self.force_bench(
+                    &format!("{} {force} + sine({} {force}, 1 Hz)", n(round(0.6 * load)), n(round(0.3 * load))),
+                    "",
+                ),
+                20.0,
+            ))
+            .solver("adaptive tol 1e-8"),
+        );
+        let half = round(0.5 * load);
+        entries.push(
+            motion(Entry::new(
+                "hold",
+                "Half of what it slides with, applied gently and held for 100 s.",
+                format!(
+                    "Damped(u = if t < 2 s then {h} {force} * (1 - cos(pi * t / 2 s)) / 2 else {h} {force})",
+                    h = n(half)
+                ),
+                102.0,
+            ))
+            .solver("adaptive tol 1e-9")
+            .expect(format!("peak_to_peak(x) < 1e-9 {length} after 12 s")),
+        );
+
+        let vp = self.pull_speeds()[2];
+        let pulled = format!(
+            "{}SpringBench(m = {} {mass}, k = {} {stiffness}, vp = {} {speed}, fr = {})",
+            self.units.bench,
+            n(m),
+            n(k),
+            n(vp),
+            self.pushed()
+        );
+        let duration = round_up_to(f_b / (k * vp) * 2.0 + 5.0, 0.02);
+        entries.push(motion(
+            Entry::new("steps_reference", "The reference of the step-size sweep.", pulled.clone(), duration)
+                .solver("adaptive tol 1e-9"),
+        ));
+        for (i, h) in self.steps().into_iter().enumerate() {
+            entries.push(motion(
+                Entry::new(
+                    format!("steps_{}", i + 1),
+                    format!("The same with a fixed step of {} s.", n(h)),
+                    pulled.clone(),
+                    duration,
+                )
+                .solver(format!("expo step {} s", n(h))),
+            ));
+        }
+        entries
+    }
+}
+
+/// A force that goes from stop to stop at a constant rate, and how long that takes.
+fn triangle(stops: &[f64], rate: f64, force: &str, per_second: &str) -> (String, f64) {
+    let (mut text, mut at, mut slope) = (String::new(), 0.0, 0.0);
+    for pair in stops.windows(2) {
+        let next = if pair[1] > pair[0] { rate } else { -rate };
+        let change: f64 = next - slope;
+        let sign = match (text.is_empty(), change > 0.0) {
+            (true, true) => "",
+            (true, false) => "-",
+            (false, true) => " + ",
+            (false, false) => " - ",
+        };
+        let _ = write!(text, "{sign}ramp({} s, 0 {force}, {} {per_second})", n(at), n(change.abs()));
+        slope = next;
+        at += (pair[1] - pair[0]).abs() / rate;
+    }
+    (text, at)
+}
+
+/// 10^k.
+fn power(k: i32) -> f64 {
+    format!("1e{k}").parse().expect("a power of ten")
+}
+
+/// The power of ten nearest to a positive number, seen on a logarithmic axis.
+pub fn power_near(x: f64) -> f64 {
+    let text = format!("{x:e}");
+    let (digits, exponent) = text.split_once('e').expect("written with an exponent");
+    let (digits, exponent): (f64, i32) = (digits.parse().expect("digits"), exponent.parse().expect("an exponent"));
+    power(if digits > 3.162 { exponent + 1 } else { exponent })
+}
+
+/// Square root: exact in every back end, so allowed here too.
+fn root(x: f64) -> f64 {
+    x.sqrt()
+}
+
+/// Two digits, not above x.
+fn round_down(x: f64) -> f64 {
+    let rounded = round(x);
+    if rounded > x { round(x * 0.99) } else { rounded }
+}
+
+/// A whole number of steps, at least x.
+fn round_up_to(x: f64, step: f64) -> f64 {
+    (x / step).ceil().max(1.0) * step
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_triangle_is_a_sum_of_ramps() {
+        let (text, end) = triangle(&[0.0, 1.0, -1.0], 0.5, "N", "N/s");
+        assert_eq!(text, "ramp(0 s, 0 N, 0.5 N/s) - ramp(2 s, 0 N, 1 N/s)");
+        assert_eq!(end, 6.0);
+    }
+
+    #[test]
+    fn powers_are_near_in_ratio() {
+        assert_eq!([1.4, 3.2, 30.0, 0.04].map(power_near), [1.0, 10.0, 10.0, 0.1]);
+    }
+}

@@ -1,0 +1,298 @@
+//! The report: one page of HTML that needs nothing but itself.
+//!
+//! In: one [`Study`] or several. Out: a page. Figures are SVG in the page, nothing is fetched, nothing is run.
+
+use super::phenomena::Seen;
+use super::study::{Graph, Study, Test, figure, prefixed};
+use crate::equations;
+use crate::plot;
+use crate::value::{show, significant};
+use std::fmt::Write;
+
+/// Width of a figure in px: two fit beside each other on a laptop.
+const WIDE: f64 = 560.0;
+
+const STYLE: &str = "
+:root { color: #1f2328; background: #fff; font: 15px/1.5 Roboto, 'Helvetica Neue', Arial, sans-serif; }
+body { max-width: 1180px; margin: 0 auto; padding: 28px 24px 60px; }
+h1 { font-size: 27px; font-weight: 500; margin: 0 0 4px; }
+h2 { font-size: 19px; font-weight: 500; margin: 38px 0 10px; padding-top: 14px; border-top: 1px solid #d8dee4; }
+h3 { font-size: 16px; font-weight: 500; margin: 0 0 2px; }
+p { margin: 0 0 8px; max-width: 80ch; }
+.faint, figcaption, .how { color: #59636e; }
+.how { font-size: 13.5px; margin-bottom: 6px; }
+table { border-collapse: collapse; font-size: 14px; margin: 6px 0 12px; }
+th { text-align: left; font-weight: 500; border-bottom: 1.5px solid #1f2328; padding: 3px 18px 4px 0; vertical-align: bottom; }
+td { border-bottom: 1px solid #e4e7eb; padding: 4px 18px 4px 0; vertical-align: top; }
+td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+td.v { white-space: nowrap; }
+.mark { display: inline-block; width: 1.3em; font-weight: 700; }
+.yes .mark { color: #00694b; } .no .mark { color: #a34700; } .na { color: #59636e; }
+.small { font-size: 12.5px; color: #59636e; line-height: 1.35; }
+.tests { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 34px 36px; }
+.wide { grid-column: 1 / -1; display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 0 36px; }
+.wide > header { grid-column: 1 / -1; }
+section { break-inside: avoid; }
+svg { width: 100%; height: auto; display: block; }
+.numbers { font-size: 13px; columns: 1; }
+.numbers td { padding: 2px 14px 2px 0; }
+.two { columns: 2; column-gap: 36px; }
+pre { font: 13px/1.45 'Roboto Mono', Menlo, Consolas, 'DejaVu Sans Mono', monospace; background: #f6f8fa; padding: 12px 14px; overflow-x: auto; margin: 6px 0 12px; }
+.doc { white-space: pre-wrap; }
+.note { border-left: 3px solid #d55e00; padding: 4px 12px; margin: 10px 0; max-width: 90ch; }
+.reason { border-left: 3px solid #c3cad2; padding: 3px 12px; color: #59636e; margin: 8px 0; }
+details > summary { cursor: pointer; color: #0072b2; }
+@media (max-width: 900px) { .tests, .wide { grid-template-columns: 1fr; } }
+@media print { body { max-width: none; padding: 0; } h2 { break-after: avoid; } details { display: none; } }
+";
+
+/// The page of one model.
+pub fn report(study: &Study) -> String {
+    let mut body = String::new();
+    let subject = &study.subject;
+    let _ = write!(body, "<h1>{}</h1>\n", escaped(&study.label));
+    let _ = write!(
+        body,
+        "<p class=\"faint\">Friction model{}, characterised by fric {} ({}, {}). Every curve and number below was \
+         computed from runs of the battery at the end of this page; nothing is taken from what the model says of \
+         itself.</p>\n",
+        if subject.rotary { " of rotary motion" } else { "" },
+        env!("CARGO_PKG_VERSION"),
+        match &subject.origin {
+            super::subject::Origin::Library => "library of the same version".to_string(),
+            super::subject::Origin::File(path) => format!("model from {}", escaped(path)),
+        },
+        "compiled to machine code"
+    );
+    for note in &study.notes {
+        let _ = write!(body, "<p class=\"note\">{}</p>\n", escaped(note));
+    }
+
+    body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th><th>seen</th><th>behind it</th></tr>\n";
+    for finding in &study.findings {
+        let _ = write!(
+            body,
+            "<tr class=\"{}\"><td>{}</td><td class=\"v\">{}{}</td><td>{}</td></tr>\n",
+            class(finding.seen),
+            finding.name,
+            mark(finding.seen),
+            finding.seen.words(),
+            escaped(&finding.why)
+        );
+    }
+    body += "</table>\n";
+
+    body += "<h2>Model</h2>\n";
+    if let Some(doc) = &subject.doc {
+        let _ = write!(body, "<p class=\"doc\">{}</p>\n", escaped(doc.trim()));
+    }
+    let _ = write!(body, "<pre>{}</pre>\n", escaped(&equations::lines(&subject.equations)));
+    body += &parameters(study);
+    body += &scales(study);
+
+    body += "<h2>Tests</h2>\n<div class=\"tests\">\n";
+    for test in &study.tests {
+        body += &section(test, &[study]);
+    }
+    body += "</div>\n";
+    body += "<h2>The battery</h2>\n<p>Save it beside the model and run it with <code>fric run</code>, or change it first.</p>\n";
+    let _ =
+        write!(body, "<details><summary>battery.fric</summary>\n<pre>{}</pre></details>\n", escaped(&study.battery));
+    page(&study.label, &body)
+}
+
+/// The page of several models side by side.
+pub fn comparison(studies: &[Study]) -> String {
+    let mut body = String::from("<h1>Friction models side by side</h1>\n");
+    let _ = write!(
+        body,
+        "<p class=\"faint\">{}; characterised by fric {}. Every verdict comes from runs, with the numbers behind \
+         it.</p>\n",
+        escaped(&studies.iter().map(|study| study.label.as_str()).collect::<Vec<_>>().join(", ")),
+        env!("CARGO_PKG_VERSION")
+    );
+    for study in studies {
+        for note in &study.notes {
+            let _ = write!(body, "<p class=\"note\">{}: {}</p>\n", escaped(&study.label), escaped(note));
+        }
+    }
+    body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th>";
+    for study in studies {
+        let _ = write!(body, "<th>{}</th>", escaped(&study.label));
+    }
+    body += "</tr>\n";
+    for (i, finding) in studies.first().map_or(&[][..], |study| &study.findings).iter().enumerate() {
+        let _ = write!(body, "<tr><td>{}</td>", finding.name);
+        for study in studies {
+            let finding = &study.findings[i];
+            let _ = write!(
+                body,
+                "<td class=\"{}\">{}{}<div class=\"small\">{}</div></td>",
+                class(finding.seen),
+                mark(finding.seen),
+                finding.seen.words(),
+                escaped(&finding.why)
+            );
+        }
+        body += "</tr>\n";
+    }
+    body += "</table>\n<h2>Scales</h2>\n<table>\n<tr><th>measured first</th>";
+    for study in studies {
+        let _ = write!(body, "<th>{}</th>", escaped(&study.label));
+    }
+    body += "</tr>\n";
+    for i in 0..4 {
+        let _ = write!(body, "<tr><td>{}</td>", scale_rows(&studies[0])[i].0);
+        for study in studies {
+            let _ = write!(body, "<td>{}</td>", scale_rows(study)[i].1);
+        }
+        body += "</tr>\n";
+    }
+    body += "</table>\n<h2>Tests</h2>\n<div class=\"tests\">\n";
+    let all: Vec<&Study> = studies.iter().collect();
+    for test in studies.first().map_or(&[][..], |study| &study.tests) {
+        body += &section(test, &all);
+    }
+    body += "</div>\n";
+    page("Friction models side by side", &body)
+}
+
+fn page(title: &str, body: &str) -> String {
+    format!(
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <title>{}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{body}</body>\n</html>\n",
+        escaped(title)
+    )
+}
+
+/// One test: figures, and its numbers where it is of one model only.
+fn section(test: &Test, studies: &[&Study]) -> String {
+    let found: Vec<(&Study, &Test)> = studies
+        .iter()
+        .filter_map(|study| Some((*study, study.tests.iter().find(|other| other.key == test.key)?)))
+        .collect();
+    let mut graphs: Vec<Vec<(&str, &Graph)>> = Vec::new();
+    let mut reasons = String::new();
+    for (study, test) in &found {
+        match &test.result {
+            Ok(own) => {
+                for graph in own {
+                    match graphs.iter_mut().find(|group| group[0].1.key == graph.key && group[0].1.x.1 == graph.x.1) {
+                        Some(group) => group.push((&study.label, graph)),
+                        None => graphs.push(vec![(&study.label, graph)]),
+                    }
+                }
+            }
+            Err(why) => {
+                let who = if studies.len() > 1 { format!("{}: ", study.label) } else { String::new() };
+                let _ = write!(reasons, "<p class=\"reason\">{}not available: {}</p>\n", escaped(&who), escaped(why));
+            }
+        }
+    }
+    let wide = graphs.len() > 1;
+    let mut out = format!("<section{}>\n<header><h3>{}</h3>\n", if wide { " class=\"wide\"" } else { "" }, test.title);
+    if let [(_, test)] = found[..] {
+        let _ = write!(out, "<p class=\"how\">{}</p>\n", escaped(&test.how));
+    }
+    out += "</header>\n";
+    for group in &graphs {
+        let id = format!("{}-", group[0].1.key);
+        // A comparison of one that has it draws that one by its name.
+        let mut drawn = figure(group);
+        if studies.len() > 1 && group.len() == 1 {
+            for curve in &mut drawn.panels[0].curves {
+                curve.name = format!("{}{}{}", group[0].0, if curve.name.is_empty() { "" } else { ", " }, curve.name);
+            }
+        }
+        let _ = write!(out, "<figure style=\"margin:0\">{}</figure>\n", plot::inline(&drawn, WIDE, &id));
+    }
+    out += &reasons;
+    if let [(_, test)] = found[..]
+        && !test.numbers.is_empty()
+    {
+        let many = if test.numbers.len() > 6 { " two" } else { "" };
+        let _ = write!(out, "<div class=\"numbers{many}\"><table>");
+        for number in &test.numbers {
+            let _ = write!(out, "<tr><td>{}</td><td class=\"n\">{}</td></tr>", escaped(&number.name), number.shown());
+        }
+        out += "</table></div>\n";
+    }
+    out + "</section>\n"
+}
+
+fn parameters(study: &Study) -> String {
+    if study.subject.params.is_empty() {
+        return String::new();
+    }
+    let mut out = String::from(
+        "<table>\n<tr><th>parameter</th><th style=\"text-align:right\">value</th><th>range</th><th></th></tr>\n",
+    );
+    for param in &study.subject.params {
+        let _ = write!(
+            out,
+            "<tr><td>{}</td><td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>\n",
+            escaped(&param.path),
+            show(param.value, &param.unit, 6),
+            range(param.range, &param.unit),
+            escaped(param.doc.as_deref().unwrap_or_default())
+        );
+    }
+    out + "</table>\n"
+}
+
+/// A range in words: `> 0`, `0.01 … 0.99`.
+pub fn range((low, high): (f64, f64), unit: &abi::unit::Unit) -> String {
+    let text = |value: f64| if value == 0.0 { "0".into() } else { show(value, unit, 6) };
+    match (low.is_finite(), high.is_finite()) {
+        (true, true) => format!("{} … {}", text(low), text(high)),
+        (true, false) => format!("from {}", text(low)),
+        (false, true) => format!("up to {}", text(high)),
+        (false, false) => String::new(),
+    }
+}
+
+fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
+    let scales = &study.scales;
+    let shown = |value: f64, base: &str| show(value, &prefixed(base, value).0, 4);
+    [
+        ("break-away force of a slow ramp, F_b", shown(scales.f_b, study.units.force)),
+        ("travel until then, x_b", shown(scales.x_b, study.units.length)),
+        ("least force of sliding, F_c", shown(scales.f_c, study.units.force)),
+        ("speed scale, v_s", shown(scales.v_s, study.units.speed)),
+    ]
+}
+
+fn scales(study: &Study) -> String {
+    let mut out = String::from("<p>The battery is laid out with scales that were measured first:</p>\n<table>\n");
+    for (name, value) in scale_rows(study) {
+        let _ = write!(out, "<tr><td>{name}</td><td class=\"n\">{value}</td></tr>\n");
+    }
+    let _ = write!(
+        out,
+        "<tr><td>mass on the benches</td><td class=\"n\">{} {}</td></tr>\n</table>\n",
+        significant(study.scales.mass, 3),
+        study.units.mass.replace("^2", "²")
+    );
+    out
+}
+
+fn class(seen: Seen) -> &'static str {
+    match seen {
+        Seen::Shown => "yes",
+        Seen::NotShown => "no",
+        Seen::NotApplicable => "na",
+    }
+}
+
+fn mark(seen: Seen) -> &'static str {
+    match seen {
+        Seen::Shown => "<span class=\"mark\">✓</span>",
+        Seen::NotShown => "<span class=\"mark\">✗</span>",
+        Seen::NotApplicable => "<span class=\"mark\">–</span>",
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}

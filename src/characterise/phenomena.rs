@@ -1,0 +1,371 @@
+//! Which phenomena a model was seen to show.
+//!
+//! In: the numbers that the tests read from the curves. Out: a verdict for each phenomenon with the numbers behind it.
+//! Nothing here asks what a model says of itself.
+
+use super::battery::Scales;
+use super::study::{Number, Test};
+use super::subject::{External, Subject};
+
+/// A phenomenon and whether the model shows it.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Finding {
+    /// For programs: `return_point_memory`.
+    pub key: &'static str,
+    /// For people.
+    pub name: &'static str,
+    /// The verdict.
+    pub seen: Seen,
+    /// The numbers behind it, or the reason.
+    pub why: String,
+}
+
+/// A verdict.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Seen {
+    /// It was seen.
+    Shown,
+    /// It was looked for and not seen.
+    NotShown,
+    /// The question has no meaning for this model.
+    NotApplicable,
+}
+
+impl Seen {
+    /// In words.
+    pub fn words(self) -> &'static str {
+        match self {
+            Seen::Shown => "shown",
+            Seen::NotShown => "not shown",
+            Seen::NotApplicable => "not applicable",
+        }
+    }
+
+    /// In JSON.
+    pub fn key(self) -> &'static str {
+        match self {
+            Seen::Shown => "shown",
+            Seen::NotShown => "not-shown",
+            Seen::NotApplicable => "not-applicable",
+        }
+    }
+}
+
+/// All of them, in the order of the table.
+pub fn findings(subject: &Subject, scales: &Scales, tests: &[Test], chatter: Option<&str>) -> Vec<Finding> {
+    let look = Look { subject, scales, tests, chatter };
+    vec![
+        look.finding("holds", "holds a load at rest", Look::holds),
+        look.finding("no_drift", "keeps its place when shaken", Look::no_drift),
+        look.finding("stiction_peak", "stiction peak", Look::stiction_peak),
+        look.finding("stribeck", "Stribeck curve", Look::stribeck),
+        look.finding("viscous", "viscous friction", Look::viscous),
+        look.finding("presliding", "presliding displacement", Look::presliding),
+        look.finding("hysteresis", "presliding hysteresis", Look::hysteresis),
+        look.finding("return_point_memory", "return-point memory", Look::memory),
+        look.finding("lag", "frictional lag", Look::lag),
+        look.finding("varying_break_away", "varying break-away", Look::varying),
+        look.finding("stick_slip", "stick-slip on a spring", Look::stick_slip),
+        look.finding("rate_independent", "rate independent", Look::rate_independent),
+        look.finding("dissipative", "dissipative", Look::dissipative),
+        look.finding("symmetric", "symmetric", Look::symmetric),
+    ]
+}
+
+struct Look<'a> {
+    subject: &'a Subject,
+    scales: &'a Scales,
+    tests: &'a [Test],
+    chatter: Option<&'a str>,
+}
+
+type Answer = (Seen, String);
+
+fn when(shown: bool, why: String) -> Answer {
+    (if shown { Seen::Shown } else { Seen::NotShown }, why)
+}
+
+impl Look<'_> {
+    fn finding(&self, key: &'static str, name: &'static str, look: fn(&Self) -> Answer) -> Finding {
+        let (seen, why) = look(self);
+        Finding { key, name, seen, why }
+    }
+
+    fn test(&self, key: &str) -> Result<&Test, Answer> {
+        let test = self.tests.iter().find(|test| test.key == key).expect("every test has its place");
+        match &test.result {
+            Ok(_) => Ok(test),
+            Err(why) => Err((Seen::NotApplicable, why.lines().next().unwrap_or_default().to_string())),
+        }
+    }
+
+    fn all<'t>(test: &'t Test, key: &str) -> Vec<&'t Number> {
+        test.numbers.iter().filter(|number| number.key == key).collect()
+    }
+
+    fn number<'t>(test: &'t Test, key: &str) -> Option<&'t Number> {
+        test.numbers.iter().find(|number| number.key == key)
+    }
+
+    /// A memoryless map: questions about memory have no meaning for it.
+    fn is_static(&self) -> bool {
+        self.subject.states == 0 && self.subject.regimes.is_empty()
+    }
+
+    fn holds(&self) -> Answer {
+        let test = match self.test("hold") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        if let (Some(chatter), External::Absent) = (self.chatter, self.subject.external) {
+            return (Seen::NotShown, format!("it has no port F_ext and {chatter}; put it into `Sticking(law = …)`"));
+        }
+        let (moved, creep) = (Self::number(test, "held_peak_to_peak"), Self::number(test, "creep_speed"));
+        let (Some(moved), Some(creep)) = (moved, creep) else { return (Seen::NotApplicable, "not measured".into()) };
+        let needs =
+            if self.subject.external == External::Absent && self.is_static() { "; it would need F_ext" } else { "" };
+        match moved.value < 1e-9 {
+            true => when(true, format!("moves {} in 90 s", moved.shown())),
+            false => when(false, format!("creeps at {}{needs}", creep.shown())),
+        }
+    }
+
+    fn no_drift(&self) -> Answer {
+        let (holds, why) = self.holds();
+        if holds != Seen::Shown {
+            return (Seen::NotApplicable, format!("does not hold: {why}"));
+        }
+        let test = match self.test("drift") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let Some(drift) = Self::number(test, "drift") else { return (Seen::NotApplicable, "not measured".into()) };
+        when(drift.value.abs() < 1e-9, format!("drifts {} in a cycle", drift.shown()))
+    }
+
+    fn stiction_peak(&self) -> Answer {
+        let test = match self.test("break_away") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let highest = Self::all(test, "break_away_force").into_iter().max_by(|a, b| a.value.total_cmp(&b.value));
+        let Some(highest) = highest else { return (Seen::NotApplicable, "never let go".into()) };
+        let sliding = Number { value: self.scales.f_c, ..highest.clone() };
+        let why = format!("lets go at up to {}, slides with {}", highest.shown(), sliding.shown());
+        // What is viscous at the speed that counts as sliding is no stiction.
+        let viscous =
+            self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
+        when(highest.value > 1.02 * self.scales.f_c + viscous.abs() * self.scales.v_slip && self.scales.f_c > 0.0, why)
+    }
+
+    fn stribeck(&self) -> Answer {
+        let test = match self.test("steady") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let (peak, low) = (Self::number(test, "steady_peak"), Self::number(test, "sliding_force"));
+        let (Some(peak), Some(low), Some(points)) = (peak, low, Self::number(test, "stribeck_points")) else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        match (Self::number(test, "stribeck_speed"), points.value >= 3.0 && peak.value > 1.01 * low.value) {
+            (Some(speed), true) => {
+                when(true, format!("falls from {} to {}, 1/e at {}", peak.shown(), low.shown(), speed.shown()))
+            }
+            (Some(speed), false) => {
+                when(false, format!("jumps from {} to {} near {}", peak.shown(), low.shown(), speed.shown()))
+            }
+            (None, _) => when(false, "the force of steady sliding never falls with speed".into()),
+        }
+    }
+
+    fn viscous(&self) -> Answer {
+        let test = match self.test("steady") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let Some(slope) = Self::number(test, "viscous_slope") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        let part = slope.value * self.scales.v_max / self.scales.f_ref;
+        when(part > 1e-3, format!("{} at the fastest", slope.shown()))
+    }
+
+    fn presliding(&self) -> Answer {
+        if let Some(chatter) = self.chatter {
+            return (Seen::NotShown, chatter.to_string());
+        }
+        let test = match self.test("presliding") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        if self.holds().0 != Seen::Shown {
+            return (Seen::NotShown, "what moves below break-away is creep: it does not come to rest".into());
+        }
+        let Some(travel) = Self::number(test, "presliding_travel") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        let why = match Self::number(test, "stiffness") {
+            Some(stiffness) if travel.value > 1e-9 => {
+                format!("moves {} within ±30 %, {}", travel.shown(), stiffness.shown())
+            }
+            Some(_) | None => format!("moves {} within ±30 %", travel.shown()),
+        };
+        when(travel.value > 1e-8, why)
+    }
+
+    fn hysteresis(&self) -> Answer {
+        let (presliding, why) = self.presliding();
+        if presliding != Seen::Shown {
+            return (Seen::NotApplicable, format!("no presliding: {why}"));
+        }
+        let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
+        let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };
+        when(
+            area.value > 0.005,
+            format!("the loop fills {} % of its box", super::study::plain((1000.0 * area.value).round() / 10.0)),
+        )
+    }
+
+    fn memory(&self) -> Answer {
+        let (hysteresis, why) = self.hysteresis();
+        match hysteresis {
+            Seen::Shown => {}
+            Seen::NotShown => return (Seen::NotApplicable, format!("elastic, so every loop closes: {why}")),
+            Seen::NotApplicable => return (Seen::NotApplicable, why),
+        }
+        let error = self.test("presliding").ok().and_then(|test| Self::number(test, "memory_error"));
+        let Some(error) = error else { return (Seen::NotApplicable, "not measured".into()) };
+        when(
+            error.value < 0.01,
+            format!(
+                "the inner loop misses its start by {} % of its width",
+                super::study::plain((1000.0 * error.value).round() / 10.0)
+            ),
+        )
+    }
+
+    fn lag(&self) -> Answer {
+        let test = match self.test("lag") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let widest = Self::all(test, "lag").into_iter().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
+        let Some(widest) = widest else { return (Seen::NotApplicable, "not measured".into()) };
+        let size = self.scales.f_c.max(self.scales.f_b);
+        when(widest.value > 0.005 * size, format!("loop up to {} wide", widest.shown()))
+    }
+
+    fn varying(&self) -> Answer {
+        let test = match self.test("break_away") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let forces = Self::all(test, "break_away_force");
+        let Some(change) = Self::number(test, "break_away_change") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        let (Some(slow), Some(fast)) = (forces.first(), forces.last()) else {
+            return (Seen::NotApplicable, "never let go".into());
+        };
+        let overshoot = |key| {
+            let test = self.test("reversal").ok()?;
+            Some(Self::number(test, key)?.value)
+        };
+        let viscous =
+            self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
+        if change.value > 0.02 + viscous.abs() * self.scales.v_slip / slow.value && self.chatter.is_none() {
+            return when(
+                true,
+                format!("with the rate: {} {}, {} {}", slow.shown(), slow.name, fast.shown(), fast.name),
+            );
+        }
+        if let (Some(first), Some(second)) = (overshoot("virgin_overshoot"), overshoot("reversal_overshoot"))
+            && second > 0.02 * self.scales.f_b
+            && second > 1.05 * first
+        {
+            let ratio = super::study::plain((100.0 * second / first.max(1e-300)).round() / 100.0);
+            return when(
+                true,
+                format!("with the history: the overshoot after a reversal is {ratio} times that from rest"),
+            );
+        }
+        when(
+            false,
+            format!(
+                "{} at every rate, within {} %",
+                slow.shown(),
+                super::study::plain((1000.0 * change.value).round() / 10.0)
+            ),
+        )
+    }
+
+    fn stick_slip(&self) -> Answer {
+        let test = match self.test("stick_slip") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        match (Self::number(test, "stick_slip_up_to"), Self::number(test, "stick_slip_gone")) {
+            (Some(up_to), Some(gone)) => {
+                when(true, format!("up to {}, smooth from {} on", up_to.shown(), gone.shown()))
+            }
+            (Some(up_to), None) => when(true, format!("up to {}, the fastest pull", up_to.shown())),
+            (None, _) => when(false, "slides without sticking at every pull speed".into()),
+        }
+    }
+
+    fn rate_independent(&self) -> Answer {
+        if self.is_static() || !self.subject.regimes.is_empty() && self.presliding().0 != Seen::Shown {
+            return (Seen::NotApplicable, "no memory of the path".into());
+        }
+        let test = match self.test("rate") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let Some(part) = Self::number(test, "rate_difference_part") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        when(
+            part.value < 2e-3,
+            format!(
+                "differs by {} % from 0.1 to 10 times the speed",
+                super::study::plain((1e4 * part.value).round() / 100.0)
+            ),
+        )
+    }
+
+    fn dissipative(&self) -> Answer {
+        let test = match self.test("dissipation") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let Some(least) = Self::number(test, "least_work") else { return (Seen::NotApplicable, "not measured".into()) };
+        if let (Some(v), Some(force)) = (Self::number(test, "pushes_at"), Self::number(test, "pushes_with")) {
+            return when(false, format!("can push: at v = {} with F = {}", v.shown(), force.shown()));
+        }
+        if least.value < 0.0 {
+            return when(false, format!("gives out {} on a closed path", least.shown()));
+        }
+        match Self::number(test, "dissipation_points") {
+            Some(points) => {
+                when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown()))
+            }
+            None => when(true, format!("least work of six rounds {}; no `storage` to search with", least.shown())),
+        }
+    }
+
+    fn symmetric(&self) -> Answer {
+        let test = match self.test("steady") {
+            Ok(test) => test,
+            Err(answer) => return answer,
+        };
+        let Some(asymmetry) = Self::number(test, "asymmetry") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        match asymmetry.value == 0.0 {
+            true => when(true, "both directions agree to the last bit".into()),
+            false => {
+                when(asymmetry.value < 1e-9 * self.scales.f_ref, format!("directions differ by {}", asymmetry.shown()))
+            }
+        }
+    }
+}

@@ -1,0 +1,999 @@
+//! Lays the battery out, runs it, and reads from the curves what the model did.
+//!
+//! In: a [`Subject`]. Out: a [`Study`]. Scales come first: the force of fast sliding, then break-away and presliding
+//! travel, then the steady curve; the rest is laid out with them.
+
+use super::battery::{self, Entry, Layout, Scales, Units, n};
+use super::bench::{self, Ran, Results};
+use super::phenomena::{self, Finding};
+use super::subject::{External, Subject};
+use crate::compile::{self, Sources, Verdict};
+use crate::plot::{Axis, Curve, Figure, Panel};
+use crate::value::{show, significant};
+use abi::unit::Unit;
+
+/// What was done with a model and what came of it.
+#[derive(Clone, Debug)]
+pub struct Study {
+    /// The model.
+    pub subject: Subject,
+    /// Short name for legends.
+    pub label: String,
+    /// Units of the model.
+    pub units: Units,
+    /// The battery that was run.
+    pub battery: String,
+    /// Scales, SI.
+    pub scales: Scales,
+    /// In the order of the report.
+    pub tests: Vec<Test>,
+    /// What it shows.
+    pub findings: Vec<Finding>,
+    /// Remarks on the whole, such as that it chatters.
+    pub notes: Vec<String>,
+}
+
+/// One test of the battery.
+#[derive(Clone, Debug)]
+pub struct Test {
+    /// For files: `break_away`.
+    pub key: &'static str,
+    /// Heading.
+    pub title: &'static str,
+    /// What was done, in a sentence.
+    pub how: String,
+    /// Curves, or the reason why there are none.
+    pub result: Result<Vec<Graph>, String>,
+    /// What was measured.
+    pub numbers: Vec<Number>,
+}
+
+/// A measured number.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Number {
+    /// For programs: `break_away_force`.
+    pub key: &'static str,
+    /// For people.
+    pub name: String,
+    /// SI.
+    pub value: f64,
+    /// Coherent SI unit, empty for a pure number.
+    pub unit: String,
+}
+
+impl Number {
+    /// With a unit that suits its size.
+    pub fn shown(&self) -> String {
+        if self.value == f64::INFINITY {
+            return "more than was tried".into();
+        }
+        let (unit, _) = prefixed(&self.unit, self.value.abs());
+        show(self.value, &unit, 4)
+    }
+}
+
+/// Curves over common axes; values in SI.
+#[derive(Clone, Debug)]
+pub struct Graph {
+    /// For files: `energy`.
+    pub key: &'static str,
+    /// Name and coherent unit of what is drawn to the right.
+    pub x: (String, String),
+    /// The same upwards.
+    pub y: (String, String),
+    /// Whether in powers of ten.
+    pub logarithmic: (bool, bool),
+    /// The curves.
+    pub lines: Vec<Line>,
+}
+
+/// One curve of a graph.
+#[derive(Clone, Debug)]
+pub struct Line {
+    /// For the legend; may be empty.
+    pub name: String,
+    /// SI.
+    pub points: Vec<(f64, f64)>,
+    /// Measured points rather than a course.
+    pub marks: bool,
+    /// Shown when several models share the axes.
+    pub main: bool,
+}
+
+impl Line {
+    fn course(name: impl Into<String>, points: Vec<(f64, f64)>) -> Line {
+        Line { name: name.into(), points, marks: false, main: true }
+    }
+
+    fn marked(name: impl Into<String>, points: Vec<(f64, f64)>) -> Line {
+        Line { name: name.into(), points, marks: true, main: true }
+    }
+
+    fn aside(self) -> Line {
+        Line { main: false, ..self }
+    }
+}
+
+/// A unit with the prefix that suits a size, and what one of it is in SI.
+pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
+    const PREFIXES: [(&str, f64); 6] = [("G", 1e9), ("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("u", 1e-6)];
+    let plain = || (Unit::parse(base).unwrap_or_else(|_| Unit::none()), 1.0);
+    if base.is_empty() || base == "s" || base == "Hz" || base.starts_with("kg") || size == 0.0 || !size.is_finite() {
+        return plain();
+    }
+    let fitting = PREFIXES.into_iter().find(|(_, scale)| size >= 0.9999 * scale).unwrap_or(("n", 1e-9));
+    match Unit::parse(&format!("{}{base}", fitting.0)) {
+        Ok(unit) => (unit, fitting.1),
+        Err(_) => plain(),
+    }
+}
+
+/// A graph as a figure: the curves of several models, or all curves of one.
+pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
+    let Some((_, first)) = graphs.first() else { return Figure::default() };
+    let alone = graphs.len() == 1;
+    let shown = |line: &&Line| alone || line.main;
+    let lines =
+        || graphs.iter().flat_map(|(name, graph)| graph.lines.iter().filter(shown).map(move |line| (*name, line)));
+    let size = |of: fn(&(f64, f64)) -> f64| {
+        let values = lines().flat_map(|(_, line)| line.points.iter().map(of));
+        values.filter(|value| value.is_finite()).fold(0.0, |size: f64, value| size.max(value.abs()))
+    };
+    let (x_unit, x_scale) = prefixed(&first.x.1, size(|point| point.0));
+    let (y_unit, y_scale) = prefixed(&first.y.1, size(|point| point.1));
+    let curves = lines().map(|(model, line)| Curve {
+        name: match (alone, graphs.iter().map(|(_, graph)| graph.lines.iter().filter(shown).count()).max() > Some(1)) {
+            (true, _) => line.name.clone(),
+            (false, true) => format!("{model}, {}", line.name),
+            (false, false) => model.into(),
+        },
+        points: line.points.iter().map(|(x, y)| (x / x_scale, y / y_scale)).collect(),
+        boolean: false,
+        marks: line.marks,
+    });
+    let axis = |(name, _): &(String, String), unit: Unit, logarithmic| Axis {
+        name: name.clone(),
+        unit: unit.text,
+        logarithmic,
+    };
+    let panel = Panel {
+        x: axis(&first.x, x_unit, first.logarithmic.0),
+        y: axis(&first.y, y_unit, first.logarithmic.1),
+        curves: curves.collect(),
+        bands: Vec::new(),
+    };
+    Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
+}
+
+/// Puts a model through the battery.
+///
+/// # Errors
+/// Why nothing at all can be said, as a message or a report.
+pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Result<Study, String> {
+    let rotary = subject.rotary;
+    let mut runner =
+        Runner { subject: &subject, name, sources, entries: Vec::new(), results: Results::new(), chatter: None };
+    let v_max = if rotary { 10.0 } else { 1.0 };
+    let mut scales =
+        Scales { f_ref: 0.0, mass: 1.0, f_b: 0.0, x_b: 0.0, f_c: 0.0, v_s: 0.01 * v_max, v_slip: 0.01 * v_max, v_max };
+
+    runner.run(&scales, |layout| vec![layout.scale_sliding()])?;
+    let sliding = runner.one("scale_sliding")?.rows().map_err(|why| format!("does not slide steadily: {why}"))?;
+    scales.f_ref = sliding.last().map_or(0.0, |row| row[1].abs());
+    if scales.f_ref.is_nan() || scales.f_ref <= 0.0 {
+        return Err("gives no force when it slides, so there is nothing to characterise".into());
+    }
+    scales.mass = battery::power_near(scales.f_ref);
+
+    for times in [1.0, 10.0] {
+        runner.run(&scales, |layout| vec![layout.scale_break_away(times)])?;
+        let rows = runner.one("scale_break_away")?.rows().map_err(|why| format!("cannot be pushed: {why}"))?;
+        if let Some((force, travel)) = break_away(&rows, scales.v_slip) {
+            (scales.f_b, scales.x_b) = (force, travel.abs());
+            break;
+        }
+        runner.entries.retain(|entry| entry.name != "scale_break_away");
+    }
+    if scales.f_b <= 0.0 {
+        return Err(format!("does not let go under {} times the force it slides with", 60));
+    }
+
+    runner.run(&scales, |layout| layout.steady())?;
+    let units = Units::of(rotary);
+    let steady = Steady::of(&runner.results)?;
+    (scales.f_c, scales.v_s) = (steady.f_c, steady.v_s.unwrap_or(scales.v_s / 10.0));
+    // Ten times the Stribeck speed is sliding; it is 10 mm/s for the textbook's 1 mm/s.
+    scales.v_slip = battery::round(10.0 * scales.v_s);
+
+    runner.run(&scales, |layout| layout.rest())?;
+    let layout = Layout::new(&subject, scales.clone());
+    let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
+    let dissipation = runner.dissipation(&text);
+    let chatter = runner.chatter.clone();
+    let reader = Reader { results: &runner.results, layout: &layout, units, scales: &scales, steady: &steady };
+    let tests = reader.tests(dissipation);
+    let findings = phenomena::findings(&subject, &scales, &tests, chatter.as_deref());
+    let mut notes = Vec::new();
+    if let Some(chatter) = chatter {
+        notes.push(format!(
+            "Chatters at rest ({chatter}). What needs rest was run with a fixed step instead; there the force jumps to \
+             and fro, and what it holds is an average."
+        ));
+    }
+    if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
+        notes.push("A static map of the velocity: it has no memory, and no port F_ext to hold a load with.".into());
+    }
+    let label = subject.instance.label();
+    Ok(Study { label, units, battery: text, scales, tests, findings, notes, subject })
+}
+
+/// Collects the experiments and what became of them.
+struct Runner<'a> {
+    subject: &'a Subject,
+    name: &'a str,
+    sources: &'a (dyn Sources + Sync),
+    entries: Vec<Entry>,
+    results: Results,
+    chatter: Option<String>,
+}
+
+impl Runner<'_> {
+    fn run(&mut self, scales: &Scales, entries: impl Fn(&Layout) -> Vec<Entry>) -> Result<(), String> {
+        let layout = Layout::new(self.subject, scales.clone());
+        let first = self.entries.len();
+        self.entries.extend(entries(&layout));
+        let mut names: Vec<String> = self.entries[first..].iter().map(|entry| entry.name.clone()).collect();
+        for _ in 0..2 {
+            let text = battery::text(&self.subject.imports, &layout.head(), &self.entries);
+            let loaded = bench::load(self.name, &text, self.sources)?;
+            let results = bench::run(&loaded, &names, self.sources);
+            names =
+                results.iter().filter(|(_, result)| bench::chatters(result)).map(|(name, _)| name.clone()).collect();
+            self.results.extend(results);
+            for entry in self.entries.iter_mut().filter(|entry| names.contains(&entry.name) && entry.adaptive()) {
+                if let (None, Some(Ok(cases))) = (&self.chatter, self.results.get(&entry.name)) {
+                    let why = cases.iter().find_map(|ran| ran.result.as_ref().err());
+                    self.chatter = why.map(|why| why.to_string().split(';').next().unwrap_or_default().to_string());
+                }
+                entry.step_fixed();
+            }
+            if names.is_empty() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn one(&self, name: &str) -> Result<&Ran, String> {
+        one(&self.results, name)
+    }
+
+    fn dissipation(&self, text: &str) -> Option<Verdict> {
+        let loaded = bench::load(self.name, text, self.sources).ok()?;
+        let written = self.subject.instance.to_string();
+        let (instance, _) = grammar::parse::parse_instance(loaded.root(), &written);
+        compile::dissipation(&loaded, self.sources, &instance?, loaded.root())
+    }
+}
+
+fn one<'a>(results: &'a Results, name: &str) -> Result<&'a Ran, String> {
+    match results.get(name) {
+        Some(Ok(cases)) => cases.first().ok_or_else(|| format!("{name} has no case")),
+        Some(Err(report)) => Err(report.clone()),
+        None => Err(format!("{name} was not run")),
+    }
+}
+
+/// Largest force before the speed first reaches `v_slip`, and the travel at it. Rows hold t, F, x, v.
+fn break_away(rows: &[Vec<f64>], v_slip: f64) -> Option<(f64, f64)> {
+    let end = rows.iter().position(|row| row[3].abs() >= v_slip)?;
+    let best = rows[..=end].iter().max_by(|a, b| a[1].total_cmp(&b[1]))?;
+    Some((best[1], best[2]))
+}
+
+/// The steady curve.
+struct Steady {
+    /// Speed and force, ascending in speed, for both directions.
+    forward: Vec<(f64, f64)>,
+    backward: Vec<(f64, f64)>,
+    f_c: f64,
+    v_s: Option<f64>,
+    /// Speed and height of the peak, and how many steps of the grid the force falls behind it.
+    peak: (f64, f64),
+    falls: usize,
+    viscous: f64,
+    asymmetry: f64,
+    failures: Vec<String>,
+}
+
+impl Steady {
+    fn of(results: &Results) -> Result<Steady, String> {
+        let (mut forward, mut backward, mut failures) = (Vec::new(), Vec::new(), Vec::new());
+        for (name, cases) in results.iter().filter(|(name, _)| name.starts_with("steady_")) {
+            let cases = cases.as_ref().map_err(|why| why.clone())?;
+            for ran in cases {
+                let speed = ran.label.split_once('=').and_then(|(_, value)| crate::value::parse(value).ok());
+                let Some((speed, _)) = speed else { continue };
+                match ran.rows() {
+                    Ok(rows) => {
+                        let force = rows.last().map_or(f64::NAN, |row| row[1]);
+                        if speed > 0.0 { forward.push((speed, force)) } else { backward.push((speed, force)) }
+                    }
+                    Err(why) => failures.push(format!("{name}, {}: {why}", ran.label)),
+                }
+            }
+        }
+        forward.sort_by(|a, b| a.0.total_cmp(&b.0));
+        backward.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let [.., before, last] = forward[..] else {
+            return Err(failures.into_iter().next().unwrap_or_else(|| "it has no steady curve".into()));
+        };
+        let viscous = (last.1 - before.1) / (last.0 - before.0);
+        // The first speed from which on the force falls, and where it has stopped falling.
+        let top = (0..forward.len() - 1).find(|i| forward[i + 1].1 < forward[*i].1 * (1.0 - 5e-4));
+        let (mut falls, mut v_s, mut peak) = (0, None, forward[0]);
+        let intercept = last.1 - viscous * last.0;
+        let mut f_c = if intercept > 0.0 { intercept.min(last.1) } else { 0.0 };
+        if let Some(top) = top {
+            peak = forward[top];
+            let foot =
+                (top..forward.len() - 1).find(|i| forward[i + 1].1 >= forward[*i].1).unwrap_or(forward.len() - 1);
+            falls = foot - top;
+            f_c = forward[foot].1;
+            let level = f_c + (peak.1 - f_c) / std::f64::consts::E;
+            let below = (top..=foot).find(|i| forward[*i].1 <= level).unwrap_or(foot);
+            let (a, b) = (forward[below - 1], forward[below]);
+            v_s = Some(a.0 + (b.0 - a.0) * ((a.1 - level) / (a.1 - b.1)).clamp(0.0, 1.0));
+        }
+        let asymmetry = forward.iter().zip(&backward).map(|(a, b)| (a.1 + b.1).abs()).fold(0.0, f64::max);
+        Ok(Steady { forward, backward, f_c, v_s, peak, falls, viscous, asymmetry, failures })
+    }
+}
+
+/// Reads tests from results.
+struct Reader<'a> {
+    results: &'a Results,
+    layout: &'a Layout<'a>,
+    units: Units,
+    scales: &'a Scales,
+    steady: &'a Steady,
+}
+
+type Read = Result<(Vec<Graph>, Vec<Number>), String>;
+
+impl Reader<'_> {
+    fn tests(&self, dissipation: Option<Verdict>) -> Vec<Test> {
+        let s = self.scales;
+        let test = |key, title, how: String, read: Read| {
+            let (result, numbers) = match read {
+                Ok((graphs, numbers)) => (Ok(graphs), numbers),
+                Err(why) => (Err(why), Vec::new()),
+            };
+            Test { key, title, how, result, numbers }
+        };
+        let speed = |v: f64| Number { key: "", name: String::new(), value: v, unit: self.units.speed.into() }.shown();
+        let force = |f: f64| Number { key: "", name: String::new(), value: f, unit: self.units.force.into() }.shown();
+        vec![
+            test(
+                "steady",
+                "Steady friction against velocity",
+                format!(
+                    "Moved at constant speed until the force had settled; {} speeds in each direction.",
+                    self.steady.forward.len()
+                ),
+                self.read_steady(),
+            ),
+            test(
+                "break_away",
+                "Break-away against force rate",
+                format!(
+                    "A mass of {} {} pushed by a growing force; the largest friction before the speed first reaches {}.",
+                    n(s.mass),
+                    self.units.mass,
+                    speed(s.v_slip)
+                ),
+                self.read_break_away(),
+            ),
+            test(
+                "presliding",
+                "Presliding hysteresis",
+                format!(
+                    "A slow force to 30 % and 95 % of the break-away force ({}) and back, with an inner loop.",
+                    force(s.f_b)
+                ),
+                self.read_presliding(),
+            ),
+            test(
+                "lag",
+                "Frictional lag",
+                format!("Speed {} · (1.5 + sin ωt), which keeps its sign; the last cycle of each.", speed(s.v_s)),
+                self.read_lag(),
+            ),
+            test(
+                "reversal",
+                "Start and reversal",
+                format!("At {} from rest, and then back.", speed(self.layout.cycle_speed())),
+                self.read_reversal(),
+            ),
+            test(
+                "stick_slip",
+                "Stick-slip on a spring",
+                format!(
+                    "A mass of {} {} pulled through a spring of {} {} without damping.",
+                    n(s.mass),
+                    self.units.mass,
+                    n(2.0 * s.mass),
+                    self.units.stiffness
+                ),
+                self.read_stick_slip(),
+            ),
+            test("coast_down", "Coast-down", "A mass thrown and left alone.".into(), self.read_coast_down()),
+            test(
+                "hold",
+                "Holding a load",
+                "Half of the sliding force, applied within 2 s and held for 100 s, on a lightly damped mass.".into(),
+                self.read_hold(),
+            ),
+            test(
+                "drift",
+                "Drift under a small oscillation",
+                "A load of 0.6 times the sliding force, shaken by 0.3 times it at 1 Hz for 20 s.".into(),
+                self.read_drift(),
+            ),
+            test(
+                "energy",
+                "Energy per cycle",
+                "Sinusoidal cycles of growing amplitude at one greatest speed; the loss of the last of three.".into(),
+                self.read_energy(),
+            ),
+            test(
+                "rate",
+                "Rate independence",
+                format!(
+                    "The same path at 0.1, 1 and 10 times {}; a rate-independent model draws one curve.",
+                    speed(self.layout.cycle_speed())
+                ),
+                self.read_rate(),
+            ),
+            test(
+                "dissipation",
+                "Verdict",
+                "Irregular motions on closed paths, and a search for a point at which power is given out.".into(),
+                self.read_dissipation(dissipation),
+            ),
+            test(
+                "steps",
+                "Step size",
+                "The spring again with fixed steps (expo): error of the position at the end against the adaptive run."
+                    .into(),
+                self.read_steps(),
+            ),
+        ]
+    }
+
+    fn number(&self, key: &'static str, name: impl Into<String>, value: f64, unit: &str) -> Number {
+        Number { key, name: name.into(), value, unit: unit.into() }
+    }
+
+    fn rows(&self, name: &str) -> Result<Vec<Vec<f64>>, String> {
+        one(self.results, name)?.rows()
+    }
+
+    fn axis(&self, name: &str, unit: &str) -> (String, String) {
+        (name.into(), unit.into())
+    }
+
+    fn read_steady(&self) -> Read {
+        let steady = self.steady;
+        let mirrored = steady.backward.iter().map(|(v, f)| (-v, -f)).collect();
+        let graph = Graph {
+            key: "steady",
+            x: self.axis("|v|", self.units.speed),
+            y: self.axis("|F|", self.units.force),
+            logarithmic: (true, false),
+            lines: vec![Line::course("forward", steady.forward.clone()), Line::course("backward", mirrored).aside()],
+        };
+        let mut numbers = vec![
+            self.number("sliding_force", "least sliding force F_c", steady.f_c, self.units.force),
+            self.number("steady_peak", "greatest force of slow sliding", steady.peak.1, self.units.force),
+        ];
+        if let Some(v_s) = steady.v_s {
+            numbers.push(self.number("stribeck_speed", "speed at which the excess is 1/e", v_s, self.units.speed));
+        }
+        numbers.push(self.number("stribeck_points", "points of the grid over which it falls", steady.falls as f64, ""));
+        numbers.push(self.number("viscous_slope", "viscous slope", steady.viscous, self.units.damping));
+        numbers.push(self.number(
+            "asymmetry",
+            "greatest difference of the directions",
+            steady.asymmetry,
+            self.units.force,
+        ));
+        if !steady.failures.is_empty() {
+            numbers.push(self.number("failures", "speeds at which it failed", steady.failures.len() as f64, ""));
+        }
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_break_away(&self) -> Read {
+        let mut points = Vec::new();
+        let mut lines = Vec::new();
+        let rates = self.layout.rates();
+        for (i, rate) in rates.iter().enumerate() {
+            let rows = self.rows(&format!("break_away_{}", i + 1))?;
+            let Some((force, _)) = break_away(&rows, self.scales.v_slip) else { continue };
+            points.push((*rate, force));
+            if [3, 6, 9].contains(&i) {
+                let course = rows.iter().filter(|row| row[3].abs() <= self.scales.v_slip).map(|row| (row[2], row[1]));
+                lines.push(Line::course(format!("{} {}", n(*rate), self.units.rate), course.collect()).aside());
+            }
+        }
+        if points.is_empty() {
+            return Err("never let go at any rate".into());
+        }
+        if let Some(line) = lines.first_mut() {
+            line.main = true;
+        }
+        let graphs = vec![
+            Graph {
+                key: "break_away",
+                x: self.axis("force rate", self.units.rate),
+                y: self.axis("break-away force", self.units.force),
+                logarithmic: (true, false),
+                lines: vec![Line::marked("", points.clone())],
+            },
+            Graph {
+                key: "break_away_travel",
+                x: self.axis("x", self.units.length),
+                y: self.axis("F", self.units.force),
+                logarithmic: (false, false),
+                lines,
+            },
+        ];
+        let forces = points.iter().map(|point| point.1);
+        let (low, high) = forces.fold((f64::INFINITY, 0.0_f64), |(low, high), f| (low.min(f), high.max(f)));
+        let mut numbers: Vec<Number> = points
+            .iter()
+            .map(|(rate, force)| {
+                self.number(
+                    "break_away_force",
+                    format!("at {} {}", n(*rate), self.units.rate),
+                    *force,
+                    self.units.force,
+                )
+            })
+            .collect();
+        numbers.push(self.number("break_away_change", "fall from the greatest to the least", (high - low) / high, ""));
+        numbers.push(self.number("break_away_travel", "travel at break-away", self.scales.x_b, self.units.length));
+        Ok((graphs, numbers))
+    }
+
+    fn read_presliding(&self) -> Read {
+        let (small, large) = (self.rows("presliding_small")?, self.rows("presliding_large")?);
+        let course = |rows: &[Vec<f64>]| rows.iter().map(|row| (row[2], row[1])).collect::<Vec<_>>();
+        let graph = Graph {
+            key: "presliding",
+            x: self.axis("x", self.units.length),
+            y: self.axis("F", self.units.force),
+            logarithmic: (false, false),
+            lines: vec![Line::course("to 95 %", course(&large)), Line::course("to 30 %", course(&small)).aside()],
+        };
+        let small_travel = peak_to_peak(&small, 2);
+        let large_travel = peak_to_peak(&large, 2);
+        let early = small.iter().find(|row| row[1] >= 0.1 * self.scales.f_b);
+        let stiffness = early.map_or(f64::NAN, |row| row[1] / row[2]);
+        // u: 0, a, −a, a/2, 0, a. Times of the stops follow from the constant rate.
+        let a = large.iter().map(|row| row[1]).fold(0.0, f64::max);
+        let end = large.last().map_or(0.0, |row| row[0]);
+        // Of the whole path of 6 a: first at a/2 on the way up after 4.5 a, back there after 5.5 a.
+        let at = |part: f64| value_at(&large, end * part / 6.0, 2);
+        let (left, turned, back) = (at(4.5), at(5.0), at(5.5));
+        let inner = (left - turned).abs();
+        let loop_area = area(&large, end * 1.0 / 6.0, end * 5.0 / 6.0);
+        let mut numbers = vec![
+            self.number("presliding_travel", "travel within ±30 %", small_travel, self.units.length),
+            self.number("presliding_travel_large", "travel within ±95 %", large_travel, self.units.length),
+        ];
+        if stiffness.is_finite() && stiffness > 0.0 && small_travel > 0.0 {
+            numbers.push(self.number("stiffness", "stiffness at 10 %", stiffness, self.units.stiffness));
+        }
+        numbers.push(self.number(
+            "loop_area",
+            "area of the large loop over its box",
+            loop_area / (2.0 * a * large_travel).max(1e-300),
+            "",
+        ));
+        if inner > 0.0 {
+            numbers.push(self.number(
+                "memory_error",
+                "inner loop misses its start by, of its width",
+                (back - left).abs() / inner,
+                "",
+            ));
+        }
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_lag(&self) -> Read {
+        let mut lines = Vec::new();
+        let mut widths = Vec::new();
+        let mut numbers = Vec::new();
+        for (i, f) in self.layout.lag_frequencies().into_iter().enumerate() {
+            let rows = self.rows(&format!("lag_{}", i + 1))?;
+            let end = rows.last().map_or(0.0, |row| row[0]);
+            let last: Vec<(f64, f64)> =
+                rows.iter().filter(|row| row[0] >= end - 1.0 / f).map(|row| (row[2], row[1])).collect();
+            let width = lag(&last);
+            widths.push((f, width.abs()));
+            numbers.push(self.number(
+                "lag",
+                format!("F rising minus F falling at {} Hz, greatest", n(f)),
+                width,
+                self.units.force,
+            ));
+            let line = Line::course(format!("{} Hz", n(f)), last);
+            lines.push(if i == 1 { line } else { line.aside() });
+        }
+        let graph = Graph {
+            key: "lag",
+            x: self.axis("v", self.units.speed),
+            y: self.axis("F", self.units.force),
+            logarithmic: (false, false),
+            lines,
+        };
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_reversal(&self) -> Read {
+        let rows = self.rows("reversal")?;
+        let turn = rows.iter().map(|row| row[2]).fold(0.0, f64::max);
+        let half = rows.last().map_or(0.0, |row| row[0]) / 2.0;
+        let forth: Vec<(f64, f64)> = rows.iter().filter(|row| row[0] < half).map(|row| (row[2], row[1])).collect();
+        let back: Vec<(f64, f64)> =
+            rows.iter().filter(|row| row[0] > half).map(|row| (turn - row[2], -row[1])).collect();
+        let top = |points: &[(f64, f64)]| points.iter().map(|point| point.1).fold(f64::NEG_INFINITY, f64::max);
+        let settled = forth.last().map_or(f64::NAN, |point| point.1);
+        let (first, second) = (top(&forth) - settled, top(&back) - settled);
+        let graph = Graph {
+            key: "reversal",
+            x: self.axis("path", self.units.length),
+            y: self.axis("F", self.units.force),
+            logarithmic: (false, false),
+            lines: vec![
+                Line::course("from rest", forth),
+                Line::course("after the reversal, turned over", back).aside(),
+            ],
+        };
+        let force = self.units.force;
+        let numbers = vec![
+            self.number("settled_force", "settled force", settled, force),
+            self.number("virgin_overshoot", "overshoot from rest", first, force),
+            self.number("reversal_overshoot", "overshoot after the reversal", second, force),
+        ];
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_stick_slip(&self) -> Read {
+        let (mut lines, mut numbers, mut periods) = (Vec::new(), Vec::new(), Vec::new());
+        let speeds = self.layout.pull_speeds();
+        let (mut sticks_last, mut smooth_first) = (None, None);
+        for (i, vp) in speeds.iter().enumerate() {
+            let rows = self.rows(&format!("stick_slip_{}", i + 1))?;
+            let slips = slips(&rows, *vp);
+            let sticking = slips.len() >= 3;
+            if sticking {
+                sticks_last = Some(*vp);
+                let period = (slips[slips.len() - 1] - slips[0]) / (slips.len() - 1) as f64;
+                periods.push((*vp, period));
+                let half = rows.last().map_or(0.0, |row| row[0]) / 2.0;
+                let peak = rows.iter().filter(|row| row[0] > half).map(|row| row[1]).fold(0.0, f64::max);
+                let at = format!("at {} {}", n(*vp), self.units.speed);
+                numbers.push(self.number("period", format!("period {at}"), period, "s"));
+                numbers.push(self.number("peak_force", format!("peak force {at}"), peak, self.units.force));
+            } else if smooth_first.is_none() && sticks_last.is_some() {
+                smooth_first = Some(*vp);
+            }
+            if i == 2 {
+                lines.push(Line::course("x", rows.iter().map(|row| (row[0], row[2])).collect()));
+                let end = rows.last().map_or(0.0, |row| row[0]);
+                lines.push(Line::course("far end of the spring", vec![(0.0, 0.0), (end, vp * end)]).aside());
+            }
+        }
+        let mut graphs = vec![Graph {
+            key: "stick_slip",
+            x: self.axis("t", "s"),
+            y: self.axis("x", self.units.length),
+            logarithmic: (false, false),
+            lines,
+        }];
+        if periods.len() > 1 {
+            graphs.push(Graph {
+                key: "stick_slip_period",
+                x: self.axis("pull speed", self.units.speed),
+                y: self.axis("period", "s"),
+                logarithmic: (true, true),
+                lines: vec![Line::marked("", periods)],
+            });
+        }
+        if let Some(vp) = sticks_last {
+            numbers.push(self.number("stick_slip_up_to", "sticks and slips up to", vp, self.units.speed));
+        }
+        if let Some(vp) = smooth_first {
+            numbers.push(self.number("stick_slip_gone", "smooth from", vp, self.units.speed));
+        }
+        Ok((graphs, numbers))
+    }
+
+    fn read_coast_down(&self) -> Read {
+        let rows = self.rows("coast_down")?;
+        let v0 = rows.first().map_or(0.0, |row| row[3]);
+        let stop = rows.iter().find(|row| row[3].abs() < 1e-4 * v0).map(|row| row[0]);
+        let graph = Graph {
+            key: "coast_down",
+            x: self.axis("t", "s"),
+            y: self.axis("v", self.units.speed),
+            logarithmic: (false, false),
+            lines: vec![Line::course("", rows.iter().map(|row| (row[0], row[3])).collect())],
+        };
+        let mut numbers = vec![self.number("start_speed", "speed at the start", v0, self.units.speed)];
+        if let Some(stop) = stop {
+            numbers.push(self.number("stop_time", "time to 1e-4 of it", stop, "s"));
+        }
+        let travel = rows.last().map_or(0.0, |row| row[2]);
+        numbers.push(self.number("stop_distance", "travel after 2 s", travel, self.units.length));
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_hold(&self) -> Read {
+        let rows = self.rows("hold")?;
+        let end = rows.last().map_or(0.0, |row| row[0]);
+        let graph = Graph {
+            key: "hold",
+            x: self.axis("t", "s"),
+            y: self.axis("x", self.units.length),
+            logarithmic: (false, false),
+            lines: vec![Line::course("", rows.iter().map(|row| (row[0], row[2])).collect())],
+        };
+        let creep = (value_at(&rows, end, 2) - value_at(&rows, 12.0, 2)) / (end - 12.0);
+        let numbers = vec![
+            self.number(
+                "held_peak_to_peak",
+                "motion from 12 s on",
+                one(self.results, "hold")?.reading(0).unwrap_or(f64::NAN),
+                self.units.length,
+            ),
+            self.number("creep_speed", "creep speed", creep, self.units.speed),
+        ];
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_drift(&self) -> Read {
+        let rows = self.rows("drift")?;
+        let drift = (value_at(&rows, 20.0, 2) - value_at(&rows, 10.0, 2)) / 10.0;
+        let graph = Graph {
+            key: "drift",
+            x: self.axis("t", "s"),
+            y: self.axis("x", self.units.length),
+            logarithmic: (false, false),
+            lines: vec![Line::course("", rows.iter().map(|row| (row[0], row[2])).collect())],
+        };
+        Ok((vec![graph], vec![self.number("drift", "drift in a cycle", drift, self.units.length)]))
+    }
+
+    fn read_energy(&self) -> Read {
+        let mut points = Vec::new();
+        let mut lines = Vec::new();
+        for (i, x) in self.layout.amplitudes().into_iter().enumerate() {
+            let name = format!("energy_{}", i + 1);
+            let loss = one(self.results, &name)?.reading(0);
+            let rows = self.rows(&name)?;
+            points.push((x, loss.unwrap_or(f64::NAN)));
+            if i == 5 {
+                let from = rows.last().map_or(0.0, |row| row[0]) * 2.0 / 3.0;
+                let cycle = rows.iter().filter(|row| row[0] >= from).map(|row| (row[2] - x, row[1])).collect();
+                lines.push(Line::course("", cycle));
+            }
+        }
+        let least = points.iter().map(|point| point.1).fold(f64::INFINITY, f64::min);
+        let (x, loss) = points[points.len() - 1];
+        let numbers = vec![
+            self.number("least_loss", "least loss of a cycle", least, "J"),
+            self.number("mean_force", "loss over path, largest cycle", loss / (4.0 * x), self.units.force),
+        ];
+        let graphs = vec![
+            Graph {
+                key: "energy",
+                x: self.axis("amplitude", self.units.length),
+                y: self.axis("loss per cycle", "J"),
+                logarithmic: (true, true),
+                lines: vec![Line::marked("", points)],
+            },
+            Graph {
+                key: "energy_cycle",
+                x: self.axis("x", self.units.length),
+                y: self.axis("F", self.units.force),
+                logarithmic: (false, false),
+                lines,
+            },
+        ];
+        Ok((graphs, numbers))
+    }
+
+    fn read_rate(&self) -> Read {
+        let mut lines = Vec::new();
+        let mut courses: Vec<Vec<Vec<f64>>> = Vec::new();
+        for (i, times) in [0.1, 1.0, 10.0].into_iter().enumerate() {
+            let mut rows = self.rows(&format!("rate_{}", i + 1))?;
+            let end = rows.last().map_or(1.0, |row| row[0]);
+            for row in &mut rows {
+                row[0] /= end;
+            }
+            // The second of two cycles, over a path of length 1: what the rounding of the frequency changes is left out.
+            let whole = peak_to_peak(&rows, 2).max(1e-300);
+            let cycle: Vec<(f64, f64)> =
+                rows.iter().filter(|row| row[0] >= 0.5).map(|row| (row[2] / whole, row[1])).collect();
+            let line = Line::course(format!("{} times", n(times)), cycle);
+            lines.push(if i == 1 { line } else { line.aside() });
+            courses.push(rows);
+        }
+        let mut difference = 0.0_f64;
+        for i in 0..=400 {
+            let t = 0.5 + 0.5 * f64::from(i) / 400.0;
+            // At the turn itself the force may jump.
+            if !((i % 200) < 3 || (i % 200) > 197) {
+                let forces: Vec<f64> = courses.iter().map(|rows| value_at(rows, t, 1)).collect();
+                for a in &forces {
+                    for b in &forces {
+                        difference = difference.max((a - b).abs());
+                    }
+                }
+            }
+        }
+        let graph = Graph {
+            key: "rate",
+            x: self.axis("place on the path", ""),
+            y: self.axis("F", self.units.force),
+            logarithmic: (false, false),
+            lines,
+        };
+        let size = self.scales.f_b.max(self.scales.f_c);
+        let numbers = vec![
+            self.number("rate_difference", "greatest difference of the force", difference, self.units.force),
+            self.number("rate_difference_part", "of the break-away force", difference / size, ""),
+        ];
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_dissipation(&self, verdict: Option<Verdict>) -> Read {
+        let (mut least, mut lines) = (f64::INFINITY, Vec::new());
+        for i in 1..=6 {
+            let name = format!("closed_path_{i}");
+            let work = one(self.results, &name)?.reading(0).unwrap_or(f64::NAN);
+            let rows = self.rows(&name)?;
+            if work < least {
+                least = work;
+                let second = rows.iter().filter(|row| row[0] >= 1.0);
+                let power = second.map(|row| (row[0] - 1.0, row[1] * row[2])).collect();
+                lines = vec![Line::course("power into the contact, least of six", power)];
+            }
+        }
+        let graph = Graph {
+            key: "dissipation",
+            x: self.axis("t", "s"),
+            y: self.axis("F v", "W"),
+            logarithmic: (false, false),
+            lines,
+        };
+        let mut numbers = vec![self.number("least_work", "least work of a round", least, "J")];
+        match verdict {
+            Some(Verdict::Holds(points)) => {
+                numbers.push(self.number(
+                    "dissipation_points",
+                    "points searched, none gives out power",
+                    points as f64,
+                    "",
+                ));
+            }
+            Some(Verdict::Fails(point)) => {
+                numbers.push(self.number("pushes_at", "gives out power at v =", point.v, self.units.speed));
+                numbers.push(self.number("pushes_with", "there F =", point.force, self.units.force));
+            }
+            Some(Verdict::NotChecked) | None => {}
+        }
+        Ok((vec![graph], numbers))
+    }
+
+    fn read_steps(&self) -> Read {
+        let reference = self.rows("steps_reference")?;
+        let end = |rows: &[Vec<f64>]| rows.last().map_or(f64::NAN, |row| row[2]);
+        let travel = end(&reference).abs().max(peak_to_peak(&reference, 2));
+        let mut points = Vec::new();
+        let mut numbers = Vec::new();
+        let mut failed = Vec::new();
+        for (i, h) in self.layout.steps().into_iter().enumerate() {
+            match self.rows(&format!("steps_{}", i + 1)) {
+                Ok(rows) => {
+                    let error = (end(&rows) - end(&reference)).abs() / travel;
+                    points.push((h, error.max(1e-16)));
+                    numbers.push(self.number("step_error", format!("error at a step of {} s", n(h)), error, ""));
+                }
+                Err(why) => failed.push(format!("{} s: {why}", n(h))),
+            }
+        }
+        if points.is_empty() {
+            return Err(failed.join("; "));
+        }
+        let graph = Graph {
+            key: "steps",
+            x: self.axis("step", "s"),
+            y: self.axis("error of x, relative", ""),
+            logarithmic: (true, true),
+            lines: vec![Line::marked("", points)],
+        };
+        Ok((vec![graph], numbers))
+    }
+}
+
+/// Greatest minus least of a column.
+fn peak_to_peak(rows: &[Vec<f64>], column: usize) -> f64 {
+    let values = rows.iter().map(|row| row[column]);
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
+    high - low
+}
+
+/// A column at a time, straight lines between rows.
+fn value_at(rows: &[Vec<f64>], t: f64, column: usize) -> f64 {
+    let next = rows.partition_point(|row| row[0] < t);
+    match (rows.get(next.wrapping_sub(1)), rows.get(next)) {
+        (Some(a), Some(b)) if b[0] > a[0] => a[column] + (b[column] - a[column]) * (t - a[0]) / (b[0] - a[0]),
+        (_, Some(row)) | (Some(row), None) => row[column],
+        (None, None) => f64::NAN,
+    }
+}
+
+/// ∮ F dx between two times. Rows hold t, F, x.
+fn area(rows: &[Vec<f64>], from: f64, to: f64) -> f64 {
+    let inside: Vec<&Vec<f64>> = rows.iter().filter(|row| row[0] >= from && row[0] <= to).collect();
+    inside.windows(2).map(|pair| 0.5 * (pair[0][1] + pair[1][1]) * (pair[1][2] - pair[0][2])).sum::<f64>().abs()
+}
+
+/// Force at a rising speed minus force at the same falling speed, where that is greatest in size.
+fn lag(cycle: &[(f64, f64)]) -> f64 {
+    let (mut rising, mut falling): (Vec<Vec<f64>>, Vec<Vec<f64>>) = (Vec::new(), Vec::new());
+    for pair in cycle.windows(2) {
+        let row = vec![pair[1].0, pair[1].1];
+        if pair[1].0 > pair[0].0 {
+            rising.push(row);
+        } else if pair[1].0 < pair[0].0 {
+            falling.push(row);
+        }
+    }
+    rising.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    falling.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let (Some(first), Some(last)) = (rising.first(), rising.last()) else { return f64::NAN };
+    let (low, high) = (first[0], last[0]);
+    let gap = |i: u32| {
+        // The ends of the loop are where it turns: nothing to compare.
+        let v = low + (high - low) * (0.05 + 0.9 * f64::from(i) / 100.0);
+        value_at(&rising, v, 1) - value_at(&falling, v, 1)
+    };
+    (0..=100).map(gap).fold(0.0, |widest: f64, gap| if gap.abs() > widest.abs() { gap } else { widest })
+}
+
+/// Instants at which a pulled mass begins to slip after it was at rest, without the first.
+fn slips(rows: &[Vec<f64>], vp: f64) -> Vec<f64> {
+    let (mut resting, mut starts) = (true, Vec::new());
+    for row in rows {
+        if resting && row[3] > 0.5 * vp {
+            starts.push(row[0]);
+            resting = false;
+        } else if row[3].abs() < 0.02 * vp {
+            resting = true;
+        }
+    }
+    starts.split_off(1.min(starts.len()))
+}
+
+/// A plain number for texts.
+pub fn plain(x: f64) -> String {
+    significant(x, 4)
+}

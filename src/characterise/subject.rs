@@ -1,0 +1,275 @@
+//! The model under test: where its text is, how it is written, what its ports are.
+//!
+//! In: a model's name with arguments and where to look for it. Out: a [`Subject`], or why it cannot be tested.
+
+use crate::compile::{Loaded, Lookup, Space};
+use abi::Instance;
+use abi::description::Kind;
+use abi::unit::{Dimension, Unit};
+use grammar::ast::{self, BindValue, DeclarationKind, Item, Statement};
+use grammar::span::FileId;
+
+/// Where a model comes from.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Origin {
+    /// The library.
+    Library,
+    /// A text of the user's: its path as the battery imports it.
+    File(String),
+}
+
+/// A model as it is put to the test.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    /// The model's name: `LuGre`.
+    pub model: String,
+    /// What a slot is filled with: `LuGre(vd = 10 mm/s)`, with `rotary` where the user wrote it.
+    pub instance: Written,
+    /// Where its text is.
+    pub origin: Origin,
+    /// Lines before the first experiment of the battery.
+    pub imports: String,
+    /// Doc comment.
+    pub doc: Option<String>,
+    /// Equations, in the symbols of the text.
+    pub equations: Vec<(String, String)>,
+    /// Whether velocities are angular.
+    pub rotary: bool,
+    /// Whether it asks for the external force, and whether it insists on it.
+    pub external: External,
+    /// Its parameters with the values of this instance.
+    pub params: Vec<Param>,
+    /// Continuous states, and whether it has regimes or sampled code.
+    pub states: usize,
+    pub regimes: Vec<String>,
+}
+
+/// The port `F_ext`.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum External {
+    /// The model has none.
+    Absent,
+    /// It has a default.
+    Optional,
+    /// It must be given.
+    Required,
+}
+
+/// A parameter and its value.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Param {
+    /// Such as `Fc` or `law.Fc`.
+    pub path: String,
+    /// In SI.
+    pub value: f64,
+    /// In which it is declared.
+    pub unit: Unit,
+    /// Where it may lie, SI.
+    pub range: (f64, f64),
+    /// Doc comment.
+    pub doc: Option<String>,
+}
+
+/// An instance as text, whose arguments can be changed.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Written {
+    rotary: bool,
+    model: String,
+    args: Vec<(String, Argument)>,
+}
+
+#[derive(Clone, PartialEq, Debug)]
+enum Argument {
+    Value(String),
+    Model(Written),
+}
+
+impl Written {
+    /// Reads `LuGre`, `LuGre(vd = 10 mm/s)`, `rotary LuGre()`.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words.
+    pub fn read(text: &str) -> Result<Written, String> {
+        let text = if text.contains('(') { text.trim().to_string() } else { format!("{}()", text.trim()) };
+        let (instance, errors) = grammar::parse::parse_instance(FileId(0), &text);
+        match (instance, errors.iter().find(|error| error.is_error())) {
+            (Some(instance), None) => Ok(Written::of(&instance, &text)),
+            (_, Some(error)) => Err(format!("`{text}`: {}", error.message)),
+            (None, None) => Err(format!("`{text}` is not a model with arguments, such as `LuGre(Fs = 2 N)`")),
+        }
+    }
+
+    fn of(instance: &ast::Instance, text: &str) -> Written {
+        let argument = |bind: &ast::Bind| {
+            let value = match &bind.value {
+                BindValue::Instance(instance) => Argument::Model(Written::of(instance, text)),
+                BindValue::Expr(_) => {
+                    let whole = &text[bind.span.range()];
+                    Argument::Value(whole.split_once('=').map_or(whole, |(_, value)| value).trim().into())
+                }
+            };
+            (bind.name.text.clone(), value)
+        };
+        Written {
+            rotary: instance.rotary,
+            model: instance.model.text.clone(),
+            args: instance.args.iter().map(argument).collect(),
+        }
+    }
+
+    /// The model's name.
+    pub fn model(&self) -> &str {
+        &self.model
+    }
+
+    /// Gives an argument another value: `Fs`, or `law.Fs` of a part that is an argument itself.
+    ///
+    /// # Errors
+    /// Where the path does not lead, in words.
+    pub fn set(&mut self, path: &str, value: &str) -> Result<(), String> {
+        match path.split_once('.') {
+            None => {
+                let value = match value.trim_start().starts_with(|c: char| c.is_ascii_uppercase()) {
+                    true => Argument::Model(Written::read(value)?),
+                    false => Argument::Value(value.into()),
+                };
+                match self.args.iter_mut().find(|(name, _)| name == path) {
+                    Some((_, old)) => *old = value,
+                    None => self.args.push((path.into(), value)),
+                }
+                Ok(())
+            }
+            Some((first, rest)) => match self.args.iter_mut().find(|(name, _)| name == first) {
+                Some((_, Argument::Model(part))) => part.set(rest, value),
+                Some(_) | None => Err(format!(
+                    "--set {path}: give the part `{first}` as an argument first, for example '{}({first} = Tustin())'",
+                    self.model
+                )),
+            },
+        }
+    }
+
+    /// The text with further arguments where it does not give them itself.
+    pub fn with(&self, more: &[(&str, &str)]) -> String {
+        let mut written = self.clone();
+        for (name, value) in more {
+            if !written.args.iter().any(|(given, _)| given == name) {
+                written.args.push((name.to_string(), Argument::Value(value.to_string())));
+            }
+        }
+        written.to_string()
+    }
+
+    /// Short, for legends: without empty parentheses.
+    pub fn label(&self) -> String {
+        let text = self.to_string();
+        text.strip_suffix("()").map_or(text.clone(), str::to_string)
+    }
+}
+
+impl std::fmt::Display for Written {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}{}(", if self.rotary { "rotary " } else { "" }, self.model)?;
+        for (i, (name, value)) in self.args.iter().enumerate() {
+            let comma = if i > 0 { ", " } else { "" };
+            match value {
+                Argument::Value(value) => write!(f, "{comma}{name} = {value}")?,
+                Argument::Model(model) => write!(f, "{comma}{name} = {model}")?,
+            }
+        }
+        f.write_str(")")
+    }
+}
+
+/// A model's tree, wherever it is visible from the asked-for file.
+pub fn model<'a>(loaded: &'a Loaded, name: &str) -> Option<(FileId, &'a ast::Model)> {
+    match loaded.find(loaded.root(), Space::Type, name) {
+        Lookup::Found(item, Item::Model(model)) => Some((item.file, model)),
+        Lookup::Found(..) | Lookup::Ambiguous(..) | Lookup::Missing => None,
+    }
+}
+
+/// The inputs of a model that have no default.
+pub fn open_inputs(model: &ast::Model) -> Vec<&str> {
+    inputs(model).filter(|(_, optional)| !optional).map(|(name, _)| name).collect()
+}
+
+/// Names of the inputs, and whether they have a default.
+fn inputs(model: &ast::Model) -> impl Iterator<Item = (&str, bool)> {
+    declarations(model)
+        .filter(|declaration| declaration.kind == DeclarationKind::Input)
+        .map(|declaration| (declaration.name.text.as_str(), declaration.value.is_some()))
+}
+
+fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
+    model.body.iter().filter_map(|statement| match statement {
+        Statement::Declaration(declaration) => Some(declaration),
+        _ => None,
+    })
+}
+
+/// Whether a model has an input `v` and an output `F`: what it takes to be a friction model, but for units.
+pub fn looks_like_friction(model: &ast::Model) -> bool {
+    inputs(model).any(|(name, _)| name == "v")
+        && declarations(model).any(|d| d.kind == DeclarationKind::Output && d.name.text == "F")
+}
+
+/// How a model treats the external force.
+pub fn external(model: &ast::Model) -> External {
+    match inputs(model).find(|(name, _)| *name == "F_ext") {
+        None => External::Absent,
+        Some((_, true)) => External::Optional,
+        Some((_, false)) => External::Required,
+    }
+}
+
+/// Whether the ports of a model are those of a friction model, and then whether of a rotary one.
+///
+/// # Errors
+/// Which port does not fit, in words.
+pub fn rotary(model: &ast::Model, written: &Written, instance: &Instance) -> Result<bool, String> {
+    // A bound input is no quantity of its own any more, so its unit is read where it is declared.
+    let declared = declarations(model).find(|declaration| declaration.name.text == "v");
+    let v = declared.and_then(|v| Unit::parse(&v.unit.as_ref()?.text).ok()).map(|unit| unit.dimension);
+    let force = instance.description().quantity("F").map(|quantity| quantity.unit.dimension);
+    let unit = |text: &str| Some(Unit::parse(text).expect("it is known").dimension);
+    let turned = (v == unit("m/s") && written.rotary, v == unit("rad/s"));
+    match (turned, force == unit("N"), force == unit("N·m")) {
+        ((false, false), true, _) if v == unit("m/s") => Ok(false),
+        ((true, _) | (_, true), _, true) => Ok(true),
+        _ => {
+            let words = |of: Option<Dimension>| of.map_or("missing".into(), |dimension| dimension.describe());
+            let (v, force) = (words(v), words(force));
+            Err(format!("`v` is {v} and `F` is {force}; a friction model turns a velocity into a force"))
+        }
+    }
+}
+
+/// The parameters of a compiled model, nested ones too.
+pub fn params(instance: &Instance) -> Vec<Param> {
+    let of_kind = instance.description().quantities.iter().filter(|quantity| quantity.kind == Kind::Param);
+    let param = |quantity: &abi::description::Quantity| Param {
+        path: quantity.path.clone(),
+        value: instance.get(quantity.slot),
+        unit: quantity.unit.clone(),
+        range: quantity.range,
+        doc: quantity.doc.clone(),
+    };
+    of_kind.map(param).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arguments_are_kept_and_changed() {
+        let mut written = Written::read("Sticking(law = Tustin(vs = 2 mm/s), peak = 1.2)").unwrap();
+        written.set("law.vs", "3 mm/s").unwrap();
+        written.set("B", "10 N·s/m").unwrap();
+        assert_eq!(written.to_string(), "Sticking(law = Tustin(vs = 3 mm/s), peak = 1.2, B = 10 N·s/m)");
+        assert_eq!(Written::read("rotary LuGre").unwrap().to_string(), "rotary LuGre()");
+        assert_eq!(Written::read("LuGre()").unwrap().label(), "LuGre");
+        assert!(written.set("other.vs", "1").is_err() && Written::read("3 +").is_err());
+    }
+}

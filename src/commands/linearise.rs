@@ -1,0 +1,270 @@
+//! `fric linearise`: A, B, C, D at a point, and the modes of A.
+
+use super::{End, load, reported};
+use crate::args::Linearise;
+use crate::compile::{self, Changes, Linear, Matrices, Options, Ports, Stopwatch};
+use crate::matrices::{self, Matrix};
+use crate::results::number;
+use crate::terminal::{Style, Terminal};
+use crate::value::{parse, show, significant};
+use crate::{project, value};
+use abi::Slot;
+use abi::description::{Kind, Quantity};
+use abi::unit::Unit;
+use runtime::engine::{self, Continue};
+use runtime::modes::{Mode, modes};
+use serde_json::{Value, json};
+use std::f64::consts::TAU;
+
+pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
+    let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
+    let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone() };
+    let changes = Changes {
+        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
+        ports: Some(ports),
+        ..Changes::default()
+    };
+    let options = Options { changes, ..Options::default() };
+    let mut linear = match compile::linear(&mut loaded, &project::Disk, &args.name, &options, &mut Vec::new()) {
+        Ok(linear) => linear,
+        Err(diagnostics) => {
+            reported(&loaded, &diagnostics, terminal);
+            return End::Failed;
+        }
+    };
+    if let Err(message) = go_to_point(&mut linear, args) {
+        terminal.error(&message);
+        return End::Failed;
+    }
+    let found = linear.at();
+    let all = [&found.a, &found.b, &found.c, &found.d];
+    if !all.iter().all(|matrix| matrix.iter().all(|entry| entry.is_finite())) {
+        terminal.error("the derivatives are not finite at this point; give another one with --at");
+        return End::Failed;
+    }
+    let modes = modes(linear.states.len(), &found.a);
+    let Some(modes) = modes else {
+        terminal.error("the eigenvalues of A could not be found");
+        return End::Failed;
+    };
+    if let Some(path) = &args.out {
+        let bytes = match path.extension().and_then(|extension| extension.to_str()) {
+            Some("npz") => matrices::npz(&named(&linear, &found)),
+            Some("mat") => matrices::mat(&named(&linear, &found)),
+            _ => format!("{}\n", object(&linear, &found, &modes)).into_bytes(),
+        };
+        if let Err(error) = project::write(path, &bytes) {
+            terminal.error(&format!("cannot write {}: {error}", path.display()));
+            return End::Failed;
+        }
+    }
+    if args.json {
+        terminal.line(&object(&linear, &found, &modes).to_string());
+    } else {
+        let words = words(&linear, &found, &modes, terminal);
+        terminal.print(&words);
+        if let Some(path) = &args.out {
+            terminal.line(&format!("  wrote {}", path.display()));
+        }
+    }
+    End::Fine
+}
+
+/// Puts the instance to the point: where the run is at that time, if an experiment was asked for; then what is given.
+fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
+    let mut later = Vec::new();
+    for (path, text) in &args.at {
+        if let Some((slot, number)) = regime(linear, path, text) {
+            later.push((slot, number?));
+            continue;
+        }
+        let Some(quantity) = linear.movable().find(|quantity| quantity.path == *path) else {
+            let known: Vec<&str> = linear.movable().map(|quantity| quantity.path.as_str()).collect();
+            let help = match project::nearest(path, known.into_iter()) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => "give states, free inputs and parameters; other values change with --set".into(),
+            };
+            return Err(format!("there is no state, free input or parameter `{path}`; {help}"));
+        };
+        let value = given(quantity, text)?;
+        match quantity.kind {
+            // What initial values may follow from comes before the start.
+            Kind::Param | Kind::Input => linear.instance.set(quantity.slot, value),
+            _ => later.push((quantity.slot, value)),
+        }
+    }
+    let experiment = linear.experiment.clone();
+    match (args.time, experiment) {
+        (Some(time), Some(mut experiment)) => {
+            experiment.duration = time;
+            experiment.corners.retain(|corner| *corner < time);
+            let layout = &linear.instance.description().layout;
+            let kept = [layout.params, layout.inputs, layout.states, layout.memory, layout.regimes];
+            let slots: Vec<Slot> =
+                kept.iter().flat_map(|segment| segment.range()).map(|slot| Slot(slot as u32)).collect();
+            let go_on = &mut |_| Continue::Continue(());
+            let (values, ended) = engine::sample(linear.instance.clone(), &experiment, &[time], &slots, go_on);
+            ended.map_err(|failure| failure.to_string())?;
+            for (slot, value) in slots.iter().zip(values) {
+                linear.instance.set(*slot, value);
+            }
+            linear.instance.set(Slot::TIME, time);
+        }
+        (time, _) => {
+            linear.instance.start(0.0);
+            linear.instance.set(Slot::TIME, time.unwrap_or(0.0));
+        }
+    }
+    for (slot, value) in later {
+        linear.instance.set(slot, value);
+    }
+    Ok(())
+}
+
+/// `fr=stick`: the automaton of a part, and one of its regimes.
+fn regime(linear: &Linear, path: &str, text: &str) -> Option<(Slot, Result<f64, String>)> {
+    let automaton = linear.instance.description().automata.iter().find(|automaton| automaton.path == path)?;
+    let at = automaton.regimes.iter().position(|regime| regime == text.trim());
+    let number = at
+        .map(|at| at as f64)
+        .ok_or_else(|| format!("`{path}` has no regime `{}`; it has {}", text.trim(), automaton.regimes.join(", ")));
+    Some((automaton.slot, number))
+}
+
+/// A value in SI of the kind of a quantity.
+fn given(quantity: &Quantity, text: &str) -> Result<f64, String> {
+    let (value, unit) = parse(text).map_err(|reason| format!("{}: {reason}", quantity.path))?;
+    let fits = unit.dimension == quantity.unit.dimension || value == 0.0 && unit.text.is_empty();
+    match fits {
+        true => Ok(value),
+        false if unit.text.is_empty() => {
+            Err(format!("`{}` needs a unit: {}={} {}", quantity.path, quantity.path, text.trim(), quantity.unit))
+        }
+        false => Err(format!(
+            "`{}` is {}, not {}",
+            quantity.path,
+            quantity.unit.dimension.describe(),
+            unit.dimension.describe()
+        )),
+    }
+}
+
+fn named<'a>(linear: &Linear, found: &'a Matrices) -> [Matrix<'a>; 4] {
+    let (n, m, p) = (linear.states.len(), linear.inputs.len(), linear.outputs.len());
+    let matrix = |name, rows, columns, values| Matrix { name, rows, columns, values };
+    [
+        matrix("A", n, n, &found.a[..]),
+        matrix("B", n, m, &found.b),
+        matrix("C", p, n, &found.c),
+        matrix("D", p, m, &found.d),
+    ]
+}
+
+fn object(linear: &Linear, found: &Matrices, modes: &[Mode]) -> Value {
+    let rows = |matrix: &Matrix| -> Value {
+        let row = |i: usize| -> Value {
+            matrix.values[i * matrix.columns..(i + 1) * matrix.columns].iter().map(|entry| number(*entry)).collect()
+        };
+        (0..matrix.rows).map(row).collect()
+    };
+    let state = |(quantity, rate): (&Quantity, &f64)| {
+        json!({
+            "name": quantity.path,
+            "unit": Unit::si(quantity.unit.dimension).text,
+            "value": number(linear.instance.get(quantity.slot)),
+            "rate": number(*rate),
+        })
+    };
+    let port =
+        |(path, quantity): &(String, Quantity)| json!({ "name": path, "unit": Unit::si(quantity.unit.dimension).text });
+    let mode = |mode: &Mode| {
+        json!({
+            "real": number(mode.real),
+            "imaginary": number(mode.imaginary),
+            "frequency": number(mode.frequency()),
+            "damping": mode.damping().map(number),
+        })
+    };
+    let mut object = json!({
+        "model": linear.instance.description().name,
+        "time": number(linear.instance.get(Slot::TIME)),
+        "states": linear.states.iter().zip(&found.rates).map(state).collect::<Value>(),
+        "inputs": linear.inputs.iter().map(port).collect::<Value>(),
+        "outputs": linear.outputs.iter().map(port).collect::<Value>(),
+        "modes": modes.iter().map(mode).collect::<Value>(),
+    });
+    for matrix in named(linear, found) {
+        object[matrix.name] = rows(&matrix);
+    }
+    object
+}
+
+fn words(linear: &Linear, found: &Matrices, modes: &[Mode], terminal: &Terminal) -> String {
+    let description = linear.instance.description();
+    let mut out = terminal.styled(Style::Bold, &description.name);
+    out += &format!(" at t = {}; all in SI\n", value::duration(linear.instance.get(Slot::TIME)));
+    let regimes: Vec<String> = description
+        .automata
+        .iter()
+        .filter_map(|automaton| {
+            let name = automaton.regimes.get(linear.instance.get(automaton.slot) as usize)?;
+            Some(if automaton.path.is_empty() { name.clone() } else { format!("{}.{name}", automaton.path) })
+        })
+        .collect();
+    if !regimes.is_empty() {
+        out += &format!("  in {}\n", regimes.join(", "));
+    }
+    if !description.ticks.is_empty() {
+        out += "  what is sampled is held\n";
+    }
+    let names: Vec<&str> = linear.states.iter().map(|quantity| quantity.path.as_str()).collect();
+    for (quantity, rate) in linear.states.iter().zip(&found.rates) {
+        let unit = Unit::si(quantity.unit.dimension);
+        let value = show(linear.instance.get(quantity.slot), &unit, 6);
+        out += &format!("  {} = {value}, changes by {}/s\n", quantity.path, significant(*rate, 4));
+    }
+    let inputs: Vec<&str> = linear.inputs.iter().map(|(path, _)| path.as_str()).collect();
+    let outputs: Vec<&str> = linear.outputs.iter().map(|(path, _)| path.as_str()).collect();
+    let rates: Vec<String> = names.iter().map(|name| format!("d{name}/dt")).collect();
+    let rates: Vec<&str> = rates.iter().map(String::as_str).collect();
+    for (matrix, (rows, columns)) in
+        named(linear, found).iter().zip([(&rates, &names), (&rates, &inputs), (&outputs, &names), (&outputs, &inputs)])
+    {
+        if matrix.rows > 0 && matrix.columns > 0 {
+            out += &format!("\n{}", table(matrix, rows, columns));
+        }
+    }
+    if !modes.is_empty() {
+        out += &format!("\n  {:>13}  {:>13}  {:>10}  {:>10}  {:>9}\n", "eigenvalue", "± i", "rad/s", "Hz", "damping");
+    }
+    for mode in modes {
+        let damping = mode.damping().map_or("-".into(), |damping| significant(damping, 4));
+        let imaginary = if mode.imaginary > 0.0 { significant(mode.imaginary, 5) } else { String::new() };
+        let (frequency, real) = (mode.frequency(), significant(mode.real, 5));
+        let [rad, hertz] = [frequency, frequency / TAU].map(|x| significant(x, 4));
+        let grows = if mode.real > 0.0 { "  grows" } else { "" };
+        out += &format!("  {real:>13}  {imaginary:>13}  {rad:>10}  {hertz:>10}  {damping:>9}{grows}\n");
+    }
+    out
+}
+
+/// A matrix with the names of its rows and columns.
+fn table(matrix: &Matrix, rows: &[&str], columns: &[&str]) -> String {
+    let entry = |i: usize, j: usize| significant(matrix.values[i * matrix.columns + j], 6);
+    let first = rows.iter().map(|name| name.chars().count()).max().unwrap_or(0);
+    let width = |j: usize| {
+        let entries = (0..matrix.rows).map(|i| entry(i, j).chars().count());
+        entries.max().unwrap_or(0).max(columns[j].chars().count())
+    };
+    let widths: Vec<usize> = (0..matrix.columns).map(width).collect();
+    let line = |name: &str, cells: Vec<String>| {
+        let cells: Vec<String> = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:>width$}")).collect();
+        format!("  {name:first$}  {}\n", cells.join("  "))
+    };
+    let mut out = format!("  {}\n", matrix.name);
+    out += &line("", columns.iter().map(|name| (*name).to_string()).collect());
+    for (i, name) in rows.iter().enumerate() {
+        out += &line(name, (0..matrix.columns).map(|j| entry(i, j)).collect());
+    }
+    out
+}

@@ -1,0 +1,676 @@
+//! `fric sweep`: many runs of one experiment under other parameters, one row each.
+//!
+//! Rows are appended in the order of the runs as they are done, so a file that was interrupted is the beginning of the
+//! whole one, and shards written one behind the other are the whole. A neighbour of the file, `.NAME.unfinished`, holds
+//! what the sweep was asked for until it is complete: nobody goes on with another one.
+
+use super::{End, load, reported};
+use crate::args::Sweep;
+use crate::compile::{self, Changes, Loaded, Options, Stopwatch, Varying};
+use crate::plot::{self, Axis, Curve, Figure, Panel};
+use crate::terminal::{Style, Terminal};
+use crate::value::{self, count, significant};
+use crate::vary::{Dice, Vary};
+use crate::{project, results};
+use abi::Slot;
+use abi::plan::Measure;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use runtime::engine::{self, Cause, Continue};
+use runtime::sweep;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
+use std::ops::Range;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Most values of a column that are kept to find its quantiles and to draw it.
+const SAMPLE: usize = 1 << 16;
+
+/// Draws of distributions where nobody says how many.
+const DEFAULT_RUNS: u64 = 100;
+
+pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
+    let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
+    let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
+    if !all.contains(&args.experiment) {
+        let help = match project::nearest(&args.experiment, all.iter().map(String::as_str)) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!("it has {}", all.join(", ")),
+        };
+        terminal.error(&format!("{} has no experiment `{}`; {help}", args.file.display(), args.experiment));
+        return End::Failed;
+    }
+    for (k, vary) in args.vary.iter().enumerate() {
+        if args.vary[..k].iter().any(|other| other.path == vary.path) {
+            terminal.error(&format!("`{}` is varied twice; give it one --vary", vary.path));
+            return End::Misused;
+        }
+    }
+    let Some(cases) = compiled(args, &mut loaded, terminal) else { return End::Failed };
+    let table = match Table::new(args, cases) {
+        Ok(table) => table,
+        Err(message) => {
+            terminal.error(&message);
+            return End::Misused;
+        }
+    };
+    match table.run(args, &loaded, terminal) {
+        Ok(end) => end,
+        Err(message) => {
+            terminal.error(&message);
+            End::Failed
+        }
+    }
+}
+
+/// The experiment with its parameters open; a parameter that follows from others, or has no value, is given one first.
+fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
+    let given: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+    let mut options = Options {
+        changes: Changes {
+            set: given.clone(),
+            method: args.solver,
+            step: args.step,
+            tol: args.tol,
+            duration: args.duration,
+            vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
+            ports: None,
+        },
+        interpret: args.interpret,
+    };
+    let name = &args.experiment;
+    let first = compile::varying(loaded, &project::Disk, name, &options, &mut Vec::new());
+    let open = |vary: &&Vary| match &first {
+        Ok(cases) => cases.iter().any(|case| case.param(&vary.path).is_none()),
+        Err(_) => true,
+    };
+    let missing: Vec<&Vary> = args.vary.iter().filter(open).collect();
+    if missing.is_empty()
+        && let Ok(cases) = first
+    {
+        return Some(cases);
+    }
+    let shown = |vary: &Vary| format!("{}={} {}", vary.path, vary.unit.from_si(vary.typical()), vary.unit);
+    options.changes.set.extend(missing.into_iter().map(shown));
+    match compile::varying(loaded, &project::Disk, name, &options, &mut Vec::new()) {
+        Ok(cases) => Some(cases),
+        Err(diagnostics) => {
+            reported(loaded, &diagnostics, terminal);
+            None
+        }
+    }
+}
+
+/// All runs of a sweep and what is written of them.
+struct Table {
+    cases: Vec<Varying>,
+    vary: Vec<Vary>,
+    /// For each case the slots of the parameters.
+    slots: Vec<Vec<Slot>>,
+    /// Combinations of the grids, and draws of each.
+    grid: u64,
+    draws: u64,
+    seed: u64,
+    columns: Vec<Column>,
+}
+
+/// A column of the file.
+struct Column {
+    title: String,
+    /// For a figure.
+    axis: Axis,
+    kind: ColumnKind,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum ColumnKind {
+    Run,
+    Case,
+    Varied,
+    Measure(usize, usize),
+    Verdict(usize),
+    Status,
+}
+
+impl Table {
+    fn new(args: &Sweep, cases: Vec<Varying>) -> Result<Table, String> {
+        let mut slots = Vec::new();
+        for case in &cases {
+            let mut of_case = Vec::new();
+            for vary in &args.vary {
+                let Some(param) = case.param(&vary.path) else {
+                    return Err(format!("`{}` is not a parameter: only parameters vary", vary.path));
+                };
+                if param.unit.dimension != vary.unit.dimension {
+                    let (wanted, found) = (param.unit.dimension.describe(), vary.unit.dimension.describe());
+                    return Err(format!("`{}` is {wanted}, it cannot be {found}", vary.path));
+                }
+                of_case.push(param.slot);
+            }
+            slots.push(of_case);
+        }
+        let grid = args.vary.iter().filter_map(Vary::len).map(|len| len as u64).product();
+        let random = args.vary.iter().any(|vary| vary.len().is_none());
+        let draws = match (random, args.runs) {
+            (true, runs) => runs.unwrap_or(DEFAULT_RUNS),
+            (false, None | Some(1)) => 1,
+            (false, Some(_)) => {
+                return Err("--runs is for distributions, such as --vary 'm ~ normal(1 kg, 0.1 kg)'".into());
+            }
+        };
+        let columns = columns(&cases, &args.vary);
+        Ok(Table { cases, vary: args.vary.clone(), slots, grid, draws, seed: args.seed, columns })
+    }
+
+    fn total(&self) -> u64 {
+        self.cases.len() as u64 * self.grid * self.draws
+    }
+
+    /// The case of a run and its values in SI: the last grid changes fastest, draws within it.
+    fn values(&self, run: u64, dice: &Dice) -> (usize, Vec<f64>) {
+        let (point, draw) = (run / self.draws, run % self.draws);
+        let (case, mut left) = ((point / self.grid) as usize, point % self.grid);
+        let mut values = vec![0.0; self.vary.len()];
+        let mut stride = self.grid;
+        let mut k = 0;
+        for (vary, value) in self.vary.iter().zip(&mut values) {
+            match &vary.how {
+                crate::vary::How::Values(all) => {
+                    stride /= all.len() as u64;
+                    *value = all[(left / stride) as usize];
+                    left %= stride;
+                }
+                how => {
+                    // The same draws at each point of a grid: points differ by what was changed, not by chance.
+                    *value = dice.value(how, draw, k);
+                    k += 1;
+                }
+            }
+        }
+        (case, values)
+    }
+
+    /// One run as a row; none if it was stopped.
+    fn row(&self, run: u64, dice: &Dice, stopped: &AtomicBool) -> Option<Vec<u8>> {
+        let (at, values) = self.values(run, dice);
+        let case = &self.cases[at];
+        let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
+        let mut readings: Vec<Vec<(String, f64)>> = Vec::new();
+        let mut verdicts = Vec::new();
+        let status = match case.fit(&given) {
+            Err(broken) => format!("not run: {broken}"),
+            Ok(fitted) => {
+                let description = fitted.instance.description().clone();
+                let mut watch = |_| match stopped.load(Ordering::Relaxed) {
+                    true => Continue::Break(()),
+                    false => Continue::Continue(()),
+                };
+                match engine::run(fitted.instance, &fitted.experiment, &mut watch) {
+                    Err(failure) if failure.cause == Cause::Stopped => return None,
+                    Err(failure) => format!("stopped: {failure}"),
+                    Ok(outcome) => {
+                        let (own, watched) = outcome.verdicts.split_at(case.expects());
+                        let extremes: Vec<(f64, f64)> = watched
+                            .iter()
+                            .map(|verdict| {
+                                let value =
+                                    |k: usize| verdict.readings.get(k).map_or(f64::NAN, |reading| reading.value);
+                                (value(0), value(1))
+                            })
+                            .collect();
+                        for verdict in own {
+                            let read = |r: &runtime::measure::Reading| (r.text.clone(), r.unit.from_si(r.value));
+                            readings.push(verdict.readings.iter().map(read).collect());
+                            verdicts.push(verdict.holds);
+                        }
+                        let problem = own.iter().find_map(|verdict| verdict.problem.clone());
+                        match (case.left(&description, &extremes), problem) {
+                            (Some(left), _) => format!("stopped: {left}"),
+                            (None, Some(problem)) => problem,
+                            (None, None) => "ok".into(),
+                        }
+                    }
+                }
+            }
+        };
+        let cell = |column: &Column| match column.kind {
+            ColumnKind::Run => run.to_string(),
+            ColumnKind::Case => case.label.clone(),
+            ColumnKind::Varied => {
+                let k = self.vary.iter().position(|vary| vary.path == column.axis.name).expect("it is varied");
+                runtime::show::plain(self.vary[k].unit.from_si(values[k]))
+            }
+            ColumnKind::Measure(k, j) => {
+                // Of an expectation that could not be evaluated some measures may be missing.
+                let text = &case.experiment.expects[k].measures[j].text;
+                let found = readings.get(k).and_then(|read| read.iter().find(|(known, _)| known == text));
+                found.map_or(String::new(), |(_, value)| runtime::show::plain(*value))
+            }
+            ColumnKind::Verdict(k) => verdicts.get(k).map_or(String::new(), bool::to_string),
+            ColumnKind::Status => status.split_whitespace().collect::<Vec<_>>().join(" "),
+        };
+        Some(line(self.columns.iter().map(cell)))
+    }
+
+    fn run(&self, args: &Sweep, loaded: &Loaded, terminal: &mut Terminal) -> Result<End, String> {
+        let begin = Instant::now();
+        let total = self.total();
+        let (shard, shards) = args.shard.unwrap_or((1, 1));
+        let part = |i: u64| (u128::from(total) * u128::from(i) / u128::from(shards)) as u64;
+        let range = part(shard - 1)..part(shard);
+        // Only the first shard has a header: so that all of them one behind the other are the whole.
+        let header = if shard == 1 { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() };
+        let asked = self.asked(args, loaded, &range);
+        let out = &args.out;
+        let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", out.display());
+        let marker = out.with_file_name(format!(".{}.unfinished", name_of(out)));
+        let before = fs::read_to_string(&marker).ok();
+        let done = match (args.resume, &before) {
+            (true, Some(before)) if *before != asked => {
+                return Err(format!(
+                    "{} was begun with other settings or another text:\n{}now:\n{}give the same, or remove it",
+                    out.display(),
+                    indented(before),
+                    indented(&asked)
+                ));
+            }
+            (true, Some(_)) => kept(out, &header).map_err(|error| told("read", error))?,
+            (true, None) if out.exists() => {
+                return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
+            }
+            (false, Some(_)) if out.exists() => {
+                return Err(format!(
+                    "{} holds a sweep that is not finished; go on with --resume, or remove it",
+                    out.display()
+                ));
+            }
+            (true | false, _) => 0,
+        };
+        project::make_folder_of(out).map_err(|error| told("write", error))?;
+        let mut file = if done > 0 {
+            OpenOptions::new().append(true).open(out).map_err(|error| told("write", error))?
+        } else {
+            fs::write(&marker, &asked).map_err(|error| told("write", error))?;
+            let mut file = File::create(out).map_err(|error| told("write", error))?;
+            file.write_all(&header).map_err(|error| told("write", error))?;
+            file
+        };
+        let threads = args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
+        let from = range.start + done;
+        let written = self.append(args, &mut file, from..range.end, threads).map_err(|error| told("write", error))?;
+        let reached = from + written;
+        let wall = begin.elapsed().as_secs_f64();
+        if reached < range.end {
+            terminal.report(&format!(
+                "stopped after {} of {} runs, which are kept in {}; go on with --resume\n",
+                count(reached - range.start),
+                count(range.end - range.start),
+                out.display()
+            ));
+            return Ok(End::Failed);
+        }
+        file.sync_all().map_err(|error| told("write", error))?;
+        let _ = fs::remove_file(&marker);
+        let summary = self.summary(out, shard == 1).map_err(|error| told("read", error))?;
+        if let Some(path) = &args.plot {
+            let figure = self.figure(args, &summary)?;
+            let png = path.extension().is_some_and(|extension| extension == "png");
+            let bytes = if png { plot::png(&figure) } else { plot::svg(&figure).into_bytes() };
+            project::write(path, &bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        }
+        if !args.quiet {
+            let speed = written as f64 / wall;
+            let heading = format!(
+                "{}, {}: {} runs in {}, {} a second on {} thread{}",
+                args.experiment,
+                results::solver(&self.cases[0].experiment.solver),
+                count(written),
+                value::duration(wall),
+                significant(speed, 3),
+                threads,
+                if threads == 1 { "" } else { "s" }
+            );
+            terminal.line(&terminal.styled(Style::Bold, &heading));
+            for note in self.cases.iter().flat_map(|case| &case.notes) {
+                terminal.line(&format!("  note: {note}"));
+            }
+            terminal.print(&summary.words());
+            let files = args.plot.iter().map(|path| format!(", {}", path.display())).collect::<String>();
+            terminal.line(&format!("  wrote {}{files}", out.display()));
+        }
+        Ok(End::Fine)
+    }
+
+    /// Appends rows; returns how many.
+    fn append(&self, args: &Sweep, file: &mut File, range: Range<u64>, threads: usize) -> io::Result<u64> {
+        let stopped = std::sync::Arc::new(AtomicBool::new(false));
+        let flag = stopped.clone();
+        // A second Ctrl-C ends the process at once; what is written is whole rows but for the last, which --resume drops.
+        let _ = ctrlc::set_handler(move || {
+            if flag.swap(true, Ordering::Relaxed) {
+                std::process::exit(130);
+            }
+        });
+        let target = if args.quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() };
+        let bar = ProgressBar::with_draw_target(Some(range.end - range.start), target);
+        let template = "  {bar:40} {human_pos} of {human_len}  {per_sec}  {eta} left";
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            bar.set_style(style.progress_chars("━╸ "));
+        }
+        let dice = Dice::new(self.seed);
+        let mut writer = BufWriter::new(file);
+        let (mut written, mut failed) = (0, None);
+        let mut flushed = Instant::now();
+        let job = |run: u64| self.row(run, &dice, &stopped);
+        sweep::ordered(range, threads, &job, &mut |_, row| {
+            let mut put = || {
+                writer.write_all(&row)?;
+                if flushed.elapsed() > Duration::from_millis(200) {
+                    writer.flush()?;
+                    flushed = Instant::now();
+                    bar.set_position(written + 1);
+                }
+                Ok(())
+            };
+            match put() {
+                Ok(()) => {
+                    written += 1;
+                    Continue::Continue(())
+                }
+                Err(error) => {
+                    failed = Some(error);
+                    // Runs under way need not come to their ends.
+                    stopped.store(true, Ordering::Relaxed);
+                    Continue::Break(())
+                }
+            }
+        });
+        bar.finish_and_clear();
+        match failed {
+            Some(error) => Err(error),
+            None => writer.flush().map(|()| written),
+        }
+    }
+
+    /// What a sweep must have in common with one that it goes on with.
+    fn asked(&self, args: &Sweep, loaded: &Loaded, range: &Range<u64>) -> String {
+        // FNV-1a.
+        let hash = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+        let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
+        let texts = texts.flat_map(|file| file.text.bytes()).fold(0xcbf2_9ce4_8422_2325, hash);
+        let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
+        let solver = results::solver(&self.cases[0].experiment.solver);
+        asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
+        for (path, value) in &args.set {
+            asked += &format!("--set {path}={value}\n");
+        }
+        for vary in &self.vary {
+            let how = match &vary.how {
+                crate::vary::How::Values(values) => {
+                    format!("{} values, {:?} .. {:?}", values.len(), values[0], values[values.len() - 1])
+                }
+                how => format!("{how:?}"),
+            };
+            asked += &format!("--vary {} in {}: {how}\n", vary.path, vary.unit);
+        }
+        asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed, range.start, range.end, self.total())
+    }
+
+    /// Reads the file once.
+    fn summary(&self, path: &Path, header: bool) -> io::Result<Summary> {
+        let mut reader = csv::ReaderBuilder::new().has_headers(header).from_path(path).map_err(io::Error::other)?;
+        let tallies = self.columns.iter().map(|column| Tally::new(&column.title, column.kind)).collect();
+        let mut summary = Summary { tallies, kept: Vec::new(), every: 1, rows: 0, ended: Vec::new() };
+        let mut record = csv::StringRecord::new();
+        while reader.read_record(&mut record).map_err(io::Error::other)? {
+            summary.see(&record);
+        }
+        Ok(summary)
+    }
+
+    /// A measure over a parameter: those named, else the first parameter and every measure.
+    fn figure(&self, args: &Sweep, summary: &Summary) -> Result<Figure, String> {
+        let (show, against) = (args.show.as_deref(), args.against.as_deref());
+        let is_measure = |column: &&Column| matches!(column.kind, ColumnKind::Measure(..));
+        let named = |column: &&Column, name: &str| column.axis.name == name || column.title == name;
+        let x = match against {
+            None => self.columns.iter().position(|column| column.kind == ColumnKind::Varied),
+            Some(name) => {
+                self.columns.iter().position(|column| column.kind == ColumnKind::Varied && named(&column, name))
+            }
+        };
+        let Some(x) = x else {
+            let varied: Vec<&str> = self.vary.iter().map(|vary| vary.path.as_str()).collect();
+            return Err(format!("--against names none of what is varied: {}", varied.join(", ")));
+        };
+        let wanted = |column: &&Column| is_measure(column) && show.is_none_or(|name| named(column, name));
+        let shown: Vec<usize> = (0..self.columns.len()).filter(|k| wanted(&&self.columns[*k])).collect();
+        if shown.is_empty() {
+            let all: Vec<&str> =
+                self.columns.iter().filter(is_measure).map(|column| column.axis.name.as_str()).collect();
+            return Err(match all.is_empty() {
+                true => "there is nothing to plot: the experiment expects nothing, so nothing is measured".into(),
+                false => format!("--show names no measure of the experiment; it has {}", all.join(", ")),
+            });
+        }
+        let panel = |y: usize| {
+            // Each point by itself: a gap before the next.
+            let points = summary.kept.iter().flat_map(|row| [(row[x], row[y]), (f64::NAN, f64::NAN)]).collect();
+            Panel {
+                x: self.columns[x].axis.clone(),
+                y: self.columns[y].axis.clone(),
+                curves: vec![Curve { name: String::new(), points, boolean: false, marks: true }],
+                bands: Vec::new(),
+            }
+        };
+        Ok(Figure {
+            title: args.experiment.clone(),
+            subtitle: format!("{} runs, {}", count(summary.rows), results::solver(&self.cases[0].experiment.solver)),
+            panels: shown.into_iter().map(panel).collect(),
+        })
+    }
+}
+
+fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
+    let plain = |title: &str, kind| Column { title: title.into(), axis: Axis::default(), kind };
+    let mut columns = vec![plain("run", ColumnKind::Run)];
+    if cases.len() > 1 {
+        columns.push(plain("case", ColumnKind::Case));
+    }
+    for vary in vary {
+        let axis = Axis { name: vary.path.clone(), unit: vary.unit.text.clone(), logarithmic: false };
+        columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Varied });
+    }
+    let first = &cases[0];
+    for (k, expect) in first.experiment.expects[..first.expects()].iter().enumerate() {
+        for (j, Measure { text, unit, .. }) in expect.measures.iter().enumerate() {
+            let axis = Axis { name: text.clone(), unit: unit.text.clone(), logarithmic: false };
+            columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Measure(k, j) });
+        }
+        columns.push(plain(&expect.text, ColumnKind::Verdict(k)));
+    }
+    columns.push(plain("status", ColumnKind::Status));
+    columns
+}
+
+/// A row of the file.
+fn line(cells: impl Iterator<Item = String>) -> Vec<u8> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer.write_record(cells).expect("writing to memory does not fail");
+    writer.into_inner().expect("writing to memory does not fail")
+}
+
+/// Number of whole rows behind the header; what follows the last one is cut off. None where the header is another.
+fn kept(path: &Path, header: &[u8]) -> io::Result<u64> {
+    let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else { return Ok(0) };
+    let mut begin = vec![0; header.len()];
+    if file.read_exact(&mut begin).is_err() || begin != header {
+        return Ok(0);
+    }
+    let (mut rows, mut at, mut end) = (0, header.len() as u64, header.len() as u64);
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        let length = file.read(&mut buffer)?;
+        if length == 0 {
+            break;
+        }
+        for byte in &buffer[..length] {
+            at += 1;
+            if *byte == b'\n' {
+                (rows, end) = (rows + 1, at);
+            }
+        }
+    }
+    file.set_len(end)?;
+    file.seek(SeekFrom::End(0))?;
+    Ok(rows)
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+fn indented(text: &str) -> String {
+    text.lines().map(|line| format!("  {line}\n")).collect()
+}
+
+/// What a file holds, column by column.
+struct Summary {
+    tallies: Vec<Tally>,
+    /// Every so many-th row as numbers: for quantiles and figures, in bounded memory.
+    kept: Vec<Vec<f64>>,
+    every: u64,
+    rows: u64,
+    /// How runs ended that did not end well, and how many did so.
+    ended: Vec<(String, u64)>,
+}
+
+/// One column.
+struct Tally {
+    title: String,
+    kind: ColumnKind,
+    number: u64,
+    mean: f64,
+    /// Sum of squares of distances to the mean.
+    square: f64,
+    least: f64,
+    most: f64,
+    /// Verdicts that hold.
+    held: u64,
+}
+
+impl Tally {
+    fn new(title: &str, kind: ColumnKind) -> Tally {
+        let (least, most) = (f64::INFINITY, f64::NEG_INFINITY);
+        Tally { title: title.into(), kind, number: 0, mean: 0.0, square: 0.0, least, most, held: 0 }
+    }
+
+    fn see(&mut self, cell: &str) -> f64 {
+        let value = match (self.kind, cell) {
+            (ColumnKind::Verdict(_), "true" | "false") => {
+                self.number += 1;
+                self.held += u64::from(cell == "true");
+                return f64::NAN;
+            }
+            (ColumnKind::Varied | ColumnKind::Measure(..), cell) => cell.parse().unwrap_or(f64::NAN),
+            _ => return f64::NAN,
+        };
+        if f64::is_finite(value) {
+            self.number += 1;
+            // Welford's recurrence.
+            let distance = value - self.mean;
+            self.mean += distance / self.number as f64;
+            self.square += distance * (value - self.mean);
+            self.least = self.least.min(value);
+            self.most = self.most.max(value);
+        }
+        value
+    }
+}
+
+impl Summary {
+    fn see(&mut self, record: &csv::StringRecord) {
+        let row: Vec<f64> = self.tallies.iter_mut().zip(record).map(|(tally, cell)| tally.see(cell)).collect();
+        if self.rows.is_multiple_of(self.every) {
+            self.kept.push(row);
+            if self.kept.len() == SAMPLE {
+                let mut even = false;
+                self.kept.retain(|_| {
+                    even = !even;
+                    even
+                });
+                self.every *= 2;
+            }
+        }
+        self.rows += 1;
+        let status = record.get(record.len() - 1).unwrap_or_default();
+        if status != "ok" {
+            // Instants and values differ from run to run: what comes before the first number tells the kinds apart.
+            let kind = status.split(|c: char| c.is_ascii_digit()).next().unwrap_or(status).trim_end().to_string();
+            match self.ended.iter().position(|(known, _)| *known == kind) {
+                Some(at) => self.ended[at].1 += 1,
+                None if self.ended.len() < 20 => self.ended.push((kind, 1)),
+                None => {}
+            }
+        }
+    }
+
+    fn words(&self) -> String {
+        let mut table =
+            vec![["", "mean", "deviation", "least", "5 %", "median", "95 %", "greatest"].map(str::to_string).to_vec()];
+        for (k, tally) in self.tallies.iter().enumerate() {
+            if !matches!(tally.kind, ColumnKind::Varied | ColumnKind::Measure(..)) || tally.number == 0 {
+                continue;
+            }
+            let mut values: Vec<f64> = self.kept.iter().map(|row| row[k]).filter(|value| value.is_finite()).collect();
+            values.sort_by(f64::total_cmp);
+            let at = |part: f64| values.get((part * (values.len().max(1) - 1) as f64).round() as usize).copied();
+            let deviation = (tally.square / (tally.number.max(2) - 1) as f64).sqrt();
+            let mut cells = vec![tally.title.clone()];
+            let quantiles = [0.05, 0.5, 0.95].map(|part| at(part).unwrap_or(f64::NAN));
+            let numbers = [tally.mean, deviation, tally.least, quantiles[0], quantiles[1], quantiles[2], tally.most];
+            cells.extend(numbers.map(|number| significant(number, 5)));
+            table.push(cells);
+        }
+        let mut out = String::new();
+        if table.len() > 1 {
+            let widths: Vec<usize> =
+                (0..8).map(|k| table.iter().map(|row| row[k].chars().count()).max().unwrap_or(0)).collect();
+            for row in &table {
+                let cells: Vec<String> =
+                    row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+                out += &format!("  {}\n", cells.join("  ").trim_end());
+            }
+        }
+        for tally in self.tallies.iter().filter(|tally| matches!(tally.kind, ColumnKind::Verdict(_))) {
+            let share = 100.0 * tally.held as f64 / self.rows.max(1) as f64;
+            out += &format!(
+                "  {} held in {} of {} runs ({} %)\n",
+                tally.title,
+                count(tally.held),
+                count(self.rows),
+                significant(share, 4)
+            );
+        }
+        for (kind, number) in &self.ended {
+            out += &format!("  {} run{}: {kind}\n", count(*number), if *number == 1 { "" } else { "s" });
+        }
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_cut_short_is_dropped() {
+        let path = std::env::temp_dir().join(format!("fric-kept-{}.csv", std::process::id()));
+        fs::write(&path, "run,a\n0,1\n1,2\n2,").unwrap();
+        assert_eq!(kept(&path, b"run,a\n").unwrap(), 2);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "run,a\n0,1\n1,2\n");
+        assert_eq!(kept(&path, b"run,b\n").unwrap(), 0);
+        fs::remove_file(&path).unwrap();
+    }
+}

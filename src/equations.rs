@@ -1,0 +1,291 @@
+//! Equations as people print them: `σ₀ z + σ₁ dz/dt` for `sigma0 * z + sigma1 * dz/dt`.
+//!
+//! In: the tree of a model. Out: lines of text. What a text means is not changed by it: symbols, raised exponents and
+//! bars for `abs` only.
+
+use grammar::ast::{
+    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Statement, Target, UnaryOp,
+};
+
+/// The equations of a model, left and right side, in the order of the text; regimes have a heading of their own, which
+/// has no right side.
+pub fn equations(model: &Model) -> Vec<(String, String)> {
+    let mut lines = Vec::new();
+    for statement in &model.body {
+        match statement {
+            Statement::Declaration(declaration) => {
+                let value = declaration.value.as_ref();
+                let computed = matches!(declaration.kind, DeclarationKind::Let | DeclarationKind::Output);
+                if let Some(value) = value.filter(|_| computed) {
+                    lines.push((symbol(&declaration.name.text), expression(value)));
+                }
+            }
+            Statement::Equation(equation) => lines.push(sides(equation)),
+            Statement::Part(part) => {
+                let repeat = part.repeat.as_ref().map_or(String::new(), |repeat| {
+                    format!(", {} = {} … {}", repeat.index.text, expression(&repeat.first), expression(&repeat.last))
+                });
+                lines.push((symbol(&part.name.text), format!("{}{repeat}", part.instance.model.text)));
+            }
+            Statement::Every(every) => sampled(every, &mut lines),
+            Statement::Mode(mode) => {
+                lines.push((format!("in {}:", mode.name.text), String::new()));
+                lines.extend(mode.equations.iter().map(sides));
+                for go in &mode.transitions {
+                    lines.push((format!("→ {}", go.target.text), format!("when {}", expression(&go.condition))));
+                }
+            }
+            Statement::When(when) => {
+                let resets = when
+                    .resets
+                    .iter()
+                    .map(|reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value)));
+                lines.push((format!("when {}", expression(&when.condition)), resets.collect::<Vec<_>>().join(", ")));
+            }
+            Statement::Require(_) | Statement::Storage(_) | Statement::Allow(_) => {}
+        }
+    }
+    lines
+}
+
+/// One line for each equation, the equals signs below each other.
+pub fn lines(equations: &[(String, String)]) -> String {
+    let width = equations.iter().filter(|(_, right)| !right.is_empty()).map(|(left, _)| left.chars().count()).max();
+    let mut text = String::new();
+    for (left, right) in equations {
+        match (right.is_empty(), left.starts_with('→') || left.starts_with("when")) {
+            (true, _) => text += &format!("{left}\n"),
+            (false, true) => text += &format!("{left} {right}\n"),
+            (false, false) => text += &format!("{left:width$} = {right}\n", width = width.unwrap_or(0).min(12)),
+        }
+    }
+    text
+}
+
+fn sampled(every: &Every, lines: &mut Vec<(String, String)>) {
+    lines.push((format!("every {}:", expression(&every.period)), String::new()));
+    for statement in &every.body {
+        match statement {
+            EveryStatement::Declaration(declaration) => {
+                if let Some(value) = &declaration.value {
+                    lines.push((symbol(&declaration.name.text), expression(value)));
+                }
+            }
+            EveryStatement::Equation(equation) => lines.push(sides(equation)),
+        }
+    }
+}
+
+fn sides(equation: &Equation) -> (String, String) {
+    let left = match &equation.target {
+        Target::Name(name) => symbol(&name.text),
+        Target::Derivative { of, along, .. } => derivative(&of.text, &along.text),
+        Target::Next { name, .. } => format!("{}⁺", symbol(&name.text)),
+    };
+    (left, expression(&equation.value))
+}
+
+fn derivative(of: &str, along: &str) -> String {
+    format!("d{}/d{}", symbol(of), symbol(along))
+}
+
+/// How tightly an operator binds; the higher, the tighter.
+fn tightness(expr: &Expr) -> u8 {
+    match &expr.kind {
+        ExprKind::If(..) => 0,
+        ExprKind::Binary(op, ..) => match op {
+            BinaryOp::Or => 1,
+            BinaryOp::And => 2,
+            BinaryOp::Less
+            | BinaryOp::LessEqual
+            | BinaryOp::Greater
+            | BinaryOp::GreaterEqual
+            | BinaryOp::Equal
+            | BinaryOp::NotEqual
+            | BinaryOp::Crosses
+            | BinaryOp::Rises
+            | BinaryOp::Falls => 4,
+            BinaryOp::Add | BinaryOp::Subtract => 5,
+            BinaryOp::Multiply | BinaryOp::Divide => 6,
+            BinaryOp::Power => 8,
+        },
+        ExprKind::Unary(UnaryOp::Not, _) => 3,
+        ExprKind::Unary(UnaryOp::Negate, _) => 6,
+        // `dz/dt` squared, or divided by, stands in parentheses.
+        ExprKind::Derivative { .. } => 6,
+        ExprKind::Number { unit: Some(_), .. } => 6,
+        ExprKind::Number { .. } | ExprKind::Path(_) | ExprKind::Call { .. } | ExprKind::Hole | ExprKind::Error => 9,
+    }
+}
+
+/// In parentheses unless it binds at least as tightly as asked for.
+fn inside(expr: &Expr, least: u8) -> String {
+    let text = expression(expr);
+    if tightness(expr) >= least { text } else { format!("({text})") }
+}
+
+/// An expression with symbols.
+pub fn expression(expr: &Expr) -> String {
+    match &expr.kind {
+        ExprKind::Number { value, unit } => {
+            let number = crate::value::significant(*value, 15);
+            match unit {
+                Some(unit) => format!("{number} {}", unit_text(&unit.text)),
+                None => number,
+            }
+        }
+        ExprKind::Path(path) => path_text(path),
+        ExprKind::Derivative { of, along } => derivative(&of.text, &along.text),
+        ExprKind::Call { function, args } => {
+            let shown: Vec<String> = args.iter().map(expression).collect();
+            match (function.text.as_str(), shown.as_slice()) {
+                ("abs", [x]) => format!("|{x}|"),
+                ("sqrt", [x]) => match tightness(&args[0]) {
+                    9 => format!("√{x}"),
+                    _ => format!("√({x})"),
+                },
+                ("sign", [x]) => format!("sgn({x})"),
+                (name, _) => format!("{name}({})", shown.join(", ")),
+            }
+        }
+        ExprKind::Unary(UnaryOp::Negate, x) => format!("−{}", inside(x, 6)),
+        ExprKind::Unary(UnaryOp::Not, x) => format!("not {}", inside(x, 4)),
+        ExprKind::Binary(op, _, a, b) => binary(*op, a, b),
+        ExprKind::If(condition, yes, no) => {
+            format!("{} if {}, else {}", inside(yes, 1), expression(condition), expression(no))
+        }
+        ExprKind::Hole => "?".into(),
+        ExprKind::Error => "…".into(),
+    }
+}
+
+fn binary(op: BinaryOp, a: &Expr, b: &Expr) -> String {
+    let joined = |sign: &str, left: u8, right: u8| format!("{}{sign}{}", inside(a, left), inside(b, right));
+    match op {
+        BinaryOp::Add => joined(" + ", 5, 5),
+        BinaryOp::Subtract => joined(" − ", 5, 6),
+        BinaryOp::Multiply => joined(" · ", 6, 7),
+        BinaryOp::Divide => joined(" / ", 6, 7),
+        BinaryOp::Power => match exponent(b) {
+            Some(raised) => format!("{}{raised}", inside(a, 9)),
+            None => format!("{}^{}", inside(a, 9), inside(b, 9)),
+        },
+        BinaryOp::Less => joined(" < ", 5, 5),
+        BinaryOp::LessEqual => joined(" ≤ ", 5, 5),
+        BinaryOp::Greater => joined(" > ", 5, 5),
+        BinaryOp::GreaterEqual => joined(" ≥ ", 5, 5),
+        BinaryOp::Equal => joined(" = ", 5, 5),
+        BinaryOp::NotEqual => joined(" ≠ ", 5, 5),
+        BinaryOp::And => joined(" and ", 2, 3),
+        BinaryOp::Or => joined(" or ", 1, 2),
+        BinaryOp::Crosses => joined(" crosses ", 5, 5),
+        BinaryOp::Rises => joined(" rises through ", 5, 5),
+        BinaryOp::Falls => joined(" falls through ", 5, 5),
+    }
+}
+
+/// A whole number as raised digits.
+fn exponent(expr: &Expr) -> Option<String> {
+    let raised = |value: f64| {
+        (value.fract() == 0.0 && (0.0..100.0).contains(&value)).then(|| {
+            value.to_string().chars().map(|c| digit(c, &['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'])).collect()
+        })
+    };
+    match &expr.kind {
+        ExprKind::Number { value, unit: None } => raised(*value),
+        ExprKind::Unary(UnaryOp::Negate, x) => exponent(x).map(|digits: String| format!("⁻{digits}")),
+        _ => None,
+    }
+}
+
+fn digit(c: char, forms: &[char; 10]) -> char {
+    c.to_digit(10).map_or(c, |digit| forms[digit as usize])
+}
+
+fn path_text(path: &Path) -> String {
+    let segments: Vec<String> = path
+        .segments
+        .iter()
+        .map(|segment| {
+            let index = segment.index.map_or(String::new(), |index| format!("[{index}]"));
+            format!("{}{index}", symbol(&segment.name.text))
+        })
+        .collect();
+    match segments.as_slice() {
+        [one] if one == "inf" => "∞".into(),
+        segments => segments.join("."),
+    }
+}
+
+/// A unit as it is printed.
+fn unit_text(unit: &str) -> String {
+    let mut text = String::new();
+    let mut chars = unit.chars().peekable();
+    while let Some(c) = chars.next() {
+        match (c, chars.peek()) {
+            ('^', Some('2')) => {
+                chars.next();
+                text.push('²');
+            }
+            ('^', Some('3')) => {
+                chars.next();
+                text.push('³');
+            }
+            ('u', Some('m' | 's' | 'r' | 'N')) => text.push('µ'),
+            _ => text.push(c),
+        }
+    }
+    text
+}
+
+/// A name as a symbol: Greek letters and lowered digits.
+pub fn symbol(name: &str) -> String {
+    const GREEK: [(&str, &str); 21] = [
+        ("alpha", "α"),
+        ("beta", "β"),
+        ("gamma", "γ"),
+        ("delta", "δ"),
+        ("epsilon", "ε"),
+        ("eps", "ε"),
+        ("zeta", "ζ"),
+        ("theta", "θ"),
+        ("eta", "η"),
+        ("kappa", "κ"),
+        ("lambda", "λ"),
+        ("mu", "μ"),
+        ("nu", "ν"),
+        ("xi", "ξ"),
+        ("rho", "ρ"),
+        ("sigma", "σ"),
+        ("tau", "τ"),
+        ("phi", "φ"),
+        ("psi", "ψ"),
+        ("omega", "ω"),
+        ("pi", "π"),
+    ];
+    let (stem, digits) = name.split_at(name.trim_end_matches(|c: char| c.is_ascii_digit()).len());
+    let (stem, tail) = stem.split_once('_').map_or((stem, String::new()), |(stem, tail)| (stem, format!("_{tail}")));
+    let stem = GREEK.iter().find(|(word, _)| *word == stem).map_or(stem, |(_, letter)| letter);
+    let lowered: String =
+        digits.chars().map(|c| digit(c, &['₀', '₁', '₂', '₃', '₄', '₅', '₆', '₇', '₈', '₉'])).collect();
+    format!("{stem}{tail}{lowered}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use grammar::span::FileId;
+
+    #[test]
+    fn expressions_look_like_the_paper() {
+        let shown = |text: &str| expression(&grammar::parse::parse_expr(FileId(0), text).0);
+        assert_eq!(shown("v - sigma0 * abs(v) / g * z"), "v − σ₀ · |v| / g · z");
+        assert_eq!(shown("Fc + (Fs - Fc) * exp(-(v / vs)^2)"), "Fc + (Fs − Fc) · exp(−(v / vs)²)");
+        assert_eq!(shown("a - (b - c)"), "a − (b − c)");
+        assert_eq!(shown("a / (b * c)"), "a / (b · c)");
+        assert_eq!(shown("if abs(v) < Dv then 0 else 10 um/s"), "0 if |v| < Dv, else 10 µm/s");
+        assert_eq!(shown("(a + b)^-1 * 3 N·s^2/m^2"), "(a + b)⁻¹ · (3 N·s²/m²)");
+        assert_eq!(symbol("eps_f"), "ε_f");
+        assert_eq!(symbol("Fc"), "Fc");
+    }
+}

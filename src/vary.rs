@@ -1,0 +1,317 @@
+//! What `--vary` says: a grid of values, or a distribution.
+//!
+//! In: text such as `fr.Fs = 1 N .. 2 N by 0.1 N` or `fr.vs ~ lognormal(1 mm/s, 0.2)`. Out: the value of each run, from
+//! its number alone. Random numbers are drawn by counter, so that a run has the same ones on every machine, in any order.
+
+use crate::compile::Alone;
+use crate::value;
+use abi::unit::Unit;
+
+/// Most values of a grid.
+const MOST_VALUES: usize = 10_000_000;
+
+/// One parameter that changes.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Vary {
+    /// Its path.
+    pub path: String,
+    /// The unit of its values as written.
+    pub unit: Unit,
+    /// What it becomes.
+    pub how: How,
+}
+
+/// Values in SI.
+#[derive(Clone, PartialEq, Debug)]
+pub enum How {
+    /// One after the other.
+    Values(Vec<f64>),
+    /// Of this mean and standard deviation.
+    Normal(f64, f64),
+    /// Of this median; the second is the standard deviation of its logarithm.
+    Lognormal(f64, f64),
+    /// Between two bounds.
+    Uniform(f64, f64),
+}
+
+/// Reads one `--vary`.
+///
+/// # Errors
+/// What is wrong with it, and how to write it.
+pub fn parse(text: &str) -> Result<Vary, String> {
+    const EXAMPLES: &str = "write it as `fr.Fs = 1 N .. 2 N by 0.1 N`, `fr.Fs = 1 N, 2 N`, \
+        or `fr.vs ~ normal(1 mm/s, 0.1 mm/s)`, lognormal(median, spread), uniform(from, to)";
+    let split = text.find(['=', '~']).ok_or(EXAMPLES)?;
+    let (path, rest) = (text[..split].trim(), text[split + 1..].trim());
+    if path.is_empty() || rest.is_empty() {
+        return Err(EXAMPLES.into());
+    }
+    let (unit, how) = if text[split..].starts_with('~') { drawn(rest, EXAMPLES)? } else { listed(rest, EXAMPLES)? };
+    Ok(Vary { path: path.into(), unit, how })
+}
+
+fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
+    let Some((first, rest)) = text.split_once("..") else {
+        let (values, unit) = of_one_kind(&text.split(',').collect::<Vec<_>>())?;
+        return Ok((unit, How::Values(values)));
+    };
+    let (last, step) = rest.split_once(" by ").ok_or(examples)?;
+    let (values, unit) = of_one_kind(&[first, last, step])?;
+    let [first, last, step] = [values[0], values[1], values[2]];
+    if step <= 0.0 || last < first {
+        return Err("a grid goes from a smaller to a larger value by a positive step".into());
+    }
+    let count = ((last - first) / step + 1e-9).floor() + 1.0;
+    if count > MOST_VALUES as f64 {
+        return Err(format!("{count} values are too many; {MOST_VALUES} are possible"));
+    }
+    // Twelve digits in the unit as written: without the noise of a sum.
+    let value = |k: usize| {
+        let shown: f64 = format!("{:.11e}", unit.from_si(first + k as f64 * step)).parse().unwrap_or(f64::NAN);
+        value::si(shown, &unit)
+    };
+    Ok((unit.clone(), How::Values((0..count as usize).map(value).collect())))
+}
+
+fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
+    let (name, rest) = text.split_once('(').ok_or(examples)?;
+    let inside = rest.trim_end().strip_suffix(')').ok_or(examples)?;
+    let parts: Vec<&str> = inside.split(',').collect();
+    let &[first, second] = parts.as_slice() else { return Err(examples.into()) };
+    let pair = || of_one_kind(&[first, second]);
+    match name.trim() {
+        "normal" => match pair()? {
+            (values, unit) if values[1] >= 0.0 => Ok((unit, How::Normal(values[0], values[1]))),
+            _ => Err("a standard deviation is not negative".into()),
+        },
+        "uniform" => match pair()? {
+            (values, unit) if values[0] <= values[1] => Ok((unit, How::Uniform(values[0], values[1]))),
+            _ => Err("uniform goes from a smaller to a larger value".into()),
+        },
+        "lognormal" => {
+            let ((median, unit), (spread, plain)) = (value::parse(first)?, value::parse(second)?);
+            if !plain.text.is_empty() || spread < 0.0 {
+                return Err("the spread of a lognormal distribution is a number such as 0.2: about 20 %".into());
+            }
+            if median <= 0.0 {
+                return Err("the median of a lognormal distribution is positive".into());
+            }
+            Ok((unit, How::Lognormal(median, spread)))
+        }
+        other => Err(format!("`{other}` is not a known distribution: normal, lognormal, uniform")),
+    }
+}
+
+/// Values of one kind; the unit is that of the first.
+fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
+    let read: Vec<(f64, Unit)> = texts.iter().map(|text| value::parse(text)).collect::<Result<_, _>>()?;
+    let unit = read[0].1.clone();
+    for ((_, other), text) in read.iter().zip(texts) {
+        if other.dimension != unit.dimension {
+            let name = |unit: &Unit| if unit.text.is_empty() { "a pure number".into() } else { format!("in {unit}") };
+            return Err(format!("`{}` is {}, `{}` {}", texts[0].trim(), name(&unit), text.trim(), name(other)));
+        }
+    }
+    Ok((read.iter().map(|(value, _)| *value).collect(), unit))
+}
+
+impl Vary {
+    /// Number of values of a grid; none of a distribution.
+    pub fn len(&self) -> Option<usize> {
+        match &self.how {
+            How::Values(values) => Some(values.len()),
+            How::Normal(..) | How::Lognormal(..) | How::Uniform(..) => None,
+        }
+    }
+
+    /// One value that is typical: to see whether the text can be compiled with it.
+    pub fn typical(&self) -> f64 {
+        match &self.how {
+            How::Values(values) => values[values.len() / 2],
+            How::Normal(mean, _) => *mean,
+            How::Lognormal(median, _) => *median,
+            How::Uniform(low, high) => 0.5 * (low + high),
+        }
+    }
+}
+
+/// Draws values.
+pub struct Dice {
+    seed: u64,
+    exp: Alone,
+    log: Alone,
+}
+
+impl Dice {
+    /// All that is drawn follows from the seed.
+    pub fn new(seed: u64) -> Dice {
+        Dice { seed, exp: Alone::exp(), log: Alone::log() }
+    }
+
+    /// The value in SI of a distribution in this draw; `k`: which of the distributions it is.
+    pub fn value(&self, how: &How, draw: u64, k: u64) -> f64 {
+        // Never 0 nor 1.
+        let bits = word(word(self.seed, draw), k) >> 11;
+        let uniform = (bits as f64 + 0.5) / 9_007_199_254_740_992.0;
+        match *how {
+            How::Normal(mean, deviation) => mean + deviation * self.normal(uniform),
+            How::Lognormal(median, spread) => median * self.exp.at(spread * self.normal(uniform)),
+            How::Uniform(low, high) => low + (high - low) * uniform,
+            How::Values(ref values) => values[(uniform * values.len() as f64) as usize],
+        }
+    }
+
+    /// The value that a standard normal variable is below with probability `p`; to 16 digits.
+    /// Source: Wichura, Appl. Statist. 37 (1988), algorithm AS 241, PPND16.
+    fn normal(&self, p: f64) -> f64 {
+        let ratio = |x: f64, above: &[f64; 8], below: &[f64; 8]| {
+            let sum = |c: &[f64; 8]| c.iter().rev().fold(0.0, |sum, c| sum * x + c);
+            sum(above) / sum(below)
+        };
+        let q = p - 0.5;
+        if q.abs() <= 0.425 {
+            return q * ratio(0.180625 - q * q, &CENTRE.0, &CENTRE.1);
+        }
+        let r = (-self.log.at(p.min(1.0 - p))).sqrt();
+        let size = if r <= 5.0 { ratio(r - 1.6, &SIDE.0, &SIDE.1) } else { ratio(r - 5.0, &TAIL.0, &TAIL.1) };
+        if q < 0.0 { -size } else { size }
+    }
+}
+
+/// SplitMix64's finaliser of seed · 0x9E37… + k: what the language's `random` is made of.
+fn word(seed: u64, k: u64) -> u64 {
+    let mut z = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(k);
+    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    z ^ (z >> 31)
+}
+
+type Ratio = ([f64; 8], [f64; 8]);
+
+#[allow(clippy::excessive_precision, reason = "as published")]
+const CENTRE: Ratio = (
+    [
+        3.3871328727963666080e0,
+        1.3314166789178437745e2,
+        1.9715909503065514427e3,
+        1.3731693765509461125e4,
+        4.5921953931549871457e4,
+        6.7265770927008700853e4,
+        3.3430575583588128105e4,
+        2.5090809287301226727e3,
+    ],
+    [
+        1.0,
+        4.2313330701600911252e1,
+        6.8718700749205790830e2,
+        5.3941960214247511077e3,
+        2.1213794301586595867e4,
+        3.9307895800092710610e4,
+        2.8729085735721942674e4,
+        5.2264952788528545610e3,
+    ],
+);
+
+#[allow(clippy::excessive_precision, reason = "as published")]
+const SIDE: Ratio = (
+    [
+        1.42343711074968357734e0,
+        4.63033784615654529590e0,
+        5.76949722146069140550e0,
+        3.64784832476320460504e0,
+        1.27045825245236838258e0,
+        2.41780725177450611770e-1,
+        2.27238449892691845833e-2,
+        7.74545014278341407640e-4,
+    ],
+    [
+        1.0,
+        2.05319162663775882187e0,
+        1.67638483018380384940e0,
+        6.89767334985100004550e-1,
+        1.48103976427480074590e-1,
+        1.51986665636164571966e-2,
+        5.47593808499534494600e-4,
+        1.05075007164441684324e-9,
+    ],
+);
+
+#[allow(clippy::excessive_precision, reason = "as published")]
+const TAIL: Ratio = (
+    [
+        6.65790464350110377720e0,
+        5.46378491116411436990e0,
+        1.78482653991729133580e0,
+        2.96560571828504891230e-1,
+        2.65321895265761230930e-2,
+        1.24266094738807843860e-3,
+        2.71155556874348757815e-5,
+        2.01033439929228813265e-7,
+    ],
+    [
+        1.0,
+        5.99832206555887937690e-1,
+        1.36929880922735805310e-1,
+        1.48753612908506148525e-2,
+        7.86869131145613259100e-4,
+        1.84631831751005468180e-5,
+        1.42151175831644588870e-7,
+        2.04426310338993978564e-15,
+    ],
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn grids_lists_and_distributions_are_read() {
+        let grid = parse("fr.Fs = 1 N .. 2 N by 0.1 N").unwrap();
+        let How::Values(values) = &grid.how else { panic!("{grid:?}") };
+        assert_eq!((grid.path.as_str(), values.len(), values[3], values[10]), ("fr.Fs", 11, 1.3, 2.0));
+        assert_eq!(parse("k=1 N/m, 2 N/m").unwrap().how, How::Values(vec![1.0, 2.0]));
+        let vs = parse("fr.vs ~ lognormal(1 mm/s, 0.2)").unwrap();
+        assert_eq!((vs.unit.text.as_str(), vs.how), ("mm/s", How::Lognormal(1e-3, 0.2)));
+        assert_eq!(parse("m~uniform(1kg, 2kg)").unwrap().how, How::Uniform(1.0, 2.0));
+        assert_eq!(parse("m ~ normal(1 kg, 50 g)").unwrap().how, How::Normal(1.0, 0.05));
+    }
+
+    #[test]
+    fn slips_are_told() {
+        let told = |text: &str| parse(text).unwrap_err();
+        assert!(told("fr.Fs").contains("fr.Fs = 1 N .. 2 N by 0.1 N"));
+        assert!(told("fr.Fs = 1 N .. 2 N").contains("by 0.1 N"));
+        assert_eq!(told("m = 1 kg .. 2 N by 1 kg"), "`1 kg` is in kg, `2 N` in N");
+        assert!(told("m = 2 kg .. 1 kg by 1 kg").contains("smaller to a larger"));
+        assert!(told("m ~ gauss(1 kg, 1 kg)").contains("normal, lognormal, uniform"));
+        assert!(told("m ~ lognormal(1 kg, 0.1 kg)").contains("such as 0.2"));
+        assert!(told("m = 1 kg .. 2 kg by 1 ng").contains("too many"));
+    }
+
+    #[test]
+    fn the_normal_distribution_has_its_quantiles() {
+        let dice = Dice::new(1);
+        for (p, expected) in [
+            (0.5, 0.0),
+            (0.975, 1.959963984540054),
+            (0.001, -3.090232306167813),
+            (1e-10, -6.361340902404056),
+            (0.841344746068543, 1.0),
+        ] {
+            let found = dice.normal(p);
+            assert!((found - expected).abs() < 1e-13 * (1.0 + f64::abs(expected)), "{p}: {found}");
+        }
+    }
+
+    #[test]
+    fn draws_have_their_moments_and_do_not_depend_on_order() {
+        let dice = Dice::new(7);
+        let draws: Vec<f64> = (0..20_000).map(|draw| dice.value(&How::Normal(3.0, 2.0), draw, 0)).collect();
+        let mean = draws.iter().sum::<f64>() / 2e4;
+        let square = draws.iter().map(|x| (x - mean) * (x - mean)).sum::<f64>() / 2e4;
+        assert!((mean - 3.0).abs() < 0.05 && (square.sqrt() - 2.0).abs() < 0.05, "{mean} {square}");
+        assert_eq!(dice.value(&How::Normal(3.0, 2.0), 17, 0), draws[17]);
+        assert_ne!(dice.value(&How::Uniform(0.0, 1.0), 0, 0), dice.value(&How::Uniform(0.0, 1.0), 0, 1));
+        assert!((0..1000).all(|n| dice.value(&How::Lognormal(1.0, 1.0), n, 0) > 0.0));
+    }
+}
