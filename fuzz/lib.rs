@@ -11,7 +11,8 @@ pub struct Library;
 
 static FILES: LazyLock<Vec<(String, String)>> = LazyLock::new(|| {
     let mut files = Vec::new();
-    collect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../stdlib-models"), "std", &mut files).expect("the library is there");
+    collect(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../stdlib-models"), "std", &mut files)
+        .expect("the library is there");
     files.sort();
     files
 });

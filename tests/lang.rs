@@ -357,7 +357,10 @@ fn mutated(corpus: &[String], chance: &mut Chance) -> String {
         let (start, end) = (places[i], places[j]);
         match chance.below(8) {
             0 => text.replace_range(start..end, ""),
-            1 => text.insert_str(end, &text[start..end].to_string()),
+            1 => {
+                let doubled = text[start..end].to_string();
+                text.insert_str(end, &doubled);
+            }
             2 => text.replace_range(start..end, chance.of::<&str>(WORDS)),
             3 => text.insert_str(start, &format!(" {} ", chance.of(WORDS))),
             4 => text.truncate(start),
