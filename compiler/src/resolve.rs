@@ -176,8 +176,13 @@ pub const RESERVED: [&str; 5] = ["t", "pi", "inf", "true", "false"];
 /// Reads `text`, called `name`, and everything it imports.
 pub fn load(name: &str, text: &str, sources: &dyn Sources) -> Loaded {
     let mut loader = Loader { loaded: Loaded::default(), sources, by_name: HashMap::new(), open: Vec::new() };
-    loader.add(name.to_string(), text, false);
-    loader.loaded
+    let root = loader.add(name.to_string(), text, false);
+    let mut loaded = loader.loaded;
+    if loaded.files.get(root).ast.items.is_empty() && loaded.diagnostics.is_empty() {
+        let error = Diagnostic::error("E0001", "there is nothing in this file").label(Span::new(root, 0, 0), "empty");
+        loaded.diagnostics.push(error.help("begin with a model: `model M { … }`, or let `fric new DIR` write one"));
+    }
+    loaded
 }
 
 struct Loader<'a> {
