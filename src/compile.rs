@@ -1,9 +1,8 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use compiler::experiment::Ports;
 pub use compiler::explain::Explanation;
 pub use compiler::friction::Verdict;
-pub use compiler::linearise::{Linear, Matrices};
+pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{

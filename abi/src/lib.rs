@@ -3,11 +3,11 @@
 //! A model's numbers live in one flat block of `f64`, addressed by [`Slot`]s; every function of the model reads
 //! and writes that block and nothing else. Knows neither the language nor any solver.
 
-pub mod description;
-pub mod instance;
-pub mod plan;
-pub mod table;
 pub mod unit;
+pub mod description;
+pub mod table;
+pub mod plan;
+pub mod instance;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;

@@ -4,6 +4,7 @@
 //! that holds slots only.
 
 use crate::flatten::{Instance, Override, OverrideValue, Request, flatten};
+use crate::linearise::{PortSlots, Ports, open};
 use crate::lower::{Lowered, Wanted, evaluate, lower};
 use crate::resolve::Loaded;
 use crate::source::Sources;
@@ -37,15 +38,6 @@ pub struct Changes {
     pub ports: Option<Ports>,
 }
 
-/// Inputs and outputs of a linearisation, by path. Where none are named, those of the whole.
-#[derive(Clone, Debug, Default)]
-pub struct Ports {
-    /// Inputs.
-    pub inputs: Vec<String>,
-    /// Outputs, or any other quantity.
-    pub outputs: Vec<String>,
-}
-
 /// A number of a plan that was computed from an expression.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Place {
@@ -60,9 +52,6 @@ pub enum Place {
     /// Second argument of this measure of this expectation.
     Second(usize, usize),
 }
-
-/// Inputs and outputs by path, with the slots of their values.
-pub type PortSlots = (Vec<(String, Slot)>, Vec<(String, Slot)>);
 
 /// One combination of an experiment's sweeps, lowered.
 pub struct Variant {
@@ -512,7 +501,7 @@ fn variant(
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
-    let ports = given.ports.as_ref().map(|ports| crate::linearise::open(&mut system, ports, &mut diagnostics));
+    let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
     let ports = ports.unwrap_or_default();
     on_stage("check");
     let types = units::check(&system, &loaded.files, &mut diagnostics);

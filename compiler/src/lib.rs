@@ -27,8 +27,8 @@ pub mod domains;
 pub mod friction;
 pub mod lints;
 pub mod explain;
-pub mod experiment;
 pub mod linearise;
+pub mod experiment;
 pub mod vary;
 
 pub use experiment::Changes;

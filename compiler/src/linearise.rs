@@ -6,7 +6,6 @@
 
 use crate::backend::interp::run_once;
 use crate::derive;
-use crate::experiment::{PortSlots, Ports};
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
@@ -21,6 +20,18 @@ use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::sync::Arc;
+
+/// Inputs and outputs of a linearisation, by path. Where none are named, those of the whole.
+#[derive(Clone, Debug, Default)]
+pub struct Ports {
+    /// Inputs.
+    pub inputs: Vec<String>,
+    /// Outputs, or any other quantity.
+    pub outputs: Vec<String>,
+}
+
+/// Inputs and outputs by path, with the slots of their values.
+pub type PortSlots = (Vec<(String, Slot)>, Vec<(String, Slot)>);
 
 /// Inputs and outputs found in a system.
 #[derive(Default)]
