@@ -208,7 +208,9 @@ impl<'a> Prover<'a> {
         match (self.system.node(a), self.system.node(b)) {
             (Node::Fits { value, .. }, _) => self.same(*value, b),
             (_, Node::Fits { value, .. }) => self.same(a, *value),
-            (Node::Var(x), Node::Var(y)) => x == y,
+            (Node::Var(x), Node::Var(y)) | (Node::Rate(x), Node::Rate(y)) | (Node::PathRate(x), Node::PathRate(y)) => {
+                x == y
+            }
             (Node::Number { value: x, .. }, Node::Number { value: y, .. }) => x == y,
             (Node::Negate(x), Node::Negate(y)) => self.same(*x, *y),
             (Node::Binary(op, a, b), Node::Binary(other, c, d)) => {
