@@ -590,6 +590,7 @@ fn odd_texts_are_answered() {
         let short: Vec<String> = lines.iter().map(|line| line.chars().take(100).collect()).collect();
         assert!(found.iter().any(|diagnostic| diagnostic.code == *code), "{what}: {short:?}");
         assert!(found.len() <= 2, "{what}: {short:?}");
-        assert!(!grammar::format::format(text, 100).is_ok_and(|text| text.is_empty()), "{what}");
+        let emptied = grammar::format::format(text, 100).is_ok_and(|formatted| formatted.is_empty());
+        assert!(!emptied || text.trim().is_empty(), "{what}");
     }
 }
