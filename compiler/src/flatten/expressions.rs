@@ -555,15 +555,21 @@ impl<'a> Flattener<'a> {
             return self.error(span);
         };
         let x = self.expr(arg, env);
-        if !self.tables.contains_key(&item) {
+        let key = (item, env.rotary);
+        if !self.tables.contains_key(&key) {
             let made = crate::tables::read(self.loaded, self.sources, item.file, table, &mut self.diagnostics);
-            let number = made.map(|table| {
+            let number = made.map(|mut table| {
+                if env.rotary {
+                    // The twin has the same numbers over the mapped dimensions.
+                    table.x_dimension = table.x_dimension.rotary();
+                    table.y_dimension = table.y_dimension.rotary();
+                }
                 self.system.tables.push(table);
                 self.system.tables.len() as u32 - 1
             });
-            self.tables.insert(item, number);
+            self.tables.insert(key, number);
         }
-        match self.tables[&item] {
+        match self.tables[&key] {
             Some(number) => self.system.push(Node::Table(number, x), span),
             None => self.error(span),
         }

@@ -173,7 +173,8 @@ struct Flattener<'a> {
     expansions: HashMap<(ItemRef, Vec<ExprId>, bool, bool), ExprId>,
     /// Functions being expanded: to find circles.
     functions: Vec<ItemRef>,
-    tables: HashMap<ItemRef, Option<u32>>,
+    /// By item and whether it is the rotary twin.
+    tables: HashMap<(ItemRef, bool), Option<u32>>,
     consts: HashMap<(ItemRef, bool), ExprId>,
     open_consts: Vec<ItemRef>,
     /// Models being instantiated: to find circles.
