@@ -12,7 +12,6 @@ use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
 use crate::{causality, checks};
-use abi::Slot;
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
