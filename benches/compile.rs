@@ -2,7 +2,7 @@
 //! library takes to be checked. Medians over many rounds; run with `cargo bench --bench compile`.
 
 #[path = "../src/project.rs"]
-#[expect(dead_code, reason = "the command uses more of it")]
+#[allow(dead_code, unused_imports, reason = "the command uses more of it")]
 mod project;
 
 mod compile {

@@ -3,7 +3,7 @@
 //! Two runs of one compiled program: its order of evaluation is one, so every rounding has its mirror image.
 
 #[path = "../src/project.rs"]
-#[expect(dead_code, reason = "the command uses more of it")]
+#[allow(dead_code, unused_imports, reason = "the command uses more of it")]
 mod project;
 
 mod compile {
