@@ -38,6 +38,8 @@ pub enum Command {
     Characterise(Characterise),
     /// Put several friction models through the battery, on shared axes
     Compare(Compare),
+    /// Write the page of all models of the library, from its own text
+    Doc(Doc),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -48,7 +50,7 @@ pub enum Command {
     /// Print the manual page of fric, or of one of its commands
     Man {
         /// Such as run
-        #[arg(value_parser = ["run", "test", "check", "fmt", "explain", "characterise", "compare", "new", "completions"])]
+        #[arg(value_parser = ["run", "test", "check", "fmt", "explain", "characterise", "compare", "doc", "new", "completions"])]
         command: Option<String>,
     },
 }
@@ -177,6 +179,17 @@ pub struct Compare {
     /// Print one JSON object a line for each model instead of words
     #[arg(long)]
     pub json: bool,
+}
+
+/// `fric doc`
+#[derive(clap::Args, Debug)]
+pub struct Doc {
+    /// The page; plots go into the folder of the same name
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "docs/models.md")]
+    pub out: PathBuf,
+    /// Write nothing; fail if the page would change
+    #[arg(long)]
+    pub check: bool,
 }
 
 /// `fric new`

@@ -3,7 +3,9 @@
 //! In: the tree of a model. Out: lines of text. What a text means is not changed by it: symbols, raised exponents and
 //! bars for `abs` only.
 
-use grammar::ast::{BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Statement, Target, UnaryOp};
+use grammar::ast::{
+    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Statement, Target, UnaryOp,
+};
 
 /// The equations of a model, left and right side, in the order of the text; regimes have a heading of their own, which
 /// has no right side.
@@ -34,7 +36,10 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
                 }
             }
             Statement::When(when) => {
-                let resets = when.resets.iter().map(|reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value)));
+                let resets = when
+                    .resets
+                    .iter()
+                    .map(|reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value)));
                 lines.push((format!("when {}", expression(&when.condition)), resets.collect::<Vec<_>>().join(", ")));
             }
             Statement::Require(_) | Statement::Storage(_) | Statement::Allow(_) => {}
@@ -182,8 +187,9 @@ fn binary(op: BinaryOp, a: &Expr, b: &Expr) -> String {
 /// A whole number as raised digits.
 fn exponent(expr: &Expr) -> Option<String> {
     let raised = |value: f64| {
-        (value.fract() == 0.0 && (0.0..100.0).contains(&value))
-            .then(|| value.to_string().chars().map(|c| digit(c, &['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'])).collect())
+        (value.fract() == 0.0 && (0.0..100.0).contains(&value)).then(|| {
+            value.to_string().chars().map(|c| digit(c, &['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'])).collect()
+        })
     };
     match &expr.kind {
         ExprKind::Number { value, unit: None } => raised(*value),

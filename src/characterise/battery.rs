@@ -133,7 +133,13 @@ impl Entry {
     }
 
     fn text(&self) -> String {
-        let mut text = format!("/// {}\nexperiment {} {{\n  run    {} for {} s\n", self.doc, self.name, self.run, n(self.duration));
+        let mut text = format!(
+            "/// {}\nexperiment {} {{\n  run    {} for {} s\n",
+            self.doc,
+            self.name,
+            self.run,
+            n(self.duration)
+        );
         if let Some(solver) = &self.solver {
             let _ = writeln!(text, "  solver {solver}");
         }
@@ -241,10 +247,15 @@ impl<'a> Layout<'a> {
         let Units { force, rate, length, speed, .. } = self.units;
         let rate_ref = round(self.scales.f_ref * times);
         let u = format!("ramp(0 s, 0 {force}, {} {rate})", n(rate_ref));
-        Entry::new("scale_break_away", "Break-away force and presliding travel, from a slow ramp.", self.force_bench(&u, ""), 6.0)
-            .plot(format!("F [{force}]"))
-            .plot(format!("x [{length}]"))
-            .plot(format!("v [{speed}]"))
+        Entry::new(
+            "scale_break_away",
+            "Break-away force and presliding travel, from a slow ramp.",
+            self.force_bench(&u, ""),
+            6.0,
+        )
+        .plot(format!("F [{force}]"))
+        .plot(format!("x [{length}]"))
+        .plot(format!("v [{speed}]"))
     }
 
     /// Steady friction against velocity: a sweep for each decade, both directions.
@@ -277,7 +288,8 @@ impl<'a> Layout<'a> {
 
     /// Frequencies of the lag loops in Hz.
     pub fn lag_frequencies(&self) -> [f64; 3] {
-        let middle = if self.scales.x_b > 1e-4 * self.scales.v_s { self.scales.v_s / self.scales.x_b / 60.0 } else { 1.0 };
+        let middle =
+            if self.scales.x_b > 1e-4 * self.scales.v_s { self.scales.v_s / self.scales.x_b / 60.0 } else { 1.0 };
         let middle = power_near(middle.clamp(0.1, 10.0));
         [0.1 * middle, middle, 10.0 * middle]
     }
@@ -401,11 +413,7 @@ impl<'a> Layout<'a> {
                 Entry::new(
                     format!("energy_{}", i + 1),
                     format!("Loss of a cycle of {} {length} to either side.", n(x)),
-                    self.speed_bench(&format!(
-                        "sine({} {speed}, {} Hz)",
-                        n(2.0 * std::f64::consts::PI * f * x),
-                        n(f)
-                    )),
+                    self.speed_bench(&format!("sine({} {speed}, {} Hz)", n(2.0 * std::f64::consts::PI * f * x), n(f))),
                     3.0 / f,
                 )
                 .plot(format!("F [{force}]"))

@@ -29,7 +29,7 @@ td.v { white-space: nowrap; }
 .mark { display: inline-block; width: 1.3em; font-weight: 700; }
 .yes .mark { color: #00694b; } .no .mark { color: #a34700; } .na { color: #59636e; }
 .small { font-size: 12.5px; color: #59636e; line-height: 1.35; }
-.tests { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 34px 36px; }
+.tests { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 34px 36px; grid-auto-flow: dense; align-items: start; }
 .wide { grid-column: 1 / -1; display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 0 36px; }
 .wide > header { grid-column: 1 / -1; }
 section { break-inside: avoid; }
@@ -38,11 +38,14 @@ svg { width: 100%; height: auto; display: block; }
 .numbers td { padding: 2px 14px 2px 0; }
 .two { columns: 2; column-gap: 36px; }
 pre { font: 13px/1.45 'Roboto Mono', Menlo, Consolas, 'DejaVu Sans Mono', monospace; background: #f6f8fa; padding: 12px 14px; overflow-x: auto; margin: 6px 0 12px; }
-.doc { white-space: pre-wrap; }
+.quiet { background: none; padding: 2px 14px; color: #1f2328; }
+code { font: 0.9em 'Roboto Mono', Menlo, Consolas, 'DejaVu Sans Mono', monospace; background: #f6f8fa; padding: 1px 4px; }
+.numbers table { margin: 0; }
+.top { display: grid; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 0 48px; align-items: start; }
 .note { border-left: 3px solid #d55e00; padding: 4px 12px; margin: 10px 0; max-width: 90ch; }
 .reason { border-left: 3px solid #c3cad2; padding: 3px 12px; color: #59636e; margin: 8px 0; }
 details > summary { cursor: pointer; color: #0072b2; }
-@media (max-width: 900px) { .tests, .wide { grid-template-columns: 1fr; } }
+@media (max-width: 900px) { .tests, .wide, .top { grid-template-columns: 1fr; } }
 @media print { body { max-width: none; padding: 0; } h2 { break-after: avoid; } details { display: none; } }
 ";
 
@@ -68,7 +71,8 @@ pub fn report(study: &Study) -> String {
         let _ = write!(body, "<p class=\"note\">{}</p>\n", escaped(note));
     }
 
-    body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th><th>seen</th><th>behind it</th></tr>\n";
+    body += "<div class=\"top\">\n<div>\n<h2>Phenomena</h2>\n<table>\n\
+             <tr><th>phenomenon</th><th>seen</th><th>behind it</th></tr>\n";
     for finding in &study.findings {
         let _ = write!(
             body,
@@ -80,15 +84,16 @@ pub fn report(study: &Study) -> String {
             escaped(&finding.why)
         );
     }
-    body += "</table>\n";
+    body += "</table>\n</div>\n<div>\n<h2>Parameters</h2>\n";
+    body += &parameters(study);
+    body += &scales(study);
+    body += "</div>\n</div>\n";
 
     body += "<h2>Model</h2>\n";
     if let Some(doc) = &subject.doc {
-        let _ = write!(body, "<p class=\"doc\">{}</p>\n", escaped(doc.trim()));
+        body += &prose(doc);
     }
     let _ = write!(body, "<pre>{}</pre>\n", escaped(&equations::lines(&subject.equations)));
-    body += &parameters(study);
-    body += &scales(study);
 
     body += "<h2>Tests</h2>\n<div class=\"tests\">\n";
     for test in &study.tests {
@@ -96,7 +101,8 @@ pub fn report(study: &Study) -> String {
     }
     body += "</div>\n";
     body += "<h2>The battery</h2>\n<p>Save it beside the model and run it with <code>fric run</code>, or change it first.</p>\n";
-    let _ = write!(body, "<details><summary>battery.fric</summary>\n<pre>{}</pre></details>\n", escaped(&study.battery));
+    let _ =
+        write!(body, "<details><summary>battery.fric</summary>\n<pre>{}</pre></details>\n", escaped(&study.battery));
     page(&study.label, &body)
 }
 
@@ -222,33 +228,22 @@ fn section(test: &Test, studies: &[&Study]) -> String {
 
 fn parameters(study: &Study) -> String {
     if study.subject.params.is_empty() {
-        return String::new();
+        return "<p class=\"faint\">none</p>\n".into();
     }
     let mut out = String::from(
-        "<table>\n<tr><th>parameter</th><th style=\"text-align:right\">value</th><th>range</th><th></th></tr>\n",
+        "<table>\n<tr><th>parameter</th><th style=\"text-align:right\">value</th><th>range</th><th>meaning</th></tr>\n",
     );
     for param in &study.subject.params {
         let _ = write!(
             out,
             "<tr><td>{}</td><td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>\n",
             escaped(&param.path),
-            show(param.value, &param.unit, 6),
-            range(param.range, &param.unit),
+            value(param.value, &param.unit),
+            escaped(&param.range),
             escaped(param.doc.as_deref().unwrap_or_default())
         );
     }
     out + "</table>\n"
-}
-
-/// A range in words: `> 0`, `0.01 … 0.99`.
-pub fn range((low, high): (f64, f64), unit: &abi::unit::Unit) -> String {
-    let text = |value: f64| if value == 0.0 { "0".into() } else { show(value, unit, 6) };
-    match (low.is_finite(), high.is_finite()) {
-        (true, true) => format!("{} … {}", text(low), text(high)),
-        (true, false) => format!("from {}", text(low)),
-        (false, true) => format!("up to {}", text(high)),
-        (false, false) => String::new(),
-    }
 }
 
 fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
@@ -273,6 +268,36 @@ fn scales(study: &Study) -> String {
         significant(study.scales.mass, 3),
         study.units.mass.replace("^2", "²")
     );
+    out
+}
+
+/// A parameter's value; what has no bound is ∞.
+fn value(si: f64, unit: &abi::unit::Unit) -> String {
+    if si == f64::INFINITY { "∞".into() } else { show(si, unit, 6) }
+}
+
+/// A doc comment: paragraphs, and lines that are set in as they stand.
+fn prose(doc: &str) -> String {
+    let mut out = String::new();
+    for block in doc.trim_matches('\n').split("\n\n") {
+        let set_in = |line: &str| line.starts_with("  ");
+        let (mut words, mut lines) = (String::new(), String::new());
+        for line in block.lines() {
+            if set_in(line) {
+                lines += &format!("{}\n", escaped(line.trim_end()));
+            } else {
+                words += &format!("{} ", escaped(line.trim()));
+            }
+        }
+        if !words.is_empty() {
+            let code = words.trim().split('`').enumerate();
+            let code = code.map(|(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { part.to_string() });
+            out += &format!("<p>{}</p>\n", code.collect::<String>());
+        }
+        if !lines.is_empty() {
+            out += &format!("<pre class=\"quiet\">{lines}</pre>\n");
+        }
+    }
     out
 }
 

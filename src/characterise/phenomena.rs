@@ -117,12 +117,16 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        if let (Some(chatter), External::Absent) = (self.chatter, self.subject.external) {
-            return (Seen::NotShown, format!("it has no port F_ext and {chatter}; put it into `Sticking(law = …)`"));
+        if self.chatter.is_some() && self.subject.external == External::Absent {
+            return (Seen::NotShown, "needs F_ext: without it the force jumps to and fro at rest".into());
         }
         let (moved, creep) = (Self::number(test, "held_peak_to_peak"), Self::number(test, "creep_speed"));
         let (Some(moved), Some(creep)) = (moved, creep) else { return (Seen::NotApplicable, "not measured".into()) };
-        let needs = if self.subject.external == External::Absent && self.is_static() { "; it would need F_ext" } else { "" };
+        let needs = if self.subject.external == External::Absent && self.is_static() {
+            "; to hold it would need F_ext"
+        } else {
+            ""
+        };
         match moved.value < 1e-9 {
             true => when(true, format!("moves {} in 90 s", moved.shown())),
             false => when(false, format!("creeps at {}{needs}", creep.shown())),
@@ -132,7 +136,10 @@ impl Look<'_> {
     fn no_drift(&self) -> Answer {
         let (holds, why) = self.holds();
         if holds != Seen::Shown {
-            return (Seen::NotApplicable, format!("does not hold: {why}"));
+            return (
+                Seen::NotApplicable,
+                format!("does not hold a load: {}", why.split(':').next().unwrap_or_default()),
+            );
         }
         let test = match self.test("drift") {
             Ok(test) => test,
@@ -149,10 +156,14 @@ impl Look<'_> {
         };
         let highest = Self::all(test, "break_away_force").into_iter().max_by(|a, b| a.value.total_cmp(&b.value));
         let Some(highest) = highest else { return (Seen::NotApplicable, "never let go".into()) };
+        if self.scales.f_c < 1e-6 * self.scales.f_ref {
+            return (Seen::NotApplicable, "no dry friction: the force goes to zero with the speed".into());
+        }
         let sliding = Number { value: self.scales.f_c, ..highest.clone() };
         let why = format!("lets go at up to {}, slides with {}", highest.shown(), sliding.shown());
         // What is viscous at the speed that counts as sliding is no stiction.
-        let viscous = self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
+        let viscous =
+            self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
         when(highest.value > 1.02 * self.scales.f_c + viscous.abs() * self.scales.v_slip && self.scales.f_c > 0.0, why)
     }
 
@@ -169,7 +180,9 @@ impl Look<'_> {
             (Some(speed), true) => {
                 when(true, format!("falls from {} to {}, 1/e at {}", peak.shown(), low.shown(), speed.shown()))
             }
-            (Some(speed), false) => when(false, format!("jumps from {} to {} near {}", peak.shown(), low.shown(), speed.shown())),
+            (Some(speed), false) => {
+                when(false, format!("jumps from {} to {} near {}", peak.shown(), low.shown(), speed.shown()))
+            }
             (None, _) => when(false, "the force of steady sliding never falls with speed".into()),
         }
     }
@@ -179,14 +192,16 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        let Some(slope) = Self::number(test, "viscous_slope") else { return (Seen::NotApplicable, "not measured".into()) };
+        let Some(slope) = Self::number(test, "viscous_slope") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
         let part = slope.value * self.scales.v_max / self.scales.f_ref;
-        when(part > 1e-3, format!("{} at the fastest", slope.shown()))
+        when(part > 1e-3, format!("slope {}", slope.shown()))
     }
 
     fn presliding(&self) -> Answer {
-        if let Some(chatter) = self.chatter {
-            return (Seen::NotShown, chatter.to_string());
+        if self.chatter.is_some() {
+            return (Seen::NotShown, "at rest the force jumps to and fro".into());
         }
         let test = match self.test("presliding") {
             Ok(test) => test,
@@ -195,22 +210,28 @@ impl Look<'_> {
         if self.holds().0 != Seen::Shown {
             return (Seen::NotShown, "what moves below break-away is creep: it does not come to rest".into());
         }
-        let Some(travel) = Self::number(test, "presliding_travel") else { return (Seen::NotApplicable, "not measured".into()) };
+        let Some(travel) = Self::number(test, "presliding_travel") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
         let why = match Self::number(test, "stiffness") {
-            Some(stiffness) if travel.value > 1e-9 => format!("moves {} within ±30 %, {}", travel.shown(), stiffness.shown()),
+            Some(stiffness) if travel.value > 1e-9 => {
+                format!("moves {} within ±30 %, {}", travel.shown(), stiffness.shown())
+            }
             Some(_) | None => format!("moves {} within ±30 %", travel.shown()),
         };
         when(travel.value > 1e-8, why)
     }
 
     fn hysteresis(&self) -> Answer {
-        let (presliding, why) = self.presliding();
-        if presliding != Seen::Shown {
-            return (Seen::NotApplicable, format!("no presliding: {why}"));
+        if self.presliding().0 != Seen::Shown {
+            return (Seen::NotApplicable, "no presliding".into());
         }
         let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
         let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };
-        when(area.value > 0.005, format!("the loop fills {} % of its box", super::study::plain((1000.0 * area.value).round() / 10.0)))
+        when(
+            area.value > 0.005,
+            format!("the loop fills {} % of its box", super::study::plain((1000.0 * area.value).round() / 10.0)),
+        )
     }
 
     fn memory(&self) -> Answer {
@@ -222,7 +243,13 @@ impl Look<'_> {
         }
         let error = self.test("presliding").ok().and_then(|test| Self::number(test, "memory_error"));
         let Some(error) = error else { return (Seen::NotApplicable, "not measured".into()) };
-        when(error.value < 0.01, format!("the inner loop misses its start by {} % of its width", super::study::plain((1000.0 * error.value).round() / 10.0)))
+        when(
+            error.value < 0.01,
+            format!(
+                "the inner loop misses its start by {} % of its width",
+                super::study::plain((1000.0 * error.value).round() / 10.0)
+            ),
+        )
     }
 
     fn lag(&self) -> Answer {
@@ -242,24 +269,42 @@ impl Look<'_> {
             Err(answer) => return answer,
         };
         let forces = Self::all(test, "break_away_force");
-        let Some(change) = Self::number(test, "break_away_change") else { return (Seen::NotApplicable, "not measured".into()) };
-        let (Some(slow), Some(fast)) = (forces.first(), forces.last()) else { return (Seen::NotApplicable, "never let go".into()) };
+        let Some(change) = Self::number(test, "break_away_change") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        let (Some(slow), Some(fast)) = (forces.first(), forces.last()) else {
+            return (Seen::NotApplicable, "never let go".into());
+        };
         let overshoot = |key| {
             let test = self.test("reversal").ok()?;
             Some(Self::number(test, key)?.value)
         };
-        let viscous = self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
+        let viscous =
+            self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
         if change.value > 0.02 + viscous.abs() * self.scales.v_slip / slow.value && self.chatter.is_none() {
-            return when(true, format!("with the rate: {} {}, {} {}", slow.shown(), slow.name, fast.shown(), fast.name));
+            return when(
+                true,
+                format!("with the rate: {} {}, {} {}", slow.shown(), slow.name, fast.shown(), fast.name),
+            );
         }
         if let (Some(first), Some(second)) = (overshoot("virgin_overshoot"), overshoot("reversal_overshoot"))
             && second > 0.02 * self.scales.f_b
             && second > 1.05 * first
         {
             let ratio = super::study::plain((100.0 * second / first.max(1e-300)).round() / 100.0);
-            return when(true, format!("with the history: the overshoot after a reversal is {ratio} times that from rest"));
+            return when(
+                true,
+                format!("with the history: the overshoot after a reversal is {ratio} times that from rest"),
+            );
         }
-        when(false, format!("{} at every rate, within {} %", slow.shown(), super::study::plain((1000.0 * change.value).round() / 10.0)))
+        when(
+            false,
+            format!(
+                "{} at every rate, within {} %",
+                slow.shown(),
+                super::study::plain((1000.0 * change.value).round() / 10.0)
+            ),
+        )
     }
 
     fn stick_slip(&self) -> Answer {
@@ -268,7 +313,9 @@ impl Look<'_> {
             Err(answer) => return answer,
         };
         match (Self::number(test, "stick_slip_up_to"), Self::number(test, "stick_slip_gone")) {
-            (Some(up_to), Some(gone)) => when(true, format!("up to {}, smooth from {} on", up_to.shown(), gone.shown())),
+            (Some(up_to), Some(gone)) => {
+                when(true, format!("up to {}, smooth from {} on", up_to.shown(), gone.shown()))
+            }
             (Some(up_to), None) => when(true, format!("up to {}, the fastest pull", up_to.shown())),
             (None, _) => when(false, "slides without sticking at every pull speed".into()),
         }
@@ -282,8 +329,16 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        let Some(part) = Self::number(test, "rate_difference_part") else { return (Seen::NotApplicable, "not measured".into()) };
-        when(part.value < 2e-3, format!("differs by {} % from 0.1 to 10 times the speed", super::study::plain((1e4 * part.value).round() / 100.0)))
+        let Some(part) = Self::number(test, "rate_difference_part") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
+        when(
+            part.value < 2e-3,
+            format!(
+                "differs by {} % from 0.1 to 10 times the speed",
+                super::study::plain((1e4 * part.value).round() / 100.0)
+            ),
+        )
     }
 
     fn dissipative(&self) -> Answer {
@@ -299,7 +354,9 @@ impl Look<'_> {
             return when(false, format!("gives out {} on a closed path", least.shown()));
         }
         match Self::number(test, "dissipation_points") {
-            Some(points) => when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown())),
+            Some(points) => {
+                when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown()))
+            }
             None => when(true, format!("least work of six rounds {}; no `storage` to search with", least.shown())),
         }
     }
@@ -309,10 +366,14 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        let Some(asymmetry) = Self::number(test, "asymmetry") else { return (Seen::NotApplicable, "not measured".into()) };
+        let Some(asymmetry) = Self::number(test, "asymmetry") else {
+            return (Seen::NotApplicable, "not measured".into());
+        };
         match asymmetry.value == 0.0 {
             true => when(true, "both directions agree to the last bit".into()),
-            false => when(asymmetry.value < 1e-9 * self.scales.f_ref, format!("directions differ by {}", asymmetry.shown())),
+            false => {
+                when(asymmetry.value < 1e-9 * self.scales.f_ref, format!("directions differ by {}", asymmetry.shown()))
+            }
         }
     }
 }

@@ -33,6 +33,15 @@ pub struct Study {
     pub notes: Vec<String>,
 }
 
+/// How much of the battery is run.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Extent {
+    /// All of it.
+    Whole,
+    /// The steady curve and the presliding loops: what a page of many models shows.
+    Sketch,
+}
+
 /// One test of the battery.
 #[derive(Clone, Debug)]
 pub struct Test {
@@ -66,6 +75,10 @@ impl Number {
     pub fn shown(&self) -> String {
         if self.value == f64::INFINITY {
             return "more than was tried".into();
+        }
+        // What is left of nothing after rounding is nothing.
+        if self.value.abs() < 1e-13 && !self.unit.is_empty() {
+            return format!("0 {}", prefixed(&self.unit, 0.0).0);
         }
         let (unit, _) = prefixed(&self.unit, self.value.abs());
         show(self.value, &unit, 4)
@@ -121,6 +134,9 @@ pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
     if base.is_empty() || base == "s" || base == "Hz" || base.starts_with("kg") || size == 0.0 || !size.is_finite() {
         return plain();
     }
+    if (0.1..1e4).contains(&size) {
+        return plain();
+    }
     let fitting = PREFIXES.into_iter().find(|(_, scale)| size >= 0.9999 * scale).unwrap_or(("n", 1e-9));
     match Unit::parse(&format!("{}{base}", fitting.0)) {
         Ok(unit) => (unit, fitting.1),
@@ -133,7 +149,8 @@ pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
     let Some((_, first)) = graphs.first() else { return Figure::default() };
     let alone = graphs.len() == 1;
     let shown = |line: &&Line| alone || line.main;
-    let lines = || graphs.iter().flat_map(|(name, graph)| graph.lines.iter().filter(shown).map(move |line| (*name, line)));
+    let lines =
+        || graphs.iter().flat_map(|(name, graph)| graph.lines.iter().filter(shown).map(move |line| (*name, line)));
     let size = |of: fn(&(f64, f64)) -> f64| {
         let values = lines().flat_map(|(_, line)| line.points.iter().map(of));
         values.filter(|value| value.is_finite()).fold(0.0, |size: f64, value| size.max(value.abs()))
@@ -150,7 +167,11 @@ pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
         boolean: false,
         marks: line.marks,
     });
-    let axis = |(name, _): &(String, String), unit: Unit, logarithmic| Axis { name: name.clone(), unit: unit.text, logarithmic };
+    let axis = |(name, _): &(String, String), unit: Unit, logarithmic| Axis {
+        name: name.clone(),
+        unit: unit.text,
+        logarithmic,
+    };
     let panel = Panel {
         x: axis(&first.x, x_unit, first.logarithmic.0),
         y: axis(&first.y, y_unit, first.logarithmic.1),
@@ -160,14 +181,25 @@ pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
     Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
 }
 
+/// The figure of one graph of a study, if it has it.
+pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
+    let graphs = study.tests.iter().filter_map(|test| test.result.as_ref().ok()).flatten();
+    let graph = graphs.into_iter().find(|graph| graph.key == key)?;
+    // What did not move is no curve.
+    let moved = graph.lines.iter().any(|line| line.points.iter().any(|point| point.0.abs() > 1e-12));
+    moved.then(|| figure(&[(&study.label, graph)]))
+}
+
 /// Puts a model through the battery.
 ///
 /// # Errors
 /// Why nothing at all can be said, as a message or a report.
-pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Result<Study, String> {
+pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), extent: Extent) -> Result<Study, String> {
     let rotary = subject.rotary;
-    let mut runner = Runner { subject: &subject, name, sources, entries: Vec::new(), results: Results::new(), chatter: None };
-    let v_max = if rotary { 10.0 } else { 1.0 };
+    let mut runner =
+        Runner { subject: &subject, name, sources, entries: Vec::new(), results: Results::new(), chatter: None };
+    // Twins of straight models keep their numbers; what is written for shafts turns faster.
+    let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
     let mut scales =
         Scales { f_ref: 0.0, mass: 1.0, f_b: 0.0, x_b: 0.0, f_c: 0.0, v_s: 0.01 * v_max, v_slip: 0.01 * v_max, v_max };
 
@@ -199,7 +231,10 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Re
     // Ten times the Stribeck speed is sliding; it is 10 mm/s for the textbook's 1 mm/s.
     scales.v_slip = battery::round(10.0 * scales.v_s);
 
-    runner.run(&scales, |layout| layout.rest())?;
+    runner.run(&scales, |layout| {
+        let wanted = |entry: &Entry| extent == Extent::Whole || entry.name.starts_with("presliding");
+        layout.rest().into_iter().filter(wanted).collect()
+    })?;
     let layout = Layout::new(&subject, scales.clone());
     let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
     let dissipation = runner.dissipation(&text);
@@ -210,8 +245,9 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Re
     let mut notes = Vec::new();
     if let Some(chatter) = chatter {
         notes.push(format!(
-            "Chatters at rest ({chatter}). What needs rest was run with a fixed step instead; there the force jumps to \
-             and fro, and what it holds is an average."
+            "At rest it {chatter}. What comes to rest was therefore run with a fixed step; there the force jumps to and \
+             fro at every step, and what it carries is an average. `Sticking(law = {})` is the same law made to hold.",
+            subject.instance
         ));
     }
     if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
@@ -241,7 +277,8 @@ impl Runner<'_> {
             let text = battery::text(&self.subject.imports, &layout.head(), &self.entries);
             let loaded = bench::load(self.name, &text, self.sources)?;
             let results = bench::run(&loaded, &names, self.sources);
-            names = results.iter().filter(|(_, result)| bench::chatters(result)).map(|(name, _)| name.clone()).collect();
+            names =
+                results.iter().filter(|(_, result)| bench::chatters(result)).map(|(name, _)| name.clone()).collect();
             self.results.extend(results);
             for entry in self.entries.iter_mut().filter(|entry| names.contains(&entry.name) && entry.adaptive()) {
                 if let (None, Some(Ok(cases))) = (&self.chatter, self.results.get(&entry.name)) {
@@ -329,7 +366,8 @@ impl Steady {
         let mut f_c = if intercept > 0.0 { intercept.min(last.1) } else { 0.0 };
         if let Some(top) = top {
             peak = forward[top];
-            let foot = (top..forward.len() - 1).find(|i| forward[i + 1].1 >= forward[*i].1).unwrap_or(forward.len() - 1);
+            let foot =
+                (top..forward.len() - 1).find(|i| forward[i + 1].1 >= forward[*i].1).unwrap_or(forward.len() - 1);
             falls = foot - top;
             f_c = forward[foot].1;
             let level = f_c + (peak.1 - f_c) / std::f64::consts::E;
@@ -456,7 +494,8 @@ impl Reader<'_> {
             test(
                 "steps",
                 "Step size",
-                "The spring again with fixed steps (expo): error of the position at the end against the adaptive run.".into(),
+                "The spring again with fixed steps (expo): error of the position at the end against the adaptive run."
+                    .into(),
                 self.read_steps(),
             ),
         ]
@@ -482,10 +521,7 @@ impl Reader<'_> {
             x: self.axis("|v|", self.units.speed),
             y: self.axis("|F|", self.units.force),
             logarithmic: (true, false),
-            lines: vec![
-                Line::course("forward", steady.forward.clone()),
-                Line::course("backward", mirrored).aside(),
-            ],
+            lines: vec![Line::course("forward", steady.forward.clone()), Line::course("backward", mirrored).aside()],
         };
         let mut numbers = vec![
             self.number("sliding_force", "least sliding force F_c", steady.f_c, self.units.force),
@@ -496,7 +532,12 @@ impl Reader<'_> {
         }
         numbers.push(self.number("stribeck_points", "points of the grid over which it falls", steady.falls as f64, ""));
         numbers.push(self.number("viscous_slope", "viscous slope", steady.viscous, self.units.damping));
-        numbers.push(self.number("asymmetry", "greatest difference of the directions", steady.asymmetry, self.units.force));
+        numbers.push(self.number(
+            "asymmetry",
+            "greatest difference of the directions",
+            steady.asymmetry,
+            self.units.force,
+        ));
         if !steady.failures.is_empty() {
             numbers.push(self.number("failures", "speeds at which it failed", steady.failures.len() as f64, ""));
         }
@@ -543,7 +584,12 @@ impl Reader<'_> {
         let mut numbers: Vec<Number> = points
             .iter()
             .map(|(rate, force)| {
-                self.number("break_away_force", format!("at {} {}", n(*rate), self.units.rate), *force, self.units.force)
+                self.number(
+                    "break_away_force",
+                    format!("at {} {}", n(*rate), self.units.rate),
+                    *force,
+                    self.units.force,
+                )
             })
             .collect();
         numbers.push(self.number("break_away_change", "fall from the greatest to the least", (high - low) / high, ""));
@@ -559,10 +605,7 @@ impl Reader<'_> {
             x: self.axis("x", self.units.length),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
-            lines: vec![
-                Line::course("to 95 %", course(&large)),
-                Line::course("to 30 %", course(&small)).aside(),
-            ],
+            lines: vec![Line::course("to 95 %", course(&large)), Line::course("to 30 %", course(&small)).aside()],
         };
         let small_travel = peak_to_peak(&small, 2);
         let large_travel = peak_to_peak(&large, 2);
@@ -583,9 +626,19 @@ impl Reader<'_> {
         if stiffness.is_finite() && stiffness > 0.0 && small_travel > 0.0 {
             numbers.push(self.number("stiffness", "stiffness at 10 %", stiffness, self.units.stiffness));
         }
-        numbers.push(self.number("loop_area", "area of the large loop over its box", loop_area / (2.0 * a * large_travel).max(1e-300), ""));
+        numbers.push(self.number(
+            "loop_area",
+            "area of the large loop over its box",
+            loop_area / (2.0 * a * large_travel).max(1e-300),
+            "",
+        ));
         if inner > 0.0 {
-            numbers.push(self.number("memory_error", "inner loop misses its start by, of its width", (back - left).abs() / inner, ""));
+            numbers.push(self.number(
+                "memory_error",
+                "inner loop misses its start by, of its width",
+                (back - left).abs() / inner,
+                "",
+            ));
         }
         Ok((vec![graph], numbers))
     }
@@ -597,11 +650,17 @@ impl Reader<'_> {
         for (i, f) in self.layout.lag_frequencies().into_iter().enumerate() {
             let rows = self.rows(&format!("lag_{}", i + 1))?;
             let end = rows.last().map_or(0.0, |row| row[0]);
-            let last: Vec<(f64, f64)> =
-                rows.iter().filter(|row| row[0] >= end - 1.0 / f).map(|row| (row[2], row[1])).collect();
+            // From the row before on, so that the loop closes.
+            let first = rows.partition_point(|row| row[0] < end - 1.0 / f).saturating_sub(1);
+            let last: Vec<(f64, f64)> = rows[first..].iter().map(|row| (row[2], row[1])).collect();
             let width = lag(&last);
             widths.push((f, width.abs()));
-            numbers.push(self.number("lag", format!("F rising minus F falling at {} Hz, greatest", n(f)), width, self.units.force));
+            numbers.push(self.number(
+                "lag",
+                format!("F rising minus F falling at {} Hz, greatest", n(f)),
+                width,
+                self.units.force,
+            ));
             let line = Line::course(format!("{} Hz", n(f)), last);
             lines.push(if i == 1 { line } else { line.aside() });
         }
@@ -625,12 +684,24 @@ impl Reader<'_> {
         let top = |points: &[(f64, f64)]| points.iter().map(|point| point.1).fold(f64::NEG_INFINITY, f64::max);
         let settled = forth.last().map_or(f64::NAN, |point| point.1);
         let (first, second) = (top(&forth) - settled, top(&back) - settled);
+        // Where both have settled there is nothing more to see.
+        let size = settled.abs().max(1e-300);
+        let moving = |points: &[(f64, f64)]| {
+            let last = points.iter().rev().find(|point| (point.1 - settled).abs() > 0.01 * size);
+            last.map_or(0.0, |point| point.0)
+        };
+        let far = (2.5 * moving(&forth).max(moving(&back))).max(1e-3 * turn);
+        let cut = |points: Vec<(f64, f64)>| points.into_iter().filter(|point| point.0 <= far).collect::<Vec<_>>();
+        let (forth, back) = (cut(forth), cut(back));
         let graph = Graph {
             key: "reversal",
             x: self.axis("path", self.units.length),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
-            lines: vec![Line::course("from rest", forth), Line::course("after the reversal, turned over", back).aside()],
+            lines: vec![
+                Line::course("from rest", forth),
+                Line::course("after the reversal, turned over", back).aside(),
+            ],
         };
         let force = self.units.force;
         let numbers = vec![
@@ -643,10 +714,17 @@ impl Reader<'_> {
 
     fn read_stick_slip(&self) -> Read {
         let (mut lines, mut numbers, mut periods) = (Vec::new(), Vec::new(), Vec::new());
+        let mut failed = Vec::new();
         let speeds = self.layout.pull_speeds();
         let (mut sticks_last, mut smooth_first) = (None, None);
         for (i, vp) in speeds.iter().enumerate() {
-            let rows = self.rows(&format!("stick_slip_{}", i + 1))?;
+            let rows = match self.rows(&format!("stick_slip_{}", i + 1)) {
+                Ok(rows) => rows,
+                Err(why) => {
+                    failed.push(format!("at {} {}: {why}", n(*vp), self.units.speed));
+                    continue;
+                }
+            };
             let slips = slips(&rows, *vp);
             let sticking = slips.len() >= 3;
             if sticking {
@@ -666,6 +744,9 @@ impl Reader<'_> {
                 let end = rows.last().map_or(0.0, |row| row[0]);
                 lines.push(Line::course("far end of the spring", vec![(0.0, 0.0), (end, vp * end)]).aside());
             }
+        }
+        if lines.is_empty() {
+            return Err(failed.join("; "));
         }
         let mut graphs = vec![Graph {
             key: "stick_slip",
@@ -724,7 +805,12 @@ impl Reader<'_> {
         };
         let creep = (value_at(&rows, end, 2) - value_at(&rows, 12.0, 2)) / (end - 12.0);
         let numbers = vec![
-            self.number("held_peak_to_peak", "motion from 12 s on", one(self.results, "hold")?.reading(0).unwrap_or(f64::NAN), self.units.length),
+            self.number(
+                "held_peak_to_peak",
+                "motion from 12 s on",
+                one(self.results, "hold")?.reading(0).unwrap_or(f64::NAN),
+                self.units.length,
+            ),
             self.number("creep_speed", "creep speed", creep, self.units.speed),
         ];
         Ok((vec![graph], numbers))
@@ -850,7 +936,12 @@ impl Reader<'_> {
         let mut numbers = vec![self.number("least_work", "least work of a round", least, "J")];
         match verdict {
             Some(Dissipation::Holds(points)) => {
-                numbers.push(self.number("dissipation_points", "points searched, none gives out power", points as f64, ""));
+                numbers.push(self.number(
+                    "dissipation_points",
+                    "points searched, none gives out power",
+                    points as f64,
+                    "",
+                ));
             }
             Some(Dissipation::Fails(point)) => {
                 numbers.push(self.number("pushes_at", "gives out power at v =", point.v, self.units.speed));
@@ -942,10 +1033,10 @@ fn lag(cycle: &[(f64, f64)]) -> f64 {
 fn slips(rows: &[Vec<f64>], vp: f64) -> Vec<f64> {
     let (mut resting, mut starts) = (true, Vec::new());
     for row in rows {
-        if resting && row[3] > 0.5 * vp {
+        if resting && row[3] > 0.7 * vp {
             starts.push(row[0]);
             resting = false;
-        } else if row[3].abs() < 0.02 * vp {
+        } else if row[3].abs() < 0.1 * vp {
             resting = true;
         }
     }

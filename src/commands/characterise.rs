@@ -3,7 +3,7 @@
 use super::End;
 use crate::args::{Characterise, Compare};
 use crate::characterise::subject::{self, Origin, Subject, Written};
-use crate::characterise::{Seen, Study, page, study};
+use crate::characterise::{Extent, Seen, Study, page, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
 use crate::{equations, project, report};
@@ -18,7 +18,7 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
     for (subject, folder) in found {
         let label = subject.instance.label();
-        let study = match study(subject, &battery_in(&folder), &project::Disk) {
+        let study = match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
             Ok(study) => study,
             Err(why) => {
                 end = failed(terminal, &format!("{label} {why}"));
@@ -54,7 +54,7 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
         };
         for (subject, _) in found {
             let label = subject.instance.label();
-            match study(subject, &battery_in(&folder), &project::Disk) {
+            match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
                 Ok(study) => studies.push(study),
                 Err(why) => end = failed(terminal, &format!("{label} {why}")),
             }
@@ -135,7 +135,7 @@ fn subjects(
 }
 
 /// Finds a model, compiles it alone, and reads its ports.
-fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subject, String> {
+pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subject, String> {
     let (origin, own) = match file {
         None => (Origin::Library, String::new()),
         Some(path) => {
@@ -170,15 +170,16 @@ fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subjec
     if !subject::looks_like_friction(model) {
         return Err(format!("{} is no friction model: one has an input `v` and an output `F`", written.model()));
     }
-    let open: Vec<&str> = subject::open_inputs(model).into_iter().filter(|name| matches!(*name, "v" | "F_ext")).collect();
+    let open: Vec<&str> =
+        subject::open_inputs(model).into_iter().filter(|name| matches!(*name, "v" | "F_ext")).collect();
     let zero: Vec<(&str, &str)> = open.iter().map(|name| (*name, "0")).collect();
     let loaded = compile::load(&name, &probe(&imports, &written, &zero), &project::Disk);
     let cases = compiled(&loaded, "probe")?;
     let instance = &cases[0].instance;
     let description = instance.description();
     let (_, model) = subject::model(&loaded, written.model()).expect("it was there before");
-    let rotary = subject::rotary(model, &written, instance)
-        .map_err(|why| format!("{} does not fit: {why}", written.model()))?;
+    let rotary =
+        subject::rotary(model, &written, instance).map_err(|why| format!("{} does not fit: {why}", written.model()))?;
     Ok(Subject {
         model: written.model().into(),
         origin,
@@ -190,7 +191,7 @@ fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subjec
         equations: equations::equations(model),
         rotary,
         external: subject::external(model),
-        params: subject::params(instance),
+        params: subject::params(model, instance),
         states: crate::results::states(description),
         regimes: description.automata.iter().flat_map(|automaton| automaton.regimes.clone()).collect(),
         instance: written,
@@ -312,9 +313,9 @@ fn json(study: &Study) -> Value {
             "numbers": numbers,
         })
     });
-    let findings = study.findings.iter().map(|finding| {
-        json!({ "key": finding.key, "name": finding.name, "seen": finding.seen.key(), "why": finding.why })
-    });
+    let findings = study.findings.iter().map(
+        |finding| json!({ "key": finding.key, "name": finding.name, "seen": finding.seen.key(), "why": finding.why }),
+    );
     json!({
         "model": study.subject.model,
         "instance": study.subject.instance.to_string(),
