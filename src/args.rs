@@ -43,6 +43,8 @@ pub enum Command {
     Characterise(Characterise),
     /// Put several friction models through the battery, on shared axes
     Compare(Compare),
+    /// Write the page of all models of the library, from its own text
+    Doc(Doc),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -54,7 +56,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "check", "fmt", "explain", "characterise", "compare", "new", "completions",
+            "run", "test", "sweep", "linearise", "check", "fmt", "explain", "characterise", "compare", "doc", "new",
+            "completions",
         ])]
         command: Option<String>,
     },
@@ -289,6 +292,17 @@ pub struct Compare {
     /// Print one JSON object a line for each model instead of words
     #[arg(long)]
     pub json: bool,
+}
+
+/// `fric doc`
+#[derive(clap::Args, Debug)]
+pub struct Doc {
+    /// The page; plots go into the folder of the same name
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "docs/models.md")]
+    pub out: PathBuf,
+    /// Write nothing; fail if the page would change
+    #[arg(long)]
+    pub check: bool,
 }
 
 /// `fric new`

@@ -9,6 +9,11 @@ use std::path::{Component, Path, PathBuf};
 /// The library: dotted name of each file (`std.friction.lugre`) and its text, in the order of the names.
 const LIBRARY: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/library.rs"));
 
+/// The library: dotted name and text of each file.
+pub fn library() -> &'static [(&'static str, &'static str)] {
+    LIBRARY
+}
+
 /// A text longer than this is not one that somebody wrote.
 const MOST_BYTES: u64 = 64 << 20;
 

@@ -211,7 +211,7 @@ fn bad_input_is_a_message_and_never_a_panic() {
         ("folder.fric", "it is a folder"),
         ("binary.fric", "byte 4 is zero"),
         ("latin1.fric", "line 2"),
-        ("empty.fric", "no experiment"),
+        ("empty.fric", "empty.fric:1:1"),
         ("open.fric", "open.fric:1:"),
         ("deep.fric", "deep.fric:1:"),
         ("words.fric", "words.fric:1:1"),
@@ -220,7 +220,7 @@ fn bad_input_is_a_message_and_never_a_panic() {
         let (_, err) = folder.check(&["run", file], 1, words);
         assert!(!err.contains("panicked") && err.len() < 20_000, "{file}: {} bytes of\n{err:.2000}", err.len());
     }
-    folder.check(&["check", "empty.fric"], 0, "1 file: 0 errors, 0 warnings");
+    folder.check(&["check", "empty.fric"], 1, "there is nothing in this file");
     folder.check(&["check", "missing.fric", "words.fric"], 1, "words.fric:1:1");
     let (out, _) = folder.check(&["check", "--short", "words.fric"], 1, "");
     assert!(out.starts_with("words.fric:1:1: E0"), "{out}");

@@ -34,10 +34,12 @@ fn mirrored(solver: &str, h: f64, steps: u32) {
         let slot = |path: &str| a.description().quantity(path).expect("the probe has it").slot;
         let (amplitude, force) = (slot("A"), slot("F"));
         b.set(amplitude, -b.get(amplitude));
-        (a.start(h), b.start(h));
+        a.start(h);
+        b.start(h);
         let mut moved = false;
         for step in 0..steps {
-            (a.advance(1), b.advance(1));
+            a.advance(1);
+            b.advance(1);
             let (one, other) = (a.get(force), -b.get(force));
             assert!(one == other, "{}, {solver}, step {step}: {one:e} and {other:e}", case.label);
             moved |= one != 0.0;

@@ -5,10 +5,13 @@
 
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::report;
-use runtime::engine::{Cause, Continue, Failure, Outcome};
-use runtime::sweep;
+use runtime::engine::{self, Cause, Continue, Failure, Outcome};
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
+
+/// An adaptive run is given up after 64 times as many tries of a step: twenty times what any test should need.
+const MOST_LOOKS: u32 = 1000;
 
 /// What became of one case of an experiment.
 pub struct Ran {
@@ -23,6 +26,9 @@ impl Ran {
     pub fn rows(&self) -> Result<Vec<Vec<f64>>, String> {
         match &self.result {
             Ok(outcome) => Ok(outcome.recording.rows().map(<[f64]>::to_vec).collect()),
+            Err(failure) if failure.cause == Cause::Stopped => {
+                Err(format!("takes too many steps: given up at {}", runtime::show::time(failure.time)))
+            }
             Err(failure) => Err(failure.to_string()),
         }
     }
@@ -52,17 +58,8 @@ pub fn load(name: &str, text: &str, sources: &(dyn compile::Sources + Sync)) -> 
 /// Compiles and runs experiments of a loaded text.
 pub fn run(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + Sync)) -> Results {
     let compiled = compiled(loaded, names, sources);
-    let cases: Vec<sweep::Case> = compiled
-        .iter()
-        .filter_map(|(_, cases)| cases.as_ref().ok())
-        .flatten()
-        .map(|case| sweep::Case {
-            label: case.label.clone(),
-            instance: case.instance.clone(),
-            experiment: case.experiment.clone(),
-        })
-        .collect();
-    let mut results = sweep::run(&cases, &|_| Continue::Continue(())).into_iter();
+    let cases: Vec<&compile::Case> = compiled.iter().filter_map(|(_, cases)| cases.as_ref().ok()).flatten().collect();
+    let mut results = outcomes(&cases).into_iter();
     compiled
         .into_iter()
         .map(|(name, cases)| {
@@ -76,6 +73,32 @@ pub fn run(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + 
             (name, ran)
         })
         .collect()
+}
+
+/// Runs cases on all cores; the results are in their order, and the same for any number of threads.
+fn outcomes(cases: &[&compile::Case]) -> Vec<Result<Outcome, Failure>> {
+    let next = AtomicUsize::new(0);
+    let work = || {
+        let mut done = Vec::new();
+        while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)).copied() {
+            // Counted, not timed, so that what is given up does not depend on the machine.
+            let mut looks = 0;
+            let mut watch = |_| {
+                looks += 1;
+                if looks > MOST_LOOKS { Continue::Break(()) } else { Continue::Continue(()) }
+            };
+            let index = cases.iter().position(|other| std::ptr::eq(*other, case)).expect("it is one of them");
+            done.push((index, engine::run(case.instance.clone(), &case.experiment, &mut watch)));
+        }
+        done
+    };
+    let workers = thread::available_parallelism().map_or(1, usize::from).min(cases.len().max(1));
+    let mut done: Vec<(usize, Result<Outcome, Failure>)> = thread::scope(|scope| {
+        let work: Vec<_> = (0..workers).map(|_| scope.spawn(work)).collect();
+        work.into_iter().flat_map(|work| work.join().expect("a worker does not panic")).collect()
+    });
+    done.sort_by_key(|(index, _)| *index);
+    done.into_iter().map(|(_, result)| result).collect()
 }
 
 /// Whether the reason is that a model turns to and fro without end.

@@ -29,7 +29,7 @@ td.v { white-space: nowrap; }
 .mark { display: inline-block; width: 1.3em; font-weight: 700; }
 .yes .mark { color: #00694b; } .no .mark { color: #a34700; } .na { color: #59636e; }
 .small { font-size: 12.5px; color: #59636e; line-height: 1.35; }
-.tests { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 34px 36px; }
+.tests { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 34px 36px; grid-auto-flow: dense; align-items: start; }
 .wide { grid-column: 1 / -1; display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 0 36px; }
 .wide > header { grid-column: 1 / -1; }
 section { break-inside: avoid; }
@@ -38,11 +38,14 @@ svg { width: 100%; height: auto; display: block; }
 .numbers td { padding: 2px 14px 2px 0; }
 .two { columns: 2; column-gap: 36px; }
 pre { font: 13px/1.45 'Roboto Mono', Menlo, Consolas, 'DejaVu Sans Mono', monospace; background: #f6f8fa; padding: 12px 14px; overflow-x: auto; margin: 6px 0 12px; }
-.doc { white-space: pre-wrap; }
+.quiet { background: none; padding: 2px 14px; color: #1f2328; }
+code { font: 0.9em 'Roboto Mono', Menlo, Consolas, 'DejaVu Sans Mono', monospace; background: #f6f8fa; padding: 1px 4px; }
+.numbers table { margin: 0; }
+.top { display: grid; grid-template-columns: minmax(0, 3fr) minmax(0, 2fr); gap: 0 48px; align-items: start; }
 .note { border-left: 3px solid #d55e00; padding: 4px 12px; margin: 10px 0; max-width: 90ch; }
 .reason { border-left: 3px solid #c3cad2; padding: 3px 12px; color: #59636e; margin: 8px 0; }
 details > summary { cursor: pointer; color: #0072b2; }
-@media (max-width: 900px) { .tests, .wide { grid-template-columns: 1fr; } }
+@media (max-width: 900px) { .tests, .wide, .top { grid-template-columns: 1fr; } }
 @media print { body { max-width: none; padding: 0; } h2 { break-after: avoid; } details { display: none; } }
 ";
 
@@ -50,29 +53,29 @@ details > summary { cursor: pointer; color: #0072b2; }
 pub fn report(study: &Study) -> String {
     let mut body = String::new();
     let subject = &study.subject;
-    let _ = write!(body, "<h1>{}</h1>\n", escaped(&study.label));
-    let _ = write!(
+    let _ = writeln!(body, "<h1>{}</h1>", escaped(&study.label));
+    let _ = writeln!(
         body,
-        "<p class=\"faint\">Friction model{}, characterised by fric {} ({}, {}). Every curve and number below was \
+        "<p class=\"faint\">Friction model{}, characterised by fric {} ({}, compiled to machine code). Every curve and number below was \
          computed from runs of the battery at the end of this page; nothing is taken from what the model says of \
-         itself.</p>\n",
+         itself.</p>",
         if subject.rotary { " of rotary motion" } else { "" },
         env!("CARGO_PKG_VERSION"),
         match &subject.origin {
             super::subject::Origin::Library => "library of the same version".to_string(),
             super::subject::Origin::File(path) => format!("model from {}", escaped(path)),
-        },
-        "compiled to machine code"
+        }
     );
     for note in &study.notes {
-        let _ = write!(body, "<p class=\"note\">{}</p>\n", escaped(note));
+        let _ = writeln!(body, "<p class=\"note\">{}</p>", escaped(note));
     }
 
-    body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th><th>seen</th><th>behind it</th></tr>\n";
+    body += "<div class=\"top\">\n<div>\n<h2>Phenomena</h2>\n<table>\n\
+             <tr><th>phenomenon</th><th>seen</th><th>behind it</th></tr>\n";
     for finding in &study.findings {
-        let _ = write!(
+        let _ = writeln!(
             body,
-            "<tr class=\"{}\"><td>{}</td><td class=\"v\">{}{}</td><td>{}</td></tr>\n",
+            "<tr class=\"{}\"><td>{}</td><td class=\"v\">{}{}</td><td>{}</td></tr>",
             class(finding.seen),
             finding.name,
             mark(finding.seen),
@@ -80,15 +83,16 @@ pub fn report(study: &Study) -> String {
             escaped(&finding.why)
         );
     }
-    body += "</table>\n";
+    body += "</table>\n</div>\n<div>\n<h2>Parameters</h2>\n";
+    body += &parameters(study);
+    body += &scales(study);
+    body += "</div>\n</div>\n";
 
     body += "<h2>Model</h2>\n";
     if let Some(doc) = &subject.doc {
-        let _ = write!(body, "<p class=\"doc\">{}</p>\n", escaped(doc.trim()));
+        body += &prose(doc);
     }
-    let _ = write!(body, "<pre>{}</pre>\n", escaped(&equations::lines(&subject.equations)));
-    body += &parameters(study);
-    body += &scales(study);
+    let _ = writeln!(body, "<pre>{}</pre>", escaped(&equations::lines(&subject.equations)));
 
     body += "<h2>Tests</h2>\n<div class=\"tests\">\n";
     for test in &study.tests {
@@ -104,16 +108,16 @@ pub fn report(study: &Study) -> String {
 /// The page of several models side by side.
 pub fn comparison(studies: &[Study]) -> String {
     let mut body = String::from("<h1>Friction models side by side</h1>\n");
-    let _ = write!(
+    let _ = writeln!(
         body,
         "<p class=\"faint\">{}; characterised by fric {}. Every verdict comes from runs, with the numbers behind \
-         it.</p>\n",
+         it.</p>",
         escaped(&studies.iter().map(|study| study.label.as_str()).collect::<Vec<_>>().join(", ")),
         env!("CARGO_PKG_VERSION")
     );
     for study in studies {
         for note in &study.notes {
-            let _ = write!(body, "<p class=\"note\">{}: {}</p>\n", escaped(&study.label), escaped(note));
+            let _ = writeln!(body, "<p class=\"note\">{}: {}</p>", escaped(&study.label), escaped(note));
         }
     }
     body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th>";
@@ -186,14 +190,14 @@ fn section(test: &Test, studies: &[&Study]) -> String {
             }
             Err(why) => {
                 let who = if studies.len() > 1 { format!("{}: ", study.label) } else { String::new() };
-                let _ = write!(reasons, "<p class=\"reason\">{}not available: {}</p>\n", escaped(&who), escaped(why));
+                let _ = writeln!(reasons, "<p class=\"reason\">{}not available: {}</p>", escaped(&who), escaped(why));
             }
         }
     }
     let wide = graphs.len() > 1;
     let mut out = format!("<section{}>\n<header><h3>{}</h3>\n", if wide { " class=\"wide\"" } else { "" }, test.title);
     if let [(_, test)] = found[..] {
-        let _ = write!(out, "<p class=\"how\">{}</p>\n", escaped(&test.how));
+        let _ = writeln!(out, "<p class=\"how\">{}</p>", escaped(&test.how));
     }
     out += "</header>\n";
     for group in &graphs {
@@ -205,7 +209,7 @@ fn section(test: &Test, studies: &[&Study]) -> String {
                 curve.name = format!("{}{}{}", group[0].0, if curve.name.is_empty() { "" } else { ", " }, curve.name);
             }
         }
-        let _ = write!(out, "<figure style=\"margin:0\">{}</figure>\n", plot::inline(&drawn, WIDE, &id));
+        let _ = writeln!(out, "<figure style=\"margin:0\">{}</figure>", plot::inline(&drawn, WIDE, &id));
     }
     out += &reasons;
     if let [(_, test)] = found[..]
@@ -223,33 +227,22 @@ fn section(test: &Test, studies: &[&Study]) -> String {
 
 fn parameters(study: &Study) -> String {
     if study.subject.params.is_empty() {
-        return String::new();
+        return "<p class=\"faint\">none</p>\n".into();
     }
     let mut out = String::from(
-        "<table>\n<tr><th>parameter</th><th style=\"text-align:right\">value</th><th>range</th><th></th></tr>\n",
+        "<table>\n<tr><th>parameter</th><th style=\"text-align:right\">value</th><th>range</th><th>meaning</th></tr>\n",
     );
     for param in &study.subject.params {
-        let _ = write!(
+        let _ = writeln!(
             out,
-            "<tr><td>{}</td><td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>\n",
+            "<tr><td>{}</td><td class=\"n\">{}</td><td>{}</td><td>{}</td></tr>",
             escaped(&param.path),
-            show(param.value, &param.unit, 6),
-            range(param.range, &param.unit),
+            value(param.value, &param.unit),
+            escaped(&param.range),
             escaped(param.doc.as_deref().unwrap_or_default())
         );
     }
     out + "</table>\n"
-}
-
-/// A range in words: `> 0`, `0.01 … 0.99`.
-pub fn range((low, high): (f64, f64), unit: &abi::unit::Unit) -> String {
-    let text = |value: f64| if value == 0.0 { "0".into() } else { show(value, unit, 6) };
-    match (low.is_finite(), high.is_finite()) {
-        (true, true) => format!("{} … {}", text(low), text(high)),
-        (true, false) => format!("from {}", text(low)),
-        (false, true) => format!("up to {}", text(high)),
-        (false, false) => String::new(),
-    }
 }
 
 fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
@@ -266,7 +259,7 @@ fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
 fn scales(study: &Study) -> String {
     let mut out = String::from("<p>The battery is laid out with scales that were measured first:</p>\n<table>\n");
     for (name, value) in scale_rows(study) {
-        let _ = write!(out, "<tr><td>{name}</td><td class=\"n\">{value}</td></tr>\n");
+        let _ = writeln!(out, "<tr><td>{name}</td><td class=\"n\">{value}</td></tr>");
     }
     let _ = write!(
         out,
@@ -274,6 +267,36 @@ fn scales(study: &Study) -> String {
         significant(study.scales.mass, 3),
         study.units.mass.replace("^2", "²")
     );
+    out
+}
+
+/// A parameter's value; what has no bound is ∞.
+fn value(si: f64, unit: &abi::unit::Unit) -> String {
+    if si == f64::INFINITY { "∞".into() } else { show(si, unit, 6) }
+}
+
+/// A doc comment: paragraphs, and lines that are set in as they stand.
+fn prose(doc: &str) -> String {
+    let mut out = String::new();
+    for block in doc.trim_matches('\n').split("\n\n") {
+        let set_in = |line: &str| line.starts_with("  ");
+        let (mut words, mut lines) = (String::new(), String::new());
+        for line in block.lines() {
+            if set_in(line) {
+                lines += &format!("{}\n", escaped(line.trim_end()));
+            } else {
+                words += &format!("{} ", escaped(line.trim()));
+            }
+        }
+        if !words.is_empty() {
+            let code = words.trim().split('`').enumerate();
+            let code = code.map(|(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { part.to_string() });
+            out += &format!("<p>{}</p>\n", code.collect::<String>());
+        }
+        if !lines.is_empty() {
+            out += &format!("<pre class=\"quiet\">{lines}</pre>\n");
+        }
+    }
     out
 }
 

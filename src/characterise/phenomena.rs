@@ -117,13 +117,16 @@ impl Look<'_> {
             Ok(test) => test,
             Err(answer) => return answer,
         };
-        if let (Some(chatter), External::Absent) = (self.chatter, self.subject.external) {
-            return (Seen::NotShown, format!("it has no port F_ext and {chatter}; put it into `Sticking(law = …)`"));
+        if self.chatter.is_some() && self.subject.external == External::Absent {
+            return (Seen::NotShown, "needs F_ext: without it the force jumps to and fro at rest".into());
         }
         let (moved, creep) = (Self::number(test, "held_peak_to_peak"), Self::number(test, "creep_speed"));
         let (Some(moved), Some(creep)) = (moved, creep) else { return (Seen::NotApplicable, "not measured".into()) };
-        let needs =
-            if self.subject.external == External::Absent && self.is_static() { "; it would need F_ext" } else { "" };
+        let needs = if self.subject.external == External::Absent && self.is_static() {
+            "; to hold it would need F_ext"
+        } else {
+            ""
+        };
         match moved.value < 1e-9 {
             true => when(true, format!("moves {} in 90 s", moved.shown())),
             false => when(false, format!("creeps at {}{needs}", creep.shown())),
@@ -133,7 +136,10 @@ impl Look<'_> {
     fn no_drift(&self) -> Answer {
         let (holds, why) = self.holds();
         if holds != Seen::Shown {
-            return (Seen::NotApplicable, format!("does not hold: {why}"));
+            return (
+                Seen::NotApplicable,
+                format!("does not hold a load: {}", why.split(':').next().unwrap_or_default()),
+            );
         }
         let test = match self.test("drift") {
             Ok(test) => test,
@@ -150,6 +156,9 @@ impl Look<'_> {
         };
         let highest = Self::all(test, "break_away_force").into_iter().max_by(|a, b| a.value.total_cmp(&b.value));
         let Some(highest) = highest else { return (Seen::NotApplicable, "never let go".into()) };
+        if self.scales.f_c < 1e-6 * self.scales.f_ref {
+            return (Seen::NotApplicable, "no dry friction: the force goes to zero with the speed".into());
+        }
         let sliding = Number { value: self.scales.f_c, ..highest.clone() };
         let why = format!("lets go at up to {}, slides with {}", highest.shown(), sliding.shown());
         // What is viscous at the speed that counts as sliding is no stiction.
@@ -187,12 +196,12 @@ impl Look<'_> {
             return (Seen::NotApplicable, "not measured".into());
         };
         let part = slope.value * self.scales.v_max / self.scales.f_ref;
-        when(part > 1e-3, format!("{} at the fastest", slope.shown()))
+        when(part > 1e-3, format!("slope {}", slope.shown()))
     }
 
     fn presliding(&self) -> Answer {
-        if let Some(chatter) = self.chatter {
-            return (Seen::NotShown, chatter.to_string());
+        if self.chatter.is_some() {
+            return (Seen::NotShown, "at rest the force jumps to and fro".into());
         }
         let test = match self.test("presliding") {
             Ok(test) => test,
@@ -214,9 +223,8 @@ impl Look<'_> {
     }
 
     fn hysteresis(&self) -> Answer {
-        let (presliding, why) = self.presliding();
-        if presliding != Seen::Shown {
-            return (Seen::NotApplicable, format!("no presliding: {why}"));
+        if self.presliding().0 != Seen::Shown {
+            return (Seen::NotApplicable, "no presliding".into());
         }
         let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
         let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };

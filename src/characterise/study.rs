@@ -33,6 +33,15 @@ pub struct Study {
     pub notes: Vec<String>,
 }
 
+/// How much of the battery is run.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Extent {
+    /// All of it.
+    Whole,
+    /// The steady curve and the presliding loops: what a page of many models shows.
+    Sketch,
+}
+
 /// One test of the battery.
 #[derive(Clone, Debug)]
 pub struct Test {
@@ -66,6 +75,10 @@ impl Number {
     pub fn shown(&self) -> String {
         if self.value == f64::INFINITY {
             return "more than was tried".into();
+        }
+        // What is left of nothing after rounding is nothing.
+        if self.value.abs() < 1e-13 && !self.unit.is_empty() {
+            return format!("0 {}", prefixed(&self.unit, 0.0).0);
         }
         let (unit, _) = prefixed(&self.unit, self.value.abs());
         show(self.value, &unit, 4)
@@ -121,6 +134,9 @@ pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
     if base.is_empty() || base == "s" || base == "Hz" || base.starts_with("kg") || size == 0.0 || !size.is_finite() {
         return plain();
     }
+    if (0.1..1e4).contains(&size) {
+        return plain();
+    }
     let fitting = PREFIXES.into_iter().find(|(_, scale)| size >= 0.9999 * scale).unwrap_or(("n", 1e-9));
     match Unit::parse(&format!("{}{base}", fitting.0)) {
         Ok(unit) => (unit, fitting.1),
@@ -165,15 +181,25 @@ pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
     Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
 }
 
+/// The figure of one graph of a study, if it has it.
+pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
+    let graphs = study.tests.iter().filter_map(|test| test.result.as_ref().ok()).flatten();
+    let graph = graphs.into_iter().find(|graph| graph.key == key)?;
+    // What did not move is no curve.
+    let moved = graph.lines.iter().any(|line| line.points.iter().any(|point| point.0.abs() > 1e-12));
+    moved.then(|| figure(&[(&study.label, graph)]))
+}
+
 /// Puts a model through the battery.
 ///
 /// # Errors
 /// Why nothing at all can be said, as a message or a report.
-pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Result<Study, String> {
+pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), extent: Extent) -> Result<Study, String> {
     let rotary = subject.rotary;
     let mut runner =
         Runner { subject: &subject, name, sources, entries: Vec::new(), results: Results::new(), chatter: None };
-    let v_max = if rotary { 10.0 } else { 1.0 };
+    // Twins of straight models keep their numbers; what is written for shafts turns faster.
+    let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
     let mut scales =
         Scales { f_ref: 0.0, mass: 1.0, f_b: 0.0, x_b: 0.0, f_c: 0.0, v_s: 0.01 * v_max, v_slip: 0.01 * v_max, v_max };
 
@@ -205,7 +231,10 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Re
     // Ten times the Stribeck speed is sliding; it is 10 mm/s for the textbook's 1 mm/s.
     scales.v_slip = battery::round(10.0 * scales.v_s);
 
-    runner.run(&scales, |layout| layout.rest())?;
+    runner.run(&scales, |layout| {
+        let wanted = |entry: &Entry| extent == Extent::Whole || entry.name.starts_with("presliding");
+        layout.rest().into_iter().filter(wanted).collect()
+    })?;
     let layout = Layout::new(&subject, scales.clone());
     let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
     let dissipation = runner.dissipation(&text);
@@ -216,8 +245,9 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync)) -> Re
     let mut notes = Vec::new();
     if let Some(chatter) = chatter {
         notes.push(format!(
-            "Chatters at rest ({chatter}). What needs rest was run with a fixed step instead; there the force jumps to \
-             and fro, and what it holds is an average."
+            "At rest it {chatter}. What comes to rest was therefore run with a fixed step; there the force jumps to and \
+             fro at every step, and what it carries is an average. `Sticking(law = {})` is the same law made to hold.",
+            subject.instance
         ));
     }
     if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
@@ -620,8 +650,9 @@ impl Reader<'_> {
         for (i, f) in self.layout.lag_frequencies().into_iter().enumerate() {
             let rows = self.rows(&format!("lag_{}", i + 1))?;
             let end = rows.last().map_or(0.0, |row| row[0]);
-            let last: Vec<(f64, f64)> =
-                rows.iter().filter(|row| row[0] >= end - 1.0 / f).map(|row| (row[2], row[1])).collect();
+            // From the row before on, so that the loop closes.
+            let first = rows.partition_point(|row| row[0] < end - 1.0 / f).saturating_sub(1);
+            let last: Vec<(f64, f64)> = rows[first..].iter().map(|row| (row[2], row[1])).collect();
             let width = lag(&last);
             widths.push((f, width.abs()));
             numbers.push(self.number(
@@ -653,6 +684,15 @@ impl Reader<'_> {
         let top = |points: &[(f64, f64)]| points.iter().map(|point| point.1).fold(f64::NEG_INFINITY, f64::max);
         let settled = forth.last().map_or(f64::NAN, |point| point.1);
         let (first, second) = (top(&forth) - settled, top(&back) - settled);
+        // Where both have settled there is nothing more to see.
+        let size = settled.abs().max(1e-300);
+        let moving = |points: &[(f64, f64)]| {
+            let last = points.iter().rev().find(|point| (point.1 - settled).abs() > 0.01 * size);
+            last.map_or(0.0, |point| point.0)
+        };
+        let far = (2.5 * moving(&forth).max(moving(&back))).max(1e-3 * turn);
+        let cut = |points: Vec<(f64, f64)>| points.into_iter().filter(|point| point.0 <= far).collect::<Vec<_>>();
+        let (forth, back) = (cut(forth), cut(back));
         let graph = Graph {
             key: "reversal",
             x: self.axis("path", self.units.length),
@@ -674,10 +714,17 @@ impl Reader<'_> {
 
     fn read_stick_slip(&self) -> Read {
         let (mut lines, mut numbers, mut periods) = (Vec::new(), Vec::new(), Vec::new());
+        let mut failed = Vec::new();
         let speeds = self.layout.pull_speeds();
         let (mut sticks_last, mut smooth_first) = (None, None);
         for (i, vp) in speeds.iter().enumerate() {
-            let rows = self.rows(&format!("stick_slip_{}", i + 1))?;
+            let rows = match self.rows(&format!("stick_slip_{}", i + 1)) {
+                Ok(rows) => rows,
+                Err(why) => {
+                    failed.push(format!("at {} {}: {why}", n(*vp), self.units.speed));
+                    continue;
+                }
+            };
             let slips = slips(&rows, *vp);
             let sticking = slips.len() >= 3;
             if sticking {
@@ -697,6 +744,9 @@ impl Reader<'_> {
                 let end = rows.last().map_or(0.0, |row| row[0]);
                 lines.push(Line::course("far end of the spring", vec![(0.0, 0.0), (end, vp * end)]).aside());
             }
+        }
+        if lines.is_empty() {
+            return Err(failed.join("; "));
         }
         let mut graphs = vec![Graph {
             key: "stick_slip",
@@ -983,10 +1033,10 @@ fn lag(cycle: &[(f64, f64)]) -> f64 {
 fn slips(rows: &[Vec<f64>], vp: f64) -> Vec<f64> {
     let (mut resting, mut starts) = (true, Vec::new());
     for row in rows {
-        if resting && row[3] > 0.5 * vp {
+        if resting && row[3] > 0.7 * vp {
             starts.push(row[0]);
             resting = false;
-        } else if row[3].abs() < 0.02 * vp {
+        } else if row[3].abs() < 0.1 * vp {
             resting = true;
         }
     }

@@ -3,6 +3,7 @@
 //! In: a model's name with arguments and where to look for it. Out: a [`Subject`], or why it cannot be tested.
 
 use crate::compile::{Loaded, Lookup, Space};
+use crate::equations::expression;
 use abi::Instance;
 use abi::description::Kind;
 use abi::unit::{Dimension, Unit};
@@ -64,8 +65,8 @@ pub struct Param {
     pub value: f64,
     /// In which it is declared.
     pub unit: Unit,
-    /// Where it may lie, SI.
-    pub range: (f64, f64),
+    /// Where it may lie, as in the text: `> 0`; may be empty.
+    pub range: String,
     /// Doc comment.
     pub doc: Option<String>,
 }
@@ -115,6 +116,11 @@ impl Written {
             model: instance.model.text.clone(),
             args: instance.args.iter().map(argument).collect(),
         }
+    }
+
+    /// Whether it is written as the rotary twin of a straight model.
+    pub fn is_rotary(&self) -> bool {
+        self.rotary
     }
 
     /// The model's name.
@@ -245,14 +251,42 @@ pub fn rotary(model: &ast::Model, written: &Written, instance: &Instance) -> Res
     }
 }
 
-/// The parameters of a compiled model, nested ones too.
-pub fn params(instance: &Instance) -> Vec<Param> {
+/// What stands behind `in`, with symbols: `> 0`, `0.01 … 0.99`.
+pub fn range(range: &ast::Range) -> String {
+    match range {
+        ast::Range::Between(low, high) => format!("{} … {}", expression(low), expression(high)),
+        ast::Range::Bound(op, limit) => {
+            let sign = match op.text() {
+                "<=" => "≤",
+                ">=" => "≥",
+                other => other,
+            };
+            format!("{sign} {}", expression(limit))
+        }
+    }
+}
+
+/// The parameters of a compiled model, those of its parts too.
+pub fn params(model: &ast::Model, instance: &Instance) -> Vec<Param> {
+    let stated = |path: &str| {
+        let declaration = declarations(model).find(|declaration| declaration.name.text == path)?;
+        Some(declaration.range.as_ref().map_or(String::new(), range))
+    };
+    let numbers = |quantity: &abi::description::Quantity| {
+        let text = |value: f64| crate::value::show(value, &quantity.unit, 6);
+        match quantity.range {
+            (low, high) if low.is_finite() && high.is_finite() => format!("{} … {}", text(low), text(high)),
+            (low, _) if low.is_finite() => format!("≥ {}", text(low)),
+            (_, high) if high.is_finite() => format!("≤ {}", text(high)),
+            _ => String::new(),
+        }
+    };
     let of_kind = instance.description().quantities.iter().filter(|quantity| quantity.kind == Kind::Param);
     let param = |quantity: &abi::description::Quantity| Param {
         path: quantity.path.clone(),
         value: instance.get(quantity.slot),
         unit: quantity.unit.clone(),
-        range: quantity.range,
+        range: stated(&quantity.path).unwrap_or_else(|| numbers(quantity)),
         doc: quantity.doc.clone(),
     };
     of_kind.map(param).collect()

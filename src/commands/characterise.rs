@@ -3,7 +3,7 @@
 use super::End;
 use crate::args::{Characterise, Compare};
 use crate::characterise::subject::{self, Origin, Subject, Written};
-use crate::characterise::{Seen, Study, page, study};
+use crate::characterise::{Extent, Seen, Study, page, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
 use crate::{equations, project, report};
@@ -18,7 +18,7 @@ pub fn characterise(args: &Characterise, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
     for (subject, folder) in found {
         let label = subject.instance.label();
-        let study = match study(subject, &battery_in(&folder), &project::Disk) {
+        let study = match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
             Ok(study) => study,
             Err(why) => {
                 end = failed(terminal, &format!("{label} {why}"));
@@ -54,7 +54,7 @@ pub fn compare(args: &Compare, terminal: &mut Terminal) -> End {
         };
         for (subject, _) in found {
             let label = subject.instance.label();
-            match study(subject, &battery_in(&folder), &project::Disk) {
+            match study(subject, &battery_in(&folder), &project::Disk, Extent::Whole) {
                 Ok(study) => studies.push(study),
                 Err(why) => end = failed(terminal, &format!("{label} {why}")),
             }
@@ -135,7 +135,7 @@ fn subjects(
 }
 
 /// Finds a model, compiles it alone, and reads its ports.
-fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subject, String> {
+pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subject, String> {
     let (origin, own) = match file {
         None => (Origin::Library, String::new()),
         Some(path) => {
@@ -191,7 +191,7 @@ fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Result<Subjec
         equations: equations::equations(model),
         rotary,
         external: subject::external(model),
-        params: subject::params(instance),
+        params: subject::params(model, instance),
         states: crate::results::states(description),
         regimes: description.automata.iter().flat_map(|automaton| automaton.regimes.clone()).collect(),
         instance: written,

@@ -3,6 +3,7 @@
 mod characterise;
 mod check;
 mod cross;
+mod doc;
 mod explain;
 mod fmt;
 mod linearise;
@@ -46,6 +47,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Explain(explain) => explain::explain(explain, terminal),
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
+        Command::Doc(args) => doc::doc(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();

@@ -71,7 +71,7 @@ impl Scale {
     /// A logarithmic axis between two exponents of ten: ticks at powers of ten, and at 2 and 5 where there are few.
     pub fn decades(from: f64, to: f64, count: usize) -> Scale {
         /// Decimal logarithms of 2 and 5.
-        const BETWEEN: [(&str, f64); 2] = [("2", 0.301_029_995_663_981_2), ("5", 0.698_970_004_336_018_8)];
+        const BETWEEN: [(&str, f64); 2] = [("2", std::f64::consts::LOG10_2), ("5", 1.0 - std::f64::consts::LOG10_2)];
         let (from, to) = opened(from, to);
         let (first, last) = (from.floor() as i32, to.ceil() as i32);
         let every = ((last - first).max(1) as usize).div_ceil(count.max(1)) as i32;

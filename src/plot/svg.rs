@@ -90,7 +90,8 @@ fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height
     let (xs, ys) = bounds.unwrap_or(((0.0, 1.0), (0.0, 1.0)));
     let running = panel.curves.iter().all(|curve| curve.points.windows(2).all(|pair| pair[0].0 <= pair[1].0));
     // Time fills the width; a loop in the plane keeps clear of the frame.
-    let xs = if running { xs } else { padded(xs, 0.04) };
+    let marked = panel.curves.iter().any(|curve| curve.marks);
+    let xs = if running && !marked { xs } else { padded(xs, 0.04) };
     let x_axis = panel.x.scale(xs.0, xs.1, (width / 90.0) as usize);
     let y_axis = if is_boolean(panel) {
         let mut axis = Scale::new(-0.15, 1.15, 2);

@@ -1,0 +1,173 @@
+//! The battery on models whose answers are known: published break-away forces, and the table of phenomena.
+
+use serde_json::Value;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// A folder of its own for one test, empty at its start.
+fn folder(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = fs::remove_dir_all(&path);
+    fs::create_dir_all(&path).unwrap();
+    path
+}
+
+fn fric(folder: &Path, args: &[&str]) -> String {
+    let output = Command::new(env!("CARGO_BIN_EXE_fric")).args(args).current_dir(folder).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{args:?}: {error}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// What `--json` says of a model.
+fn answers(name: &str, model: &str) -> Value {
+    let folder = folder(name);
+    serde_json::from_str(&fric(&folder, &["characterise", model, "--json"])).unwrap()
+}
+
+fn number(answers: &Value, test: &str, name: &str) -> f64 {
+    let tests = answers["tests"].as_array().unwrap();
+    let test = tests.iter().find(|one| one["key"] == test).unwrap();
+    let numbers = test["numbers"].as_array().unwrap();
+    let found = numbers.iter().find(|one| one["name"] == name || one["key"] == name);
+    found.unwrap_or_else(|| panic!("no {name} in {test}"))["value"].as_f64().unwrap()
+}
+
+/// Verdicts in the order asked for: `+` shown, `-` not shown, `.` not applicable.
+fn verdicts(answers: &Value, keys: &[&str]) -> String {
+    let phenomena = answers["phenomena"].as_array().unwrap();
+    let mark = |key: &&str| match phenomena.iter().find(|one| one["key"] == *key).unwrap()["seen"].as_str().unwrap() {
+        "shown" => '+',
+        "not-shown" => '-',
+        _ => '.',
+    };
+    keys.iter().map(mark).collect()
+}
+
+/// The rows of the table in the catalogue of models, in its order.
+const TABLE: [&str; 8] = [
+    "holds",
+    "stiction_peak",
+    "stribeck",
+    "presliding",
+    "return_point_memory",
+    "lag",
+    "varying_break_away",
+    "rate_independent",
+];
+
+#[test]
+fn lugre_breaks_away_as_published_and_drifts() {
+    let lugre = answers("lugre", "LuGre");
+    // The published set; computed once with other code to four decimals.
+    for (rate, force) in [("at 1 N/s", 1.4324), ("at 50 N/s", 1.0075)] {
+        let seen = number(&lugre, "break_away", rate);
+        assert!((seen - force).abs() < 1e-4, "{rate}: {seen}");
+    }
+    // 0.6 + 0.3 sin(2πt) N: 6.09 µm a cycle.
+    let drift = number(&lugre, "drift", "drift");
+    assert!((drift - 6.09e-6).abs() < 0.01e-6, "{drift}");
+    assert!((number(&lugre, "steady", "stribeck_speed") - 1e-3).abs() < 0.05e-3);
+    // The coast-down of the solvers' tests: 0.394793 m.
+    assert!((number(&lugre, "coast_down", "stop_distance") - 0.394793).abs() < 1e-5);
+    assert_eq!(verdicts(&lugre, &TABLE), "++++-++-");
+    assert_eq!(verdicts(&lugre, &["no_drift", "dissipative", "stick_slip", "symmetric"]), "--++");
+    let fading = answers("lugre_vd", "LuGre(vd = 10 mm/s)");
+    assert_eq!(verdicts(&fading, &["dissipative"]), "+");
+}
+
+#[test]
+fn the_table_of_phenomena_is_what_the_catalogue_says() {
+    assert_eq!(verdicts(&answers("kfm", "KFM"), &TABLE), "++--.--.");
+    assert_eq!(verdicts(&answers("karnopp", "Karnopp"), &TABLE), "++--.--.");
+    // Its break-away force depends on the history: the overshoot after a reversal is twice that from rest.
+    let bliman_sorine = answers("bliman_sorine", "BlimanSorine");
+    assert_eq!(verdicts(&bliman_sorine, &TABLE), "++-+--++");
+    let overshoot = |key| number(&bliman_sorine, "reversal", key);
+    assert!((overshoot("reversal_overshoot") / overshoot("virgin_overshoot") - 2.0).abs() < 1e-3);
+    // Tustin's law as the paper uses it holds; the bare map jumps at rest and cannot.
+    assert_eq!(verdicts(&answers("tustin_held", "Sticking(law = Tustin())"), &TABLE), "+++-.--.");
+    assert_eq!(verdicts(&answers("tustin", "Tustin"), &TABLE), "-++-.--.");
+}
+
+#[test]
+fn rotary_twins_give_the_same_numbers() {
+    let (straight, rotary) = (answers("straight", "LuGre"), answers("rotary", "rotary LuGre"));
+    assert_eq!(rotary["rotary"], true);
+    for rate in ["1", "50"] {
+        let force = number(&straight, "break_away", &format!("at {rate} N/s"));
+        let torque = number(&rotary, "break_away", &format!("at {rate} N·m/s"));
+        assert_eq!(force.to_bits(), torque.to_bits());
+    }
+}
+
+/// A model as a beginner writes it, in a file of its own.
+const MINE: &str = r#"
+/// My first contact.
+model Mine {
+  input  v [m/s]
+  param  Fc = 2 N        in > 0   /// Coulomb friction
+  param  k  = 1e5 N/m    in > 0   /// stiffness
+  state  f [N] = 0
+  df/dt = k * v - k * abs(v) / Fc * f
+  output F [N] = f
+}
+
+/// No friction: another port.
+model Spring {
+  input  x [m]
+  output F [N] = 3 N/m * x
+}
+"#;
+
+#[test]
+fn a_users_model_gets_a_page_a_battery_and_tables() {
+    let folder = folder("mine");
+    fs::write(folder.join("mine.fric"), MINE).unwrap();
+    let words = fric(&folder, &["characterise", "mine.fric", "--set", "Fc=3N", "--out", "report"]);
+    assert!(words.contains("Mine(Fc = 3N)") && words.contains("slides with 3 N"), "{words}");
+    let page = fs::read_to_string(folder.join("report/report.html")).unwrap();
+    assert!(page.contains("My first contact.") && page.contains("Coulomb friction"));
+    // Self-contained: nothing is fetched.
+    for request in ["http://", "https://", "src=", "<script", "<link", "@import", "url(h"] {
+        let outside = page.replace("http://www.w3.org/2000/svg", "");
+        assert!(!outside.contains(request), "{request}");
+    }
+    assert!(fs::read_to_string(folder.join("report/steady.csv")).unwrap().starts_with("curve,|v| [m/s],|F| [N]\n"));
+    // The battery is a text like any other.
+    let again = fric(&folder, &["run", "report/battery.fric", "hold", "--quiet", "--out", "again"]);
+    assert_eq!(again, "");
+    // The same bytes once more.
+    fric(&folder, &["characterise", "mine.fric", "--set", "Fc=3N", "--out", "report"]);
+    assert_eq!(fs::read_to_string(folder.join("report/report.html")).unwrap(), page);
+}
+
+#[test]
+fn what_cannot_be_characterised_is_told_why() {
+    let folder = folder("refused");
+    fs::write(folder.join("mine.fric"), MINE).unwrap();
+    let refused = |args: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_fric")).args(args).current_dir(&folder).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert!(refused(&["characterise", "LuGree"]).contains("did you mean `LuGre`?"));
+    assert!(refused(&["characterise", "mine.fric", "Spring"]).contains("no friction model"));
+    assert!(refused(&["characterise", "absent.fric"]).contains("there is no such file"));
+}
+
+#[test]
+fn models_share_axes_on_one_page() {
+    let folder = folder("compare");
+    let words = fric(&folder, &["compare", "KFM", "BlimanSorine", "--out", "page"]);
+    assert!(words.contains("1 KFM") && words.contains("2 BlimanSorine"), "{words}");
+    let page = fs::read_to_string(folder.join("page/compare.html")).unwrap();
+    assert!(page.contains("with the history") && page.matches("<svg").count() > 10);
+}
+
+#[test]
+fn the_page_of_the_library_is_up_to_date() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    fric(root, &["doc", "--check"]);
+}
