@@ -234,7 +234,9 @@ fn a_bristle_stays_in_bounds_at_ten_metres_a_second() {
 fn events_of_kfm_are_at_their_closed_forms() {
     let folder = Folder::new("events");
     folder.near("kfm_go", "--tol 1e-11", 7.5, 1e-5);
-    let text = format!("{MODELS}\nexperiment stop {{\n  run ForceBench(v_start = 1 m/s, fr = KFM()) for 2 s\n  expect first(fr.stick) > 0 s\n}}\n");
+    let text = format!(
+        "{MODELS}\nexperiment stop {{\n  run ForceBench(v_start = 1 m/s, fr = KFM()) for 2 s\n  expect first(fr.stick) > 0 s\n}}\n"
+    );
     fs::write(folder.0.join("m.fric"), text).unwrap();
     folder.near("stop", "--tol 1e-11", 2.5 * 1.4f64.ln(), 1e-9);
 }
