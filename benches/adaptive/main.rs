@@ -1,0 +1,141 @@
+//! Adaptive runs at equal error, against hand-written C with the same method: `cargo bench --bench adaptive`.
+//!
+//! Stick-slip to 20 s and hunting to 100 s. For each program the loosest tolerance is taken whose largest error of
+//! position at 201 instants stays below 1e-6 or 1e-8 m; the times are medians, taken in turn in one run, and their
+//! ratios are what counts. Needs gcc; CVODE and diffsol are not compared yet, which is said.
+
+use abi::Slot;
+use abi::plan::Experiment;
+use compiler::{Case, Changes, NoSources, Options};
+use runtime::engine::{self, Continue};
+use std::path::Path;
+use std::process::Command;
+use std::time::Instant;
+
+const TEXT: &str = r#"
+model Bristle {
+  input  v [m/s]
+  state  z [um] = 0
+  let    g = 1 N + 0.5 N * exp(-(v / 1 mm/s)^2)
+  dz/dt = v - 1e5 N/m * abs(v) / g * z
+  output F [N] = 1e5 N/m * z + 316.22776601683796 N·s/m * dz/dt + 0.4 N·s/m * v
+}
+model Pull {
+  state  x [m]   = 0
+  state  v [m/s] = 0
+  part   fr = Bristle(v = v)
+  dx/dt = v
+  dv/dt = (2 N/m * (0.1 m/s * t - x) - fr.F) / 1 kg
+}
+model Pid {
+  state  x [m]   = 0
+  state  v [m/s] = 0
+  state  i [N]   = 0
+  let    u = 3 N/m * (1 m - x) + i - 6 N·s/m * v
+  part   fr = Bristle(v = v)
+  di/dt = 4 N/m/s * (1 m - x)
+  dx/dt = v
+  dv/dt = (u - fr.F) / 1 kg
+}
+experiment stick_slip { run Pull() for 20 s }
+experiment hunting { run Pid() for 100 s }
+"#;
+
+const INSTANTS: usize = 200;
+const ROUNDS: usize = 15;
+
+/// Seconds of a run, and positions.
+type Timed = (f64, Vec<f64>);
+
+fn main() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+    println!("seconds a run at equal error; ratios below 1: faster than C (gcc -O3 -march=native)");
+    for (name, define) in [("stick_slip", "-DHUNTING=0"), ("hunting", "-DHUNTING=1")] {
+        let program = folder.join(format!("rosenbrock-{name}"));
+        let source = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/adaptive/rosenbrock.c");
+        let built = Command::new("gcc")
+            .args(["-O3", "-march=native", "-std=gnu11", define, source, "-lm", "-o"])
+            .arg(&program)
+            .status();
+        if !built.is_ok_and(|status| status.success()) {
+            println!("SKIPPED: gcc is needed to build {source}");
+            return;
+        }
+        let case = compiled(name);
+        let c = |tol: f64, rounds: usize| -> Timed {
+            let output = Command::new(&program).args([tol.to_string(), rounds.to_string()]).output();
+            let text = String::from_utf8(output.expect("it was just built").stdout).expect("it prints numbers");
+            let numbers: Vec<f64> = text.lines().map(|line| line.parse().expect("it prints numbers")).collect();
+            (numbers[0], numbers[1..].to_vec())
+        };
+        let ours = |tol: f64, rounds: usize| -> Timed {
+            let instance = &case.instance;
+            let mut experiment = Experiment { ..case.experiment.clone() };
+            experiment.solver.tol = tol;
+            let slot = instance.description().quantity("x").expect("there is a position").slot;
+            let at = |k: usize| experiment.duration * k as f64 / INSTANTS as f64;
+            let instants: Vec<f64> = (0..=INSTANTS).map(at).collect();
+            let mut times = Vec::new();
+            let mut positions = Vec::new();
+            for _ in 0..rounds {
+                let begin = Instant::now();
+                let slots: [Slot; 1] = [slot];
+                let go_on = &mut |_| Continue::Continue(());
+                let (values, ended) = engine::sample(instance.clone(), &experiment, &instants, &slots, go_on);
+                times.push(begin.elapsed().as_secs_f64());
+                ended.expect("it runs to its end");
+                positions = values;
+            }
+            times.sort_by(f64::total_cmp);
+            (times[times.len() / 2], positions)
+        };
+        let (reference, other) = (c(1e-13, 1).1, ours(1e-13, 1).1);
+        println!("{name}: both at tol 1e-13 differ by {:.1e} m", distance(&reference, &other));
+        for error in [1e-6, 1e-8] {
+            let (tol_ours, tol_c) = (loosest(&ours, &other, error), loosest(&c, &other, error));
+            let mut ratios = Vec::new();
+            let (mut best_ours, mut best_c) = (f64::INFINITY, f64::INFINITY);
+            for _ in 0..9 {
+                let (of_ours, of_c) = (ours(tol_ours, ROUNDS).0, c(tol_c, ROUNDS).0);
+                ratios.push(of_ours / of_c);
+                (best_ours, best_c) = (best_ours.min(of_ours), best_c.min(of_c));
+            }
+            ratios.sort_by(f64::total_cmp);
+            println!(
+                "  error {error:.0e} m: ours {:.3} ms (tol {tol_ours:.1e}), C {:.3} ms (tol {tol_c:.1e}), ratio {:.2}",
+                1e3 * best_ours,
+                1e3 * best_c,
+                ratios[ratios.len() / 2]
+            );
+        }
+    }
+    println!("SKIPPED: CVODE and diffsol are not compared yet");
+}
+
+fn compiled(name: &str) -> Case {
+    let mut loaded = compiler::load("bench", TEXT, &NoSources);
+    let options = Options { changes: Changes::default(), ..Options::default() };
+    let cases = compiler::compile(&mut loaded, &NoSources, name, &options, &mut Vec::new(), &mut |_| ());
+    let cases = cases.unwrap_or_else(|found| panic!("{found:?}"));
+    cases.into_iter().next().expect("one case")
+}
+
+fn distance(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+/// The loosest tolerance of 1e-3, 1e-3.1, … that keeps the error, and so does the next one.
+fn loosest(run: &dyn Fn(f64, usize) -> Timed, reference: &[f64], error: f64) -> f64 {
+    let mut tol = 1e-3;
+    let mut before = false;
+    while tol > 1e-13 {
+        let good = distance(&run(tol, 1).1, reference) <= error;
+        if good && before {
+            return tol / 0.794_328_234_724_281_5;
+        }
+        before = good;
+        tol *= 0.794_328_234_724_281_5;
+    }
+    panic!("no tolerance keeps an error of {error}")
+}
