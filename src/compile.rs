@@ -3,6 +3,7 @@
 pub use compiler::explain::Explanation;
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
+pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{

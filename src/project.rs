@@ -104,16 +104,6 @@ fn tidy(path: &Path) -> PathBuf {
     out
 }
 
-/// The name most like `name`, if one is like it at all.
-pub fn nearest<'a>(name: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
-    let distance = |other: &str| strsim::damerau_levenshtein(&name.to_lowercase(), &other.to_lowercase());
-    names
-        .map(|other| (distance(other), other))
-        .filter(|(distance, other)| *distance <= 1 + name.len().min(other.len()) / 3)
-        .min_by_key(|(distance, _)| *distance)
-        .map(|(_, other)| other)
-}
-
 /// All `.fric` files in a folder and its folders, in the order of their names. What is hidden or made by tools is left
 /// out: names that begin with a dot, and folders called `target` or `out`.
 ///
@@ -200,13 +190,5 @@ mod tests {
     fn what_is_no_text_is_refused_with_its_place() {
         assert_eq!(text(b"a\0b".to_vec()).unwrap_err(), "it is not a text: byte 1 is zero");
         assert_eq!(text(b"a\nb\xff".to_vec()).unwrap_err(), "it is not a text in UTF-8: line 2, byte 3 of the file");
-    }
-
-    #[test]
-    fn names_are_near_when_a_slip_apart() {
-        let names = ["stick_slip", "hunting", "hold"];
-        assert_eq!(nearest("stickslip", names.into_iter()), Some("stick_slip"));
-        assert_eq!(nearest("huntnig", names.into_iter()), Some("hunting"));
-        assert_eq!(nearest("coast_down", names.into_iter()), None);
     }
 }

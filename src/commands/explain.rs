@@ -20,7 +20,7 @@ pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
         terminal.print(page);
         return End::Fine;
     }
-    let help = match project::nearest(&code, codes()) {
+    let help = match compile::nearest(&code, codes()) {
         Some(near) => format!("did you mean {near}?"),
         None => "codes look like E0101 or W0703".into(),
     };
@@ -41,7 +41,7 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
     for name in wanted {
         if !all.contains(name) {
-            let help = match project::nearest(name, all.iter().map(String::as_str)) {
+            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
                 Some(near) => format!("did you mean `{near}`?"),
                 None => format!("it has {}", all.join(", ")),
             };

@@ -3,7 +3,7 @@
 use super::cross::{Crossed, cross};
 use super::{Done, End, compiled, done, load};
 use crate::args::Run;
-use crate::compile::{Changes, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{self, Changes, Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
@@ -57,7 +57,7 @@ fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
     }
     for name in &args.experiments {
         if !all.contains(name) {
-            let help = match project::nearest(name, all.iter().map(String::as_str)) {
+            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
                 Some(near) => format!("did you mean `{near}`?"),
                 None => format!("it has {}", all.join(", ")),
             };

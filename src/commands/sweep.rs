@@ -34,7 +34,7 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
     if !all.contains(&args.experiment) {
-        let help = match project::nearest(&args.experiment, all.iter().map(String::as_str)) {
+        let help = match compile::nearest(&args.experiment, all.iter().map(String::as_str)) {
             Some(near) => format!("did you mean `{near}`?"),
             None => format!("it has {}", all.join(", ")),
         };
