@@ -1,6 +1,8 @@
 //! What the solvers must show, with figures computed by other programs or in closed form; and the commands built on
 //! them: sweeps, linearisation, comparison of solvers. Best run as `cargo test --release --test numerics`.
 
+#![allow(clippy::disallowed_methods, reason = "closed forms are the platform's")]
+
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -160,7 +160,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
     }
     let Some((_, model)) = subject::model(&loaded, written.model()) else {
         let near = loaded.visible(loaded.root(), compile::Space::Type);
-        let help = match compile::nearest(written.model(), near.into_iter()) {
+        let help = match compile::nearest(written.model(), near) {
             Some(near) => format!("; did you mean `{near}`?"),
             None => String::new(),
         };

@@ -80,7 +80,7 @@ fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
         }
         let Some(quantity) = linear.movable().find(|quantity| quantity.path == *path) else {
             let known: Vec<&str> = linear.movable().map(|quantity| quantity.path.as_str()).collect();
-            let help = match compile::nearest(path, known.into_iter()) {
+            let help = match compile::nearest(path, known) {
                 Some(near) => format!("did you mean `{near}`?"),
                 None => "give states, free inputs and parameters; other values change with --set".into(),
             };
