@@ -9,7 +9,6 @@ use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
 use crate::lower::{Lowered, Wanted, lower};
 use crate::program::Program;
-use crate::source::Files;
 use crate::system::*;
 use crate::units::{Types, three_digits};
 use abi::description::Slot;
@@ -122,7 +121,7 @@ impl Bench {
 }
 
 /// Warnings of a friction model; nothing for other models.
-pub fn check(system: &System, types: &Types, files: &Files, found: &mut Vec<Diagnostic>) {
+pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
     let Some(contact) = contact(system, types) else { return };
     let Some(mut bench) = Bench::new(system, types, &contact) else { return };
     let force = system.var(contact.force);
@@ -145,7 +144,7 @@ pub fn check(system: &System, types: &Types, files: &Files, found: &mut Vec<Diag
         }
     }
     if let Verdict::Fails(point) = dissipation_of(system, &contact, &mut bench) {
-        found.push(pushes(system, types, files, force, &bench, &point));
+        found.push(pushes(system, types, force, &bench, &point));
     }
 }
 
@@ -299,14 +298,7 @@ fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
     Some(crate::math::expand(&build.finish()))
 }
 
-fn pushes(
-    system: &System,
-    types: &Types,
-    files: &Files,
-    force: &Var,
-    bench: &Bench,
-    point: &Counterexample,
-) -> Diagnostic {
+fn pushes(system: &System, types: &Types, force: &Var, bench: &Bench, point: &Counterexample) -> Diagnostic {
     let states = system.var_ids().filter(|id| matches!(system.var(*id).definition, Definition::Continuous { .. }));
     let mut at = vec![format!("v = {} m/s", three_digits(point.v))];
     for (id, value) in states.zip(&point.states) {
@@ -324,7 +316,6 @@ fn pushes(
         Some(bench.block[quantity.slot.index()])
     };
     let keep = "To keep it: `allow not-dissipative \"...\"`";
-    let _ = files;
     match (value("sigma1"), value("sigma2"), value("Fs"), value("Fc")) {
         (Some(sigma1), Some(_), Some(fs), Some(fc)) if fc > 0.0 => {
             let needed = three_digits(sigma1 * (fs - fc) / fc);

@@ -274,19 +274,11 @@ pub fn dissipation(
         };
         flatten::Override { path, value, file }
     });
-    let request = flatten::Request {
-        instance: flatten::Instance::Alone(model, item.file),
-        overrides: given.collect(),
-        observed: Vec::new(),
-        data: Vec::new(),
-    };
-    let flat = flatten::flatten(loaded, sources, &request);
-    let mut diagnostics = flat.diagnostics;
-    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    let (system, types, diagnostics) = alone(loaded, sources, model, item.file, given.collect());
     if diagnostics.iter().any(Diagnostic::is_error) {
         return None;
     }
-    friction::dissipation(&flat.system, &types)
+    friction::dissipation(&system, &types)
 }
 
 /// Explains a model of a loaded text, on its own.
@@ -299,7 +291,7 @@ pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<ex
     let Some(model) = found else {
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
-    let (system, types, diagnostics) = alone(loaded, sources, model, root);
+    let (system, types, diagnostics) = alone(loaded, sources, model, root, Vec::new());
     match diagnostics.iter().any(Diagnostic::is_error) {
         true => Err(once(diagnostics)),
         false => Ok(explain::explain(&system, &types, &loaded.files)),
@@ -312,10 +304,11 @@ fn alone(
     sources: &dyn Sources,
     model: &grammar::ast::Model,
     file: FileId,
+    overrides: Vec<flatten::Override>,
 ) -> (system::System, units::Types, Vec<Diagnostic>) {
     let request = flatten::Request {
         instance: flatten::Instance::Alone(model, file),
-        overrides: Vec::new(),
+        overrides,
         observed: Vec::new(),
         data: Vec::new(),
     };
@@ -386,7 +379,7 @@ fn check_model(
     file: FileId,
     whole: bool,
 ) -> Vec<Diagnostic> {
-    let (system, types, mut diagnostics) = alone(loaded, sources, model, file);
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, file, Vec::new());
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
         if whole {

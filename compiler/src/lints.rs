@@ -14,7 +14,7 @@ pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     unused(system, &mut found);
     regimes(system, files, &mut found);
-    friction::check(system, types, files, &mut found);
+    friction::check(system, types, &mut found);
     found
 }
 

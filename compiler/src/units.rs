@@ -240,7 +240,7 @@ impl Checker<'_> {
                 self.condition(a, "`not`");
                 Kind::Boolean
             }
-            Node::Binary(op, a, b) => self.binary(id, op, a, b),
+            Node::Binary(op, a, b) => self.binary(op, a, b),
             Node::If(c, a, b) => {
                 self.condition(c, "`if`");
                 match (self.kind(a).clone(), self.kind(b).clone()) {
@@ -264,7 +264,7 @@ impl Checker<'_> {
                     _ => Kind::Unknown,
                 }
             }
-            Node::Call(builtin, args) => self.call(id, builtin, &args),
+            Node::Call(builtin, args) => self.call(builtin, &args),
             Node::Table(table, x) => {
                 let table = &self.system.tables[table as usize];
                 let (wanted, result) = (Term::known(table.x_dimension), Term::known(table.y_dimension));
@@ -282,11 +282,8 @@ impl Checker<'_> {
                 }
                 Kind::Real(result)
             }
-            Node::Crossing(crossing) => {
-                // Its difference is a node before this one and has been checked as a subtraction.
-                let _ = self.system.crossings[crossing as usize].difference;
-                Kind::Boolean
-            }
+            // Its difference is a node before this one and has been checked as a subtraction.
+            Node::Crossing(_) => Kind::Boolean,
             Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
             Node::Measure(measure, value, second) => {
                 let Some(term) = (match (measure, self.kind(value).clone()) {
@@ -435,7 +432,7 @@ impl Checker<'_> {
         }
     }
 
-    fn binary(&mut self, id: ExprId, op: BinaryOp, a: ExprId, b: ExprId) -> Kind {
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId) -> Kind {
         match op {
             BinaryOp::And | BinaryOp::Or => {
                 let what = format!("`{}`", op.text());
@@ -478,7 +475,6 @@ impl Checker<'_> {
                 } else {
                     self.angles(a, b);
                 }
-                let _ = id;
                 Kind::Boolean
             }
         }
@@ -520,7 +516,7 @@ impl Checker<'_> {
         literal(self.system, id)
     }
 
-    fn call(&mut self, id: ExprId, builtin: Builtin, args: &[ExprId]) -> Kind {
+    fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Kind {
         let none = Term::known(Dimension::NONE);
         let (time, rate) = (Term::known(TIME), Term::known(RATE));
         let terms: Option<Vec<Term>> = {
@@ -573,7 +569,6 @@ impl Checker<'_> {
                         self.diagnostics.push(error);
                     }
                 }
-                let _ = id;
                 Kind::Real(none)
             }
             Builtin::Step => {

@@ -461,7 +461,7 @@ impl<'a> Flattener<'a> {
             let file = self.tree(id).file;
             let slot_rotary = slot.rotary || parent_rotary;
             let ports = self.interface(file, slot)?;
-            self.check_fit(model, item.file, instance, rotary, ports, slot, slot_rotary);
+            self.check_fit(model, instance, rotary, ports, slot, slot_rotary);
             let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
             let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
             if replaced {
@@ -507,7 +507,6 @@ impl<'a> Flattener<'a> {
     pub(super) fn check_fit(
         &mut self,
         model: &'a ast::Model,
-        _model_file: FileId,
         instance: &'a ast::Instance,
         rotary: bool,
         interface: &'a ast::Interface,
