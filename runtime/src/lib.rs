@@ -21,5 +21,9 @@ pub mod sweep;
 
 pub mod modes;
 
+pub mod clock;
+
+pub mod can;
+
 #[cfg(test)]
 mod models;
