@@ -9,6 +9,8 @@ pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, linear, load, varying,
 };
+#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
+pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.
