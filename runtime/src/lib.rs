@@ -25,5 +25,7 @@ pub mod clock;
 
 pub mod can;
 
+pub mod safety;
+
 #[cfg(test)]
 mod models;
