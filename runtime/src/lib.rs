@@ -27,5 +27,7 @@ pub mod can;
 
 pub mod safety;
 
+pub mod hil;
+
 #[cfg(test)]
 mod models;

@@ -138,6 +138,59 @@ impl Cause {
     }
 }
 
+impl Cause {
+    /// As two words, never both 0: kind and index, then a value.
+    pub fn to_words(self) -> [u64; 2] {
+        let (kind, index, value) = match self {
+            Cause::Asked => (1, 0, 0),
+            Cause::NotFinite(i) => (2, i, 0),
+            Cause::Guard(status) => (3, 0, status),
+            Cause::Clamped(i) => (4, i, 0),
+            Cause::Condition(i) => (5, i, 0),
+            Cause::Overrun(missed) => (6, 0, u64::from(missed)),
+            Cause::Speed(i, speed) => (7, i, speed.to_bits()),
+            Cause::Travel(i, position) => (8, i, position.to_bits()),
+            Cause::RunAway(i) => (9, i, 0),
+            Cause::Lost(i) => (10, i, 0),
+            Cause::Implausible(i) => (11, i, 0),
+            Cause::NotFollowing(i) => (12, i, 0),
+            Cause::Drive(i) => (13, i, 0),
+            Cause::Bus(i) => (14, i, 0),
+            Cause::Overload(i) => (15, i, 0),
+            Cause::Foreign(i, id) => (16, i, u64::from(id)),
+            Cause::Energy => (17, 0, 0),
+            Cause::Watchdog => (18, 0, 0),
+        };
+        [kind << 32 | index as u64, value]
+    }
+
+    /// The other way round. None if they stand for nothing.
+    pub fn from_words([first, value]: [u64; 2]) -> Option<Cause> {
+        let (i, small) = ((first & 0xffff_ffff) as usize, u32::try_from(value).ok());
+        Some(match first >> 32 {
+            1 => Cause::Asked,
+            2 => Cause::NotFinite(i),
+            3 => Cause::Guard(value),
+            4 => Cause::Clamped(i),
+            5 => Cause::Condition(i),
+            6 => Cause::Overrun(small?),
+            7 => Cause::Speed(i, f64::from_bits(value)),
+            8 => Cause::Travel(i, f64::from_bits(value)),
+            9 => Cause::RunAway(i),
+            10 => Cause::Lost(i),
+            11 => Cause::Implausible(i),
+            12 => Cause::NotFollowing(i),
+            13 => Cause::Drive(i),
+            14 => Cause::Bus(i),
+            15 => Cause::Overload(i),
+            16 => Cause::Foreign(i, small?),
+            17 => Cause::Energy,
+            18 => Cause::Watchdog,
+            _ => return None,
+        })
+    }
+}
+
 /// What drives are told.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Order {
@@ -341,13 +394,13 @@ impl Supervisor {
         self.stage == Stage::Disabled
     }
 
-    /// Gives the outputs to the model. Refused while a trip is latched.
+    /// Gives the outputs to whoever asks from now on: they come up anew. Refused while a trip is latched.
     pub fn arm(&mut self) -> bool {
-        let idle = self.stage == Stage::Idle && self.cause.is_none();
-        if idle {
+        let free = matches!(self.stage, Stage::Idle | Stage::Armed(_)) && self.cause.is_none();
+        if free {
             self.stage = Stage::Armed(0);
         }
-        idle
+        free
     }
 
     /// The operator has seen why the rig stopped: back to where arming begins. Only after the stop is over.
@@ -549,6 +602,45 @@ impl Supervisor {
             self.clamps[i] = Clamps::default();
             self.clamped[i] = 0;
         }
+    }
+
+    /// All that the next cycle depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        let (stage, cycles) = match self.stage {
+            Stage::Idle => (0, 0),
+            Stage::Armed(cycles) => (1, cycles),
+            Stage::Slewing(cycles) => (2, cycles),
+            Stage::Quick(cycles) => (3, cycles),
+            Stage::Disabled => (4, 0),
+        };
+        words.extend([stage, u64::from(cycles)]);
+        words.extend(self.cause.map_or([0, 0], Cause::to_words));
+        words.extend(self.permitted.iter().chain(&self.least).map(|x| x.to_bits()));
+        words.extend(self.clamped.iter().map(|cycles| u64::from(*cycles)));
+    }
+
+    /// Takes over what [`Supervisor::save`] gave; limits are not among it. None if it does not fit.
+    pub fn restore(&mut self, words: &mut dyn Iterator<Item = u64>) -> Option<()> {
+        let (stage, cycles) = (words.next()?, u32::try_from(words.next()?).ok()?);
+        self.stage = match stage {
+            0 => Stage::Idle,
+            1 => Stage::Armed(cycles),
+            2 => Stage::Slewing(cycles),
+            3 => Stage::Quick(cycles),
+            4 => Stage::Disabled,
+            _ => return None,
+        };
+        self.cause = match [words.next()?, words.next()?] {
+            [0, 0] => None,
+            words => Some(Cause::from_words(words)?),
+        };
+        for x in self.permitted.iter_mut().chain(&mut self.least) {
+            *x = f64::from_bits(words.next()?);
+        }
+        for cycles in &mut self.clamped {
+            *cycles = u32::try_from(words.next()?).ok()?;
+        }
+        Some(())
     }
 
     /// Whether a protection is there: always, but for a test of the tests.
@@ -826,6 +918,26 @@ mod tests {
     }
 
     #[test]
+    fn what_is_saved_goes_on_as_before() {
+        let mut first = armed(LIMITS, PATIENCE);
+        for k in 0..40 {
+            let mut words = Vec::new();
+            first.save(&mut words);
+            let mut second = armed(LIMITS, PATIENCE);
+            assert_eq!(second.restore(&mut words.iter().copied()), Some(()));
+            assert_eq!(second.restore(&mut words[1..].iter().copied()), None, "short of a word");
+            if k == 20 {
+                first.trip(Cause::Travel(0, 1.5));
+                second.trip(Cause::Travel(0, 1.5));
+            }
+            let request = f64::from(k % 7);
+            assert_eq!(first.judge(&[request], &at(30.0)), second.judge(&[request], &at(30.0)), "cycle {k}");
+            assert_eq!((first.permitted(), first.cause()), (second.permitted(), second.cause()));
+        }
+        assert!(first.is_disabled());
+    }
+
+    #[test]
     fn every_cause_has_one_reaction() {
         let quick = [
             Cause::Speed(0, 1.0),
@@ -849,6 +961,10 @@ mod tests {
             Cause::Overload(0),
             Cause::Energy,
         ];
+        for cause in quick.iter().chain(&controlled) {
+            assert_eq!(Cause::from_words(cause.to_words()), Some(*cause));
+        }
+        assert_eq!(Cause::from_words([0, 0]), None);
         assert!(quick.iter().all(|cause| cause.reaction() == Reaction::Quick));
         assert!(controlled.iter().all(|cause| cause.reaction() == Reaction::Controlled));
     }
