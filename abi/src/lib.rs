@@ -8,6 +8,8 @@ pub mod description;
 pub mod table;
 pub mod plan;
 pub mod instance;
+pub mod encode;
+pub mod image;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;

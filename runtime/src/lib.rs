@@ -19,6 +19,8 @@ mod solver;
 pub mod engine;
 pub mod sweep;
 
+pub mod blob;
+
 pub mod modes;
 
 #[cfg(test)]
