@@ -22,6 +22,8 @@ pub mod sweep;
 pub mod modes;
 
 pub mod clock;
+pub mod histogram;
+pub mod realtime;
 
 pub mod can;
 
