@@ -7,6 +7,7 @@ pub mod unit;
 pub mod description;
 pub mod table;
 pub mod plan;
+pub mod rig;
 pub mod instance;
 pub mod encode;
 pub mod image;

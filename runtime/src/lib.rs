@@ -23,5 +23,11 @@ pub mod blob;
 
 pub mod modes;
 
+pub mod clock;
+pub mod histogram;
+pub mod realtime;
+
+pub mod can;
+
 #[cfg(test)]
 mod models;
