@@ -19,9 +19,13 @@ mod solver;
 pub mod engine;
 pub mod sweep;
 
+pub mod blob;
+
 pub mod modes;
 
 pub mod clock;
+pub mod histogram;
+pub mod realtime;
 
 pub mod can;
 

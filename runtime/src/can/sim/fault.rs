@@ -118,7 +118,7 @@ impl Chance {
 
     /// Uniform in 0..n.
     pub fn below(&mut self, n: u64) -> u64 {
-        (self.number() as u128 * n as u128 >> 64) as u64
+        ((u128::from(self.number()) * u128::from(n)) >> 64) as u64
     }
 
     /// The frame with one bit of its data turned over.
