@@ -10,6 +10,8 @@ pub mod series;
 pub mod instance;
 pub mod rig;
 pub mod plan;
+pub mod encode;
+pub mod image;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;
