@@ -146,24 +146,17 @@ pub fn text(model: &Model) -> String {
     for (k, block) in blocks.iter().enumerate().filter(|(_, block)| !block.name.is_empty()) {
         let head = format!("{} : {}", block.name, block.kind);
         let inputs = block.inputs.iter().map(|(name, value)| format!("▸ {name} = {value}"));
-        let outputs = block.outputs.iter().map(|name| format!("{name} ▸"));
-        let (inputs, outputs): (Vec<String>, Vec<String>) = (inputs.collect(), outputs.collect());
+        let (inputs, outputs): (Vec<String>, &[String]) = (inputs.collect(), &block.outputs);
         let wide = |lines: &[String]| lines.iter().map(|line| line.chars().count()).max().unwrap_or(0);
-        let width = (wide(&inputs) + 3 + wide(&outputs)).max(head.chars().count() + 2);
+        let width = (wide(&inputs) + 3 + wide(outputs)).max(head.chars().count() + 2);
         out += &format!("  ┌ {head} {}┐\n", "─".repeat(width - head.chars().count()));
         for row in 0..inputs.len().max(outputs.len()) {
-            let left = inputs.get(row).map_or("", String::as_str);
-            let right = outputs.get(row).map_or("", String::as_str);
-            let gap = width + 2 - left.chars().count() - right.chars().count();
             // Ports stand on the edge of the box.
-            let (edge, left) = left.strip_prefix('▸').map_or(("│", left), |left| ("▸", left));
-            let gap = gap - usize::from(edge == "│" && left.is_empty()) + 1;
-            let line = format!("  {edge}{left}{}", " ".repeat(gap - 1));
-            let to = if row < outputs.len() { readers(k, row) } else { String::new() };
-            match right.strip_suffix('▸') {
-                Some(right) => out += &format!("{line} {right}├─▸ {to}\n"),
-                None => out += &format!("{line}{} │\n", if edge == "▸" { "" } else { " " }),
-            }
+            let left = inputs.get(row).map_or("│", String::as_str);
+            let right = outputs.get(row).map_or("│".into(), |name| format!("{name} ├─▸ {}", readers(k, row)));
+            let inner = outputs.get(row).map_or(0, |name| name.chars().count() + 1);
+            let gap = width + 3 - left.chars().count() - inner;
+            out += &format!("  {left}{}{right}\n", " ".repeat(gap));
         }
         out += &format!("  └{}┘\n", "─".repeat(width + 2));
     }
@@ -283,17 +276,17 @@ mod tests {
         let expected = "\
 Servo
   r ─▸ pid.r
-  ┌ pid : Controller = PID ┐
-  ▸ r = r                u ├─▸ body.F_motor
-  ▸ y = body.x             │
-  └────────────────────────┘
-  ┌ fr : Friction = LuGre ┐
-  ▸ v = body.v          F ├─▸ body.F_load
-  └───────────────────────┘
-  ┌ body : Axis ────────────┐
-  ▸ F_motor = pid.u       x ├─▸ pid.y, x
-  ▸ F_load = fr.F         v ├─▸ fr.v
+  ┌ pid : Controller = PID ──┐
+  ▸ r = r                  u ├─▸ body.F_motor
+  ▸ y = body.x               │
+  └──────────────────────────┘
+  ┌ fr : Friction = LuGre ──┐
+  ▸ v = body.v            F ├─▸ body.F_load
   └─────────────────────────┘
+  ┌ body : Axis ──────────┐
+  ▸ F_motor = pid.u     x ├─▸ pid.y, x
+  ▸ F_load = fr.F       v ├─▸ fr.v
+  └───────────────────────┘
   x = body.x
 ";
         assert_eq!(shown, expected, "\n{shown}");

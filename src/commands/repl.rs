@@ -173,7 +173,7 @@ impl Prompt<'_> {
         let near = repl::meant(first).filter(|_| command)?;
         let known = self.session.quantities().any(|q| q.path == first)
             || self.session.instances().iter().any(|(name, _)| name == first);
-        (!known && second.is_some() || !known && near.len() > 3)
+        (!known && (second.is_some() || near.len() > 3))
             .then(|| format!("there is no command `{first}`; did you mean `{near}`? (`help` lists them)"))
     }
 
@@ -450,8 +450,8 @@ impl Prompt<'_> {
             return;
         }
         shown.push(path.into());
-        for needed in needs.to_vec() {
-            self.needs(explanation, &needed, depth + 1, shown);
+        for needed in needs {
+            self.needs(explanation, needed, depth + 1, shown);
         }
     }
 

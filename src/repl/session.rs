@@ -352,9 +352,14 @@ impl Session {
         let typed = with_inputs(&instance, open.iter().map(|name| (name.as_str(), "0")));
         let mut loaded = compile::load(TEXT, &text, &project::Disk);
         let case = next.compiled_in(&mut loaded, EXPERIMENT, &next.bench, &[], true);
-        let (case, _) = case.map_err(|errors| match errors.is_empty() {
-            true => found(&loaded, &loaded.diagnostics, &typed, Some(at)),
-            false => found(&loaded, &errors, &typed, Some(at)),
+        let (case, _) = case.map_err(|mut errors| {
+            // The library is as near as what is in use.
+            for error in errors.iter_mut().filter(|error| error.code == "E0201") {
+                if let Some(near) = compile::nearest(&model, library_models()) {
+                    error.help = Some(format!("did you mean `{near}`?"));
+                }
+            }
+            found(&loaded, &errors, &typed, Some(at))
         })?;
         drop(case);
         next.at_bench = true;
