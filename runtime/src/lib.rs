@@ -20,7 +20,19 @@ pub mod engine;
 pub mod steady;
 pub mod sweep;
 
+pub mod blob;
+
 pub mod modes;
+
+pub mod clock;
+pub mod histogram;
+pub mod realtime;
+
+pub mod can;
+
+pub mod safety;
+
+pub mod hil;
 
 #[cfg(test)]
 mod models;
