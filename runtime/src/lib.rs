@@ -17,7 +17,10 @@ mod observe;
 mod solver;
 
 pub mod engine;
+pub mod steady;
 pub mod sweep;
+
+pub mod blob;
 
 pub mod modes;
 
@@ -26,6 +29,10 @@ pub mod histogram;
 pub mod realtime;
 
 pub mod can;
+
+pub mod safety;
+
+pub mod hil;
 
 #[cfg(test)]
 mod models;
