@@ -25,5 +25,7 @@ pub mod clock;
 
 pub mod can;
 
+pub mod canopen;
+
 #[cfg(test)]
 mod models;
