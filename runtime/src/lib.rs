@@ -27,5 +27,7 @@ pub mod can;
 
 pub mod canopen;
 
+pub mod drive;
+
 #[cfg(test)]
 mod models;

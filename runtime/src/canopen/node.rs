@@ -478,7 +478,9 @@ impl Served<'_> {
         match self.objects.entry(mapped.object) {
             None => Err(Abort::NO_OBJECT),
             Some(entry) if !entry.mappable => Err(Abort::NOT_MAPPABLE),
-            Some(entry) if entry.kind.size().map(|size| size * 8) != Some(mapped.bits.into()) => Err(Abort::NOT_MAPPABLE),
+            Some(entry) if entry.kind.size().map(|size| size * 8) != Some(mapped.bits.into()) => {
+                Err(Abort::NOT_MAPPABLE)
+            }
             Some(_) => Ok(()),
         }
     }
@@ -617,7 +619,10 @@ mod tests {
         start(&mut node);
         let mut sent = Vec::new();
         node.receive(&Frame::new(0x203, &[0x0F, 0]), 0, &mut |frame| sent.push(frame));
-        assert_eq!(Service::of(&sent[0]), Service::Emergency(3, Emergency { code: 0x8210, register: 0x11, vendor: [0; 5] }));
+        assert_eq!(
+            Service::of(&sent[0]),
+            Service::Emergency(3, Emergency { code: 0x8210, register: 0x11, vendor: [0; 5] })
+        );
         assert_eq!(node.objects.get(Object(0x6040, 0)), Some(0));
         assert_eq!((node.objects.get(Object(0x1003, 0)), node.objects.get(Object(0x1003, 1))), (Some(1), Some(0x8210)));
     }

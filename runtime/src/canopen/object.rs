@@ -310,10 +310,7 @@ mod tests {
         for abort in Abort::ALL {
             assert!(abort.meaning().is_some_and(|text| abort.to_string().starts_with(text)));
         }
-        assert_eq!(
-            Abort(0x0601_0002).to_string(),
-            "attempt to write a read only object (abort code 0x06010002)"
-        );
+        assert_eq!(Abort(0x0601_0002).to_string(), "attempt to write a read only object (abort code 0x06010002)");
         assert_eq!(Abort(0x0F00_00C0).to_string(), "abort code 0x0F0000C0 of the maker");
     }
 }

@@ -167,15 +167,18 @@ mod tests {
 
     #[test]
     fn it_is_configured_in_the_order_of_the_standard() {
-        assert_eq!(torque().configuration(), [
-            (Object(0x1400, 1), 0x8000_0203, 4),
-            (Object(0x1600, 0), 0, 1),
-            (Object(0x1600, 1), 0x6040_0010, 4),
-            (Object(0x1600, 2), 0x6071_0010, 4),
-            (Object(0x1600, 0), 2, 1),
-            (Object(0x1400, 2), 255, 1),
-            (Object(0x1400, 1), 0x203, 4),
-        ]);
+        assert_eq!(
+            torque().configuration(),
+            [
+                (Object(0x1400, 1), 0x8000_0203, 4),
+                (Object(0x1600, 0), 0, 1),
+                (Object(0x1600, 1), 0x6040_0010, 4),
+                (Object(0x1600, 2), 0x6071_0010, 4),
+                (Object(0x1600, 0), 2, 1),
+                (Object(0x1400, 2), 255, 1),
+                (Object(0x1400, 1), 0x203, 4),
+            ]
+        );
         let position = [Mapped { object: Object(0x6064, 0), bits: 32 }];
         let second = Pdo::new(Direction::Transmit, 2, 3, 1, &position);
         assert_eq!((second.cob_id, second.communication(), second.mapping()), (0x283, 0x1801, 0x1A01));

@@ -425,7 +425,11 @@ mod tests {
             Wire { client: Client::new(5, 1_000_000), server: Server::new(5), objects: dictionary(), frames: 0 }
         }
 
-        fn run(&mut self, begin: impl FnOnce(&mut Client, Send), mut bend: impl FnMut(usize, Frame) -> Option<Frame>) -> Outcome {
+        fn run(
+            &mut self,
+            begin: impl FnOnce(&mut Client, Send),
+            mut bend: impl FnMut(usize, Frame) -> Option<Frame>,
+        ) -> Outcome {
             let mut open = VecDeque::new();
             begin(&mut self.client, &mut |frame| open.push_back(frame));
             while let Some(frame) = open.pop_front() {
@@ -472,13 +476,16 @@ mod tests {
         client.write(Object(0x6060, 0), &[10], 0, &mut |frame| sent.push(frame.to_string()));
         client.write(Object(0x1016, 1), &[5, 0, 1, 0], 0, &mut |frame| sent.push(frame.to_string()));
         client.write(Object(0x1008, 0), b"eight by", 0, &mut |frame| sent.push(frame.to_string()));
-        assert_eq!(sent, [
-            "603#2B4060000F000000",
-            "603#4018100100000000",
-            "603#2F6060000A000000",
-            "603#2316100105000100",
-            "603#2108100008000000",
-        ]);
+        assert_eq!(
+            sent,
+            [
+                "603#2B4060000F000000",
+                "603#4018100100000000",
+                "603#2F6060000A000000",
+                "603#2316100105000100",
+                "603#2108100008000000",
+            ]
+        );
     }
 
     #[test]

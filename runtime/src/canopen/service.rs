@@ -269,7 +269,10 @@ mod tests {
                 assert_eq!(Service::of(&state.heartbeat(node)), Service::Heartbeat(node, Some(state), false));
             }
             assert_eq!(Service::of(&guard_request(node)), Service::GuardRequest(node));
-            assert_eq!(Service::of(&Nmt::ResetCommunication.frame(node)), Service::Nmt(Some(Nmt::ResetCommunication), node));
+            assert_eq!(
+                Service::of(&Nmt::ResetCommunication.frame(node)),
+                Service::Nmt(Some(Nmt::ResetCommunication), node)
+            );
         }
         assert_eq!(Service::of(&sync(None)), Service::Sync(None));
         assert_eq!(Service::of(&sync(Some(240))), Service::Sync(Some(240)));

@@ -118,7 +118,9 @@ mod tests {
     #[test]
     fn what_is_written_is_read() {
         for big_endian in [false, true] {
-            for (bits, format) in [(7, Format::Signed), (13, Format::Unsigned), (32, Format::Float32), (64, Format::Float64)] {
+            for (bits, format) in
+                [(7, Format::Signed), (13, Format::Unsigned), (32, Format::Float32), (64, Format::Float64)]
+            {
                 let start = if big_endian { 7 } else { 0 };
                 let mut field = field(start, bits, big_endian, format);
                 (field.scale, field.offset) = (0.5, 10.0);
