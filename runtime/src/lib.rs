@@ -17,17 +17,26 @@ mod observe;
 mod solver;
 
 pub mod engine;
+pub mod steady;
 pub mod sweep;
+
+pub mod blob;
 
 pub mod modes;
 
 pub mod clock;
+pub mod histogram;
+pub mod realtime;
 
 pub mod can;
 
 pub mod canopen;
 
 pub mod drive;
+
+pub mod safety;
+
+pub mod hil;
 
 #[cfg(test)]
 mod models;
