@@ -4,9 +4,10 @@
 //! that holds slots only.
 
 use crate::flatten::{Instance, Override, OverrideValue, Request, flatten};
-use crate::linearise::{PortSlots, Ports, open};
+use crate::linearise::{Opened, PortSlots, Ports, open};
 use crate::lower::{Lowered, Wanted, evaluate, lower};
 use crate::resolve::Loaded;
+use crate::rig::{self, Prepared};
 use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns;
@@ -70,6 +71,8 @@ pub struct Variant {
     pub places: Vec<(Place, ExprId)>,
     /// Inputs of a linearisation, each with the slot along which it moves; and its outputs.
     pub ports: PortSlots,
+    /// A dry run: the plan of the rig, and the crossed-out part.
+    pub rig: Option<(abi::rig::Rig, crate::program::Program)>,
 }
 
 /// The default of an adaptive run.
@@ -114,8 +117,9 @@ pub fn read(
     let mut diagnostics = Vec::new();
     let given = Given::read(loaded, changes, &mut diagnostics);
     let also = also(loaded, &changes.also, &mut diagnostics);
-    let loaded = &*loaded;
     let root = loaded.root();
+    let prepared = rig_of(loaded, sources, name, &given, &mut diagnostics)?;
+    let loaded = &*loaded;
     let file = loaded.files.get(root);
     let found = file.ast.items.iter().find_map(|item| match item {
         ast::Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
@@ -148,12 +152,39 @@ pub fn read(
         let error = Diagnostic::error("E0902", message).label(span, "swept here");
         return Err(vec![error.help(format!("between 1 and {MOST_VARIANTS} combinations can be run"))]);
     }
+    // Arguments of a rig are changes of the system that it runs.
+    let path = |bind: &ast::Bind| ast::Path {
+        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
+        span: bind.span,
+    };
+    let args = prepared.as_ref().map_or(&[][..], |_| &parts.run.instance.args);
+    let arg_paths: Vec<ast::Path> = args.iter().map(path).collect();
     let mut variants = Vec::new();
     for combination in combinations {
         let label = label(loaded, &combination);
         let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(Given::change));
+        let written = arg_paths.iter().zip(args).map(|(path, bind)| {
+            let value = match &bind.value {
+                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
+                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
+            };
+            Change { path, value }
+        });
+        let changes = written.chain(changes);
         let overrides = changes.map(|c| Override { path: c.path, value: c.value, file: root }).collect();
-        match variant(loaded, sources, name, &parts, &data, overrides, &given, label, warnings, on_stage) {
+        match variant(
+            loaded,
+            sources,
+            name,
+            &parts,
+            prepared.as_ref(),
+            &data,
+            overrides,
+            &given,
+            label,
+            warnings,
+            on_stage,
+        ) {
             Ok(variant) => variants.push(variant),
             Err(errors) => return Err(errors),
         }
@@ -476,6 +507,7 @@ fn variant(
     sources: &dyn Sources,
     name: &str,
     parts: &Parts,
+    prepared: Option<&Prepared>,
     data: &[(String, Table, Unit)],
     overrides: Vec<Override>,
     given: &Given,
@@ -484,10 +516,6 @@ fn variant(
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Variant, Vec<Diagnostic>> {
     let root = loaded.root();
-    if !parts.run.instance.model.text.starts_with(|c: char| c.is_ascii_uppercase()) {
-        let error = Diagnostic::error("E0905", "running a rig in an experiment is not available yet");
-        return Err(vec![error.label(parts.run.instance.span, "a rig")]);
-    }
     // Every expression of the experiment is read as one of the instance; then each is picked out again.
     let mut observed: Vec<&Expr> = Vec::new();
     let mut add = |expr| {
@@ -515,26 +543,37 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request = Request {
-        instance: Instance::Written(&parts.run.instance, root),
-        overrides,
-        observed,
-        data: data.to_vec(),
-        frame: None,
-    };
     on_stage("flatten");
-    let flat = flatten(loaded, sources, &request);
-    let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
-    let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
-    let ports = ports.unwrap_or_default();
-    on_stage("check");
-    let types = units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
-        causality::check(&system, &loaded.files, &mut diagnostics);
-    }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
-    }
+    let mut diagnostics = Vec::new();
+    let (system, types, nodes, ports, cut) = match prepared {
+        Some(prepared) => {
+            let cut = rig::read(loaded, sources, prepared, overrides, observed, data.to_vec(), &mut diagnostics);
+            on_stage("check");
+            let Some(mut cut) = cut else { return Err(diagnostics) };
+            let system = std::mem::take(&mut cut.control);
+            let types = std::mem::take(&mut cut.control_types);
+            // What deserves a look is said of the rig, not of each of its experiments.
+            diagnostics.retain(Diagnostic::is_error);
+            (system, types, std::mem::take(&mut cut.observed), Opened::default(), Some(cut))
+        }
+        None => {
+            let instance = Instance::Written(&parts.run.instance, root);
+            let request = Request { instance, overrides, observed, data: data.to_vec(), frame: None };
+            let flat = flatten(loaded, sources, &request);
+            let mut system = flat.system;
+            diagnostics = flat.diagnostics;
+            let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
+            on_stage("check");
+            let types = units::check(&system, &loaded.files, &mut diagnostics);
+            if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
+                causality::check(&system, &loaded.files, &mut diagnostics);
+            }
+            if !diagnostics.iter().any(Diagnostic::is_error) {
+                checks::values(&system, &types, &loaded.files, &mut diagnostics);
+            }
+            (system, types, flat.observed, ports.unwrap_or_default(), None)
+        }
+    };
     // What is wrong with the experiment alone does not hide what else is wrong with it.
     if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
         || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
@@ -545,6 +584,10 @@ fn variant(
     let (places, vary) = (Vec::new(), &given.vary[..]);
     let mut reader =
         Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
+    if let Some(cut) = &cut {
+        reader.wanted = cut.wanted(&system);
+    }
+    let own = reader.wanted.len();
 
     let corners = evaluate(&system, &types, &system.corners);
     let duration = match (given.duration, duration) {
@@ -565,7 +608,11 @@ fn variant(
         },
     };
     let solver = reader.solver(parts, given, step.map(|at| nodes[at]), tol.map(|at| nodes[at]));
-    if solver.method != Method::Adaptive {
+    let solver = match &cut {
+        Some(cut) => reader.between_ticks(parts, given, cut.period(), solver),
+        None => solver,
+    };
+    if cut.is_none() && solver.method != Method::Adaptive {
         let at = step.map(|at| system.span(nodes[at]));
         checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
         if duration / solver.step > MOST_STEPS {
@@ -599,7 +646,9 @@ fn variant(
     }
     warnings.extend(diagnostics);
     on_stage("lower");
-    let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);
+    let lowered = lower(&system, &types, &wanted);
+    let rig = cut.map(|cut| cut.with_plant(&lowered, own));
+    let Lowered { mut program, observed: slots } = lowered;
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
         root.text = surface_text(loaded, &root.text);
@@ -648,7 +697,48 @@ fn variant(
     });
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
-    Ok(Variant { label, system, types, program, experiment, places, ports })
+    Ok(Variant { label, system, types, program, experiment, places, ports, rig })
+}
+
+/// The rig that an experiment runs, with its descriptions; none if it runs a model.
+fn rig_of(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    given: &Given,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Result<Option<Prepared>, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let run = ast.items.iter().find_map(|item| match item {
+        ast::Item::Experiment(one) if one.name.text == experiment => {
+            one.body.iter().find_map(|statement| match statement {
+                ExperimentStatement::Run(run) => Some(run),
+                _ => None,
+            })
+        }
+        _ => None,
+    });
+    let Some(run) = run.filter(|run| !run.instance.model.text.starts_with(|c: char| c.is_ascii_uppercase())) else {
+        return Ok(None);
+    };
+    let item = rig::find(loaded, root, &run.instance.model).map_err(|error| vec![error])?;
+    if run.instance.rotary {
+        let error =
+            Diagnostic::error("E0108", "a rig is what it is: `rotary` stands before the system in its own `run`")
+                .label(run.instance.span, "a rig");
+        diagnostics.push(error.help(format!("write `run {}()`", run.instance.model.text)));
+    }
+    if !given.vary.is_empty() || given.ports.is_some() {
+        let what = if given.ports.is_some() {
+            "a rig cannot be linearised as a whole yet"
+        } else {
+            "a rig cannot be varied yet"
+        };
+        let error = Diagnostic::error("E0905", what).label(run.instance.span, "a rig");
+        return Err(vec![error.help("for a few values write a `sweep` in the experiment")]);
+    }
+    Ok(Some(rig::prepare(loaded, sources, item)))
 }
 
 /// Whether what is said concerns something outside of a place.
@@ -751,6 +841,39 @@ impl Reader<'_> {
             Method::Adaptive => Solver { method, step: 0.0, tol },
             _ => Solver { method, step: step.unwrap_or(DEFAULT_STEP), tol },
         }
+    }
+
+    /// How the crossed-out part of a rig is stepped between ticks: by a fixed method whose step divides the period.
+    fn between_ticks(&mut self, parts: &Parts, given: &Given, period: f64, solver: Solver) -> Solver {
+        let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), tol: solver.tol };
+        if given.method.is_none() && parts.solver.is_none() {
+            return match given.step {
+                Some(step) => self.divides(parts, period, Solver { step, ..usual }),
+                None => usual,
+            };
+        }
+        let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+        match solver.method {
+            Method::Adaptive => {
+                let error = Diagnostic::error("E0702", "between the ticks of a rig, steps have a fixed length")
+                    .label(span, "takes as many as it needs");
+                self.diagnostics
+                    .push(error.help("write `solver rk4 step 10 us`, or leave it out for 50 steps of `expo`"));
+                usual
+            }
+            _ => self.divides(parts, period, solver),
+        }
+    }
+
+    fn divides(&mut self, parts: &Parts, period: f64, solver: Solver) -> Solver {
+        let ratio = period / solver.step;
+        if (ratio - ratio.round()).abs() > 1e-9 * ratio || !(1.0..=1e5).contains(&ratio.round()) {
+            let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+            let error = Diagnostic::error("E0701", "the step between ticks does not divide the period of the rig")
+                .label(span, format!("{} steps in {} s", units::three_digits(ratio), period));
+            self.diagnostics.push(error.help("take a step that divides it, such as `step 20 us` of 1 ms"));
+        }
+        solver
     }
 
     /// Wants an expression; returns its number.

@@ -259,7 +259,8 @@ impl Made {
 /// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
     let program = &variant.program;
-    let functions = functions(program, variant.experiment.solver.method);
+    let method = variant.rig.as_ref().map_or(variant.experiment.solver.method, |(rig, _)| rig.method);
+    let functions = functions(program, method);
     let (code, notes) = match made {
         Some(made) if made.fits(&functions, &program.description) => (made.code.clone(), made.notes.clone()),
         _ => {
@@ -270,7 +271,16 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) 
         }
     };
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    Case { label: variant.label, instance, experiment: variant.experiment, notes }
+    let mut experiment = variant.experiment;
+    experiment.bench =
+        variant.rig.map(|(rig, plant)| Box::new(bench(rig, &plant, experiment.solver.method, interpret)));
+    Case { label: variant.label, instance, experiment, notes }
+}
+
+/// The surroundings of a dry run.
+fn bench(rig: abi::rig::Rig, plant: &program::Program, method: Method, interpret: bool) -> abi::rig::Bench {
+    let (code, _) = code(&self::functions(plant, method), &plant.description, interpret);
+    abi::rig::Bench { rig, plant: Instance::new(Arc::new(plant.description.clone()), code, &plant.params) }
 }
 
 /// The functions that a method needs, expanded to arithmetic.

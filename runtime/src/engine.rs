@@ -4,6 +4,7 @@
 //! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
+use crate::dry;
 use crate::observe::{Observer, Probe, check_finite, check_status};
 use crate::outcome::Stop;
 pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
@@ -98,6 +99,9 @@ impl<'a> Run<'a> {
     fn go(&mut self, begin: &mut dyn FnMut(&mut Instance), watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
         let duration = self.experiment.duration;
         assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
+        if let Some(bench) = &self.experiment.bench {
+            return dry::run(&mut self.instance, bench, self.experiment, &mut self.observer, &mut self.work, watch);
+        }
         match self.experiment.solver.method {
             Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => self.fixed(begin, watch),
             Method::Adaptive => {

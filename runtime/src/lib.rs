@@ -16,6 +16,10 @@ mod observe;
 
 mod solver;
 
+pub mod lag;
+pub mod lookahead;
+mod dry;
+
 pub mod engine;
 pub mod steady;
 pub mod sweep;
@@ -23,6 +27,9 @@ pub mod sweep;
 pub mod blob;
 
 pub mod modes;
+
+pub mod energy;
+pub mod predict;
 
 pub mod clock;
 pub mod histogram;

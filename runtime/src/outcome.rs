@@ -134,6 +134,13 @@ pub enum Cause {
     },
     /// The model offers no derivatives, so there is nothing to solve adaptively.
     NoDerivatives,
+    /// A `stop` of the rig.
+    Rig {
+        /// As written.
+        condition: String,
+        /// What the operator is told.
+        why: String,
+    },
     /// The caller said to stop.
     Stopped,
 }
@@ -176,6 +183,7 @@ impl fmt::Display for Failure {
                 "{steps} steps were tried and the run is only at {time}: `{path}` keeps them short; another `tol` may suit it better, or a fixed step"
             ),
             Cause::NoDerivatives => write!(f, "the model offers no derivatives: give a `solver` with a step"),
+            Cause::Rig { condition, why } => write!(f, "the rig stops at {time}: {why} (`{condition}`)"),
             Cause::Stopped => write!(f, "stopped at {time}"),
         }
     }

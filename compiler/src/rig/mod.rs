@@ -12,6 +12,7 @@ mod frames;
 mod nodes;
 mod plan;
 mod statements;
+mod step;
 mod wires;
 
 use crate::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
@@ -34,6 +35,8 @@ use grammar::span::{FileId, Span};
 use nodes::{Description, Read, Speaks};
 use statements::{Expressions, Statements};
 use std::sync::Arc;
+
+pub use step::{Discrete, StepDerivative};
 
 /// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.
 pub const PLANT_STEPS: u32 = 50;

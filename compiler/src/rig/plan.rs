@@ -279,6 +279,11 @@ impl Reader<'_, '_> {
                 (rig::Kind::Frames(messages), laid)
             }
         };
+        if param("delay") > 200.0 * period_ns as f64 * 1e-9 {
+            let error = Diagnostic::error("E0502", "a dead time of more than 200 periods")
+                .label(statement.kind.span, format!("{} s", param("delay")));
+            self.report(error.help("a command that acts so late drives nothing: is the unit right?"));
+        }
         let node = rig::Node {
             name: description.name.text.clone(),
             bus: bus.unwrap_or(0),
@@ -515,9 +520,9 @@ impl Reader<'_, '_> {
 
 impl Cut {
     /// What the control program is to give besides what an experiment wants: in front of that.
-    pub fn wanted(&self) -> Vec<Wanted> {
+    pub fn wanted(&self, control: &System) -> Vec<Wanted> {
         let commands = self.outputs.iter().zip(&self.commands_read);
-        let commands = commands.map(|(id, read)| (*read, self.control.var(*id).path.clone()));
+        let commands = commands.map(|(id, read)| (*read, control.var(*id).path.clone()));
         let stops = self.stops.iter().zip(&self.rig.stops).map(|(expr, stop)| (*expr, stop.condition.clone()));
         let records = self.records.iter().zip(&self.rig.record).map(|(expr, series)| (*expr, series.label.clone()));
         let all = commands.chain(stops).chain(records);
@@ -531,11 +536,23 @@ impl Cut {
         self.seen.iter().zip(&self.seen_read).map(one).collect()
     }
 
+    /// Period of the cycle, s.
+    pub fn period(&self) -> f64 {
+        self.rig.period_ns as f64 * 1e-9
+    }
+
+    /// The plan and the plant, for a control program that was lowered with more wanted behind the first `own`.
+    pub fn with_plant(self, control: &lower::Lowered, own: usize) -> (Rig, Program) {
+        let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
+        let rig = self.finish(&control.program, &control.observed[..own], &plant);
+        (rig, plant.program)
+    }
+
     /// Both programs, and the plan; says what deserves a look.
     pub fn lowered(&self, warnings: &mut Vec<Diagnostic>) -> super::Lowered {
-        let control = lower(&self.control, &self.control_types, &self.wanted());
+        let control = lower(&self.control, &self.control_types, &self.wanted(&self.control));
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
-        let rig = self.finish(&control, &plant);
+        let rig = self.finish(&control.program, &control.observed, &plant);
         let (control, plant) = (control.program, plant.program);
         warnings.extend(self.advice(&rig, &control, &plant));
         super::Lowered { rig, control, plant }
@@ -553,23 +570,24 @@ impl Cut {
     }
 
     /// The plan with the slots of both programs.
-    pub fn finish(&self, control: &lower::Lowered, plant: &lower::Lowered) -> Rig {
+    pub fn finish(&self, control: &Program, observed: &[Slot], plant: &lower::Lowered) -> Rig {
         let mut rig = self.rig.clone();
-        let input = |lowered: &lower::Lowered, system: &System, id: VarId| {
-            let path = &system.var(id).path;
-            let mut all = lowered.program.description.quantities.iter();
+        // Both systems have the same quantities.
+        let input = |program: &Program, id: VarId| {
+            let path = &self.plant.var(id).path;
+            let mut all = program.description.quantities.iter();
             let found = all.find(|quantity| quantity.kind == QuantityKind::Input && quantity.path == *path);
             found.map_or(Slot(0), |quantity| quantity.slot)
         };
         for (one, id) in rig.inputs.iter_mut().zip(&self.inputs) {
-            one.slot = input(control, &self.control, *id);
+            one.slot = input(control, *id);
         }
-        let mut slots = control.observed.iter().copied();
+        let mut slots = observed.iter().copied();
         rig.outputs.iter_mut().for_each(|output| output.slot = slots.next().expect("a slot for each command"));
         rig.stops.iter_mut().for_each(|stop| stop.slot = slots.next().expect("a slot for each stop"));
         rig.record.iter_mut().for_each(|series| series.slot = slots.next().expect("a slot for each record"));
         for (one, id) in rig.plant.applied.iter_mut().zip(&self.applied) {
-            one.1 = input(plant, &self.plant, *id);
+            one.1 = input(&plant.program, *id);
         }
         for (one, slot) in rig.plant.seen.iter_mut().zip(&plant.observed) {
             one.1 = *slot;
