@@ -187,7 +187,7 @@ macro_rules! files {
     };
 }
 
-files! { units derivatives sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
+files! { units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
 
 /// What is known to be wrong, and says so when it comes right.
 #[test]

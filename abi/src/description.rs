@@ -58,7 +58,7 @@ pub struct Layout {
     pub inputs: Segment,
     /// Continuous states x.
     pub states: Segment,
-    /// Sampled states, held outputs, tick counters, delay buffers, crossing memory.
+    /// Sampled states, held outputs, tick counters, what is delayed, crossing memory.
     pub memory: Segment,
     /// Active regime of each automaton: a whole number.
     pub regimes: Segment,
@@ -72,13 +72,20 @@ pub struct Layout {
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
+    /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
+    pub rings: Segment,
 }
 
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        let last = self.due;
+        let last = self.rings;
         (last.start + last.len).max(Slot::FIXED) as usize
+    }
+
+    /// The same with so many slots for rings.
+    pub fn with_rings(self, len: u32) -> Layout {
+        Layout { rings: Segment { start: self.due.start + self.due.len, len }, ..self }
     }
 
     /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
@@ -101,6 +108,7 @@ impl Layout {
             roots: take(roots),
             jacobian: take(jacobian),
             due: take(due),
+            rings: take(0),
         }
     }
 }
@@ -154,6 +162,28 @@ pub struct Tick {
     pub due: Slot,
 }
 
+/// `delay(x, T)`: x as it was T ago, on straight lines between samples. Functions of the model read it as
+/// `past + weight · (x − past)`; whoever runs them puts past and weight in place, a fixed step from its ring.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Delay {
+    /// Slot of T in s, in the segment `memory`, written by `Start`.
+    pub time: Slot,
+    /// Least and greatest T in s.
+    pub range: (f64, f64),
+    /// Slot of x, in the segment `outputs`.
+    pub source: Slot,
+    /// Slot of the value before, in the segment `memory`.
+    pub past: Slot,
+    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. None where
+    /// no step may be longer than the least T: then x at this instant is not needed.
+    pub weight: Option<Slot>,
+    /// Slot of the slope of the value before along time, per s: for ∂f/∂t.
+    pub slope: Slot,
+    /// First slot and number of slots of its ring, a power of two: sample k, at the end of step k, lies in slot
+    /// k mod number. Empty until the step is known.
+    pub ring: Segment,
+}
+
 /// One automaton: its regimes in the order of the text.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Automaton {
@@ -200,6 +230,8 @@ pub struct Description {
     pub ticks: Vec<Tick>,
     /// Automata.
     pub automata: Vec<Automaton>,
+    /// What is delayed.
+    pub delays: Vec<Delay>,
     /// Watched ranges; `status = k + 1` names guard k.
     pub guards: Vec<Guard>,
     /// Switching surfaces.

@@ -44,6 +44,7 @@ fn once(text: &str, width: usize) -> Result<String, Vec<Diagnostic>> {
     layout.fold(width);
     layout.paragraphs();
     layout.arguments();
+    layout.chosen();
     Ok(layout.write())
 }
 
@@ -565,6 +566,59 @@ impl<'s, 't> Layout<'s, 't> {
                 self.pads.insert(at, widest - self.width(at - 1));
             }
         }
+    }
+
+    /// Blanks by which something stands exactly under or above something of the neighbouring statement stay:
+    /// `F_ext >  Fs` over `F_ext < -Fs`.
+    fn chosen(&mut self) {
+        let mut kept: Vec<(usize, (usize, usize), (usize, usize))> = Vec::new();
+        let statement = |layout: &Self, line: usize| {
+            let piece = layout.lines[line].piece;
+            layout.starts.get(piece.start).copied().flatten().filter(|start| start.place.is_some()).map(|s| s.block)
+        };
+        for upper in 1..self.lines.len() {
+            let (upper, lower) = (upper - 1, upper);
+            let block = statement(self, upper);
+            if block.is_none() || block != statement(self, lower) || self.lines[lower].gap {
+                continue;
+            }
+            let (above, below) = (self.marks_of(upper), self.marks_of(lower));
+            for (line, marks, other, others) in [(upper, &above, lower, &below), (lower, &below, upper, &above)] {
+                for &(column, at, _) in marks.iter().filter(|(_, _, extra)| *extra) {
+                    // Columns ascend along a line.
+                    if let Ok(k) = others.binary_search_by_key(&column, |(column, ..)| *column)
+                        && !others[k].2
+                    {
+                        kept.push((column, (line, at), (other, others[k].1)));
+                    }
+                }
+            }
+        }
+        kept.sort_unstable();
+        for (_, (line, at), (other, mark)) in kept {
+            let (here, there) = (self.column(&self.lines[line], at), self.column(&self.lines[other], mark));
+            *self.pads.entry(at).or_insert(0) += there.saturating_sub(here);
+        }
+    }
+
+    /// The marks of a line but the first, if it was one before: the column each had, and whether it had more blanks
+    /// before it than it has now.
+    fn marks_of(&self, line: usize) -> Vec<(usize, usize, bool)> {
+        let Piece { start, end } = self.lines[line].piece;
+        let begins = |at: usize| self.source.marks[at].token.start;
+        if self.source.marks[start].line != self.source.marks[end - 1].line {
+            return Vec::new();
+        }
+        let mut column = self.old_column(begins(start));
+        let mut out = Vec::new();
+        for at in start + 1..end {
+            let before = self.source.marks[at - 1].token;
+            column += before.text(self.source.text).chars().count();
+            let blanks = begins(at) - before.end;
+            column += blanks;
+            out.push((column, at, blanks > self.space(at, start) + self.pad(at)));
+        }
+        out
     }
 
     // ---- the text

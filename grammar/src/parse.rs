@@ -169,8 +169,9 @@ fn says(pair: &Pair<Rule>, word: Rule) -> bool {
 impl<'t> Reader<'t> {
     fn new(file: FileId, text: &'t str) -> Reader<'t> {
         let mut source = Source::new(file, text);
-        let diagnostics = std::mem::take(&mut source.complaints);
+        let mut diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
+        diagnostics.extend(slips::block_comment(&source));
         Reader {
             source,
             names: Names::default(),
@@ -185,6 +186,9 @@ impl<'t> Reader<'t> {
 
     fn finish(mut self) -> Vec<Diagnostic> {
         self.diagnostics.sort_by_key(|diagnostic| diagnostic.span().start);
+        // A name in foreign letters is read wherever it is used: said once.
+        let mut names = HashSet::new();
+        self.diagnostics.retain(|d| !d.message.ends_with(slips::NO_NAME) || names.insert(d.message.clone()));
         self.diagnostics.truncate(DIAGNOSTIC_LIMIT);
         self.diagnostics
     }
@@ -241,6 +245,11 @@ impl<'t> Reader<'t> {
         let (start, end) = (self.source.marks[piece.start].token.start, self.source.marks[piece.end - 1].token.end);
         (self.base, self.too_high) = (start, false);
         let text = &self.source.text[start..end];
+        let rule = match self.source.word(piece.start) {
+            "param" | "input" | "output" | "state" | "let" if rule == Rule::one_stmt => Rule::one_decl,
+            _ if rule == Rule::one_stmt && matches!(self.source.word(piece.start + 1), "=" | "/") => Rule::one_eq,
+            _ => rule,
+        };
         // The rules of pest need many calls for each bracket.
         match stacker::maybe_grow(STACK_PER_LEVEL * (depth + 4), STACK_PER_LEVEL * (depth + 4), || {
             Fric::parse(rule, text)
@@ -307,7 +316,8 @@ impl<'t> Reader<'t> {
         if self.braces && matches!(self.source.word(first), "{" | "}") {
             return;
         }
-        if let Some(brace) = (first..piece.end).find(|&at| self.source.is_symbol(at, "}")) {
+        let brace = (first..piece.end).find(|&at| matches!(self.source.word(at), "{" | "}"));
+        if let Some(brace) = brace.filter(|&at| self.source.is_symbol(at, "}")) {
             if self.braces {
                 return;
             }
@@ -1492,6 +1502,7 @@ fn words(rule: Rule) -> Option<String> {
         Rule::expr
         | Rule::atom
         | Rule::call
+        | Rule::called
         | Rule::quantity
         | Rule::path
         | Rule::hole
@@ -1532,6 +1543,24 @@ mod tests {
     fn rule(name: &str) -> Rule {
         let found = Rule::all_rules().iter().find(|rule| format!("{rule:?}") == name);
         *found.unwrap_or_else(|| panic!("no rule {name}"))
+    }
+
+    /// The grammar writes them by their first letters.
+    #[test]
+    fn the_words_of_the_grammar_are_those_of_the_tokens() {
+        let letters = || (b'a'..=b'z').map(char::from);
+        let known = |word: &str| (takes(Rule::keyword, word), takes(Rule::context_kw, word));
+        for word in crate::tokens::KEYWORDS {
+            assert_eq!(known(word), (true, false), "{word}");
+        }
+        for word in crate::tokens::CONTEXT_WORDS {
+            assert_eq!(known(word), (false, true), "{word}");
+        }
+        let all = crate::tokens::KEYWORDS.iter().chain(&crate::tokens::CONTEXT_WORDS);
+        for word in all.flat_map(|word| letters().map(move |last| format!("{}{last}", &word[..word.len() - 1]))) {
+            let wanted = (crate::tokens::is_keyword(&word), crate::tokens::is_context_word(&word));
+            assert_eq!(known(&word), wanted, "{word}");
+        }
     }
 
     #[test]

@@ -87,6 +87,16 @@ fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loade
         terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));
         return None;
     }
+    watch.stage("check");
+    let found = compile::check_models(&loaded, &project::Disk);
+    if found.iter().any(Diagnostic::is_error) {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+        return None;
+    }
+    if !found.is_empty() {
+        let (n, s) = (found.len(), if found.len() == 1 { "" } else { "s" });
+        terminal.report(&format!("{n} warning{s}: `fric check {name}` shows {}\n", if n == 1 { "it" } else { "them" }));
+    }
     Some(loaded)
 }
 
