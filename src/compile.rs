@@ -1,5 +1,6 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+pub use abi::plan::Method;
 pub use compiler::explain::Explanation;
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
@@ -8,7 +9,7 @@ pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Case, Changes, Loaded, Options, SourceFile, Sources, check, check_models, compile, dissipation, explain, linear,
-    load, varying,
+    load, stepping, varying,
 };
 use std::time::Instant;
 

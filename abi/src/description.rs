@@ -88,6 +88,12 @@ impl Layout {
         Layout { rings: Segment { start: self.due.start + self.due.len, len }, ..self }
     }
 
+    /// Lengths of the segments but the rings, in the order of the fields.
+    pub fn lens(&self) -> [u32; 10] {
+        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, .. } = self;
+        [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
+    }
+
     /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
     pub fn new(lens: [u32; 10]) -> Layout {
         let mut next = Slot::FIXED;
@@ -244,5 +250,22 @@ impl Description {
     /// The quantity of this path.
     pub fn quantity(&self, path: &str) -> Option<&Quantity> {
         self.quantities.iter().find(|quantity| quantity.path == path)
+    }
+
+    /// Every slot that is named in it.
+    pub fn slots(&self) -> impl Iterator<Item = Slot> {
+        let quantities = self.quantities.iter().map(|quantity| quantity.slot);
+        let ticks = self.ticks.iter().flat_map(|tick| [tick.period, tick.due]);
+        let automata = self.automata.iter().map(|automaton| automaton.slot);
+        let delays = self.delays.iter().flat_map(|delay| {
+            // An empty ring lies nowhere.
+            let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
+            [Some(delay.time), Some(delay.source), Some(delay.past), Some(delay.slope), delay.weight, ring]
+        });
+        quantities
+            .chain(ticks)
+            .chain(automata)
+            .chain(delays.flatten())
+            .chain(self.guards.iter().map(|guard| guard.slot))
     }
 }

@@ -7,7 +7,10 @@ pub mod unit;
 pub mod description;
 pub mod table;
 pub mod plan;
+pub mod rig;
 pub mod instance;
+pub mod encode;
+pub mod image;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;

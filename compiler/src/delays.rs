@@ -96,6 +96,14 @@ pub fn fits(system: &System, step: f64, at: Option<Span>, diagnostics: &mut Vec<
     }
 }
 
+/// E0905: what a delay does to small motions is no matrix.
+pub fn linear(system: &System) -> Option<Diagnostic> {
+    let delay = system.delays.first()?;
+    let error = Diagnostic::error("E0905", "a model with a `delay` cannot be linearised yet")
+        .label(system.span(*delay), "depends on the past, not on states alone");
+    Some(error.help("a first-order lag comes close for slow motions: `dy/dt = (x - y) / T`"))
+}
+
 /// A time in words.
 fn shown(seconds: f64) -> String {
     match seconds < 1.0 {

@@ -131,6 +131,9 @@ pub fn linear(
     let Some(model) = model else {
         let variants = experiment::read(loaded, sources, name, &options.changes, warnings, &mut |_| ())?;
         let variant = variants.into_iter().next().expect("there is at least one combination");
+        if let Some(error) = delays::linear(&variant.system) {
+            return Err(vec![error]);
+        }
         let mut functions = functions(&variant.program, variant.experiment.solver.method);
         if !functions.iter().any(|(function, _)| *function == Function::Derivatives) {
             functions.push((Function::Derivatives, math::expand(&variant.program.derivatives)));
@@ -147,6 +150,7 @@ pub fn linear(
         data: Vec::new(),
     };
     let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    diagnostics.extend(delays::linear(&system));
     let ports = options.changes.ports.clone().unwrap_or_default();
     let opened = linearise::open(&mut system, &ports, &mut diagnostics);
     let types = units::check(&system, &loaded.files, &mut diagnostics);
@@ -297,6 +301,35 @@ pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<ex
         true => Err(once(diagnostics)),
         false => Ok(explain::explain(&system, &types, &loaded.files)),
     }
+}
+
+/// A model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
+///
+/// # Errors
+/// Everything that is wrong with it, and why there is no machine code.
+pub fn stepping(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &str,
+    method: Method,
+    step: f64,
+) -> Result<Instance, Vec<Diagnostic>> {
+    let found = loaded.models().into_iter().find(|candidate| candidate.name.text == model);
+    let Some(model) = found else {
+        return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
+    };
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, loaded.root(), Vec::new());
+    delays::check(&system, &mut diagnostics);
+    delays::fits(&system, step, None, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
+    }
+    let lower::Lowered { mut program, .. } = lower::lower(&system, &types, &[]);
+    program.size_rings(step);
+    let (code, _) = code(&functions(&program, method), &program.description, false);
+    let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    instance.start(step);
+    Ok(instance)
 }
 
 /// A model on its own, flat and typed, its circles reported.

@@ -1,0 +1,262 @@
+//! A rig as plain data: what drives the crossed-out part, how signals travel, what must never be exceeded.
+//!
+//! Like a plan, it holds slots: every expression of a rig's text is a quantity of one of two programs. The *control*
+//! program is the system with one part crossed out: the signals read from the bus are its inputs, the commands it
+//! requests are its outputs. The *plant* program is the crossed-out part alone, driven by what the drives apply and
+//! giving what their encoders see: it stands in where there is no hardware.
+
+use crate::description::Slot;
+use crate::plan::{Method, Series};
+use crate::unit::Unit;
+
+/// One rig.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Rig {
+    /// Its name.
+    pub name: String,
+    /// Period of the cycle.
+    pub period_ns: u64,
+    /// Fixed method of the control program.
+    pub method: Method,
+    /// Steps of the method in one period, at least 1.
+    pub steps: u32,
+    /// The buses, in the order of the text.
+    pub buses: Vec<Bus>,
+    /// Drives and devices, in the order of the text.
+    pub nodes: Vec<Node>,
+    /// Signals that the control program reads.
+    pub inputs: Vec<Input>,
+    /// Commands that the control program gives.
+    pub outputs: Vec<Output>,
+    /// Time without a cycle after which the watchdog stops the drives.
+    pub watchdog_ns: u64,
+    /// What a missed tick does.
+    pub overrun: Overrun,
+    /// Conditions under which the rig stops by itself.
+    pub stops: Vec<Stop>,
+    /// What is kept for every tick besides inputs, outputs and states.
+    pub record: Vec<Series>,
+    /// The drive (index into `nodes`) whose command is computed for the moment it acts.
+    pub predict: Option<usize>,
+    /// The crossed-out part as a program of its own.
+    pub plant: Plant,
+}
+
+/// `overrun stop` or `overrun hold N`.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Overrun {
+    /// To the safe values at the first missed tick.
+    Stop,
+    /// Up to this many consecutive missed ticks the last permitted commands stay.
+    Hold(u32),
+}
+
+/// One bus.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Bus {
+    /// As the rig calls it: `can0`.
+    pub name: String,
+    /// Where it is: `socketcan:can0`, `sim:bench`, `slcan:/dev/ttyACM0@1000000`, `socketcand:host:29536/can0`.
+    pub address: String,
+    /// In bit/s; 0 where the kind has none.
+    pub bit_rate: u32,
+}
+
+/// A drive or a device on a bus.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Node {
+    /// As the rig calls it: `load`.
+    pub name: String,
+    /// Index into [`Rig::buses`].
+    pub bus: usize,
+    /// What it speaks.
+    pub kind: Kind,
+    /// It can move: it is supervised and has a safe value. A `device` only talks.
+    pub moves: bool,
+    /// Dead time from a command to its effect, s.
+    pub delay: f64,
+    /// Time constant of the effect, s.
+    pub lag: f64,
+    /// Age at which a signal of it is lost; 0 where the rig names none.
+    pub timeout_ns: u64,
+}
+
+/// How a node speaks.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Kind {
+    /// CANopen with the drive profile CiA 402.
+    Cia402(Cia402),
+    /// Frames described by hand or by a DBC file.
+    Frames(Vec<Message>),
+}
+
+/// The arguments of `cia402(…)`, SI.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Cia402 {
+    /// Node id, 1 to 127.
+    pub node: u8,
+    /// Rated torque, N·m: object 6076 must agree.
+    pub rated_torque: f64,
+    /// The commanded signal.
+    pub mode: Mode,
+    /// Angle of one step of object 6064, rad.
+    pub count: f64,
+    /// One step of object 606C, rad/s.
+    pub speed_unit: f64,
+    /// Greatest torque, N·m; none: object 6072.
+    pub max_torque: Option<f64>,
+    /// Greatest speed, rad/s; none: object 6080.
+    pub max_speed: Option<f64>,
+    /// Permitted positions, rad, counted from enabling.
+    pub travel: Option<(f64, f64)>,
+    /// Greatest power, W; none: greatest torque times greatest speed.
+    pub max_power: Option<f64>,
+    /// A command acts with the next SYNC rather than when it arrives.
+    pub at_sync: bool,
+    /// The profile it is based on: `cia402`, `fc302`, `vlt5000`.
+    pub profile: String,
+}
+
+/// What a drive is told to follow.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[allow(missing_docs)]
+pub enum Mode {
+    Torque,
+    Speed,
+    Position,
+}
+
+/// A signal of a node.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
+pub struct Signal {
+    /// Index into [`Rig::nodes`].
+    pub node: usize,
+    /// Which one.
+    pub what: What,
+}
+
+/// Which signal of a node.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
+pub enum What {
+    /// Torque of a CiA 402 drive, N·m.
+    Torque,
+    /// Speed of a CiA 402 drive, rad/s.
+    Speed,
+    /// Position of a CiA 402 drive, rad, counted from enabling.
+    Position,
+    /// 1 while the drive follows commands.
+    Enabled,
+    /// 1 while the drive reports a fault.
+    Fault,
+    /// 1 while the drive reports an internal limit.
+    Limited,
+    /// A field of a node that speaks in frames: message and field, as indices.
+    Field(usize, usize),
+}
+
+/// One frame of a device.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Message {
+    /// Its name in a DBC file, or the name of its first signal.
+    pub name: String,
+    /// The identifier.
+    pub id: u32,
+    /// 29-bit rather than 11-bit.
+    pub extended: bool,
+    /// Number of data bytes.
+    pub length: u8,
+    /// From us to the device.
+    pub send: bool,
+    /// How often it is sent or expected, ns; 0: unknown.
+    pub period_ns: u64,
+    /// What it carries.
+    pub fields: Vec<Field>,
+}
+
+/// One signal in a frame. SI value = raw · scale + offset.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Field {
+    /// Its name.
+    pub name: String,
+    /// Bit of the frame at which it starts, as a DBC file counts: byte · 8 + bit in the byte, least significant bit of a
+    /// little-endian, most significant bit of a big-endian signal.
+    pub start_bit: u16,
+    /// Number of bits.
+    pub bits: u16,
+    /// Most significant byte first.
+    pub big_endian: bool,
+    /// How the bits are read.
+    pub format: Format,
+    /// SI value of one step.
+    pub scale: f64,
+    /// SI value of raw 0.
+    pub offset: f64,
+    /// Value before the first frame and in dry runs, SI.
+    pub start: f64,
+    /// The unit it is shown in.
+    pub unit: Unit,
+    /// Sent only while another field of the message has this raw value: DBC multiplexing.
+    pub multiplexed: Option<(usize, u64)>,
+}
+
+/// How the bits of a field are read.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[allow(missing_docs)]
+pub enum Format {
+    Unsigned,
+    Signed,
+    Float32,
+    Float64,
+}
+
+/// A signal that the control program reads.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Input {
+    /// Where it comes from.
+    pub signal: Signal,
+    /// The input slot of the control program it goes to.
+    pub slot: Slot,
+    /// Value before anything has arrived, SI.
+    pub start: f64,
+    /// `hardware` or a `stop` needs it: it must be fresh.
+    pub needed: bool,
+}
+
+/// A command that the control program gives.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Output {
+    /// Where it goes.
+    pub signal: Signal,
+    /// The output slot of the control program that holds the request, SI.
+    pub slot: Slot,
+    /// Least permitted value, SI; −inf where the rig names none.
+    pub low: f64,
+    /// Greatest permitted value, SI.
+    pub high: f64,
+    /// Greatest change per second, SI; inf where the rig names none.
+    pub slew: f64,
+    /// Sent on any stop, SI.
+    pub safe: f64,
+}
+
+/// `stop when COND, "why"`.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Stop {
+    /// The output slot of the control program that is not 0 when the rig must stop.
+    pub slot: Slot,
+    /// As written.
+    pub condition: String,
+    /// What the operator is told.
+    pub why: String,
+}
+
+/// The crossed-out part as a program.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Plant {
+    /// What drives apply (SI) → input slots of the plant program.
+    pub applied: Vec<(Signal, Slot)>,
+    /// What encoders see (SI) ← output slots of the plant program.
+    pub seen: Vec<(Signal, Slot)>,
+    /// Moment of inertia of the shaft, kg·m², where the compiler could find it; for prediction and its checks.
+    pub inertia: Option<f64>,
+}
