@@ -1,16 +1,18 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
 pub use abi::plan::Method;
-pub use compiler::explain::Explanation;
+pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, SourceFile, Sources, check, check_models, compile, dissipation, explain, linear,
-    load, stepping, varying,
+    Case, Changes, Loaded, Options, SourceFile, Sources, check, check_models, compile, dissipation, explain,
+    explain_in, explain_run, linear, load, quantities, stepping, varying,
 };
+#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
+pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

@@ -574,7 +574,7 @@ fn odd_texts_are_answered() {
             ),
             "E0401",
         ),
-        ("other scripts", "модель M { }\n".into(), "E0002"),
+        ("other scripts", "модель M { }\n".into(), "E0001"),
         ("a control character", model("\u{1b} 1"), "E0001"),
         ("half a model", "model M {\n  output y [1] = ".into(), "E0002"),
     ];

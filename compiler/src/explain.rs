@@ -30,6 +30,8 @@ pub struct Explanation {
     pub quantities: Vec<Listed>,
     /// Equations in the order in which they are computed: left side, right side as written.
     pub equations: Vec<(String, String)>,
+    /// For each quantity that is computed, those its equation names: paths.
+    pub needs: Vec<(String, Vec<String>)>,
     /// How each continuous state is stepped.
     pub states: Vec<Stepped>,
     /// What the fixed steps cost.
@@ -105,17 +107,6 @@ const EXAMPLE_STEP: f64 = 1e-3;
 pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     let Lowered { mut program, .. } = lower(system, types, &[]);
     program.size_rings(EXAMPLE_STEP);
-    let listed = |id: VarId| {
-        let var = system.var(id);
-        let unit = &types.units[id.0 as usize];
-        Listed {
-            kind: var.kind.word(),
-            path: var.path.clone(),
-            unit: if types.boolean_vars[id.0 as usize] { "true or false".into() } else { unit.to_string() },
-            range: var.range_span.map(|span| files.slice(span).to_string()),
-            doc: var.doc.clone(),
-        }
-    };
     let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
         let step = discretize::step(&program, method);
         let expanded = crate::math::expand(&step);
@@ -130,8 +121,9 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     });
     Explanation {
         model: system.instances.first().map_or(String::new(), |top| top.model.clone()),
-        quantities: system.var_ids().map(listed).collect(),
+        quantities: quantities(system, types, files),
         equations: equations(system, files),
+        needs: needs(system),
         states: states(system, &program),
         steps: steps.to_vec(),
         bytes: 8 * program.description.layout.size(),
@@ -139,6 +131,22 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
         rate_independent: rate_independent(system),
         dissipation: friction::dissipation(system, types),
     }
+}
+
+/// Every quantity, parts after their owner, in the order of the text.
+pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> {
+    let listed = |id: VarId| {
+        let var = system.var(id);
+        let unit = &types.units[id.0 as usize];
+        Listed {
+            kind: var.kind.word(),
+            path: var.path.clone(),
+            unit: if types.boolean_vars[id.0 as usize] { "true or false".into() } else { unit.to_string() },
+            range: var.range_span.map(|span| files.slice(span).to_string()),
+            doc: var.doc.clone(),
+        }
+    };
+    system.var_ids().map(listed).collect()
 }
 
 /// Instructions and bytes of the machine code of a function; none on a processor without.
@@ -202,6 +210,28 @@ fn equations(system: &System, files: &Files) -> Vec<(String, String)> {
         }
     }
     out
+}
+
+/// What the equation of each quantity names.
+fn needs(system: &System) -> Vec<(String, Vec<String>)> {
+    let of = |id: VarId| {
+        let var = system.var(id);
+        let values = match var.definition {
+            Definition::Missing | Definition::Free => return None,
+            Definition::Value(value, _) | Definition::Held { value, .. } => [Some(value), None],
+            Definition::Continuous { initial, rate, .. } => [Some(rate), Some(initial)],
+            Definition::Sampled { initial, next, .. } => [Some(next), Some(initial)],
+        };
+        let mut paths: Vec<String> = Vec::new();
+        for needed in values.into_iter().flatten().flat_map(|value| mentioned(system, value)) {
+            let path = &system.var(needed).path;
+            if *path != var.path && !paths.contains(path) {
+                paths.push(path.clone());
+            }
+        }
+        Some((var.path.clone(), paths))
+    };
+    system.var_ids().filter_map(of).collect()
 }
 
 /// The right side of an equation; one put together from regimes has no text of its own.

@@ -42,9 +42,11 @@ fn once(text: &str, width: usize) -> Result<String, Vec<Diagnostic>> {
     layout.lines();
     layout.heads();
     layout.fold(width);
-    layout.paragraphs();
+    let runs = layout.runs();
+    layout.names(&runs);
     layout.arguments();
     layout.chosen();
+    layout.columns(&runs);
     Ok(layout.write())
 }
 
@@ -120,6 +122,9 @@ struct Layout<'s, 't> {
     /// Where the comment of a line stands.
     comments: HashMap<usize, usize>,
 }
+
+/// Words that begin a column.
+const COLUMN_WORDS: [&str; 7] = ["in", "limit", "slew", "at", "byte", "as", "scale"];
 
 impl<'s, 't> Layout<'s, 't> {
     fn new(source: &'s Source<'t>, strokes: HashSet<usize>) -> Layout<'s, 't> {
@@ -385,9 +390,8 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Aligns neighbouring statements: names, units and equals signs of the same kind; ranges and comments of all.
-    fn paragraphs(&mut self) {
-        // Lines that begin a statement, in runs without a gap or a comment between them.
+    /// Lines that begin a statement, in runs without a gap or a comment between them.
+    fn runs(&self) -> Vec<Vec<usize>> {
         let mut runs: Vec<Vec<usize>> = Vec::new();
         let mut block = None;
         for (index, line) in self.lines.iter().enumerate() {
@@ -406,7 +410,12 @@ impl<'s, 't> Layout<'s, 't> {
                 None => {}
             }
         }
-        for run in &runs {
+        runs
+    }
+
+    /// Aligns neighbouring statements of the same kind: names, units and equals signs.
+    fn names(&mut self, runs: &[Vec<usize>]) {
+        for run in runs {
             let groups: Vec<&[usize]> = run.chunk_by(|&a, &b| self.kind(a) == self.kind(b)).collect();
             for group in groups {
                 let name: Vec<(usize, usize)> = group.iter().filter_map(|&line| self.name_stop(line)).collect();
@@ -415,7 +424,13 @@ impl<'s, 't> Layout<'s, 't> {
                 let equals: Vec<(usize, usize)> = group.iter().filter_map(|&line| self.equals_stop(line)).collect();
                 self.align(&equals, false);
             }
-            for word in ["in", "limit", "slew", "at", "byte", "as", "scale"] {
+        }
+    }
+
+    /// Aligns ranges and comments of neighbouring statements, and what else stands in columns.
+    fn columns(&mut self, runs: &[Vec<usize>]) {
+        for run in runs {
+            for word in COLUMN_WORDS {
                 let stops: Vec<(usize, usize)> = run.iter().filter_map(|&line| self.word_stop(line, word)).collect();
                 let least = if word == "in" { RANGE_COLUMN } else { 0 };
                 self.keep_or_align(&stops, least);
@@ -610,13 +625,17 @@ impl<'s, 't> Layout<'s, 't> {
             return Vec::new();
         }
         let mut column = self.old_column(begins(start));
+        let columns: Vec<usize> = COLUMN_WORDS.iter().filter_map(|word| Some(self.word_stop(line, word)?.1)).collect();
         let mut out = Vec::new();
         for at in start + 1..end {
             let before = self.source.marks[at - 1].token;
             column += before.text(self.source.text).chars().count();
             let blanks = begins(at) - before.end;
             column += blanks;
-            out.push((column, at, blanks > self.space(at, start) + self.pad(at)));
+            // What stands in a column of its own is brought there afterwards.
+            if !columns.contains(&at) {
+                out.push((column, at, blanks > self.space(at, start) + self.pad(at)));
+            }
         }
         out
     }

@@ -67,7 +67,8 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     end
 }
 
-fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
+/// Everything about a model, and how long its steps take where that was asked for.
+pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &explanation.model));
     let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
     let names = width(&mut explanation.quantities.iter().map(|q| q.path.chars().count()));
@@ -176,7 +177,7 @@ const MARGIN: f64 = 2.0;
 const STEP: f64 = 1e-3;
 
 /// How long one call took, in ns.
-struct Bound {
+pub(super) struct Bound {
     method: Method,
     median: f64,
     worst: f64,
@@ -209,8 +210,8 @@ fn nanoseconds(ns: f64) -> String {
     }
 }
 
-/// From the heading of a code to the next heading.
-fn page(code: &str) -> Option<&'static str> {
+/// The page of a code: from its heading to the next.
+pub(super) fn page(code: &str) -> Option<&'static str> {
     let start = headings().find(|at| PAGES[*at..].strip_prefix("## ").is_some_and(|rest| word(rest) == code))?;
     let end = headings().find(|at| *at > start).unwrap_or(PAGES.len());
     Some(&PAGES[start..end])

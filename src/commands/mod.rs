@@ -8,11 +8,13 @@ mod explain;
 mod fmt;
 mod linearise;
 mod new;
+mod repl;
 mod run;
 mod sweep;
 mod test;
+mod watch;
 
-use crate::args::{Args, Command};
+use crate::args::{Args, Command, Repl};
 use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
@@ -37,7 +39,8 @@ pub enum End {
 
 /// Does what was asked for.
 pub fn run(args: &Args, terminal: &mut Terminal) -> End {
-    match &args.command {
+    let Some(command) = &args.command else { return repl::repl(&Repl::default(), terminal) };
+    match command {
         Command::Run(run) => run::run(run, terminal),
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
@@ -48,6 +51,8 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        Command::Repl(args) => repl::repl(args, terminal),
+        Command::Watch(args) => watch::watch(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();
@@ -87,17 +92,26 @@ fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loade
         terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));
         return None;
     }
-    watch.stage("check");
-    let found = compile::check_models(&loaded, &project::Disk);
-    if found.iter().any(Diagnostic::is_error) {
-        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
-        return None;
-    }
-    if !found.is_empty() {
-        let (n, s) = (found.len(), if found.len() == 1 { "" } else { "s" });
-        terminal.report(&format!("{n} warning{s}: `fric check {name}` shows {}\n", if n == 1 { "it" } else { "them" }));
-    }
     Some(loaded)
+}
+
+/// Refuses what `fric check` refuses in the models of a text, and reports it; counts its warnings in one line.
+fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
+    watch.stage("models");
+    let found = compile::check_models(loaded, &project::Disk);
+    if found.iter().any(Diagnostic::is_error) {
+        reported(loaded, &found, terminal);
+        return Err(found);
+    }
+    if !found.is_empty() && !quiet {
+        let (n, s, them) = match found.len() {
+            1 => (1, "", "it"),
+            n => (n, "s", "them"),
+        };
+        let name = &loaded.files.get(loaded.root()).name;
+        terminal.report(&format!("{n} warning{s}: `fric check {name}` shows {them}\n"));
+    }
+    Ok(())
 }
 
 /// An experiment, compiled and run.
