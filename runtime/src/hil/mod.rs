@@ -7,6 +7,8 @@ pub mod control;
 pub mod trace;
 pub mod replay;
 pub mod emergency;
+pub mod cycle;
+pub mod words;
 
 #[cfg(test)]
 mod bench;
