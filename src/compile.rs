@@ -7,7 +7,8 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, linear, load, varying,
+    Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, compile, dissipation, explain, linear, load,
+    rig, varying,
 };
 use std::time::Instant;
 

@@ -11,6 +11,7 @@ mod commands;
 mod compile;
 mod equations;
 mod figure;
+mod kept;
 mod matrices;
 mod plot;
 mod project;
@@ -30,5 +31,6 @@ fn main() -> ExitCode {
         End::Fine => ExitCode::SUCCESS,
         End::Failed => ExitCode::from(1),
         End::Misused => ExitCode::from(2),
+        End::Stopped => ExitCode::from(3),
     }
 }

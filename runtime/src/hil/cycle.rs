@@ -67,7 +67,7 @@ impl Set {
 }
 
 /// How a rig is run.
-#[derive(Clone, Copy, PartialEq, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Options {
     /// What is not in its text.
     pub control: control::Options,
@@ -75,6 +75,10 @@ pub struct Options {
     pub start: drive::Options,
     /// Enable and arm as soon as that can be: for simulated drives.
     pub arms_itself: bool,
+    /// Stop when the start-up is through: nothing is armed.
+    pub checks_only: bool,
+    /// Refuse drives that are not simulated: why. They say vendor 0.
+    pub only_simulated: Option<String>,
     /// From SYNC to the computing, ns; none: as the rig's kind of drives needs it.
     pub collect_ns: Option<u64>,
     /// Time the model runs, ns; none: until somebody stops it.
@@ -87,6 +91,8 @@ impl Default for Options {
             control: control::Options::default(),
             start: drive::Options::default(),
             arms_itself: false,
+            checks_only: false,
+            only_simulated: None,
             collect_ns: None,
             duration_ns: None,
         }
@@ -105,7 +111,7 @@ pub enum End {
 }
 
 /// What was counted.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct Counts {
     /// Cycles in which the model ran.
     pub cycles: u64,
@@ -238,6 +244,9 @@ impl Wires {
     }
 }
 
+/// Where the operator's commands go in.
+pub type Operator = Producer<Command>;
+
 /// A rig under way.
 pub struct Hil {
     rig: Rig,
@@ -267,6 +276,7 @@ pub struct Hil {
     /// Since when the drives have been told to give up their torque.
     resting_ns: Option<u64>,
     counts: Counts,
+    misuse: bool,
     end: Option<End>,
 }
 
@@ -282,7 +292,7 @@ impl Hil {
         buses: Vec<Box<dyn Bus>>,
         options: Options,
         log: Option<(log::Settings, Sections)>,
-    ) -> Result<(Hil, Producer<Command>), String> {
+    ) -> Result<(Hil, Operator), String> {
         assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
         let fieldbus = Fieldbus::new(rig, options.start)?;
         let (operator, commands) = RingBuffer::new(64);
@@ -298,6 +308,7 @@ impl Hil {
         let empty = Shape { signals: 0, outputs: 0, drives: 0, recorded: 0 };
         let hil = Hil {
             rig: rig.clone(),
+            left: options.duration_ns.map(|ns| ns.div_ceil(rig.period_ns)),
             options,
             wires: Wires {
                 clock,
@@ -327,10 +338,10 @@ impl Hil {
             order: Order::Wait,
             overload: 0,
             first_trouble: None,
-            left: options.duration_ns.map(|ns| ns.div_ceil(rig.period_ns)),
             over: false,
             resting_ns: None,
             counts: Counts::default(),
+            misuse: false,
             end: None,
         };
         Ok((hil, operator))
@@ -374,6 +385,24 @@ impl Hil {
     /// How it ended, once it has.
     pub fn ended(&self) -> Option<&End> {
         self.end.as_ref()
+    }
+
+    /// Whether it was refused for what only simulated drives bear.
+    pub fn is_misuse(&self) -> bool {
+        self.misuse
+    }
+
+    /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere.
+    pub fn prepare_emergency(&self) {
+        let mut writes = Vec::new();
+        for (i, bus) in self.wires.buses.iter().enumerate() {
+            for frames in [self.fieldbus.stop_frames(i), self.fieldbus.off_frames(i)] {
+                if let Some(prepared) = bus.prepared(frames) {
+                    writes.extend(prepared.writes.into_iter().map(|bytes| (prepared.fd, bytes)));
+                }
+            }
+        }
+        emergency::prepare(writes);
     }
 
     /// Runs until it ends.
@@ -455,11 +484,14 @@ impl Hil {
                 }
             }
         }
+        if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
+            self.stop();
+        }
         let arms_itself = self.options.arms_itself && self.end.is_none() && self.resting_ns.is_none();
         if arms_itself && self.control.is_some() {
             match self.fieldbus.step() {
                 Step::AwaitEnable => _ = self.fieldbus.request(Request::Enable),
-                Step::AwaitArm => _ = self.fieldbus.request(Request::Arm),
+                Step::AwaitArm if !self.options.checks_only => _ = self.fieldbus.request(Request::Arm),
                 _ => {}
             }
         }
@@ -574,6 +606,13 @@ impl Hil {
             Bounds { torque: limits.map(|limits| limits.torque), speed: limits.map(|limits| limits.speed) }
         });
         let bounds: Vec<Bounds> = bounds.collect();
+        let real = |node: &usize| self.fieldbus.status(*node).is_some_and(|status| status.identity[0] != Some(0));
+        if let Some(why) = &self.options.only_simulated
+            && let Some(node) = (0..self.rig.nodes.len()).find(real)
+        {
+            self.misuse = true;
+            return self.refuse(format!("{why}, and `{}` is none", self.rig.nodes[node].name));
+        }
         let control = match Control::new(&self.rig, self.model.clone(), &bounds, self.options.control) {
             Ok(control) => control,
             Err(why) => return self.refuse(why),

@@ -9,6 +9,10 @@ pub mod replay;
 pub mod emergency;
 pub mod cycle;
 pub mod words;
+pub mod simulated;
 
 #[cfg(test)]
 mod bench;
+
+#[cfg(test)]
+mod tests;

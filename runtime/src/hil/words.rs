@@ -1,6 +1,7 @@
 //! What a rig has to say, in words.
 
 use super::cycle::Counts;
+use crate::drive::Step;
 use crate::histogram::Histogram;
 use crate::safety::Cause;
 use crate::show;
@@ -71,6 +72,34 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
     }
 }
 
+const STEPS: [Step; 16] = [
+    Step::Listen,
+    Step::Reset,
+    Step::Identity,
+    Step::Configure,
+    Step::Start,
+    Step::Sync,
+    Step::Mode,
+    Step::AwaitEnable,
+    Step::Enable,
+    Step::TimeoutTest,
+    Step::Reenable,
+    Step::SignTest,
+    Step::AwaitArm,
+    Step::Armed,
+    Step::Stopped,
+    Step::Refused,
+];
+
+/// The stage that a gauge shows.
+pub fn stage(number: u64) -> String {
+    match number {
+        102 => "quick stop".into(),
+        103 => "torque off".into(),
+        step => STEPS.iter().find(|known| **known as u64 == step).map_or("?".into(), Step::to_string),
+    }
+}
+
 /// What was counted, a line for each group.
 pub fn counts(counts: &Counts) -> String {
     let mut out = String::new();
@@ -84,12 +113,16 @@ pub fn counts(counts: &Counts) -> String {
     if counts.late.total() > 0 {
         let _ = writeln!(out, "late µs  {}", quantiles(&counts.late));
         let each = [("receive", &counts.receive), ("compute", &counts.compute), ("send", &counts.send)];
-        let phases = each.map(|(name, h)| format!("{name} {:.1} / {:.1}", micro(h.quantile_ns(0.5)), micro(h.max_ns())));
+        let phases =
+            each.map(|(name, h)| format!("{name} {:.1} / {:.1}", micro(h.quantile_ns(0.5)), micro(h.max_ns())));
         let _ = writeln!(out, "phases µs  {}  (p50 / max)", phases.join("   "));
     }
     let [range, slew, power] = clamped;
     let _ = writeln!(out, "clamped  range {range}, slew {slew}, power {power}");
-    let _ = writeln!(out, "frames   {stale} readings held, {lost_frames} lost, {refused_frames} not taken, {bus_errors} bus errors");
+    let _ = writeln!(
+        out,
+        "frames   {stale} readings held, {lost_frames} lost, {refused_frames} not taken, {bus_errors} bus errors"
+    );
     let _ = writeln!(out, "log      {} messages dropped", counts.log_dropped);
     out
 }
