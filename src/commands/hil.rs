@@ -9,10 +9,12 @@ use crate::{project, report, value};
 use abi::Description;
 use abi::description::Kind;
 use grammar::ast::Item;
-use runtime::can::Bus;
-use runtime::clock::{Clock, Monotonic};
+use runtime::can::address::Address;
+use runtime::can::sim::Simulation;
+use runtime::can::{self, Bus};
+use runtime::clock::Clock;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
-use runtime::hil::simulated::{Pace, World};
+use runtime::hil::simulated::{MASTER, Pace, World};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
@@ -192,21 +194,26 @@ fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> E
 
 /// Buses of this machine.
 fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
-    let clock = Monotonic::new();
+    let world = Simulation::real_time();
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
     for bus in &ready.rig.buses {
-        match runtime::can::open(&bus.address, bus.bit_rate, clock) {
+        let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
+        let open = bus.address.parse::<Address>().map_err(|why| why.to_string()).and_then(|address| {
+            can::open(&address, &options, &world, MASTER).map_err(|why| why.to_string())
+        });
+        match open {
             Ok(open) => buses.push(open),
             Err(why) => {
-                terminal.error(&format!(
-                    "bus `{}` ({}): {why}\n  `fric hil --sim` runs the rig with simulated drives; `--bus {}=ADDRESS` puts another bus under it",
-                    bus.name, bus.address, bus.name
+                terminal.error(&format!("bus `{}`: {why}", bus.name));
+                terminal.report(&format!(
+                    "  `fric hil --sim` runs the rig with simulated drives; --bus {}=ADDRESS puts another bus under it\n",
+                    bus.name
                 ));
                 return End::Failed;
             }
         }
     }
-    run(args, ready, Box::new(clock), buses, false, log, terminal)
+    run(args, ready, Box::new(world), buses, false, log, terminal)
 }
 
 fn run(
@@ -234,8 +241,6 @@ fn run(
             options.only_simulated = Some("this host gives no real time, see above".into());
         }
     }
-    let prepared: Vec<_> = buses.iter().map(|bus| bus.prepared(&[])).collect();
-    drop(prepared);
     let (mut hil, operator) = match Hil::new(&rig, control, clock, buses, options, log) {
         Ok(made) => made,
         Err(why) => {

@@ -394,15 +394,12 @@ impl Hil {
 
     /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere.
     pub fn prepare_emergency(&self) {
-        let mut writes = Vec::new();
-        for (i, bus) in self.wires.buses.iter().enumerate() {
-            for frames in [self.fieldbus.stop_frames(i), self.fieldbus.off_frames(i)] {
-                if let Some(prepared) = bus.prepared(frames) {
-                    writes.extend(prepared.writes.into_iter().map(|bytes| (prepared.fd, bytes)));
-                }
-            }
-        }
-        emergency::prepare(writes);
+        let buses = self.wires.buses.iter().enumerate();
+        let ready = buses.flat_map(|(i, bus)| {
+            let frames = self.fieldbus.stop_frames(i).iter().chain(self.fieldbus.off_frames(i));
+            frames.filter_map(|frame| bus.prepare(*frame))
+        });
+        emergency::prepare(ready.collect());
     }
 
     /// Runs until it ends.
