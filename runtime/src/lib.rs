@@ -17,6 +17,7 @@ mod observe;
 mod solver;
 
 pub mod engine;
+pub mod steady;
 pub mod sweep;
 
 pub mod blob;
