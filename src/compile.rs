@@ -10,8 +10,6 @@ pub use compiler::{
     Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, compile, dissipation, explain, explain_in,
     explain_run, linear, load, quantities, rig, varying,
 };
-#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
-pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.

@@ -180,7 +180,7 @@ fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> E
         }
     };
     for text in &args.inject {
-        match runtime::drive::hooks::parse(&ready.rig, text) {
+        match runtime::drive::hooks::read(text, &ready.rig) {
             Ok(hook) => world.bench().hook(hook),
             Err(why) => {
                 terminal.error(&format!("--inject '{text}': {why}"));

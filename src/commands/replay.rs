@@ -17,7 +17,7 @@ use std::fmt::Write;
 
 pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     let name = args.log.display().to_string();
-    let mut fail = |terminal: &mut Terminal, why: &str| {
+    let fail = |terminal: &mut Terminal, why: &str| {
         terminal.error(&format!("{name}: {why}"));
         End::Failed
     };
