@@ -198,9 +198,11 @@ fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
     for bus in &ready.rig.buses {
         let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
-        let open = bus.address.parse::<Address>().map_err(|why| why.to_string()).and_then(|address| {
-            can::open(&address, &options, &world, MASTER).map_err(|why| why.to_string())
-        });
+        let open = bus
+            .address
+            .parse::<Address>()
+            .map_err(|why| why.to_string())
+            .and_then(|address| can::open(&address, &options, &world, MASTER).map_err(|why| why.to_string()));
         match open {
             Ok(open) => buses.push(open),
             Err(why) => {
@@ -402,7 +404,7 @@ fn prompt(mut operator: runtime::hil::cycle::Operator, description: &Description
             },
         };
         match command {
-            Ok(command) if operator.push(command).is_err() => terminal.error("too much at once: say it again"),
+            Ok(command) if !operator.push(command) => terminal.error("too much at once: say it again"),
             Ok(_) => {}
             Err(why) => terminal.error(&why),
         }
