@@ -438,7 +438,7 @@ fn row_16_a_data_word_that_is_wrong() {
 #[test]
 fn row_17_and_18_a_process_that_is_frozen_or_gone() {
     for node in 0..2 {
-        let mut stand = Stand::armed(|_, _| ());
+        let stand = Stand::armed(|_, _| ());
         let now = stand.now();
         // No cycle any more: the drives must notice by themselves.
         stand.world.simulation().run_to(now + 60 * MS);
