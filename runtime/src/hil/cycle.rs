@@ -37,6 +37,7 @@ const REST_NS: u64 = 1_000_000_000;
 
 /// What an operator may ask for while the rig is under way.
 #[derive(Clone, Copy, PartialEq, Debug)]
+#[allow(clippy::large_enum_variant, reason = "a box would be freed in a cycle")]
 pub enum Command {
     /// Power on, at zero command.
     Enable,
@@ -67,7 +68,7 @@ impl Set {
 }
 
 /// How a rig is run.
-#[derive(Clone, PartialEq, Debug)]
+#[derive(Clone, PartialEq, Debug, Default)]
 pub struct Options {
     /// What is not in its text.
     pub control: control::Options,
@@ -83,20 +84,6 @@ pub struct Options {
     pub collect_ns: Option<u64>,
     /// Time the model runs, ns; none: until somebody stops it.
     pub duration_ns: Option<u64>,
-}
-
-impl Default for Options {
-    fn default() -> Options {
-        Options {
-            control: control::Options::default(),
-            start: drive::Options::default(),
-            arms_itself: false,
-            checks_only: false,
-            only_simulated: None,
-            collect_ns: None,
-            duration_ns: None,
-        }
-    }
 }
 
 /// How it ended.
