@@ -8,11 +8,9 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, SourceFile, Sources, check, check_models, compile, dissipation, explain,
-    explain_in, explain_run, linear, load, quantities, stepping, varying,
+    Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, check_models, compile, dissipation, explain,
+    explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
-#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
-pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// How long each stage took, in the order in which they ran.
