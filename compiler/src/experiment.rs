@@ -12,7 +12,7 @@ use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
-use crate::{causality, checks};
+use crate::{causality, checks, delays};
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -615,6 +615,7 @@ fn variant(
     if cut.is_none() && solver.method != Method::Adaptive {
         let at = step.map(|at| system.span(nodes[at]));
         checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+        delays::fits(&system, solver.step, at, &mut reader.diagnostics);
         if duration / solver.step > MOST_STEPS {
             let steps = units::three_digits(duration / solver.step);
             let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
@@ -647,8 +648,16 @@ fn variant(
     warnings.extend(diagnostics);
     on_stage("lower");
     let lowered = lower(&system, &types, &wanted);
-    let rig = cut.map(|cut| cut.with_plant(&lowered, own));
+    let mut rig = cut.map(|cut| cut.with_plant(&lowered, own));
     let Lowered { mut program, observed: slots } = lowered;
+    match &mut rig {
+        Some((rig, plant)) => {
+            program.size_rings(rig.period_ns as f64 * 1e-9 / f64::from(rig.steps));
+            plant.size_rings(solver.step);
+        }
+        None if solver.method != Method::Adaptive => program.size_rings(solver.step),
+        None => {}
+    }
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
         root.text = surface_text(loaded, &root.text);

@@ -553,7 +553,10 @@ impl Cut {
         let control = lower(&self.control, &self.control_types, &self.wanted(&self.control));
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
         let rig = self.finish(&control.program, &control.observed, &plant);
-        let (control, plant) = (control.program, plant.program);
+        let (mut control, mut plant) = (control.program, plant.program);
+        let period = rig.period_ns as f64 * 1e-9;
+        control.size_rings(period / f64::from(rig.steps));
+        plant.size_rings(period / f64::from(super::PLANT_STEPS));
         warnings.extend(self.advice(&rig, &control, &plant));
         super::Lowered { rig, control, plant }
     }
