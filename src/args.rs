@@ -36,6 +36,8 @@ pub enum Command {
     Linearise(Linearise),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
+    /// Say before anything moves whether a rig is stable and how true it is
+    Predict(Predict),
     /// Compute a rig's log again and compare every output to the bit
     Replay(Replay),
     /// Find mistakes without running anything
@@ -289,6 +291,25 @@ pub struct Hil {
 
 const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, stop, reset.\n\
     Exit codes: 0 ended as asked (Ctrl-C included), 1 refused or bad input, 2 wrong usage, 3 stopped by safety.";
+
+/// `fric predict`
+#[derive(clap::Args, Debug)]
+pub struct Predict {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// A dry run to compare with one whose drives act at once; without it only stability and resolution
+    pub experiment: Option<String>,
+    /// The rig [default: that of the experiment, or the only one]
+    #[arg(long, value_name = "RIG")]
+    pub rig: Option<String>,
+    /// Change a parameter or a slot: `load.delay=2ms`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// One JSON object
+    #[arg(long)]
+    pub json: bool,
+}
 
 /// `fric replay`
 #[derive(clap::Args, Debug)]

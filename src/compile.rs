@@ -6,6 +6,7 @@ pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
+pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, check_models, compile, dissipation, explain,

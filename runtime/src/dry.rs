@@ -65,7 +65,8 @@ pub(crate) fn run(
     let mut paths = paths(rig);
     let readings = readings(rig, &paths);
     let unable = |why| Stop { cause: Cause::Rig { condition: "predict".into(), why }, time: 0.0 };
-    let mut look = Ahead { wired: Wired::of(rig, &bench.plant).map_err(unable)?, seen: None, speed: None, position: None };
+    let mut look =
+        Ahead { wired: Wired::of(rig, &bench.plant).map_err(unable)?, seen: None, speed: None, position: None };
     if let Some(wired) = &look.wired {
         let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
         look.seen = slot(What::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));

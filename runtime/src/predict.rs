@@ -275,7 +275,7 @@ mod tests {
         let g = |v: f64| fc * (1.0 + 0.5 * (-(v / 1e-3) * (v / 1e-3)).exp());
         let mut drive = crate::lag::Lag::new(late.lag);
         let dead_ns = (late.dead * 1e9).round() as u64;
-        let (mut x, mut v, mut z) = (0.0f64, 1e-7, 0.0f64);
+        let (mut x, mut v, mut z) = (0.0f64, 1e-7f64, 0.0f64);
         let mut early = 0.0f64;
         let cycles = 6000;
         let mut last = 0.0f64;

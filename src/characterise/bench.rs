@@ -115,7 +115,7 @@ pub fn endless(results: &Result<Vec<Ran>, String>) -> Option<Endless> {
     let why = |ran: &Ran| match ran.result.as_ref().err()?.cause {
         Cause::Chatter(_) => Some(Endless::Chatters),
         Cause::TooManySteps { .. } | Cause::StepTooShort { .. } | Cause::Stopped => Some(Endless::Slow),
-        Cause::Guard { .. } | Cause::NotFinite { .. } | Cause::NoDerivatives => None,
+        Cause::Guard { .. } | Cause::NotFinite { .. } | Cause::NoDerivatives | Cause::Rig { .. } => None,
     };
     results.as_ref().ok()?.iter().find_map(why)
 }

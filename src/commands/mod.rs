@@ -9,6 +9,7 @@ mod fmt;
 mod hil;
 mod linearise;
 mod new;
+mod predict;
 mod repl;
 mod replay;
 mod run;
@@ -50,6 +51,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
+        Command::Predict(args) => predict::predict(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),

@@ -28,8 +28,9 @@ const TORQUE_SHARE: f64 = 0.02;
 const SPEED: Dimension = Dimension::of([0, 0, -1, 0, 0]);
 const TORQUE: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 
-/// The derivatives of a program at its start, between slots.
-fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
+/// The derivatives of a program at its start, between slots, and its number of states. None where a slot is not what is
+/// asked for.
+pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
     let description = Arc::new(program.description.clone());
     let functions = crate::functions(program, Method::Adaptive);
     let interpreter = Interpreter::new(&functions, &description.layout, description.pool.len());
@@ -117,21 +118,17 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, fou
 
 /// The answer of one command to speed and position at rest, as resistance of the shaft.
 fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot: Slot, tau: f64) -> Option<Contact> {
-    let of = |what: What| rig.inputs.iter().filter(move |input| input.signal.what == what).map(|input| input.slot);
-    let (speeds, positions): (Vec<Slot>, Vec<Slot>) = (of(What::Speed).collect(), of(What::Position).collect());
-    let inputs: Vec<Slot> = speeds.iter().chain(&positions).copied().collect();
-    let (m, n) = linear(control, &inputs, &[slot])?;
-    let width = inputs.len();
+    // A contact answers the speed: what it keeps of it is a spring. What answers the position is a controller.
+    let speeds: Vec<Slot> =
+        rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
+    let (m, n) = linear(control, &speeds, &[slot])?;
+    let width = speeds.len();
     let (mut stiffness, mut damping) = (0.0, 0.0);
     for j in 0..width {
-        let direct = m.d[j];
-        // What integrates the speed is a spring; what forgets it within the delay is none.
+        // What forgets the speed within the delay is no spring.
         let held = |i: usize| m.a[i * n + i] > -0.1 / tau;
-        let stored: f64 = (0..n).filter(|i| held(*i)).map(|i| m.c[i] * m.b[i * width + j]).sum();
-        match j < speeds.len() {
-            true => (stiffness, damping) = (stiffness - stored, damping - direct),
-            false => stiffness -= direct,
-        }
+        stiffness -= (0..n).filter(|i| held(*i)).map(|i| m.c[i] * m.b[i * width + j]).sum::<f64>();
+        damping -= m.d[j];
     }
     // The sign with which this drive turns what is seen.
     let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| *signal == command)?;
@@ -148,7 +145,9 @@ fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Dia
     let used = |what: What, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
     let params = |dimension: Dimension, angular: bool| {
         let all = quantities.iter().filter(move |q| {
-            q.kind == QuantityKind::Param && q.unit.dimension == dimension && (!angular || q.unit.angle == Angle::Angle)
+            let plain = !q.unit.text.contains("/rad");
+            let fits = if angular { q.unit.angle == Angle::Angle } else { plain };
+            q.kind == QuantityKind::Param && q.unit.dimension == dimension && fits
         });
         let value = |q: &&Quantity| {
             let layout = &control.description.layout;

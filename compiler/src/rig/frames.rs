@@ -5,7 +5,7 @@
 
 use super::dbc;
 use super::nodes::{Description, Read, Speaks, format_of};
-use abi::rig::{Field, Message, What};
+use abi::rig::{Field, Kind, Message, Rig, What};
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -186,8 +186,6 @@ pub struct OnBus<'a> {
     pub node: Option<u8>,
     /// Its messages.
     pub messages: &'a [Message],
-    /// Age at which a signal of it is lost, s; 0 where none is named.
-    pub timeout: f64,
 }
 
 /// Reports identifiers that two claim on one bus.
@@ -252,24 +250,31 @@ pub fn identifiers(nodes: &[OnBus], diagnostics: &mut Vec<Diagnostic>) {
 }
 
 /// Bits per second on a bus in the worst case.
-pub fn load(nodes: &[OnBus], bus: usize, period: f64, watchdog: f64, commanded: &dyn Fn(usize, usize) -> bool) -> f64 {
+pub fn load(rig: &Rig, bus: usize) -> f64 {
     let bits = |bytes: u8, extended: bool| 55.0 + 10.0 * f64::from(bytes) + if extended { 25.0 } else { 0.0 };
+    let (period, watchdog) = (rig.period_ns as f64 * 1e-9, rig.watchdog_ns as f64 * 1e-9);
     let mut sum = 0.0;
-    let here = nodes.iter().enumerate().filter(|(_, node)| node.bus == bus);
     let mut canopen = false;
-    for (n, node) in here {
-        if node.node.is_some() {
-            canopen = true;
-            // Target and control word out; status, torque and speed in; position in.
-            sum += (bits(4, false) + bits(8, false) + bits(4, false)) / period;
-            sum += bits(1, false) / DRIVE_HEARTBEAT;
-        }
-        for (m, message) in node.messages.iter().enumerate() {
+    for (n, node) in rig.nodes.iter().enumerate().filter(|(_, node)| node.bus == bus) {
+        let messages = match &node.kind {
+            Kind::Cia402(_) => {
+                canopen = true;
+                // Target and control word out; status, torque and speed in; position in.
+                sum += (bits(4, false) + bits(8, false) + bits(4, false)) / period + bits(1, false) / DRIVE_HEARTBEAT;
+                continue;
+            }
+            Kind::Frames(messages) => messages,
+        };
+        for (m, message) in messages.iter().enumerate() {
+            let commanded = rig
+                .outputs
+                .iter()
+                .any(|output| output.signal.node == n && matches!(output.signal.what, What::Field(k, _) if k == m));
             let every = match (message.send, message.period_ns) {
                 (_, ns) if ns > 0 => ns as f64 * 1e-9,
-                (true, _) if commanded(n, m) && node.description.statement.moves => period,
+                (true, _) if commanded && node.moves => period,
                 (true, _) => REPEATED,
-                (false, _) if node.timeout > 0.0 => node.timeout / 3.0,
+                (false, _) if node.timeout_ns > 0 => node.timeout_ns as f64 * 1e-9 / 3.0,
                 (false, _) => REPEATED,
             };
             sum += bits(message.length, message.extended) / every;

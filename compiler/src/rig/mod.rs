@@ -36,6 +36,8 @@ use nodes::{Description, Read, Speaks};
 use statements::{Expressions, Statements};
 use std::sync::Arc;
 
+pub use advice::linear;
+pub use frames::load as bus_load;
 pub use step::{Discrete, StepDerivative};
 
 /// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.

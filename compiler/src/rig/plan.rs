@@ -80,17 +80,9 @@ impl Reader<'_, '_> {
                     rig::Kind::Cia402(_) => &[],
                     rig::Kind::Frames(messages) => messages,
                 },
-                timeout: node.timeout_ns as f64 * 1e-9,
             })
             .collect();
         frames::identifiers(&on_bus, self.diagnostics);
-        let commanded = |n: usize, m: usize| {
-            lists.sends.iter().any(|send| send.node == n && matches!(signal(send).what, What::Field(k, _) if k == m))
-        };
-        for (k, (bus, statement)) in buses.iter().zip(&self.statements.buses).enumerate() {
-            let load = frames::load(&on_bus, k, period, watchdog_ns as f64 * 1e-9, &commanded);
-            frames::crowded(&bus.name, statement.span, load, f64::from(bus.bit_rate), self.diagnostics);
-        }
         let predict = self.predict(lists, &nodes);
         let stops = self.statements.stops.iter().map(|(condition, why, _)| rig::Stop {
             slot: Slot(0),
@@ -114,6 +106,10 @@ impl Reader<'_, '_> {
             predict,
             plant: rig::Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },
         };
+        for (k, (bus, statement)) in plan.buses.iter().zip(&self.statements.buses).enumerate() {
+            let load = frames::load(&plan, k);
+            frames::crowded(&bus.name, statement.span, load, f64::from(bus.bit_rate), self.diagnostics);
+        }
         (self.errors() == before).then_some(plan)
     }
 

@@ -155,17 +155,24 @@ impl Reader<'_, '_> {
             let value = framed.expressions[send.value];
             let span = system.span(value);
             let input = |id: VarId| system.var(id).kind == VarKind::Input && of_part(system, id);
+            if !mentioned(system, value).into_iter().any(input) {
+                continue; // It does not depend on what the part gets: nothing of the part feels it.
+            }
             let form = affine(&mut plant, value, &input);
-            let single = form.filter(|form| form.terms.len() == 1);
-            let Some(form) = single else {
+            let Some(mut form) = form.filter(|form| !form.terms.is_empty()) else {
                 let text = self.files.slice(send.path).to_string();
                 let error = Diagnostic::error("E0801", format!("`{text}` cannot be read backwards"))
-                    .label(span, "not a multiple of one input, plus a constant");
-                let help = "what a drive applies must say what the part gets: send one input, with a sign, a gear ratio, an offset";
+                    .label(span, "not a sum of multiples of inputs");
+                let help = "what a drive applies must say what the part gets: send inputs with a sign, a gear ratio, an offset";
                 self.report(error.help(help));
                 failed = true;
                 continue;
             };
+            // One drive that does the work of several inputs: the part feels their sum as the first of them.
+            for (other, _) in form.terms.split_off(1) {
+                let none = plant.push(nothing(), span);
+                plant.vars[other.0 as usize].definition = Definition::Value(none, Origin::Default);
+            }
             // The same name is what is commanded and what is applied.
             let signal = self.applied_signal(&mut plant, framed, send, *command);
             let signal_value = plant.push(Node::Var(signal), span);

@@ -1,0 +1,412 @@
+//! `fric predict`: says before anything moves whether an emulated contact is stable, and what is too coarse for it.
+//!
+//! The loop is that of the compiled step, differentiated, with the shaft and the drives around it; runtime::predict
+//! judges it. Advice comes as numbers.
+
+use super::{End, load};
+use crate::args::Predict as Args;
+use crate::compile::{self, Changes, Loaded, Options, Ready, StepDerivative, Stopwatch};
+use crate::terminal::Terminal;
+use crate::value::significant;
+use crate::{project, report};
+use abi::Slot;
+use abi::description::{Kind as QuantityKind, Quantity};
+use abi::rig::{Kind, Mode, Signal, What};
+use grammar::ast::{ExperimentStatement, Item};
+use runtime::engine::{self, Continue};
+use runtime::predict::{Late, Loop, Shaft, Step};
+use serde_json::{Value, json};
+
+/// The emulated contact of one drive.
+struct Contact {
+    drive: String,
+    command: usize,
+    inputs: Vec<Slot>,
+    derivative: StepDerivative,
+    shaft: Shaft,
+    late: Late,
+}
+
+pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
+    let mut watch = Stopwatch::start("read");
+    let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
+    let name = match chosen(args, &loaded) {
+        Ok(name) => name,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: false };
+    let mut found = Vec::new();
+    let ready = compile::rig(&mut loaded, &project::Disk, &name, &options, &mut found);
+    found.extend(ready.as_ref().err().into_iter().flatten().cloned());
+    if !found.is_empty() && (!args.json || ready.is_err()) {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+    }
+    let Ok(ready) = ready else { return End::Failed };
+    let contacts = contacts(&ready);
+    let (mut words, mut all, mut stable) = (String::new(), Vec::new(), true);
+    for contact in &contacts {
+        let (text, object, holds) = judged(&ready, contact);
+        words += &text;
+        all.push(object);
+        stable &= holds;
+    }
+    if contacts.is_empty() {
+        words += "stability   no drive emulates a contact: no torque answers the speed of the shaft\n";
+    }
+    let (text, resolution) = resolution(&ready);
+    words += &text;
+    let mut twin = Value::Null;
+    if let Some(experiment) = &args.experiment {
+        match twins(&mut loaded, &ready, experiment, &set) {
+            Ok((text, object)) => (words, twin) = (words + &text, object),
+            Err(errors) => {
+                terminal.report(&report::full(&loaded.files.0, &errors, terminal.error_colour()));
+                return End::Failed;
+            }
+        }
+    }
+    match args.json {
+        true => {
+            let object =
+                json!({"rig": name, "stable": stable, "contacts": all, "resolution": resolution, "twin": twin});
+            terminal.line(&object.to_string());
+        }
+        false => terminal.print(&words),
+    }
+    if stable { End::Fine } else { End::Failed }
+}
+
+/// The rig that is meant.
+fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
+    let file = args.file.display();
+    let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
+    let runs = args.experiment.as_ref().map(|name| {
+        let items = &loaded.files.get(loaded.root()).ast.items;
+        let experiment = items.iter().find_map(|item| match item {
+            Item::Experiment(one) if one.name.text == *name => Some(one),
+            _ => None,
+        });
+        let run =
+            experiment.ok_or(format!("{file} has no experiment `{name}`"))?.body.iter().find_map(|one| match one {
+                ExperimentStatement::Run(run) => Some(run.instance.model.text.clone()),
+                _ => None,
+            });
+        run.filter(|run| rigs.contains(&run.as_str())).ok_or(format!("experiment `{name}` runs no rig of {file}"))
+    });
+    match (&args.rig, runs, rigs.as_slice()) {
+        (_, Some(Err(why)), _) => Err(why),
+        (None, Some(Ok(run)), _) => Ok(run),
+        (Some(name), _, all) if all.contains(&name.as_str()) => Ok(name.clone()),
+        (Some(name), _, all) => match compile::nearest(name, all.iter().copied()) {
+            Some(near) => Err(format!("{file} has no rig `{name}`; did you mean `{near}`?")),
+            None => Err(format!("{file} has no rig `{name}`")),
+        },
+        (None, None, []) => Err(format!("{file} has no rig")),
+        (None, None, [one]) => Ok((*one).to_string()),
+        (None, None, all) => Err(format!("{file} has several rigs: name one with --rig, of {}", all.join(", "))),
+    }
+}
+
+/// Drives whose torque answers the speed of the shaft.
+fn contacts(ready: &Ready) -> Vec<Contact> {
+    let rig = &ready.rig;
+    let seen = |signal: Signal| rig.plant.seen.iter().find(|(other, _)| *other == signal).map(|(_, slot)| *slot);
+    let signals: Vec<(Slot, Slot)> = rig
+        .inputs
+        .iter()
+        .filter(|input| input.signal.what == What::Speed)
+        .filter_map(|input| Some((input.slot, seen(input.signal)?)))
+        .collect();
+    let mut out = Vec::new();
+    for output in &rig.outputs {
+        let node = &rig.nodes[output.signal.node];
+        let Kind::Cia402(drive) = &node.kind else { continue };
+        let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == output.signal);
+        let Some((_, torque)) = applied.filter(|_| drive.mode == Mode::Torque) else { continue };
+        let (inputs, outputs): (Vec<Slot>, Vec<Slot>) = signals.iter().copied().unzip();
+        let Some((shaft, states)) = compile::linear_of(&ready.plant_program, &[*torque], &outputs) else { continue };
+        let derivative = StepDerivative::new(&ready.program, rig.method, &inputs, &[output.slot]);
+        let late =
+            Late { dead: node.delay + if drive.at_sync { rig.period_ns as f64 * 1e-9 } else { 0.0 }, lag: node.lag };
+        let shaft = Shaft { states, torques: 1, signals: outputs.len(), a: shaft.a, b: shaft.b, c: shaft.c };
+        let contact =
+            Contact { drive: node.name.clone(), command: output.signal.node, inputs, derivative, shaft, late };
+        let at_rest = contact.at(ready, &[], 0.0);
+        if at_rest.step.b.iter().any(|b| *b != 0.0) && contact.stiffness(&at_rest) != 0.0
+            || at_rest.step.d.iter().any(|d| *d != 0.0)
+        {
+            out.push(contact);
+        }
+    }
+    out
+}
+
+impl Contact {
+    /// The loop with these parameters, near a speed that has lasted.
+    fn at(&self, ready: &Ready, params: &[(Slot, f64)], speed: f64) -> Loop {
+        let rig = &ready.rig;
+        let period = rig.period_ns as f64 * 1e-9;
+        let mut control = ready.control.clone();
+        for (slot, value) in params {
+            control.set(*slot, *value);
+        }
+        for input in &self.inputs {
+            control.set(*input, speed);
+        }
+        control.start(period / f64::from(rig.steps));
+        if speed != 0.0 {
+            // What a contact has to forget is forgotten in so many steps of a speed that lasts.
+            for _ in 0..2000 * rig.steps {
+                control.advance(1);
+            }
+        }
+        let discrete = self.derivative.at(control.block(), rig.steps);
+        let step = Step {
+            states: discrete.states,
+            signals: discrete.inputs,
+            commands: discrete.outputs,
+            a: discrete.a,
+            b: discrete.b,
+            c: discrete.c,
+            d: discrete.d,
+        };
+        Loop { period, step, shaft: self.shaft.clone(), late: vec![self.late] }
+    }
+
+    /// How the torque goes on answering a speed, N·m/rad: the stiffness.
+    fn stiffness(&self, near: &Loop) -> f64 {
+        let (step, signals) = (&near.step, near.step.signals);
+        let kept = |j: usize| (0..step.states).map(|i| step.c[i] * step.b[i * signals + j]).sum::<f64>();
+        (0..signals).map(kept).sum::<f64>().abs() / near.period
+    }
+}
+
+/// Stability of one contact at rest, at the Stribeck speed and while sliding, and what would help.
+fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
+    let period = ready.rig.period_ns as f64 * 1e-9;
+    let tau = 0.5 * period + contact.late.dead + contact.late.lag;
+    let ms = |seconds: f64| significant(1e3 * seconds, 3);
+    let speeds = params(ready, |unit| unit.ends_with("rad/s"));
+    let smallest =
+        speeds.iter().map(|(_, value)| *value).filter(|v| *v > 0.0 && v.is_finite()).fold(f64::INFINITY, f64::min);
+    let mut points = vec![("presliding", 0.0)];
+    if smallest.is_finite() {
+        points.push(("stribeck", smallest));
+        points.push(("sliding", 100.0 * smallest));
+    }
+    let predicted = ready.rig.predict == Some(contact.command);
+    let (mut words, mut regimes, mut stable) = (String::new(), Vec::new(), true);
+    for (regime, speed) in points {
+        let near = contact.at(ready, &[], speed);
+        let radius = near.radius();
+        // A falling characteristic grows by itself, on the shaft as on the rig: only rest is judged.
+        let limit = (regime == "presliding").then(|| near.limit(0)).flatten();
+        words += &format!("{regime:<11} {}  radius {}", contact.drive, significant(radius, 4));
+        if regime == "presliding" {
+            let holds = radius < 1.0;
+            stable &= holds || predicted;
+            match limit {
+                Some(limit) => {
+                    let total = limit - contact.late.dead + tau;
+                    words += &format!(
+                        "  delay margin {} ms (tau {}, limit {})",
+                        ms(limit - contact.late.dead),
+                        ms(tau),
+                        ms(total)
+                    );
+                }
+                None => words += "  no delay makes it unstable",
+            }
+            words += if holds { "  stable" } else { "  UNSTABLE" };
+            if predicted {
+                words += "; its commands look ahead: the limit is that of the plain coupling";
+            }
+        }
+        words += "\n";
+        let margin = limit.map(|limit| limit - contact.late.dead);
+        regimes.push(json!({"regime": regime, "speed": speed, "radius": radius, "delay_margin": margin}));
+    }
+    let (text, advice) = advised(ready, contact, tau);
+    words += &text;
+    let object =
+        json!({"drive": contact.drive, "tau": tau, "regimes": regimes, "advice": advice, "looks_ahead": predicted});
+    (words, object, stable)
+}
+
+/// The stiffness and the damping of the contact: params, and how far each may go.
+fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
+    let here = contact.at(ready, &[], 0.0);
+    let own = contact.stiffness(&here);
+    let damping = |near: &Loop| near.step.d.iter().sum::<f64>().abs();
+    let moved = |of: &dyn Fn(&Loop) -> f64, slot: Slot, value: f64| {
+        let other = contact.at(ready, &[(slot, 1.01 * value)], 0.0);
+        (of(&other) - of(&here)) / (0.01 * of(&here)).max(1e-300)
+    };
+    let stiff = |near: &Loop| contact.stiffness(near);
+    let springs = params(ready, |unit| unit.ends_with("/rad") && !unit.contains("s/rad"));
+    let dampers = params(ready, |unit| unit.ends_with("s/rad"));
+    let strongest = |all: Vec<(Quantity, f64)>, of: &dyn Fn(&Loop) -> f64| {
+        let by = all.into_iter().map(|(q, value)| (moved(of, q.slot, value), q, value));
+        by.filter(|(share, ..)| *share > 0.3).max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, q, value)| (q, value))
+    };
+    let (mut words, mut out) = (String::new(), serde_json::Map::new());
+    if own > 0.0
+        && let Some((spring, value)) = strongest(springs, &stiff)
+    {
+        let stable = |factor: f64| contact.at(ready, &[(spring.slot, factor * value)], 0.0).is_stable();
+        let (mut low, mut high) = (1e-4, 1.0);
+        while stable(high) && high < 1e4 {
+            (low, high) = (high, 2.0 * high);
+        }
+        for _ in 0..30 {
+            let middle = 0.5 * (low + high);
+            if stable(middle) { low = middle } else { high = middle }
+        }
+        let most = low * value;
+        words += &format!(
+            "            {} up to {} {} (it is {})\n",
+            spring.path,
+            significant(spring.unit.from_si(most), 3),
+            spring.unit,
+            significant(spring.unit.from_si(value), 3)
+        );
+        out.insert("stiffness".into(), json!({"param": spring.path, "value": value, "largest_stable": most}));
+    }
+    if let Some((damper, value)) = strongest(dampers, &damping) {
+        let limit = |factor: f64| {
+            contact.at(ready, &[(damper.slot, factor * value)], 0.0).limit(0).map_or(f64::INFINITY, |limit| limit)
+        };
+        let (mut best, mut most, mut factor) = (1.0, limit(1.0), 0.1);
+        while factor < 10.0 {
+            let found = limit(factor);
+            if found > most {
+                (best, most) = (factor, found);
+            }
+            factor *= 1.15;
+        }
+        let total = most - contact.late.dead + tau;
+        words += &format!(
+            "advice      {} = {} {} allows the most delay, {} ms (it is {})\n",
+            damper.path,
+            significant(damper.unit.from_si(best * value), 3),
+            damper.unit,
+            significant(1e3 * total, 3),
+            significant(damper.unit.from_si(value), 3)
+        );
+        out.insert(
+            "damping".into(),
+            json!({"param": damper.path, "value": value, "best": best * value, "limit": total}),
+        );
+    }
+    if ready.rig.predict.is_none() {
+        words += &format!(
+            "            `predict {}` lets commands look {} ms ahead\n",
+            contact.drive,
+            significant(1e3 * tau, 3)
+        );
+    }
+    (words, Value::Object(out))
+}
+
+/// Parameters whose unit reads so, with their values.
+fn params(ready: &Ready, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
+    let all = ready.control.description().quantities.iter();
+    all.filter(|q| q.kind == QuantityKind::Param && unit(&q.unit.text))
+        .map(|q| (q.clone(), ready.control.get(q.slot)))
+        .collect()
+}
+
+/// Counts in presliding, steps of torque, and how full the buses are.
+fn resolution(ready: &Ready) -> (String, Value) {
+    let rig = &ready.rig;
+    let (mut words, mut out) = (String::new(), Vec::new());
+    let quantities = &ready.control.description().quantities;
+    for node in &rig.nodes {
+        let Kind::Cia402(drive) = &node.kind else { continue };
+        let state = quantities
+            .iter()
+            .filter(|q| q.kind == QuantityKind::State && q.unit.text.ends_with("rad") && q.range.1.is_finite())
+            .min_by(|a, b| (a.range.1 - a.range.0).total_cmp(&(b.range.1 - b.range.0)));
+        let counts = state.map(|state| 0.5 * (state.range.1 - state.range.0) / drive.count);
+        let force = params(ready, |unit| unit.ends_with("N·m"));
+        let least = force.iter().map(|(_, value)| *value).filter(|value| *value > 0.0).fold(f64::INFINITY, f64::min);
+        let step = 1e-3 * drive.rated_torque;
+        let share = (step > 0.0 && least.is_finite()).then(|| least / step);
+        words += &format!("resolution  {}", node.name);
+        if let (Some(state), Some(counts)) = (state, counts) {
+            words += &format!("  {} spans {} counts either way", state.path, significant(counts, 3));
+        }
+        if let Some(share) = share {
+            words +=
+                &format!("  torque step {} N·m = the smallest force / {}", significant(step, 3), significant(share, 3));
+        }
+        words += "\n";
+        out.push(
+            json!({"drive": node.name, "presliding_counts": counts, "torque_step": step, "smallest_force": least}),
+        );
+    }
+    let mut buses = Vec::new();
+    for (k, bus) in rig.buses.iter().enumerate() {
+        let load = compile::bus_load(rig, k) / f64::from(bus.bit_rate.max(1));
+        words += &format!("bus         {}  {} % in the worst case\n", bus.name, significant(100.0 * load, 3));
+        buses.push(json!({"bus": bus.name, "load": load}));
+    }
+    (words, json!({"drives": out, "buses": buses}))
+}
+
+/// The dry run beside one whose drives act at once: how far what is drawn differs.
+fn twins(
+    loaded: &mut Loaded,
+    ready: &Ready,
+    experiment: &str,
+    set: &[String],
+) -> Result<(String, Value), Vec<grammar::diagnostic::Diagnostic>> {
+    let mut at_once = set.to_vec();
+    for node in ready.rig.nodes.iter().filter(|node| node.moves) {
+        at_once.extend([format!("{}.delay=0 s", node.name), format!("{}.lag=0 s", node.name)]);
+    }
+    let mut case = |set: Vec<String>| {
+        let options = Options { changes: Changes { set, ..Changes::default() }, interpret: false };
+        compile::compile(loaded, &project::Disk, experiment, &options, &mut Vec::new(), &mut |_| ())
+    };
+    let (late, ideal) = (case(set.to_vec())?.swap_remove(0), case(at_once)?.swap_remove(0));
+    let mut series: Vec<(String, Slot, abi::unit::Unit)> = Vec::new();
+    for one in late.experiment.plots.iter().flat_map(|plot| plot.series.iter().chain(&plot.against)) {
+        if one.slot != Slot::TIME && !one.boolean && !series.iter().any(|(_, slot, _)| *slot == one.slot) {
+            series.push((one.label.clone(), one.slot, one.unit.clone()));
+        }
+    }
+    let slots: Vec<Slot> = series.iter().map(|(_, slot, _)| *slot).collect();
+    let duration = late.experiment.duration;
+    let instants: Vec<f64> = (0..=4000).map(|k| duration * f64::from(k) / 4000.0).collect();
+    let course = |case: &compile::Case| {
+        engine::sample(case.instance.clone(), &case.experiment, &instants, &slots, &mut |_| Continue::Continue(()))
+    };
+    let ((ours, ended), (theirs, _)) = (course(&late), course(&ideal));
+    let (mut words, mut out) = (String::new(), Vec::new());
+    for (k, (label, _, unit)) in series.iter().enumerate() {
+        let of = |values: &[f64]| values.iter().skip(k).step_by(slots.len()).copied().collect::<Vec<f64>>();
+        let (ours, theirs) = (of(&ours), of(&theirs));
+        let spread = |values: &[f64]| {
+            let ends = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
+            ends.1 - ends.0
+        };
+        let squares: f64 = ours.iter().zip(&theirs).map(|(a, b)| (a - b) * (a - b)).sum();
+        let rms = (squares / ours.len().max(1) as f64).sqrt();
+        let share = 100.0 * rms / spread(&theirs).max(f64::MIN_POSITIVE);
+        words += &format!(
+            "twin        {label}  differs by {} % of its range (rms {} {unit})\n",
+            significant(share, 2),
+            significant(unit.from_si(rms), 3)
+        );
+        out.push(json!({"series": label, "rms": rms, "range": spread(&theirs), "share": 0.01 * share}));
+    }
+    if let Err(failure) = ended {
+        words += &format!("twin        {failure}\n");
+    }
+    Ok((words, json!({"experiment": experiment, "series": out})))
+}
