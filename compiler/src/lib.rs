@@ -9,6 +9,7 @@ pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod elimination;
 pub mod discretize;
 pub mod backend;
 
