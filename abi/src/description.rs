@@ -72,13 +72,14 @@ pub struct Layout {
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
+    /// One adaptive step that is tried: see [`Trial`](crate::trial::Trial). Empty where `Rosenbrock` is not there.
+    pub trial: Segment,
 }
 
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        let last = self.due;
-        (last.start + last.len).max(Slot::FIXED) as usize
+        [self.due, self.trial].map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
     }
 
     /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
@@ -101,6 +102,7 @@ impl Layout {
             roots: take(roots),
             jacobian: take(jacobian),
             due: take(due),
+            trial: Segment::default(),
         }
     }
 }

@@ -5,6 +5,8 @@
 
 pub mod unit;
 pub mod description;
+pub mod trial;
+pub mod rodas5p;
 pub mod table;
 pub mod plan;
 pub mod rig;

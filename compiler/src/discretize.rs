@@ -245,7 +245,7 @@ impl<'a> Model<'a> {
         let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
         let (f, rows) = self.f_and_gradient(self.t, &self.x);
         let matrix = Matrix::identity_less(gamma * h, &rows);
-        let factors = matrix.factorise();
+        let factors = matrix.factorise(1e-12);
         let k1 = factors.solve(&f);
         let f = self.f(self.t + h, &self.moved(h, &k1));
         let right: Vec<Real> = f.iter().zip(&k1).map(|(f, k)| *f - 2.0 * *k).collect();

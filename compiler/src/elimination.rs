@@ -41,7 +41,9 @@ impl<'a> Matrix<'a> {
 
     /// Gauss elimination, unrolled. The order is fixed: at each turn the diagonal entry whose elimination can fill in
     /// least (Markowitz), the first among equals.
-    pub fn factorise(self) -> Factors<'a> {
+    ///
+    /// A pivot smaller than `least` of the rest of its row is too small.
+    pub fn factorise(self, least: f64) -> Factors<'a> {
         let mut rows = self.rows;
         let n = rows.len();
         let mut left: Vec<usize> = (0..n).collect();
@@ -57,7 +59,7 @@ impl<'a> Matrix<'a> {
             // A row of its own pivot only is as good as its pivot is not 0.
             let size = others.into_iter().map(Real::abs).reduce(|a, b| a.below(b).choose(b, a));
             let small = match size {
-                Some(size) => !diagonal.abs().above(1e-12 * size),
+                Some(size) => !diagonal.abs().above(least * size),
                 None => !diagonal.abs().above(0.0),
             };
             factors.singular = Some(factors.singular.map_or(small, |any| any | small));

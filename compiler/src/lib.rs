@@ -11,6 +11,7 @@ pub mod program;
 pub mod derive;
 pub mod elimination;
 pub mod discretize;
+pub mod rosenbrock;
 pub mod backend;
 
 pub mod names;
@@ -224,6 +225,7 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
             if program.description.layout.jacobian.len > 0 {
                 out.push((Function::Jacobian, derive::jacobian(program)));
             }
+            out.extend(rosenbrock::rosenbrock(program).map(|step| (Function::Rosenbrock, step)));
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }

@@ -67,7 +67,10 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
         [l.params, l.inputs, l.states, l.memory, l.regimes, l.outputs, l.derivatives, l.roots, l.jacobian, l.due]
             .map(|segment| segment.len)
     };
-    let moved = Layout::new(lens);
+    let mut moved = Layout::new(lens);
+    if (1..=MOST_FUSED).contains(&moved.states.len) {
+        moved = moved.with_trial();
+    }
     let shift = |slot: Slot| match description.layout.due.contains(slot) {
         true => Slot(slot.0 - description.layout.due.start + moved.due.start),
         false => slot,
@@ -722,6 +725,9 @@ impl<'a> Plan<'a> {
 
 /// Largest number of states with a dense Jacobian in the block.
 pub const MOST_JACOBIAN: usize = 200;
+
+/// Largest number of states whose adaptive step is one function.
+const MOST_FUSED: u32 = 8;
 
 /// Which quantities are parameters whose value needs no other quantity.
 fn independent_params(system: &System) -> Vec<bool> {

@@ -23,15 +23,27 @@ type Ready = Option<u32>;
 pub fn regroup(func: &Func) -> Func {
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let carried: HashSet<Slot> = func.loads().into_iter().filter(|slot| stored.contains(slot)).collect();
-    let after = after(func, &carried);
+    between(func, &carried, &carried)
+}
+
+/// Regroups a function for the shortest chain from the slots that `vary` from one call to the next to its `results`;
+/// other slots count as constant.
+pub fn between(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>) -> Func {
+    let after = after(func, results);
     // First everything, to learn how short the longest chain can be; then only what is needed for that.
-    let (_, shortest) = rebuilt(func, &carried, &after, 0);
-    rebuilt(func, &carried, &after, shortest).0
+    let (_, shortest) = rebuilt(func, vary, results, &after, 0);
+    rebuilt(func, vary, results, &after, shortest).0
 }
 
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: u32) -> (Func, u32) {
-    let mut pass = Pass { build: Build::new(&func.name), ready: Vec::new(), carried };
+fn rebuilt(
+    func: &Func,
+    vary: &HashSet<Slot>,
+    results: &HashSet<Slot>,
+    after: &[Option<u32>],
+    enough: u32,
+) -> (Func, u32) {
+    let mut pass = Pass { build: Build::new(&func.name), ready: Vec::new(), carried: vary };
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
@@ -44,7 +56,7 @@ fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: 
     for (slot, value) in &func.stores {
         let value = values[value.index()];
         build.store(*slot, value);
-        if carried.contains(slot) {
+        if results.contains(slot) {
             longest = longest.max(pass.ready[value.index()].unwrap_or(0));
         }
     }
@@ -54,11 +66,11 @@ fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: 
     (build.finish(), longest)
 }
 
-/// For each operation, the cycles from its result to the next value of a carried slot; none if it does not matter there.
-fn after(func: &Func, carried: &HashSet<Slot>) -> Vec<Option<u32>> {
+/// For each operation, the cycles from its value to a result; none if no result needs it.
+fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Option<u32>> {
     let mut after = vec![None; func.ops.len()];
     for (slot, value) in &func.stores {
-        if carried.contains(slot) {
+        if results.contains(slot) {
             after[value.index()] = Some(0);
         }
     }
@@ -72,7 +84,7 @@ fn after(func: &Func, carried: &HashSet<Slot>) -> Vec<Option<u32>> {
 }
 
 /// Latency in cycles, rounded from current processors; only its order of size matters.
-fn latency(op: Op) -> u32 {
+pub(super) fn latency(op: Op) -> u32 {
     match op {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
         Op::Neg(_) | Op::Abs(_) => 1,

@@ -7,6 +7,7 @@
 //! Nothing here depends on the platform's elementary functions, so a run has the same bits everywhere.
 
 use super::explicit::Explicit;
+use super::fused::{Fused, Judged};
 use super::linear;
 use super::points::Points;
 use super::rosenbrock::Rosenbrock;
@@ -74,6 +75,9 @@ struct Adaptive<'a> {
     jacobian: Vec<f64>,
     room: Vec<f64>,
     rosenbrock: Rosenbrock,
+    /// The same as one function of the model, if it has it; and whether the last step was made by it.
+    fused: Option<Fused>,
+    was_fused: bool,
     explicit: Explicit,
     /// Which of the two is at work.
     stiff: bool,
@@ -122,6 +126,7 @@ impl<'a> Adaptive<'a> {
         let tol = experiment.solver.tol;
         assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
         let points = Points::new(instance, observer, experiment);
+        let fused = Fused::new(instance, tol, &scales);
         let system = System::new(instance);
         let n = system.n;
         Adaptive {
@@ -140,6 +145,8 @@ impl<'a> Adaptive<'a> {
             jacobian: vec![0.0; n * n + n],
             room: vec![0.0; 2 * n * n],
             rosenbrock: Rosenbrock::new(n),
+            fused,
+            was_fused: false,
             explicit: Explicit::new(n),
             stiff: true,
             doubts: 0,
@@ -234,22 +241,19 @@ impl<'a> Adaptive<'a> {
         }
         let stiff = self.stiff;
         self.was_stiff = stiff;
-        let solved = if stiff {
-            self.know_jacobian();
-            self.rosenbrock.attempt(&mut self.system, &mut self.step, &self.jacobian)
-        } else {
-            self.explicit.attempt(&mut self.system, &mut self.step);
-            true
-        };
-        let mut error = if solved { self.error() } else { f64::INFINITY };
-        if error <= 1.0 {
-            if stiff {
-                self.system.slope(self.step.end, &self.step.x1, &mut self.end_slope);
-                error = error.max(self.defect());
-            } else {
+        let judged = if stiff { self.fused_attempt() } else { None };
+        self.was_fused = judged.is_some();
+        let error = match judged {
+            Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
+            Some(Judged { error, defect }) if error <= 1.0 => error.max(defect),
+            Some(Judged { error, .. }) => error,
+            None if stiff => self.stiff_attempt(),
+            None => {
+                self.explicit.attempt(&mut self.system, &mut self.step);
                 self.end_slope.copy_from_slice(self.explicit.last_slope());
+                self.error()
             }
-        }
+        };
         if error.is_nan() || error > 1.0 {
             self.work.rejected += 1;
             let part = if error.is_finite() { (SAFETY / fifth_root(error)).max(0.2) } else { 0.1 };
@@ -277,6 +281,33 @@ impl<'a> Adaptive<'a> {
         self.work.stiff_steps += u64::from(stiff);
         self.consider_method();
         true
+    }
+
+    /// A stiff step by the model's own function, if it has it and its elimination went well.
+    fn fused_attempt(&mut self) -> Option<Judged> {
+        if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
+            self.know_jacobian();
+        }
+        let fused = self.fused.as_mut()?;
+        if !fused.ready {
+            fused.begin(&mut self.system, &self.x, &self.step.f0, &self.jacobian);
+        }
+        self.work.jacobians += 1;
+        fused.attempt(&mut self.system, &mut self.step, &mut self.end_slope)
+    }
+
+    /// A stiff step by the routine for any model. Gives its error as a part of what is allowed.
+    fn stiff_attempt(&mut self) -> f64 {
+        self.know_jacobian();
+        if !self.rosenbrock.attempt(&mut self.system, &mut self.step, &self.jacobian) {
+            return f64::INFINITY;
+        }
+        let error = self.error();
+        if error > 1.0 {
+            return error;
+        }
+        self.system.slope(self.step.end, &self.step.x1, &mut self.end_slope);
+        error.max(self.defect())
     }
 
     /// Largest estimated error as a part of what is allowed.
@@ -361,7 +392,9 @@ impl<'a> Adaptive<'a> {
 
     /// The Jacobian at the start of the step.
     fn know_jacobian(&mut self) {
-        if !self.jacobian_known {
+        if let Some(fused) = self.fused.as_ref().filter(|fused| fused.ready) {
+            self.jacobian.copy_from_slice(fused.jacobian(&self.system));
+        } else if !self.jacobian_known {
             let (f0, scales) = (&self.step.f0, &self.scales);
             self.system.jacobian(self.step.t, &self.step.x0, f0, scales, &mut self.jacobian);
             self.jacobian_known = true;
@@ -372,7 +405,8 @@ impl<'a> Adaptive<'a> {
     /// Follows an accepted step up to its end at time `reached`, or to its first event.
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
-        self.surfaces.begin(&mut self.system, &self.step, self.fresh);
+        let known = self.fused.as_ref().filter(|_| self.was_fused);
+        self.surfaces.begin(&mut self.system, &self.step, self.fresh, known);
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
@@ -398,6 +432,12 @@ impl<'a> Adaptive<'a> {
         self.step.f0.copy_from_slice(&self.end_slope);
         self.slope_known = true;
         self.jacobian_known = false;
+        if let Some(fused) = &mut self.fused {
+            match self.was_fused {
+                true => fused.go_on(&mut self.system),
+                false => fused.ready = false,
+            }
+        }
         self.guard()
     }
 
@@ -584,6 +624,7 @@ impl<'a> Adaptive<'a> {
         self.surfaces.restart(&mut self.system, self.t, &self.x);
         self.slope_known = false;
         self.jacobian_known = false;
+        self.fused.iter_mut().for_each(|fused| fused.ready = false);
         self.last = None;
         self.fresh = true;
     }
