@@ -10,7 +10,6 @@ use compiler::{Case, Changes, NoSources, Options};
 use runtime::engine::{self, Continue};
 use std::path::Path;
 use std::process::Command;
-use std::time::Instant;
 
 const TEXT: &str = r#"
 model Bristle {
@@ -78,16 +77,15 @@ fn main() {
             let mut times = Vec::new();
             let mut positions = Vec::new();
             for _ in 0..rounds {
-                let begin = Instant::now();
+                let begin = processor_time();
                 let slots: [Slot; 1] = [slot];
                 let go_on = &mut |_| Continue::Continue(());
                 let (values, ended) = engine::sample(instance.clone(), &experiment, &instants, &slots, go_on);
-                times.push(begin.elapsed().as_secs_f64());
+                times.push(processor_time() - begin);
                 ended.expect("it runs to its end");
                 positions = values;
             }
-            times.sort_by(f64::total_cmp);
-            (times[times.len() / 2], positions)
+            (times.into_iter().fold(f64::INFINITY, f64::min), positions)
         };
         let (reference, other) = (c(1e-13, 1).1, ours(1e-13, 1).1);
         println!("{name}: both at tol 1e-13 differ by {:.1e} m", distance(&reference, &other));
@@ -110,6 +108,12 @@ fn main() {
         }
     }
     println!("SKIPPED: CVODE and diffsol are not compared yet");
+}
+
+/// Seconds this thread has had the processor: other programs count little.
+fn processor_time() -> f64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    now.tv_sec as f64 + 1e-9 * now.tv_nsec as f64
 }
 
 fn compiled(name: &str) -> Case {

@@ -2,7 +2,7 @@
  * against. Dense elimination of fixed size, exp shared between rates and Jacobian, the error controlled as
  * `runtime/src/solver/adaptive.rs` does it; the kink of |v| is met by rejected steps, as such programs do.
  *
- * -DHUNTING chooses the loop. rosenbrock TOL ROUNDS: prints the median time of a run in s, then the position at 201 instants. */
+ * -DHUNTING chooses the loop. rosenbrock TOL ROUNDS: prints the least processor time of a run in s, then the position at 201 instants. */
 #define _POSIX_C_SOURCE 199309L
 #include <math.h>
 #include <stdio.h>
@@ -193,13 +193,13 @@ int main(int count, char **args) {
     double *times = malloc(sizeof *times * rounds);
     for (int k = 0; k < rounds; k++) {
         struct timespec from, to;
-        clock_gettime(CLOCK_MONOTONIC, &from);
+        clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &from);
         run(tol, positions);
-        clock_gettime(CLOCK_MONOTONIC, &to);
+        clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &to);
         times[k] = (to.tv_sec - from.tv_sec) + 1e-9 * (to.tv_nsec - from.tv_nsec);
     }
     qsort(times, rounds, sizeof *times, ascending);
-    printf("%.9e\n", times[rounds / 2]);
+    printf("%.9e\n", times[0]);
     for (int k = 0; k <= INSTANTS; k++) printf("%.17g\n", positions[k]);
     free(times);
     return 0;

@@ -231,7 +231,11 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
         }
         method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
     }
-    out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
+    let expanded = |(function, func): (Function, ir::Func)| match function {
+        Function::Rosenbrock => (function, rosenbrock::pooled(&math::expand(&func))),
+        _ => (function, math::expand(&func)),
+    };
+    out.into_iter().map(expanded).collect()
 }
 
 /// Machine code of functions, or the interpreter where there can be none, which is noted.

@@ -44,7 +44,7 @@ pub struct Lowered {
 
 /// Lowers a system.
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
-    let mut pool = crate::math::POOL.to_vec();
+    let mut pool = [&crate::math::POOL, crate::rosenbrock::constants()].concat();
     let tables = place_tables(system, &mut pool);
     let mut plan = Plan::new(system, types, wanted, tables);
     plan.description.pool = Arc::from(pool);

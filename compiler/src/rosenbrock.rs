@@ -10,7 +10,8 @@ use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
-use crate::ir::{Func, Value};
+use crate::ir::{Func, Op, Unary, Value};
+use crate::math::POOL;
 use crate::opt::{contract, regroup};
 use crate::program::Program;
 use abi::Slot;
@@ -18,6 +19,7 @@ use abi::description::Segment;
 use abi::rodas5p::{A, C, D, GAMMA, H, STAGES, W};
 use abi::trial::{Point, Trial};
 use std::collections::HashSet;
+use std::sync::OnceLock;
 
 /// A pivot smaller than this part of its row is too small: the digits that are left do for an error estimate, not for
 /// more.
@@ -40,6 +42,57 @@ pub fn rosenbrock(program: &Program) -> Option<Func> {
 
 fn slots(segment: Segment) -> impl Iterator<Item = Slot> {
     segment.range().map(|slot| Slot(slot as u32))
+}
+
+/// Constants of this function, to stand in the pool behind those of the elementary functions: it has too many for the
+/// registers, and in memory they are operands.
+pub fn constants() -> &'static [f64] {
+    static CONSTANTS: OnceLock<Vec<f64>> = OnceLock::new();
+    CONSTANTS.get_or_init(|| {
+        let weights = W.iter().flatten().map(|weight| GAMMA * weight);
+        let other = A.iter().flatten().chain(&C).chain(&D).chain(H.iter().flatten()).copied();
+        let mut constants: Vec<f64> = weights.chain(other).chain([GAMMA]).collect();
+        for function in Unary::ALL {
+            let mut build = Build::new("constants");
+            let x = build.load(Slot::TIME);
+            let y = build.unary(function, x);
+            build.store(Slot::TIME, y);
+            let ops = crate::math::expand(&build.finish()).ops;
+            constants.extend(ops.iter().filter_map(|op| if let Op::Real(bits) = op { Some(f64::from_bits(*bits)) } else { None }));
+        }
+        // By size, each once; NaN is no constant of a formula.
+        constants.retain(|x| !x.is_nan());
+        constants.sort_by(f64::total_cmp);
+        constants.dedup_by_key(|x| x.to_bits());
+        constants
+    })
+}
+
+/// The expanded function with those constants read from the pool.
+pub fn pooled(func: &Func) -> Func {
+    let constants = constants();
+    let mut build = Build::new(&func.name);
+    let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let known = match op {
+            Op::Real(bits) => constants.binary_search_by(|x| x.total_cmp(&f64::from_bits(*bits))).ok(),
+            _ => None,
+        };
+        values.push(match known {
+            Some(entry) => {
+                let first = build.int(0);
+                build.pool((POOL.len() + entry) as u32, 1, first)
+            }
+            None => build.op(op.map(|operand| values[operand.index()])),
+        });
+    }
+    for (slot, value) in &func.stores {
+        build.store(*slot, values[value.index()]);
+    }
+    if let Some(status) = func.status {
+        build.status(values[status.index()]);
+    }
+    build.finish()
 }
 
 struct Step<'a> {
@@ -78,7 +131,7 @@ impl<'a> Step<'a> {
                     }
                     for (weight, u) in W[stage].iter().zip(&u) {
                         let weight = u[i].constant(GAMMA * weight);
-                        early = Some(early.map_or(weight * u[i], |sum| u[i].fma(weight, sum)));
+                        early = Some(early.map_or(weight * u[i], |sum| sum + weight * u[i]));
                     }
                     let late = gh * f[i];
                     early.map_or(late, |early| early + late)
@@ -131,7 +184,7 @@ impl<'a> Step<'a> {
             defect = larger(defect, (f1[i] - slope).abs() * share);
             finite = Some(finite.map_or(0.0 * x1[i], |sum| sum + 0.0 * x1[i]));
         }
-        let defect = defect / fastest.sqrt();
+        let defect = defect * (1.0 / fastest.sqrt());
         // Zero times what is not finite is NaN.
         let worst = finite.map_or(worst, |zero| worst + zero);
         let mut build = self.build.borrow_mut();
@@ -145,7 +198,7 @@ impl<'a> Step<'a> {
         if stage > 5 {
             return last[i] + u[stage - 1][i];
         }
-        A[stage].iter().zip(u).fold(x0[i], |sum, (weight, u)| u[i].fma(*weight, sum))
+        A[stage].iter().zip(u).fold(x0[i], |sum, (weight, u)| sum + *weight * u[i])
     }
 
     /// Rows of ∂f/∂x at the start, and ∂f/∂t. What depends on neither time nor states is computed, what does is loaded:

@@ -55,8 +55,7 @@ fn generate(
     layout: &Layout,
     pool_len: usize,
 ) -> Result<(Entries, Memory, Stats), Unsupported> {
-    let isa = processor()?;
-    let mut memory = Memory::new(isa);
+    let mut memory = Memory::new(processor(Effort::Speed)?);
     let module = memory.module();
     let mut context = Context::new();
     let mut builder = FunctionBuilderContext::new();
@@ -64,6 +63,9 @@ fn generate(
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+        // Cranelift's own passes make one value of equal constants and compute where the result is used: in a function
+        // of a thousand operations this fills the registers, and what does not fit goes through memory.
+        let isa = processor(if *function == Function::Rosenbrock { Effort::Order } else { Effort::Speed })?;
         context.clear();
         clif::emit(func, &mut context.func, &mut builder, &**isa);
         let compiled = context.compile(&**isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
@@ -96,16 +98,29 @@ fn refused(func: &Func, error: &CodegenError) -> Unsupported {
     }
 }
 
+/// What Cranelift does with the order of operations.
+#[derive(Clone, Copy)]
+enum Effort {
+    /// Shares, hoists, and sinks them to their use.
+    Speed,
+    /// Keeps it.
+    Order,
+}
+
 /// What to generate for: this processor.
-fn processor() -> Result<&'static OwnedTargetIsa, Unsupported> {
-    static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
-    ISA.get_or_init(|| {
+fn processor(effort: Effort) -> Result<&'static OwnedTargetIsa, Unsupported> {
+    static ISA: [OnceLock<Result<OwnedTargetIsa, Unsupported>>; 2] = [const { OnceLock::new() }; 2];
+    let (isa, level) = match effort {
+        Effort::Speed => (&ISA[0], "speed"),
+        Effort::Order => (&ISA[1], "none"),
+    };
+    isa.get_or_init(|| {
         if let Some(lacks) = lacking() {
             return Err(Unsupported(format!("this processor lacks {lacks}")));
         }
         let mut flags = builder();
         for (flag, setting) in [
-            ("opt_level", "speed"),
+            ("opt_level", level),
             ("is_pic", "false"),
             // A frame larger than a page is touched page by page, in line.
             ("enable_probestack", "true"),

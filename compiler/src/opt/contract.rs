@@ -1,4 +1,5 @@
-//! Makes one fused operation of a product and the sum that is its only use: one rounding less, and half the latency.
+//! Makes one fused operation of a product and a sum, where sums are all it is used for: one rounding less, and half the
+//! latency.
 //!
 //! In: a function. Out: the same with a · b + c as `fma(a, b, c)`. Like regrouping, this is part of what a function *is*:
 //! it stands before every back end.
@@ -6,14 +7,16 @@
 use crate::ir::build::Build;
 use crate::ir::{Func, Op, Value};
 
-/// Contracts every sum of a product that nothing else uses. Of two products the one that is ready later is fused.
+/// Contracts every sum of a product that only sums use. Of two products the one that is ready later is fused.
 pub fn contract(func: &Func) -> Func {
-    let mut uses = vec![0u32; func.ops.len()];
+    let mut kept = vec![false; func.ops.len()];
     for op in &func.ops {
-        op.each_operand(|operand| uses[operand.index()] += 1);
+        if !matches!(op, Op::Add(..) | Op::Sub(..)) {
+            op.each_operand(|operand| kept[operand.index()] = true);
+        }
     }
     for (_, value) in &func.stores {
-        uses[value.index()] += 1;
+        kept[value.index()] = true;
     }
     let mut build = Build::new(&func.name);
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
@@ -23,7 +26,7 @@ pub fn contract(func: &Func) -> Func {
         op.each_operand(|operand| deepest = deepest.max(depth[operand.index()]));
         depth.push(deepest + super::regroup::latency(*op));
         let product = |value: Value| match func.op(value) {
-            Op::Mul(a, b) if uses[value.index()] == 1 => Some((values[a.index()], values[b.index()])),
+            Op::Mul(a, b) if !kept[value.index()] => Some((values[a.index()], values[b.index()])),
             _ => None,
         };
         let late = |a: Value, b: Value| depth[a.index()] > depth[b.index()];
@@ -76,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_product_with_one_use_is_fused() {
+    fn a_product_that_sums_use_is_fused() {
         let sum = |b: &mut Build, [x, y, z]: [Value; 3]| {
             let product = b.mul(x, y);
             vec![b.add(z, product)]
@@ -95,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn a_product_with_more_uses_keeps_its_rounding() {
+    fn a_product_with_another_use_keeps_its_rounding() {
         let twice = |b: &mut Build, [x, y, z]: [Value; 3]| {
             let product = b.mul(x, y);
             vec![b.add(z, product), product]
