@@ -82,6 +82,13 @@ impl Layout {
         [self.due, self.trial].map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
     }
 
+    /// Lengths of the segments that [`Layout::new`] takes, in the order of the fields.
+    pub fn lens(&self) -> [u32; 10] {
+        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, trial: _ } =
+            self;
+        [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
+    }
+
     /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
     pub fn new(lens: [u32; 10]) -> Layout {
         let mut next = Slot::FIXED;
@@ -214,5 +221,13 @@ impl Description {
     /// The quantity of this path.
     pub fn quantity(&self, path: &str) -> Option<&Quantity> {
         self.quantities.iter().find(|quantity| quantity.path == path)
+    }
+
+    /// Every slot that is named in it.
+    pub fn slots(&self) -> impl Iterator<Item = Slot> {
+        let quantities = self.quantities.iter().map(|quantity| quantity.slot);
+        let ticks = self.ticks.iter().flat_map(|tick| [tick.period, tick.due]);
+        let automata = self.automata.iter().map(|automaton| automaton.slot);
+        quantities.chain(ticks).chain(automata).chain(self.guards.iter().map(|guard| guard.slot))
     }
 }

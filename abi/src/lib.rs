@@ -11,6 +11,8 @@ pub mod table;
 pub mod plan;
 pub mod rig;
 pub mod instance;
+pub mod encode;
+pub mod image;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;

@@ -2,24 +2,31 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
-use std::time::Instant;
 
 /// Where time comes from.
 pub trait Clock {
     /// Nanoseconds since the clock's origin; never falls.
     fn now_ns(&self) -> u64;
+
+    /// Returns when it shows this time: by sleeping, or by moving on.
+    fn sleep_until(&self, until_ns: u64);
 }
 
 /// The machine's monotonic clock, counted from its making.
 #[derive(Clone, Copy, Debug)]
 pub struct Monotonic {
-    origin: Instant,
+    origin_ns: u64,
 }
 
 impl Monotonic {
     /// A clock that starts at 0 now.
     pub fn new() -> Monotonic {
-        Monotonic { origin: Instant::now() }
+        Monotonic { origin_ns: monotonic_ns() }
+    }
+
+    /// What CLOCK_MONOTONIC showed at 0.
+    pub fn origin_ns(&self) -> u64 {
+        self.origin_ns
     }
 }
 
@@ -31,8 +38,31 @@ impl Default for Monotonic {
 
 impl Clock for Monotonic {
     fn now_ns(&self) -> u64 {
-        u64::try_from(self.origin.elapsed().as_nanos()).expect("a run ends before 584 years")
+        monotonic_ns() - self.origin_ns
     }
+
+    /// Sleeps to an instant, not for a while: what came between does not add up.
+    fn sleep_until(&self, until_ns: u64) {
+        let until_ns = self.origin_ns.saturating_add(until_ns);
+        let seconds = i64::try_from(until_ns / SECOND_NS).unwrap_or(i64::MAX);
+        let until = libc::timespec { tv_sec: seconds, tv_nsec: (until_ns % SECOND_NS) as i64 };
+        // SAFETY: `until` is a valid time and outlives the call; what remains is not asked for.
+        let sleep = || unsafe {
+            libc::clock_nanosleep(libc::CLOCK_MONOTONIC, libc::TIMER_ABSTIME, &until, std::ptr::null_mut())
+        };
+        while sleep() == libc::EINTR {}
+    }
+}
+
+const SECOND_NS: u64 = 1_000_000_000;
+
+/// CLOCK_MONOTONIC.
+fn monotonic_ns() -> u64 {
+    let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `now` is written by the call and outlives it.
+    let done = unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut now) };
+    assert_eq!(done, 0, "every Linux has a monotonic clock");
+    now.tv_sec as u64 * SECOND_NS + now.tv_nsec as u64
 }
 
 /// Time that stands until it is moved. Copies show the same time.
@@ -60,5 +90,9 @@ impl Simulated {
 impl Clock for Simulated {
     fn now_ns(&self) -> u64 {
         self.now_ns.get()
+    }
+
+    fn sleep_until(&self, until_ns: u64) {
+        self.now_ns.set(until_ns.max(self.now_ns.get()));
     }
 }

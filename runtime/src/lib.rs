@@ -19,11 +19,19 @@ mod solver;
 pub mod engine;
 pub mod sweep;
 
+pub mod blob;
+
 pub mod modes;
 
 pub mod clock;
+pub mod histogram;
+pub mod realtime;
 
 pub mod can;
+
+pub mod safety;
+
+pub mod hil;
 
 #[cfg(test)]
 mod models;

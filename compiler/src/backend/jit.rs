@@ -3,31 +3,18 @@
 //! The memory is written first and made executable afterwards, never both at once, and is given back when the last
 //! clone of the code goes. The code has no symbols, calls nothing and needs no relocation.
 
-use super::clif;
+use super::clif::signature;
+use super::target::{Coder, here, in_order};
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
 use abi::table::{Entry, Machine};
 use abi::{Function, Layout};
 use cranelift_codegen::isa::OwnedTargetIsa;
-use cranelift_codegen::settings::{Configurable, Flags, builder};
-use cranelift_codegen::{CodegenError, Context};
-use cranelift_frontend::FunctionBuilderContext;
 use cranelift_jit::{JITBuilder, JITModule};
 use cranelift_module::Module;
-use std::fmt;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex};
 
-/// Why there is no machine code: run the interpreter, and say so.
-#[derive(Clone, PartialEq, Eq, Debug)]
-pub struct Unsupported(pub String);
-
-impl fmt::Display for Unsupported {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for Unsupported {}
+pub use super::target::Unsupported;
 
 /// Size of the code made.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
@@ -55,26 +42,20 @@ fn generate(
     layout: &Layout,
     pool_len: usize,
 ) -> Result<(Entries, Memory, Stats), Unsupported> {
-    let mut memory = Memory::new(processor(Effort::Speed)?);
+    let isa = here()?;
+    let mut memory = Memory::new(isa);
     let module = memory.module();
-    let mut context = Context::new();
-    let mut builder = FunctionBuilderContext::new();
+    let (mut coder, mut keeping) = (Coder::new(isa), Coder::new(in_order()?));
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
-        // Cranelift's own passes make one value of equal constants and compute where the result is used: in a function
-        // of a thousand operations this fills the registers, and what does not fit goes through memory.
-        let isa = processor(if *function == Function::Rosenbrock { Effort::Order } else { Effort::Speed })?;
-        context.clear();
-        clif::emit(func, &mut context.func, &mut builder, &**isa);
-        let compiled = context.compile(&**isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
-        assert!(compiled.buffer.relocs().is_empty(), "{} needs relocations", func.name);
+        let coder = if *function == Function::Rosenbrock { &mut keeping } else { &mut coder };
+        let bytes = coder.function(func)?;
         let failed = |error| Unsupported(format!("no memory for the code of `{}`: {error}", func.name));
-        let id = module.declare_anonymous_function(&clif::signature(&**isa)).map_err(failed)?;
-        let (code, alignment) = (compiled.code_buffer(), u64::from(compiled.buffer.alignment));
-        module.define_function_bytes(id, alignment, code, &[]).map_err(failed)?;
-        stats.functions.push((*function, func.ops.len(), code.len()));
+        let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
+        module.define_function_bytes(id, bytes.alignment as u64, &bytes.code, &[]).map_err(failed)?;
+        stats.functions.push((*function, func.ops.len(), bytes.code.len()));
         ids.push((*function, id));
     }
     let failed = |error| Unsupported(format!("the code cannot be made executable: {error}"));
@@ -86,69 +67,6 @@ fn generate(
         entries[function as usize] = Some(unsafe { std::mem::transmute::<*const u8, Entry>(address) });
     }
     Ok((entries, memory, stats))
-}
-
-fn refused(func: &Func, error: &CodegenError) -> Unsupported {
-    let ops = func.ops.len();
-    match error {
-        CodegenError::CodeTooLarge | CodegenError::ImplLimitExceeded => {
-            Unsupported(format!("`{}` is too large for machine code: {ops} operations", func.name))
-        }
-        error => Unsupported(format!("no machine code for `{}` of {ops} operations: {error}", func.name)),
-    }
-}
-
-/// What Cranelift does with the order of operations.
-#[derive(Clone, Copy)]
-enum Effort {
-    /// Shares, hoists, and sinks them to their use.
-    Speed,
-    /// Keeps it.
-    Order,
-}
-
-/// What to generate for: this processor.
-fn processor(effort: Effort) -> Result<&'static OwnedTargetIsa, Unsupported> {
-    static ISA: [OnceLock<Result<OwnedTargetIsa, Unsupported>>; 2] = [const { OnceLock::new() }; 2];
-    let (isa, level) = match effort {
-        Effort::Speed => (&ISA[0], "speed"),
-        Effort::Order => (&ISA[1], "none"),
-    };
-    isa.get_or_init(|| {
-        if let Some(lacks) = lacking() {
-            return Err(Unsupported(format!("this processor lacks {lacks}")));
-        }
-        let mut flags = builder();
-        for (flag, setting) in [
-            ("opt_level", level),
-            ("is_pic", "false"),
-            // A frame larger than a page is touched page by page, in line.
-            ("enable_probestack", "true"),
-            ("probestack_strategy", "inline"),
-            ("unwind_info", "false"),
-            ("enable_verifier", if cfg!(debug_assertions) { "true" } else { "false" }),
-        ] {
-            flags.set(flag, setting).expect("a flag of this version");
-        }
-        let native = cranelift_native::builder().map_err(|what| Unsupported(what.into()))?;
-        native.finish(Flags::new(flags)).map_err(|what| Unsupported(what.to_string()))
-    })
-    .as_ref()
-    .map_err(Clone::clone)
-}
-
-/// Instructions that are needed and not there. Without them fma, floor and nearest would be calls.
-fn lacking() -> Option<&'static str> {
-    #[cfg(target_arch = "x86_64")]
-    for (there, name) in [
-        (std::arch::is_x86_feature_detected!("fma"), "fused multiply-add (FMA)"),
-        (std::arch::is_x86_feature_detected!("sse4.1"), "rounding (SSE4.1)"),
-    ] {
-        if !there {
-            return Some(name);
-        }
-    }
-    None
 }
 
 /// The memory of the code.

@@ -1,9 +1,11 @@
 //! Runs the straight-line program: an interpreter that says what is right, and machine code that agrees to the bit.
 //!
-//! Cranelift is known to `clif` and `jit` only.
+//! Cranelift is known to `clif`, `target` and `jit` only.
 
 pub mod interp;
 mod clif;
+pub mod target;
 pub mod jit;
+pub mod blob;
 #[cfg(test)]
 mod agree;

@@ -2,6 +2,9 @@
 //!
 //! In: addresses and frames. Out: frames, stamps and events of the bus. Knows no drive and no model.
 
+pub mod sim;
+pub mod wire;
+
 use std::fmt;
 
 /// One classical CAN frame.
@@ -92,6 +95,30 @@ impl fmt::Display for Frame {
 impl fmt::Debug for Frame {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{self}")
+    }
+}
+
+/// Which frames come in.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub enum Filter {
+    /// All of them.
+    #[default]
+    All,
+    /// Those with exactly these identifiers, 29-bit ones with [`Filter::EXTENDED`] added.
+    Only(Vec<u32>),
+}
+
+impl Filter {
+    /// Marks an identifier of 29 bits.
+    pub const EXTENDED: u32 = 1 << 31;
+
+    /// Whether a frame comes in.
+    pub fn accepts(&self, frame: &Frame) -> bool {
+        let extended = if frame.is_extended() { Filter::EXTENDED } else { 0 };
+        match self {
+            Filter::All => true,
+            Filter::Only(ids) => ids.contains(&(frame.id() | extended)),
+        }
     }
 }
 

@@ -1,0 +1,136 @@
+//! What can go wrong with a node of a simulated bus, on purpose.
+//!
+//! In: a seed and what was planted. Out: what becomes of each frame. Knows nothing of the line.
+
+use super::super::Frame;
+
+/// What goes wrong.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Kind {
+    /// A frame that the node hands over never reaches the line.
+    Drop,
+    /// One bit of the data is wrong, and the checksum agrees with it: nobody on the bus notices.
+    Corrupt,
+    /// Disturbed on the line: an error frame, both counters, and the frame again.
+    Disturb,
+    /// On its way for this many nanoseconds longer; frames behind it may pass.
+    Delay(u64),
+    /// Sent twice.
+    Duplicate,
+    /// Sent after the next frame of the node.
+    Reorder,
+    /// The node finds its queue full.
+    Full,
+    /// The node doesn't get a frame of the others, and counts it as lost.
+    Overrun,
+}
+
+/// A fault of one node: which frames, how often, and when.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Fault {
+    kind: Kind,
+    id: Option<u32>,
+    chance: f64,
+    from_ns: u64,
+    until_ns: u64,
+    times: u32,
+}
+
+impl Fault {
+    /// It happens to every frame, always.
+    pub fn new(kind: Kind) -> Fault {
+        Fault { kind, id: None, chance: 1.0, from_ns: 0, until_ns: u64::MAX, times: u32::MAX }
+    }
+
+    /// Only to frames with this identifier.
+    pub fn id(self, id: u32) -> Fault {
+        Fault { id: Some(id), ..self }
+    }
+
+    /// Only to this fraction of them, 0 to 1.
+    pub fn chance(self, chance: f64) -> Fault {
+        Fault { chance, ..self }
+    }
+
+    /// Not before this time.
+    pub fn from(self, from_ns: u64) -> Fault {
+        Fault { from_ns, ..self }
+    }
+
+    /// No longer from this time on.
+    pub fn until(self, until_ns: u64) -> Fault {
+        Fault { until_ns, ..self }
+    }
+
+    /// At most so often.
+    pub fn times(self, times: u32) -> Fault {
+        Fault { times, ..self }
+    }
+}
+
+/// The faults of a node.
+#[derive(Default)]
+pub(super) struct Faults(Vec<Fault>);
+
+impl Faults {
+    pub fn plant(&mut self, fault: Fault) {
+        self.0.push(fault);
+    }
+
+    /// Whether one of a kind strikes this frame now; it is then counted.
+    pub fn strike(
+        &mut self,
+        frame: &Frame,
+        now_ns: u64,
+        chance: &mut Chance,
+        is: impl Fn(Kind) -> bool,
+    ) -> Option<Kind> {
+        self.0.iter_mut().find_map(|fault| {
+            let due = is(fault.kind)
+                && fault.times > 0
+                && (fault.from_ns..fault.until_ns).contains(&now_ns)
+                && fault.id.is_none_or(|id| id == frame.id())
+                && (fault.chance >= 1.0 || chance.fraction() < fault.chance);
+            due.then(|| {
+                fault.times = fault.times.saturating_sub(u32::from(fault.times != u32::MAX));
+                fault.kind
+            })
+        })
+    }
+}
+
+/// A seeded generator: SplitMix64.
+pub(super) struct Chance(pub u64);
+
+impl Chance {
+    pub fn number(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ z >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ z >> 31
+    }
+
+    /// Uniform in [0, 1).
+    pub fn fraction(&mut self) -> f64 {
+        (self.number() >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// Uniform in 0..n.
+    pub fn below(&mut self, n: u64) -> u64 {
+        ((u128::from(self.number()) * u128::from(n)) >> 64) as u64
+    }
+
+    /// The frame with one bit of its data turned over.
+    pub fn corrupted(&mut self, frame: Frame) -> Frame {
+        if frame.data().is_empty() {
+            return frame;
+        }
+        let at = self.below(8 * frame.data().len() as u64);
+        let mut data = [0; 8];
+        data[..frame.data().len()].copy_from_slice(frame.data());
+        data[at as usize / 8] ^= 1 << (at % 8);
+        let data = &data[..frame.data().len()];
+        if frame.is_extended() { Frame::extended(frame.id(), data) } else { Frame::new(frame.id(), data) }
+    }
+}
