@@ -79,7 +79,8 @@ pub struct Layout {
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        [self.due, self.trial].map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
+        [self.due, self.trial].map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max)
+            as usize
     }
 
     /// Lengths of the segments that [`Layout::new`] takes, in the order of the fields.

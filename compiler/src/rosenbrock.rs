@@ -58,7 +58,9 @@ pub fn constants() -> &'static [f64] {
             let y = build.unary(function, x);
             build.store(Slot::TIME, y);
             let ops = crate::math::expand(&build.finish()).ops;
-            constants.extend(ops.iter().filter_map(|op| if let Op::Real(bits) = op { Some(f64::from_bits(*bits)) } else { None }));
+            constants.extend(
+                ops.iter().filter_map(|op| if let Op::Real(bits) = op { Some(f64::from_bits(*bits)) } else { None }),
+            );
         }
         // By size, each once; NaN is no constant of a formula.
         constants.retain(|x| !x.is_nan());
@@ -306,5 +308,250 @@ impl<'a> Step<'a> {
         for (slot, value) in slots(segment).zip(values) {
             self.build.borrow_mut().store(slot, value.value);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::interp::{Interpreter, run_once};
+    use crate::backend::jit::compile;
+    use crate::experiment::{Changes, read};
+    use crate::ir::random::Random;
+    use crate::math::expand;
+    use crate::source::NoSources;
+    use abi::{Code, Function};
+    use std::sync::Arc;
+
+    const TEXT: &str = "
+model Bristle {
+  input  v [m/s]
+  state  z [um] = 0
+  let    g = 1 N + 0.5 N * exp(-(v / 1 mm/s)^2)
+  dz/dt = v - 1e5 N/m * abs(v) / g * z
+  output F [N] = 1e5 N/m * z + 316 N*s/m * dz/dt + 0.4 N*s/m * v
+}
+model Pull {
+  param  m = 1 kg
+  state  x [m]   = 0
+  state  v [m/s] = 0
+  part   fr = Bristle(v = v)
+  dx/dt = v
+  dv/dt = (2 N/m * (0.1 m/s * t - x) - fr.F) / m
+}
+model Pid {
+  state  x [m]   = 0
+  state  v [m/s] = 0
+  state  i [N]   = 0
+  let    u = 3 N/m * (1 m - x) + i - 6 N*s/m * v
+  part   fr = Bristle(v = v)
+  di/dt = 4 N/m/s * (1 m - x)
+  dx/dt = v
+  dv/dt = (clamp(u, -20 N, 20 N) - fr.F) / 1 kg
+}
+model Waves {
+  param  w = 3 rad/s
+  state  a = 1
+  state  b = 0.5
+  state  c = 0.25
+  da/dt = (b * sin(w * t) - a * c) * 1 1/s
+  db/dt = (if a > 0.7 then sqrt(1 + c^2) else tanh(b) - c / (2 + a^2)) * 1 1/s
+  dc/dt = (exp(-a) - 40 * c + max(a, b)) * 1 1/s
+}
+experiment pull { run Pull() for 1 s }
+experiment hunting { run Pid() for 1 s }
+experiment waves { run Waves() for 1 s }
+";
+
+    fn program(name: &str) -> Program {
+        let mut loaded = crate::load("test", TEXT, &NoSources);
+        let read = read(&mut loaded, &NoSources, name, &Changes::default(), &mut Vec::new(), &mut |_| ());
+        read.unwrap_or_else(|found| panic!("{found:?}")).remove(0).program
+    }
+
+    /// The model at a point, by its plain functions.
+    struct Plain<'p> {
+        program: &'p Program,
+        derivatives: Func,
+        jacobian: Func,
+        block: Vec<f64>,
+    }
+
+    impl<'p> Plain<'p> {
+        fn new(program: &'p Program) -> Plain<'p> {
+            let layout = &program.description.layout;
+            let mut block = vec![0.0; layout.size()];
+            block[layout.params.range()].copy_from_slice(&program.params);
+            let (derivatives, jacobian) = (expand(&program.derivatives), expand(&derive::jacobian(program)));
+            Plain { program, derivatives, jacobian, block }
+        }
+
+        fn at(&mut self, func: fn(&Plain<'p>) -> Func, result: Segment, t: f64, x: &[f64]) -> Vec<f64> {
+            self.block[Slot::TIME.index()] = t;
+            self.block[self.program.description.layout.states.range()].copy_from_slice(x);
+            let func = func(self);
+            run_once(&func, &mut self.block, &self.program.description.pool);
+            self.block[result.range()].to_vec()
+        }
+
+        fn f(&mut self, t: f64, x: &[f64]) -> Vec<f64> {
+            self.at(|plain| plain.derivatives.clone(), self.program.description.layout.derivatives, t, x)
+        }
+
+        fn jacobian(&mut self, t: f64, x: &[f64]) -> Vec<f64> {
+            self.at(|plain| plain.jacobian.clone(), self.program.description.layout.jacobian, t, x)
+        }
+
+        fn roots(&mut self, t: f64, x: &[f64]) -> Vec<f64> {
+            let Some(roots) = self.program.roots.as_ref().map(expand) else { return Vec::new() };
+            self.block[Slot::TIME.index()] = t;
+            self.block[self.program.description.layout.states.range()].copy_from_slice(x);
+            run_once(&roots, &mut self.block, &self.program.description.pool);
+            self.block[self.program.description.layout.roots.range()].to_vec()
+        }
+    }
+
+    /// x of A x = b by elimination with the largest pivot.
+    fn solve(a: &[f64], b: &[f64]) -> Vec<f64> {
+        let n = b.len();
+        let mut rows: Vec<Vec<f64>> = (0..n).map(|i| [&a[i * n..(i + 1) * n], &[b[i]]].concat()).collect();
+        for k in 0..n {
+            let largest = (k..n).max_by(|i, j| rows[*i][k].abs().total_cmp(&rows[*j][k].abs())).unwrap();
+            rows.swap(k, largest);
+            for i in 0..n {
+                if i != k {
+                    let part = rows[i][k] / rows[k][k];
+                    let pivot = rows[k].clone();
+                    rows[i].iter_mut().zip(&pivot).for_each(|(entry, above)| *entry -= part * above);
+                }
+            }
+        }
+        (0..n).map(|k| rows[k][n] / rows[k][k]).collect()
+    }
+
+    /// u of every stage, as the formulas of the method stand in its source.
+    fn stages(plain: &mut Plain, t: f64, h: f64, end: f64, x0: &[f64]) -> Vec<Vec<f64>> {
+        let n = x0.len();
+        let jacobian = plain.jacobian(t, x0);
+        let mut matrix: Vec<f64> = jacobian[..n * n].iter().map(|entry| -entry).collect();
+        (0..n).for_each(|i| matrix[i * n + i] += 1.0 / (GAMMA * h));
+        let mut u: Vec<Vec<f64>> = Vec::new();
+        for stage in 0..STAGES {
+            let weights = [&A[stage.min(5)][..], &[1.0, 1.0]].concat();
+            let argument = |i: usize| weights.iter().zip(&u).map(|(weight, u)| weight * u[i]).sum::<f64>();
+            let x: Vec<f64> = (0..n).map(|i| x0[i] + argument(i)).collect();
+            let time = if stage < 5 { t + C[stage] * h } else { end };
+            let f = plain.f(time, &x);
+            let right = |i: usize| {
+                let earlier: f64 = W[stage].iter().zip(&u).map(|(w, u)| w * u[i]).sum();
+                f[i] + earlier / h + h * D[stage] * jacobian[n * n + i]
+            };
+            u.push(solve(&matrix, &(0..n).map(right).collect::<Vec<f64>>()));
+        }
+        u
+    }
+
+    #[test]
+    fn a_step_is_that_of_the_method() {
+        for name in ["pull", "hunting", "waves"] {
+            let program = program(name);
+            let layout = &program.description.layout;
+            let n = layout.states.len as usize;
+            let trial = Trial::of(layout).expect("few states");
+            let func = pooled(&expand(&rosenbrock(&program).expect("few states")));
+            let mut plain = Plain::new(&program);
+            let mut random = Random(7);
+            for case in 0..200 {
+                let size = if name == "waves" { 1.0 } else { [1e-2, 1e-3, 1e-5][case % 3] };
+                let x0: Vec<f64> = (0..n).map(|_| random.within(-size, size)).collect();
+                let (t, h) = (random.within(0.0, 2.0), [1e-2, 1e-4, 1e-6][case % 3]);
+                let end = (t + h).next_down();
+                let u = stages(&mut plain, t, h, end, &x0);
+                let mut block = plain.block.clone();
+                let set = |block: &mut Vec<f64>, slot: Slot, value| block[slot.index()] = value;
+                set(&mut block, trial.time(), t);
+                set(&mut block, trial.step(), h);
+                set(&mut block, trial.end(), end);
+                set(&mut block, trial.tol(), 1e-6);
+                block[trial.scales().range()].fill(1.0);
+                block[trial.from().states.range()].copy_from_slice(&x0);
+                block[trial.from().derivatives.range()].copy_from_slice(&plain.f(t, &x0));
+                block[trial.from().jacobian.range()].copy_from_slice(&plain.jacobian(t, &x0));
+                assert_eq!(run_once(&func, &mut block, &program.description.pool), 0, "{name} {case}");
+                let found = |segment: Segment| &block[segment.range()];
+                let x1 = found(trial.to().states).to_vec();
+                let most = |i: usize| u.iter().map(|u| u[i].abs()).fold(1e-9 * x0[i].abs() + 1e-15, f64::max);
+                let check = |what: &str, i: usize, found: f64, expected: f64| {
+                    assert!(
+                        (found - expected).abs() < 1e-8 * most(i),
+                        "{name} {case}: {what} {i}: {found} and not {expected}"
+                    );
+                };
+                for i in 0..n {
+                    let argument: f64 = (0..5).map(|j| A[5][j] * u[j][i]).sum();
+                    check("x1", i, x1[i], x0[i] + argument + u[5][i] + u[6][i] + u[7][i]);
+                    check("error", i, found(trial.error())[i], u[7][i]);
+                    for (k, segment) in trial.course().into_iter().enumerate() {
+                        check("course", i, found(segment)[i], (0..STAGES).map(|j| H[k][j] * u[j][i]).sum());
+                    }
+                }
+                // What holds at the end is that of the state found, up to rounding.
+                let near = |what: &str, found: &[f64], expected: &[f64]| {
+                    for (a, b) in found.iter().zip(expected) {
+                        assert!(
+                            (a - b).abs() <= 1e-11 * (1.0 + a.abs().max(b.abs())),
+                            "{name} {case}: {what} {found:?} and not {expected:?}"
+                        );
+                    }
+                };
+                let f1 = plain.f(end, &x1);
+                near("slope", found(trial.to().derivatives), &f1);
+                near("jacobian", found(trial.to().jacobian), &plain.jacobian(end, &x1));
+                near("surfaces", found(trial.last()), &plain.roots(end, &x1));
+                let [k1, k2, k3] = trial.course().map(|segment| found(segment).to_vec());
+                let half = |i: usize| x0[i] + 0.5 * (x1[i] - x0[i] + 0.5 * (k1[i] + 0.5 * (k2[i] + 0.5 * k3[i])));
+                let middle: Vec<f64> = (0..n).map(half).collect();
+                near("surfaces in the middle", found(trial.middle()), &plain.roots(t + 0.5 * h, &middle));
+                let allowed = |i: usize| 1e-6 * (x0[i].abs().max(x1[i].abs()) + 1.0);
+                let worst = (0..n).map(|i| u[7][i].abs() / allowed(i)).fold(0.0, f64::max);
+                let told = block[trial.worst().index()];
+                assert!((told - worst).abs() <= 1e-6 * worst + 1e-9, "{name} {case}: {told} and not {worst}");
+            }
+        }
+    }
+
+    /// Interpreted and as machine code, over many steps.
+    #[test]
+    fn steps_agree_to_the_bit() {
+        let program = program("hunting");
+        let layout = &program.description.layout;
+        let trial = Trial::of(layout).expect("few states");
+        let funcs = [(Function::Rosenbrock, pooled(&expand(&rosenbrock(&program).expect("few states"))))];
+        let pool = &program.description.pool;
+        let machine = Code::Machine(compile(&funcs, layout, pool.len()).expect("this processor can").0);
+        let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
+        let mut plain = Plain::new(&program);
+        let x0 = [1e-3, 2e-3, 0.1, 1e-6];
+        let (f, jacobian) = (plain.f(0.0, &x0), plain.jacobian(0.0, &x0));
+        let mut block = plain.block.clone();
+        block[trial.tol().index()] = 1e-6;
+        block[trial.scales().range()].fill(1.0);
+        block[trial.from().states.range()].copy_from_slice(&x0);
+        block[trial.from().derivatives.range()].copy_from_slice(&f);
+        block[trial.from().jacobian.range()].copy_from_slice(&jacobian);
+        for step in 0..500 {
+            let t = 1e-4 * f64::from(step);
+            for (slot, value) in [(trial.time(), t), (trial.step(), 1e-4), (trial.end(), t + 1e-4)] {
+                block[slot.index()] = value;
+            }
+            let mut other = block.clone();
+            assert_eq!(machine.call(Function::Rosenbrock, &mut block, pool, 1), 0);
+            assert_eq!(reference.call(Function::Rosenbrock, &mut other, pool, 1), 0);
+            for (slot, (a, b)) in block.iter().zip(&other).enumerate() {
+                assert_eq!(a.to_bits(), b.to_bits(), "step {step}, slot {slot} of {trial:?}: {a} and {b}");
+            }
+            block.copy_within(trial.to().whole().range(), trial.from().states.start as usize);
+        }
+        assert!(block.iter().all(|x| x.is_finite()));
     }
 }

@@ -41,13 +41,7 @@ fn shortened(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>, early: 
 }
 
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(
-    func: &Func,
-    mut pass: Pass,
-    results: &HashSet<Slot>,
-    after: &[Option<u32>],
-    enough: u32,
-) -> (Func, u32) {
+fn rebuilt(func: &Func, mut pass: Pass, results: &HashSet<Slot>, after: &[Option<u32>], enough: u32) -> (Func, u32) {
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
