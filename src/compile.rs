@@ -1,13 +1,14 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-pub use compiler::explain::Explanation;
+pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, linear, load, varying,
+    Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, explain_in, explain_run,
+    linear, load, quantities, varying,
 };
 use std::time::Instant;
 

@@ -35,6 +35,8 @@ pub struct Changes {
     pub vary: Vec<String>,
     /// What is needed besides to linearise.
     pub ports: Option<Ports>,
+    /// Statements that the experiment gets besides its own, as text: `expect max(x) < 1 mm`.
+    pub also: Vec<String>,
 }
 
 /// A number of a plan that was computed from an expression.
@@ -111,6 +113,7 @@ pub fn read(
 ) -> Result<Vec<Variant>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
     let given = Given::read(loaded, changes, &mut diagnostics);
+    let also = also(loaded, &changes.also, &mut diagnostics);
     let loaded = &*loaded;
     let root = loaded.root();
     let file = loaded.files.get(root);
@@ -123,6 +126,11 @@ pub fn read(
         return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
     };
     let misread = loaded.diagnostics.iter().any(|d| d.is_error() && !outside_of(experiment.span, d));
+    let mut experiment = std::borrow::Cow::Borrowed(experiment);
+    if !also.is_empty() {
+        experiment.to_mut().body.extend(also);
+    }
+    let experiment = &*experiment;
     let Some(parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
     let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
     let Some(data) = data else { return Err(diagnostics) };
@@ -151,6 +159,18 @@ pub fn read(
         }
     }
     Ok(variants)
+}
+
+/// Further statements of an experiment, each with its own text.
+fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>) -> Vec<ExperimentStatement> {
+    let mut out = Vec::new();
+    for text in texts {
+        let id = loaded.add_text("--also", text);
+        let (statements, errors) = grammar::parse::parse_statements(id, text);
+        out.extend(statements);
+        diagnostics.extend(errors);
+    }
+    out
 }
 
 /// Texts given on the command line, read.

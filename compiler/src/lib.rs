@@ -294,15 +294,69 @@ pub fn dissipation(
 /// Everything that is wrong with it.
 pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<explain::Explanation, Vec<Diagnostic>> {
     let root = loaded.root();
-    let found = loaded.models().into_iter().find(|candidate| candidate.name.text == model);
-    let Some(model) = found else {
+    match loaded.models().into_iter().any(|candidate| candidate.name.text == model) {
+        true => explain_in(loaded, sources, model, root),
+        false => Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]),
+    }
+}
+
+/// Explains a model of any file of a loaded text, on its own.
+///
+/// # Errors
+/// Everything that is wrong with it, or that there is none.
+pub fn explain_in(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &str,
+    file: FileId,
+) -> Result<explain::Explanation, Vec<Diagnostic>> {
+    let resolve::Lookup::Found(item, Item::Model(model)) = loaded.find(file, resolve::Space::Type, model) else {
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
-    let (system, types, diagnostics) = alone(loaded, sources, model, root, Vec::new());
+    let (system, types, diagnostics) = alone(loaded, sources, model, item.file, Vec::new());
     match diagnostics.iter().any(Diagnostic::is_error) {
         true => Err(once(diagnostics)),
         false => Ok(explain::explain(&system, &types, &loaded.files)),
     }
+}
+
+/// Every quantity of what an experiment runs, with these changes.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn quantities(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    changes: &Changes,
+) -> Result<Vec<explain::Listed>, Vec<Diagnostic>> {
+    let variant = first(loaded, sources, experiment, changes)?;
+    Ok(explain::quantities(&variant.system, &variant.types, &loaded.files))
+}
+
+/// Explains what an experiment runs, with these changes.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn explain_run(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    changes: &Changes,
+) -> Result<explain::Explanation, Vec<Diagnostic>> {
+    let variant = first(loaded, sources, experiment, changes)?;
+    Ok(explain::explain(&variant.system, &variant.types, &loaded.files))
+}
+
+/// The first combination of an experiment's sweeps.
+fn first(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    changes: &Changes,
+) -> Result<experiment::Variant, Vec<Diagnostic>> {
+    let variants = experiment::read(loaded, sources, experiment, changes, &mut Vec::new(), &mut |_| ())?;
+    Ok(variants.into_iter().next().expect("there is at least one combination"))
 }
 
 /// A model on its own, flat and typed, its circles reported.

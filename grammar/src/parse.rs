@@ -82,6 +82,18 @@ pub fn parse_setting(file: FileId, text: &str) -> (Option<(Path, Expr)>, Vec<Dia
     (setting, reader.finish())
 }
 
+/// Reads statements of an experiment: `expect max(F) < 2 N`, `plot x [mm]`.
+pub fn parse_statements(file: FileId, text: &str) -> (Vec<ExperimentStatement>, Vec<Diagnostic>) {
+    let mut reader = Reader::new(file, text);
+    let whole = Piece { start: 0, end: reader.source.marks.len() };
+    let found = reader.runs(Place::Experiment, whole).into_iter().filter_map(|statement| match statement {
+        FitStatement::Experiment(statement) => Some(statement),
+        FitStatement::Vary(..) | FitStatement::Minimise(..) => None,
+    });
+    let found = found.collect();
+    (found, reader.finish())
+}
+
 mod pest_rules {
     #![allow(missing_docs)]
     #[derive(pest_derive::Parser)]
