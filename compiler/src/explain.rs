@@ -12,8 +12,8 @@ use crate::lower::{Lowered, lower};
 use crate::program::Program;
 use crate::source::Files;
 use crate::system::*;
-use crate::units::{Types, three_digits};
-use crate::{derive, discretize};
+use crate::units::{Types, seconds, three_digits};
+use crate::{derive, discretize, stability};
 use abi::description::Slot;
 use abi::plan::Method;
 use grammar::ast::BinaryOp;
@@ -33,7 +33,10 @@ pub struct Explanation {
     pub states: Vec<Stepped>,
     /// Operations of the fixed steps, before functions are expanded and after: method, count, count, divisions.
     pub steps: Vec<(Method, usize, usize, usize)>,
-    /// Bytes of the block of one instance.
+    /// The largest step, in s, that is stable at the bounds of the declared ranges, of each method of which it is known;
+    /// at most 1 s.
+    pub stable: Vec<(Method, f64)>,
+    /// Bytes of the block of one instance, without room for adaptive steps.
     pub bytes: usize,
     /// Whether the friction depends on the path only; none for other models.
     pub rate_independent: Option<bool>,
@@ -96,7 +99,12 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
         needs: needs(system),
         states: states(system, &program),
         steps: steps.to_vec(),
-        bytes: 8 * program.description.layout.size(),
+        stable: Method::ALL
+            .into_iter()
+            .filter(|method| *method != Method::Adaptive)
+            .filter_map(|method| Some((method, stability::largest(&program, method)?)))
+            .collect(),
+        bytes: 8 * (program.description.layout.size() - program.description.layout.trial.len as usize),
         rate_independent: rate_independent(system),
         dissipation: friction::dissipation(system, types),
     }
@@ -370,21 +378,10 @@ impl Stepped {
             text += &format!(
                 "; own rate {} 1/s{at}, where euler needs steps below {} and rk4 below {}",
                 three_digits(rate),
-                time(2.0 / rate),
-                time(2.785 / rate)
+                seconds(2.0 / rate),
+                seconds(2.785 / rate)
             );
         }
         text
     }
-}
-
-/// A time with a handy prefix.
-fn time(t: f64) -> String {
-    let (scale, unit) = match t {
-        t if t < 1e-6 => (1e-9, "ns"),
-        t if t < 1e-3 => (1e-6, "us"),
-        t if t < 1.0 => (1e-3, "ms"),
-        _ => (1.0, "s"),
-    };
-    format!("{} {unit}", three_digits(t / scale))
 }

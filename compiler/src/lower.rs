@@ -197,6 +197,8 @@ struct Plan<'a> {
     /// Quantity or expression of each output slot.
     outputs: Vec<Output>,
     observed: Vec<Slot>,
+    /// Expressions that are looked at while the model runs.
+    wanted: Vec<ExprId>,
     tables: Vec<u32>,
 }
 
@@ -321,6 +323,7 @@ impl<'a> Plan<'a> {
             events,
             outputs,
             observed,
+            wanted: wanted.iter().map(|one| one.expr).collect(),
             tables,
         };
         plan.describe(wanted);
@@ -601,7 +604,8 @@ impl<'a> Plan<'a> {
         emit.build.finish()
     }
 
-    /// Surfaces on which a branch of what moves the states changes, or a transition or event happens.
+    /// Surfaces on which a branch of what moves the states or of what is looked at changes, or a transition or event
+    /// happens.
     fn roots(&self, mut emit: Emit) -> (Func, Vec<Root>) {
         // Conditions first: a surface that a branch shares with a condition counts as the condition's.
         let mut from: Vec<ExprId> = Vec::new();
@@ -615,6 +619,8 @@ impl<'a> Plan<'a> {
                 from.push(rate);
             }
         }
+        // What an output alone does is seen only where somebody looks.
+        from.extend(&self.wanted);
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();

@@ -86,8 +86,13 @@ pub(super) fn tell(explanation: &Explanation, terminal: &mut Terminal) {
     }
     terminal.line(&format!("\n  an instance takes {} bytes; one fixed step, with its outputs:", explanation.bytes));
     for (method, plain, expanded, divisions) in &explanation.steps {
+        let stable = explanation.stable.iter().find(|(of, _)| of == method);
+        let stable = stable.map_or(String::new(), |(_, step)| match *step < 1.0 {
+            true => format!(", stable up to {}", crate::value::duration(*step)),
+            false => ", stable at any step".into(),
+        });
         terminal.line(&format!(
-            "    {:<8} {expanded} operations ({plain} before functions are expanded), {divisions} divisions and roots",
+            "    {:<8} {expanded} operations ({plain} before functions are expanded), {divisions} divisions and roots{stable}",
             method.name()
         ));
     }
