@@ -8,9 +8,10 @@ pub mod description;
 pub mod trial;
 pub mod rodas5p;
 pub mod table;
-pub mod plan;
-pub mod rig;
+pub mod series;
 pub mod instance;
+pub mod rig;
+pub mod plan;
 pub mod encode;
 pub mod image;
 
