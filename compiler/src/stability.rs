@@ -116,7 +116,7 @@ pub fn chatter(program: &Program) -> Option<Chatter> {
     let (f, gradients) = (expand(&program.derivatives), expand(&slopes_of(roots, program)?));
     let start = map.block.clone();
     // g, dg/dt along the motion, and the motion.
-    let mut at = |block: &mut Vec<f64>, k: usize| {
+    let at = |block: &mut Vec<f64>, k: usize| {
         run_once(&f, block, &program.description.pool);
         run_once(&gradients, block, &program.description.pool);
         let g = block[layout.roots.slot(k).index()];
@@ -127,8 +127,8 @@ pub fn chatter(program: &Program) -> Option<Chatter> {
     for k in 0..program.description.roots.len().min(layout.jacobian.len as usize / n.max(1)) {
         for j in 0..n {
             let scale = map.state(j).map_or(1.0, |state| state.unit.scale);
-            let mut beside = |size: f64| {
-                let mut side = |by: f64| {
+            let beside = |size: f64| {
+                let side = |by: f64| {
                     let mut block = start.clone();
                     block[layout.states.slot(j).index()] += by;
                     at(&mut block, k)
