@@ -321,6 +321,9 @@ fn a_sweep_is_one_figure_and_a_file_of_data_each() {
     let cases: Vec<Value> =
         out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
     assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
+    // What is said from outside takes the place of the sweep.
+    let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json", "--set", "k=3 N/m"], 0, "");
+    assert_eq!(out.lines().count(), 1, "{out}");
 }
 
 #[test]
