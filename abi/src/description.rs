@@ -58,7 +58,7 @@ pub struct Layout {
     pub inputs: Segment,
     /// Continuous states x.
     pub states: Segment,
-    /// Sampled states, held outputs, tick counters, delay buffers, crossing memory.
+    /// Sampled states, held outputs, tick counters, what is delayed, crossing memory.
     pub memory: Segment,
     /// Active regime of each automaton: a whole number.
     pub regimes: Segment,
@@ -74,19 +74,26 @@ pub struct Layout {
     pub due: Segment,
     /// One adaptive step that is tried: see [`Trial`](crate::trial::Trial). Empty where `Rosenbrock` is not there.
     pub trial: Segment,
+    /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
+    pub rings: Segment,
 }
 
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        [self.due, self.trial].map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max)
-            as usize
+        let segments = [self.due, self.trial, self.rings];
+        segments.map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
+    }
+
+    /// The same with so many slots for rings.
+    pub fn with_rings(self, len: u32) -> Layout {
+        let start = Layout { rings: Segment::default(), ..self.clone() }.size() as u32;
+        Layout { rings: Segment { start, len }, ..self }
     }
 
     /// Lengths of the segments that [`Layout::new`] takes, in the order of the fields.
     pub fn lens(&self) -> [u32; 10] {
-        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, trial: _ } =
-            self;
+        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, .. } = self;
         [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
     }
 
@@ -111,6 +118,7 @@ impl Layout {
             jacobian: take(jacobian),
             due: take(due),
             trial: Segment::default(),
+            rings: take(0),
         }
     }
 }
@@ -164,6 +172,28 @@ pub struct Tick {
     pub due: Slot,
 }
 
+/// `delay(x, T)`: x as it was T ago, on straight lines between samples. Functions of the model read it as
+/// `past + weight · (x − past)`; whoever runs them puts past and weight in place, a fixed step from its ring.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Delay {
+    /// Slot of T in s, in the segment `memory`, written by `Start`.
+    pub time: Slot,
+    /// Least and greatest T in s.
+    pub range: (f64, f64),
+    /// Slot of x, in the segment `outputs`.
+    pub source: Slot,
+    /// Slot of the value before, in the segment `memory`.
+    pub past: Slot,
+    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. None where
+    /// no step may be longer than the least T: then x at this instant is not needed.
+    pub weight: Option<Slot>,
+    /// Slot of the slope of the value before along time, per s: for ∂f/∂t.
+    pub slope: Slot,
+    /// First slot and number of slots of its ring, a power of two: sample k, at the end of step k, lies in slot
+    /// k mod number. Empty until the step is known.
+    pub ring: Segment,
+}
+
 /// One automaton: its regimes in the order of the text.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Automaton {
@@ -210,6 +240,8 @@ pub struct Description {
     pub ticks: Vec<Tick>,
     /// Automata.
     pub automata: Vec<Automaton>,
+    /// What is delayed.
+    pub delays: Vec<Delay>,
     /// Watched ranges; `status = k + 1` names guard k.
     pub guards: Vec<Guard>,
     /// Switching surfaces.
@@ -229,6 +261,15 @@ impl Description {
         let quantities = self.quantities.iter().map(|quantity| quantity.slot);
         let ticks = self.ticks.iter().flat_map(|tick| [tick.period, tick.due]);
         let automata = self.automata.iter().map(|automaton| automaton.slot);
-        quantities.chain(ticks).chain(automata).chain(self.guards.iter().map(|guard| guard.slot))
+        let delays = self.delays.iter().flat_map(|delay| {
+            // An empty ring lies nowhere.
+            let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
+            [Some(delay.time), Some(delay.source), Some(delay.past), Some(delay.slope), delay.weight, ring]
+        });
+        quantities
+            .chain(ticks)
+            .chain(automata)
+            .chain(delays.flatten())
+            .chain(self.guards.iter().map(|guard| guard.slot))
     }
 }

@@ -4,7 +4,7 @@
 //! Whole numbers and reals are little endian, a list is its length (32 bits) and its entries, a struct its fields in
 //! their order. Knows no versions: whoever writes a file says which it is.
 
-use crate::description::{Automaton, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
+use crate::description::{Automaton, Delay, Guard, Kind, Layout, Quantity, Root, Segment, Slot, Tick};
 use crate::unit::{Angle, Dimension, Ratio, Unit};
 use std::fmt;
 use std::sync::Arc;
@@ -249,7 +249,7 @@ impl Encode for Slot {
 /// As the lengths of its segments, which lie one behind the other.
 impl Encode for Layout {
     fn encode(&self, out: &mut Vec<u8>) {
-        self.lens().iter().chain([&self.trial.len]).for_each(|len| len.encode(out));
+        self.lens().iter().chain([&self.trial.len, &self.rings.len]).for_each(|len| len.encode(out));
     }
 
     fn decode(reader: &mut Reader) -> Result<Layout, Malformed> {
@@ -257,8 +257,9 @@ impl Encode for Layout {
         for len in &mut lens {
             *len = u32::decode(reader)?;
         }
-        let trial = u32::decode(reader)?;
-        let size = lens.iter().chain([&trial]).fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
+        let (trial, rings) = (u32::decode(reader)?, u32::decode(reader)?);
+        let all = lens.iter().chain([&trial, &rings]);
+        let size = all.fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
         // Generated code addresses a block by 32-bit offsets in bytes.
         if size > i32::MAX as u64 / 8 {
             return reader.wrong(format!("a block of {size} slots is too large"));
@@ -267,8 +268,8 @@ impl Encode for Layout {
         // Its length follows from the others; of more states it could not be counted.
         let with_trial = (trial > 0 && lens[2] < 1 << 14).then(|| layout.clone().with_trial());
         match with_trial {
-            Some(layout) if layout.trial.len == trial => Ok(layout),
-            _ if trial == 0 => Ok(layout),
+            Some(layout) if layout.trial.len == trial => Ok(layout.with_rings(rings)),
+            _ if trial == 0 => Ok(layout.with_rings(rings)),
             _ => reader.wrong(format!("a trial step of {} states has not {trial} slots", lens[2])),
         }
     }
@@ -303,7 +304,9 @@ encode_structs! {
     Quantity { path, kind, unit, boolean, slot, range, doc }
     Tick { period, due }
     Automaton { path, regimes, slot }
+    Segment { start, len }
+    Delay { time, range, source, past, weight, slope, ring }
     Guard { path, slot, range, unit }
     Root { text, decides }
-    crate::description::Description { name, layout, quantities, ticks, automata, guards, roots, pool }
+    crate::description::Description { name, layout, quantities, ticks, automata, delays, guards, roots, pool }
 }

@@ -13,12 +13,14 @@ use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
-/// All warnings of a model on its own.
-pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
+/// All warnings of a model on its own; `physics`: those of friction too, which take longer.
+pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     unused(system, &mut found);
     regimes(system, files, &mut found);
-    friction::check(system, types, &mut found);
+    if physics {
+        friction::check(system, types, &mut found);
+    }
     found
 }
 

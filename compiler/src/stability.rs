@@ -201,11 +201,11 @@ struct Map<'p> {
 }
 
 impl<'p> Map<'p> {
-    /// None of a model without states or with too many.
+    /// None of a model without states, with too many, or with something delayed: then these are not all its states.
     fn new(program: &'p Program, method: Method) -> Option<Map<'p>> {
         let layout = &program.description.layout;
         let n = layout.states.len as usize;
-        if n == 0 || layout.jacobian.len == 0 || n > 20 {
+        if n == 0 || layout.jacobian.len == 0 || n > 20 || !program.description.delays.is_empty() {
             return None;
         }
         let directions: Vec<Slot> = (0..n).map(|j| layout.states.slot(j)).collect();
