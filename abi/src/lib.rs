@@ -9,6 +9,7 @@ pub mod table;
 pub mod plan;
 pub mod rig;
 pub mod instance;
+pub mod lanes;
 pub mod encode;
 pub mod image;
 
