@@ -14,11 +14,11 @@ use std::path::PathBuf;
 
 /// A small equation language for friction models, controllers and the rigs they run on.
 #[derive(Parser, Debug)]
-#[command(name = "fric", version, arg_required_else_help = true, after_help = EXIT_CODES)]
+#[command(name = "fric", version, after_help = EXIT_CODES)]
 pub struct Args {
-    /// What to do.
+    /// What to do; a session at the prompt if nothing is said.
     #[command(subcommand)]
-    pub command: Command,
+    pub command: Option<Command>,
 }
 
 const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage.\n\
@@ -49,6 +49,10 @@ pub enum Command {
     Compare(Compare),
     /// Write the page of all models of the library, from its own text
     Doc(Doc),
+    /// Explore at a prompt; also what `fric` alone does
+    Repl(Repl),
+    /// Run an experiment again on each save, states carried over
+    Watch(Watch),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -60,8 +64,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "build", "check", "fmt", "explain", "characterise", "compare", "doc", "new",
-            "completions",
+            "run", "test", "sweep", "linearise", "build", "check", "fmt", "explain", "characterise", "compare", "doc", "repl",
+            "watch", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -336,6 +340,33 @@ pub struct Doc {
     /// Write nothing; fail if the page would change
     #[arg(long)]
     pub check: bool,
+}
+
+/// `fric repl`
+#[derive(clap::Args, Debug, Default)]
+pub struct Repl {
+    /// A text to use from the beginning
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: Option<PathBuf>,
+    /// Go on after an error where lines are piped in; the exit code is 1 all the same
+    #[arg(long)]
+    pub keep_going: bool,
+    /// Print each line that is piped in before what it gives, as a terminal shows it
+    #[arg(long)]
+    pub echo: bool,
+}
+
+/// `fric watch`
+#[derive(clap::Args, Debug)]
+pub struct Watch {
+    /// The text; what it imports is watched too
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The experiment in it to run; not needed if it is the only one
+    pub experiment: Option<String>,
+    /// Run from the start each time
+    #[arg(long)]
+    pub restart: bool,
 }
 
 /// `fric new`

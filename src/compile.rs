@@ -4,16 +4,18 @@ use abi::image::Target;
 use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
 use compiler::backend::{blob, c};
-pub use compiler::explain::Explanation;
+pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, SourceFile, Sources, build, check, compile, dissipation, explain, linear,
-    load, varying,
+    Built, Case, Changes, Loaded, Options, SourceFile, Sources, build, check, compile, dissipation, explain,
+    explain_in, explain_run, linear, load, quantities, varying,
 };
+#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
+pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// What `fric build` makes of a model.

@@ -104,6 +104,7 @@ fn outside_crates_have_one_home() {
         ("memmap2", "runtime/src/blob.rs"),
         ("miette", "src/report.rs"),
         ("resvg", "src/plot/png.rs"),
+        ("rustyline", "src/repl/line.rs"),
     ];
     let mut sources = Vec::new();
     for folder in ["src", "grammar/src", "abi/src", "compiler/src", "runtime/src"] {

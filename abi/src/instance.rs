@@ -1,6 +1,6 @@
 //! A model that runs: its block of numbers and its code, with every access checked.
 
-use crate::description::{Description, Slot};
+use crate::description::{Automaton, Description, Kind, Quantity, Slot};
 use crate::table::{Code, Function};
 use std::sync::Arc;
 
@@ -79,5 +79,73 @@ impl Instance {
     /// Advances by up to `n` fixed steps; returns the first status that is not 0, at which it stops.
     pub fn advance(&mut self, n: u64) -> u64 {
         self.code.call(Function::Step, &mut self.block, &self.description.pool, n)
+    }
+}
+
+/// What became of the states of an instance when another took its place.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Carried {
+    /// Paths of states and automata that went on where they were.
+    pub kept: Vec<String>,
+    /// Those that are new, or of another unit or other regimes than before, and begin anew.
+    pub fresh: Vec<String>,
+    /// Those that are no more.
+    pub lost: Vec<String>,
+}
+
+impl Instance {
+    /// Goes on where another instance is: states take over the value of the state with the same path and dimension,
+    /// automata the regime of the same name. Sampled memory that has no name (held outputs, crossings) is taken over where
+    /// both have the same; else it stays as it is after a start. Time stays this instance's own; outputs are computed
+    /// anew.
+    pub fn carry(&mut self, from: &Instance) -> Carried {
+        let mut carried = Carried::default();
+        let (new, old) = (self.description.clone(), from.description.clone());
+        let is_state = |quantity: &&Quantity| matches!(quantity.kind, Kind::State | Kind::SampledState);
+        let same_memory = new.layout.memory.len == old.layout.memory.len
+            && new.ticks.len() == old.ticks.len()
+            && new.quantities.iter().filter(is_state).map(|q| &q.path).eq(old
+                .quantities
+                .iter()
+                .filter(is_state)
+                .map(|q| &q.path));
+        if same_memory {
+            let memory = &from.block[old.layout.memory.range()];
+            self.block[new.layout.memory.range()].copy_from_slice(memory);
+        }
+        for state in new.quantities.iter().filter(is_state) {
+            let fits = |before: &&Quantity| {
+                before.path == state.path && before.kind == state.kind && before.unit.dimension == state.unit.dimension
+            };
+            match old.quantities.iter().find(fits) {
+                Some(before) => {
+                    self.block[state.slot.index()] = from.get(before.slot);
+                    carried.kept.push(state.path.clone());
+                }
+                None => carried.fresh.push(state.path.clone()),
+            }
+        }
+        let named = |automaton: &Automaton| match automaton.path.as_str() {
+            "" => "its regime".to_string(),
+            path => format!("{path}'s regime"),
+        };
+        for automaton in &new.automata {
+            let regime = old.automata.iter().find(|before| before.path == automaton.path).and_then(|before| {
+                let name = before.regimes.get(from.get(before.slot) as usize)?;
+                automaton.regimes.iter().position(|regime| regime == name)
+            });
+            match regime {
+                Some(regime) => {
+                    self.block[automaton.slot.index()] = regime as f64;
+                    carried.kept.push(named(automaton));
+                }
+                None => carried.fresh.push(named(automaton)),
+            }
+        }
+        let gone = |path: &str| !new.quantities.iter().filter(is_state).any(|state| state.path == path);
+        carried.lost =
+            old.quantities.iter().filter(is_state).map(|q| q.path.clone()).filter(|path| gone(path)).collect();
+        self.call(Function::Outputs);
+        carried
     }
 }

@@ -10,8 +10,7 @@ use std::sync::Arc;
 ///
 /// A slot's values lie side by side, `block[slot · width + lane]`; behind the slots the code has room of its own. Block
 /// and statuses begin at multiples of 64 bytes.
-pub type LanesEntry =
-    unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64;
+pub type LanesEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64;
 
 /// The step of a model for many instances at once.
 #[derive(Clone)]

@@ -35,6 +35,8 @@ pub struct Changes {
     pub vary: Vec<String>,
     /// What is needed besides to linearise.
     pub ports: Option<Ports>,
+    /// Statements that the experiment gets besides its own, as text: `expect max(x) < 1 mm`.
+    pub also: Vec<String>,
 }
 
 /// A number of a plan that was computed from an expression.
@@ -111,6 +113,7 @@ pub fn read(
 ) -> Result<Vec<Variant>, Vec<Diagnostic>> {
     let mut diagnostics = Vec::new();
     let given = Given::read(loaded, changes, &mut diagnostics);
+    let also = also(loaded, &changes.also, &mut diagnostics);
     let loaded = &*loaded;
     let root = loaded.root();
     let file = loaded.files.get(root);
@@ -123,6 +126,11 @@ pub fn read(
         return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
     };
     let misread = loaded.diagnostics.iter().any(|d| d.is_error() && !outside_of(experiment.span, d));
+    let mut experiment = std::borrow::Cow::Borrowed(experiment);
+    if !also.is_empty() {
+        experiment.to_mut().body.extend(also);
+    }
+    let experiment = &*experiment;
     let Some(parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
     let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
     let Some(data) = data else { return Err(diagnostics) };
@@ -151,6 +159,18 @@ pub fn read(
         }
     }
     Ok(variants)
+}
+
+/// Further statements of an experiment, each with its own text.
+fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>) -> Vec<ExperimentStatement> {
+    let mut out = Vec::new();
+    for text in texts {
+        let id = loaded.add_text("--also", text);
+        let (statements, errors) = grammar::parse::parse_statements(id, text);
+        out.extend(statements);
+        diagnostics.extend(errors);
+    }
+    out
 }
 
 /// Texts given on the command line, read.
@@ -495,8 +515,13 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request =
-        Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
+    let request = Request {
+        instance: Instance::Written(&parts.run.instance, root),
+        overrides,
+        observed,
+        data: data.to_vec(),
+        frame: None,
+    };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
@@ -615,7 +640,8 @@ fn variant(
     let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
-    let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };
+    let experiment =
+        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners };
     let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
         let quantity = program.description.quantity(moved)?;
         Some((path.clone(), quantity.slot))

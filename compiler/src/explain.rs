@@ -27,6 +27,8 @@ pub struct Explanation {
     pub quantities: Vec<Listed>,
     /// Equations in the order in which they are computed: left side, right side as written.
     pub equations: Vec<(String, String)>,
+    /// For each quantity that is computed, those its equation names: paths.
+    pub needs: Vec<(String, Vec<String>)>,
     /// How each continuous state is stepped.
     pub states: Vec<Stepped>,
     /// Operations of the fixed steps, before functions are expanded and after: method, count, count, divisions.
@@ -81,6 +83,27 @@ pub enum Own {
 /// Explains a model on its own.
 pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     let Lowered { program, .. } = lower(system, types, &[]);
+    let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
+        let step = discretize::step(&program, method);
+        let expanded = crate::math::expand(&step);
+        let divisions = expanded.ops.iter().filter(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))).count();
+        (method, step.ops.len(), expanded.ops.len(), divisions)
+    });
+    Explanation {
+        model: system.instances.first().map_or(String::new(), |top| top.model.clone()),
+        quantities: quantities(system, types, files),
+        equations: equations(system, files),
+        needs: needs(system),
+        states: states(system, &program),
+        steps: steps.to_vec(),
+        bytes: 8 * program.description.layout.size(),
+        rate_independent: rate_independent(system),
+        dissipation: friction::dissipation(system, types),
+    }
+}
+
+/// Every quantity, parts after their owner, in the order of the text.
+pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> {
     let listed = |id: VarId| {
         let var = system.var(id);
         let unit = &types.units[id.0 as usize];
@@ -92,22 +115,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
             doc: var.doc.clone(),
         }
     };
-    let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
-        let step = discretize::step(&program, method);
-        let expanded = crate::math::expand(&step);
-        let divisions = expanded.ops.iter().filter(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))).count();
-        (method, step.ops.len(), expanded.ops.len(), divisions)
-    });
-    Explanation {
-        model: system.instances.first().map_or(String::new(), |top| top.model.clone()),
-        quantities: system.var_ids().map(listed).collect(),
-        equations: equations(system, files),
-        states: states(system, &program),
-        steps: steps.to_vec(),
-        bytes: 8 * program.description.layout.size(),
-        rate_independent: rate_independent(system),
-        dissipation: friction::dissipation(system, types),
-    }
+    system.var_ids().map(listed).collect()
 }
 
 /// Equations in the order of need.
@@ -159,6 +167,28 @@ fn equations(system: &System, files: &Files) -> Vec<(String, String)> {
         }
     }
     out
+}
+
+/// What the equation of each quantity names.
+fn needs(system: &System) -> Vec<(String, Vec<String>)> {
+    let of = |id: VarId| {
+        let var = system.var(id);
+        let values = match var.definition {
+            Definition::Missing | Definition::Free => return None,
+            Definition::Value(value, _) | Definition::Held { value, .. } => [Some(value), None],
+            Definition::Continuous { initial, rate, .. } => [Some(rate), Some(initial)],
+            Definition::Sampled { initial, next, .. } => [Some(next), Some(initial)],
+        };
+        let mut paths: Vec<String> = Vec::new();
+        for needed in values.into_iter().flatten().flat_map(|value| mentioned(system, value)) {
+            let path = &system.var(needed).path;
+            if *path != var.path && !paths.contains(path) {
+                paths.push(path.clone());
+            }
+        }
+        Some((var.path.clone(), paths))
+    };
+    system.var_ids().filter_map(of).collect()
 }
 
 /// The right side of an equation; one put together from regimes has no text of its own.

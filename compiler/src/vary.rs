@@ -12,7 +12,7 @@ use crate::lower::formulas;
 use crate::source::Files;
 use crate::system::*;
 use abi::description::{Guard, Kind, Quantity};
-use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method};
+use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot};
 use abi::table::Code;
 use abi::unit::Unit;
 use abi::{Description, Instance, Slot};
@@ -24,6 +24,8 @@ pub struct Varying {
     pub label: String,
     /// The plan with the parameters as written.
     pub experiment: Experiment,
+    /// What the experiment shows.
+    pub plots: Vec<Plot>,
     /// What the user should know.
     pub notes: Vec<String>,
     description: Arc<Description>,
@@ -117,7 +119,7 @@ impl Varying {
         }
         let (formulas, size) = formulas(&system, &types, &exprs);
         let expects = experiment.expects.len();
-        experiment.plots.clear();
+        let plots = std::mem::take(&mut experiment.plots);
         if experiment.solver.method != Method::Adaptive {
             // The code of a fixed step holds ranges as they are written: `in_code` took out those that change.
             let guarded = uses.iter().filter_map(|one| match one {
@@ -131,6 +133,7 @@ impl Varying {
         Varying {
             label,
             experiment,
+            plots,
             notes,
             description: Arc::new(program.description),
             params: program.params,

@@ -82,6 +82,18 @@ pub fn parse_setting(file: FileId, text: &str) -> (Option<(Path, Expr)>, Vec<Dia
     (setting, reader.finish())
 }
 
+/// Reads statements of an experiment: `expect max(F) < 2 N`, `plot x [mm]`.
+pub fn parse_statements(file: FileId, text: &str) -> (Vec<ExperimentStatement>, Vec<Diagnostic>) {
+    let mut reader = Reader::new(file, text);
+    let whole = Piece { start: 0, end: reader.source.marks.len() };
+    let found = reader.runs(Place::Experiment, whole).into_iter().filter_map(|statement| match statement {
+        FitStatement::Experiment(statement) => Some(statement),
+        FitStatement::Vary(..) | FitStatement::Minimise(..) => None,
+    });
+    let found = found.collect();
+    (found, reader.finish())
+}
+
 mod pest_rules {
     #![allow(missing_docs)]
     #[derive(pest_derive::Parser)]
@@ -793,7 +805,9 @@ impl<'t> Reader<'t> {
             Rule::rate => RigStatement::Rate(self.value(&mut children), span),
             Rule::solver => RigStatement::Solver(self.solver(pair)),
             Rule::bus => {
-                let (name, kind) = (self.name(children.one()), self.name(children.one()));
+                let name = self.name(children.one());
+                children.maybe(Rule::eq);
+                let kind = self.name(children.one());
                 let args = children.all(Rule::bus_arg).into_iter().map(|arg| {
                     let inner = Children::of(arg).one();
                     match inner.as_rule() {
@@ -806,8 +820,9 @@ impl<'t> Reader<'t> {
             }
             Rule::drive => {
                 let moves = says(&pair, Rule::kw_drive);
-                let (name, kind, bus) =
-                    (self.name(children.one()), self.name(children.one()), self.name(children.one()));
+                let name = self.name(children.one());
+                children.maybe(Rule::eq);
+                let (kind, bus) = (self.name(children.one()), self.name(children.one()));
                 let args = children.all(Rule::drive_arg).into_iter().map(|arg| self.drive_argument(arg)).collect();
                 RigStatement::Drive(DriveDecl { moves, name, kind, bus, args, span })
             }

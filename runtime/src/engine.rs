@@ -36,11 +36,28 @@ pub fn run(
     experiment: &Experiment,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> Result<Outcome, Failure> {
+    run_on(instance, experiment, &mut |_| (), watch).1
+}
+
+/// Runs an experiment as [`run`] does, and gives the instance as it is at the end besides. `begin` sees the instance
+/// once it has started, at t = 0, and may put its states elsewhere.
+///
+/// # Panics
+/// As [`run`].
+pub fn run_on(
+    instance: Instance,
+    experiment: &Experiment,
+    begin: &mut dyn FnMut(&mut Instance),
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> (Instance, Result<Outcome, Failure>) {
     let mut run = Run::new(instance, experiment);
-    match run.go(watch) {
+    let result = run.go(begin, watch);
+    let instance = run.instance.clone();
+    let result = match result {
         Ok(()) => Ok(run.outcome()),
         Err(stop) => Err(Failure { cause: stop.cause, time: stop.time, recording: run.observer.recorder.recording() }),
-    }
+    };
+    (instance, result)
 }
 
 /// Values of `slots` at instants in s, ascending, row by row: the rows up to where the run came, and how it ended. An
@@ -58,7 +75,7 @@ pub fn sample(
     let bare = Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() };
     let mut run = Run::new(instance, &bare);
     run.observer.probe = Probe::new(instants, slots);
-    let result = run.go(watch);
+    let result = run.go(&mut |_| (), watch);
     let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
     (run.observer.probe.values(), result.map_err(failed))
 }
@@ -78,19 +95,23 @@ impl<'a> Run<'a> {
         Run { instance, experiment, observer, work: Work::default(), notes: Vec::new() }
     }
 
-    fn go(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+    fn go(&mut self, begin: &mut dyn FnMut(&mut Instance), watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
         let duration = self.experiment.duration;
         assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
         match self.experiment.solver.method {
-            Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => self.fixed(watch),
+            Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => self.fixed(begin, watch),
             Method::Adaptive => {
-                adaptive::run(&mut self.instance, self.experiment, &mut self.observer, &mut self.work, watch)
+                adaptive::run(&mut self.instance, self.experiment, &mut self.observer, &mut self.work, begin, watch)
             }
         }
     }
 
     /// A whole number of fixed steps.
-    fn fixed(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+    fn fixed(
+        &mut self,
+        begin: &mut dyn FnMut(&mut Instance),
+        watch: &mut dyn FnMut(f64) -> Continue,
+    ) -> Result<(), Stop> {
         let step = self.experiment.solver.step;
         assert!(step > 0.0 && step.is_finite(), "a step of {step} s");
         let total = (self.experiment.duration / step).round() as u64;
@@ -100,6 +121,7 @@ impl<'a> Run<'a> {
         }
         let each = !self.observer.only_last() || self.observer.probe.next().is_some();
         let status = self.instance.start(step);
+        begin(&mut self.instance);
         check_status(&self.instance, status)?;
         check_finite(&self.instance)?;
         self.observer.see(&self.instance)?;

@@ -17,6 +17,7 @@ mod observe;
 mod solver;
 
 pub mod engine;
+pub mod steady;
 pub mod sweep;
 
 pub mod blob;
@@ -28,6 +29,14 @@ pub mod histogram;
 pub mod realtime;
 
 pub mod can;
+
+pub mod canopen;
+
+pub mod drive;
+
+pub mod safety;
+
+pub mod hil;
 
 #[cfg(test)]
 mod models;

@@ -21,6 +21,9 @@ impl View<'_> {
     pub fn p(&self, i: usize) -> f64 {
         self.block[self.layout.params.slot(i).index()]
     }
+    pub fn u(&self, i: usize) -> f64 {
+        self.block[self.layout.inputs.slot(i).index()]
+    }
     pub fn x(&self, i: usize) -> f64 {
         self.block[self.layout.states.slot(i).index()]
     }
@@ -65,6 +68,7 @@ pub struct Model {
     params: Vec<f64>,
     states: Vec<(&'static str, Unit, (f64, f64))>,
     outputs: Vec<(&'static str, Unit)>,
+    inputs: u32,
     memory: u32,
     regimes: Vec<Vec<&'static str>>,
     roots: Vec<&'static str>,
@@ -80,6 +84,7 @@ impl Model {
             params: Vec::new(),
             states: Vec::new(),
             outputs: Vec::new(),
+            inputs: 0,
             memory: 0,
             regimes: Vec::new(),
             roots: Vec::new(),
@@ -98,6 +103,10 @@ impl Model {
     }
     pub fn output(mut self, path: &'static str, unit: &str) -> Model {
         self.outputs.push((path, Unit::parse(unit).unwrap()));
+        self
+    }
+    pub fn inputs(mut self, slots: u32) -> Model {
+        self.inputs = slots;
         self
     }
     pub fn memory(mut self, slots: u32) -> Model {
@@ -132,7 +141,7 @@ impl Model {
         let n = self.states.len() as u32;
         let layout = Layout::new([
             self.params.len() as u32,
-            0,
+            self.inputs,
             n,
             self.memory + self.periods.len() as u32,
             self.regimes.len() as u32,
@@ -321,7 +330,15 @@ pub fn slot(instance: &Instance, path: &str) -> Slot {
 /// An experiment that neither draws nor expects.
 pub fn fixed(duration: f64, step: f64) -> Experiment {
     let solver = Solver { method: Method::Rk4, step, tol: 0.0 };
-    Experiment { name: "test".into(), duration, solver, plots: Vec::new(), expects: Vec::new(), corners: Vec::new() }
+    Experiment {
+        name: "test".into(),
+        duration,
+        solver,
+        bench: None,
+        plots: Vec::new(),
+        expects: Vec::new(),
+        corners: Vec::new(),
+    }
 }
 
 /// An adaptive experiment that neither draws nor expects.

@@ -61,7 +61,8 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     end
 }
 
-fn tell(explanation: &Explanation, terminal: &mut Terminal) {
+/// Everything about a model.
+pub(super) fn tell(explanation: &Explanation, terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &explanation.model));
     let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
     let names = width(&mut explanation.quantities.iter().map(|q| q.path.chars().count()));
@@ -133,8 +134,8 @@ fn as_json(explanation: &Explanation) -> serde_json::Value {
     })
 }
 
-/// From the heading of a code to the next heading.
-fn page(code: &str) -> Option<&'static str> {
+/// The page of a code: from its heading to the next.
+pub(super) fn page(code: &str) -> Option<&'static str> {
     let start = headings().find(|at| PAGES[*at..].strip_prefix("## ").is_some_and(|rest| word(rest) == code))?;
     let end = headings().find(|at| *at > start).unwrap_or(PAGES.len());
     Some(&PAGES[start..end])

@@ -9,11 +9,13 @@ mod explain;
 mod fmt;
 mod linearise;
 mod new;
+mod repl;
 mod run;
 mod sweep;
 mod test;
+mod watch;
 
-use crate::args::{Args, Command};
+use crate::args::{Args, Command, Repl};
 use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
@@ -38,7 +40,8 @@ pub enum End {
 
 /// Does what was asked for.
 pub fn run(args: &Args, terminal: &mut Terminal) -> End {
-    match &args.command {
+    let Some(command) = &args.command else { return repl::repl(&Repl::default(), terminal) };
+    match command {
         Command::Run(run) => run::run(run, terminal),
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
@@ -50,6 +53,8 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        Command::Repl(args) => repl::repl(args, terminal),
+        Command::Watch(args) => watch::watch(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();

@@ -75,7 +75,7 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
             tol: args.tol,
             duration: args.duration,
             vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
-            ports: None,
+            ..Changes::default()
         },
         interpret: args.interpret,
     };

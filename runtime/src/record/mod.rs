@@ -3,7 +3,9 @@
 //! In: the points of a run in order of time. Out: a [`Recording`]: rows of time and values that show every minimum
 //! and maximum of every column, and no fewer than 1,000 of them if there were that many. Measures do not read it.
 
+pub mod blocks;
 pub mod csv;
+pub mod log;
 
 use abi::Slot;
 use abi::plan::{Plot, Series};

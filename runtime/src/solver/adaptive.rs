@@ -37,12 +37,14 @@ pub(crate) fn run(
     experiment: &Experiment,
     observer: &mut Observer,
     work: &mut Work,
+    begin: &mut dyn FnMut(&mut Instance),
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> Result<(), Stop> {
     if !instance.has(Function::Derivatives) && instance.description().layout.states.len > 0 {
         return Err(Stop { cause: Cause::NoDerivatives, time: 0.0 });
     }
     let status = instance.start(0.0);
+    begin(instance);
     check_status(instance, status)?;
     check_finite(instance)?;
     let mut run = Adaptive::new(instance, experiment, observer);

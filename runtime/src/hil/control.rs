@@ -1,0 +1,649 @@
+//! The part of a cycle that only computes: readings → model → safety → permitted outputs.
+//!
+//! In: what was read, how old it is, what went wrong elsewhere, what the operator changed. Out: what is permitted and
+//! what the drives are told. Knows neither clock nor bus nor file, so that a replay of the same inputs gives the same
+//! bits. It allocates in [`Control::new`] only.
+
+use crate::safety::{Cause, DriveLimits, Order, OutputLimits, Patience, Refused, Seen, Supervisor};
+use abi::rig::{Kind, Mode, Overrun, Rig, Signal, What};
+use abi::{Function, Instance, Slot};
+
+/// A value as it was read.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Reading {
+    /// SI.
+    pub value: f64,
+    /// Ticks since it came: 0 in this one, [`Reading::NEVER`] not at all.
+    pub age: u32,
+}
+
+impl Reading {
+    /// The age of what never came.
+    pub const NEVER: u32 = u32::MAX;
+}
+
+/// Who asks for the outputs.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Source {
+    /// Nobody: the rig is not armed.
+    Nobody,
+    /// The start-up, for its tests.
+    StartUp,
+    /// The model.
+    Model,
+}
+
+/// What a cycle is told.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Told<'a> {
+    /// Ticks since the cycle before: 1, more after missed ones.
+    pub ticks: u32,
+    /// One reading for each of [`Control::signals`].
+    pub readings: &'a [Reading],
+    /// Who asks.
+    pub source: Source,
+    /// What the start-up asks for, one value an output.
+    pub wanted: &'a [f64],
+    /// What went wrong elsewhere.
+    pub causes: &'a [Cause],
+    /// Parameters that change now, as one set.
+    pub set: &'a [(Slot, f64)],
+}
+
+/// A signal that is read.
+struct Watched {
+    signal: Signal,
+    /// Age in ticks at which it is lost; none: it may be missing.
+    timeout: Option<u32>,
+    /// Greatest credible change in one tick, SI; infinite: not judged.
+    jump: f64,
+    last: f64,
+    /// Ticks since `last` was taken; none: nothing was taken yet.
+    since: Option<u32>,
+    /// Ticks without a break in which it was not credible.
+    odd: u32,
+}
+
+/// Ticks in which a value that is not credible is replaced by the one before.
+const ODD: u32 = 3;
+/// Ticks after which a drive's signal is lost where the rig names no time.
+const TIMEOUT: u32 = 3;
+/// Torque that could act on a shaft beyond that of its drives, as a multiple of theirs.
+const SURPLUS: f64 = 4.0;
+
+/// What is not in the text of a rig.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Options {
+    /// Time in which outputs come up from their safe values, ns.
+    pub ramp_ns: u64,
+    /// Time for which an output may be outside its limits without a break, ns.
+    pub clamped_ns: u64,
+    /// From a controlled stop to the quick stop, and from there to disabled, ns.
+    pub standstill_ns: u64,
+    /// Time in which the step that a change of parameters makes in an output is spread, ns.
+    pub blend_ns: u64,
+    /// Missed ticks are counted only: for simulated drives.
+    pub count_overruns: bool,
+}
+
+impl Default for Options {
+    fn default() -> Options {
+        let (ramp_ns, clamped_ns, standstill_ns, blend_ns) = (100_000_000, 5_000_000_000, 1_000_000_000, 100_000_000);
+        Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns: false }
+    }
+}
+
+/// Greatest torque and speed of a drive, where known.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Bounds {
+    /// N·m
+    pub torque: Option<f64>,
+    /// rad/s
+    pub speed: Option<f64>,
+}
+
+/// The part of a cycle that only computes.
+pub struct Control {
+    model: Instance,
+    /// A block like the model's, to try things on.
+    shadow: Instance,
+    step: f64,
+    steps: u64,
+    overrun: Overrun,
+    supervisor: Supervisor,
+    watched: Vec<Watched>,
+    /// For each input: which signal, and the slot it goes to.
+    inputs: Vec<(usize, Slot)>,
+    /// For each output: the slot of the request.
+    outputs: Vec<Slot>,
+    stops: Vec<Slot>,
+    /// For each drive: where its speed and position are among the signals.
+    seen_at: Vec<(Option<usize>, Option<usize>)>,
+    seen: Vec<Seen>,
+    requests: Vec<f64>,
+    /// What a change of parameters left between the old and the new request, and the ticks it still lasts.
+    offsets: Vec<f64>,
+    blend: (u32, u32),
+    regimes: Vec<f64>,
+    running: bool,
+    refused_sets: u32,
+}
+
+impl Control {
+    /// The control part of a rig. `bounds`: one entry a node, read from the drives where the rig leaves them out.
+    ///
+    /// # Errors
+    /// What refuses the start, in words.
+    pub fn new(rig: &Rig, model: Instance, bounds: &[Bounds], options: Options) -> Result<Control, String> {
+        let period = rig.period_ns as f64 * 1e-9;
+        let ticks = |ns: u64| u32::try_from(ns.div_ceil(rig.period_ns)).unwrap_or(u32::MAX);
+        let moving: Vec<usize> = (0..rig.nodes.len()).filter(|i| rig.nodes[*i].moves).collect();
+        let mut drives = Vec::new();
+        for i in &moving {
+            drives.push(drive_limits(rig, *i, bounds)?);
+        }
+        let mut outputs = Vec::new();
+        for output in &rig.outputs {
+            outputs.push(output_limits(rig, output, &moving, bounds)?);
+        }
+        let patience = Patience {
+            ramp: ticks(options.ramp_ns),
+            clamped: ticks(options.clamped_ns),
+            standstill: ticks(options.standstill_ns),
+        };
+        let supervisor = Supervisor::new(&outputs, &drives, patience, rig.period_ns)
+            .map_err(|refused| refusal(rig, &moving, refused))?;
+
+        let torque: f64 = outputs.iter().filter(|o| o.torque).map(|o| o.low.abs().max(o.high.abs())).sum();
+        let acceleration = rig.plant.inertia.map_or(f64::INFINITY, |inertia| SURPLUS * torque / inertia);
+        let mut watched: Vec<Watched> = Vec::new();
+        let mut watch = |signal: Signal, start: f64, needed: bool| {
+            let at = watched.iter().position(|other| other.signal == signal);
+            let node = &rig.nodes[signal.node];
+            let timeout = match node.timeout_ns {
+                0 => node.moves.then_some(TIMEOUT),
+                ns => Some(u32::try_from(ns / rig.period_ns).unwrap_or(u32::MAX).max(1)),
+            };
+            let timeout = timeout.filter(|_| needed);
+            if let Some(at) = at {
+                watched[at].timeout = watched[at].timeout.or(timeout);
+                return at;
+            }
+            let jump = match (&node.kind, signal.what) {
+                (Kind::Cia402(drive), What::Speed) => acceleration * period + 4.0 * drive.speed_unit,
+                (Kind::Cia402(drive), What::Position) => {
+                    let speed = moving.iter().position(|i| *i == signal.node).map(|i| drives[i].speed);
+                    2.0 * speed.unwrap_or(f64::INFINITY) * period + 4.0 * drive.count
+                }
+                _ => f64::INFINITY,
+            };
+            watched.push(Watched { signal, timeout, jump, last: start, since: None, odd: 0 });
+            watched.len() - 1
+        };
+        let inputs = rig.inputs.iter().map(|input| (watch(input.signal, input.start, input.needed), input.slot));
+        let inputs = inputs.collect();
+        let seen_at = moving.iter().map(|node| {
+            let mut measured = |what| {
+                let speaks = matches!(rig.nodes[*node].kind, Kind::Cia402(_));
+                speaks.then(|| watch(Signal { node: *node, what }, 0.0, true))
+            };
+            measured(What::Torque);
+            (measured(What::Speed), measured(What::Position))
+        });
+        let seen_at: Vec<_> = seen_at.collect();
+        let regimes = model.description().layout.regimes;
+        Ok(Control {
+            shadow: model.clone(),
+            step: period / f64::from(rig.steps.max(1)),
+            steps: u64::from(rig.steps.max(1)),
+            overrun: if options.count_overruns { Overrun::Hold(u32::MAX) } else { rig.overrun },
+            supervisor,
+            watched,
+            inputs,
+            outputs: rig.outputs.iter().map(|output| output.slot).collect(),
+            stops: rig.stops.iter().map(|stop| stop.slot).collect(),
+            seen: vec![Seen::default(); seen_at.len()],
+            seen_at,
+            requests: rig.outputs.iter().map(|output| output.safe).collect(),
+            offsets: vec![0.0; rig.outputs.len()],
+            blend: (0, ticks(options.blend_ns).max(1)),
+            regimes: vec![0.0; regimes.len as usize],
+            running: false,
+            refused_sets: 0,
+            model,
+        })
+    }
+
+    /// The signals that are read, in the order of the readings.
+    pub fn signals(&self) -> impl ExactSizeIterator<Item = Signal> {
+        self.watched.iter().map(|watched| watched.signal)
+    }
+
+    /// What was asked for, one value an output.
+    pub fn requests(&self) -> &[f64] {
+        &self.requests
+    }
+
+    /// What watches over the outputs.
+    pub fn supervisor(&self) -> &Supervisor {
+        &self.supervisor
+    }
+
+    /// The same, to arm it, reset it or narrow its limits between cycles.
+    pub fn supervisor_mut(&mut self) -> &mut Supervisor {
+        &mut self.supervisor
+    }
+
+    /// The model as it stands.
+    pub fn model(&self) -> &Instance {
+        &self.model
+    }
+
+    /// Sets of parameters that were refused because the model could not go on with them.
+    pub fn refused_sets(&self) -> u32 {
+        self.refused_sets
+    }
+
+    /// One cycle. Who asks for outputs must have armed the supervisor.
+    pub fn cycle(&mut self, told: &Told) -> Order {
+        assert_eq!(told.readings.len(), self.watched.len(), "readings");
+        let armed = told.source != Source::Nobody;
+        told.causes.iter().for_each(|cause| self.supervisor.trip(*cause));
+        self.read(told.readings, told.ticks, armed);
+        let missed = told.ticks.saturating_sub(1);
+        let most = match self.overrun {
+            Overrun::Stop => 0,
+            Overrun::Hold(most) => most,
+        };
+        if armed && missed > most {
+            self.supervisor.trip(Cause::Overrun(missed));
+        }
+        match told.source {
+            Source::Model if self.supervisor.is_armed() => self.advance(told),
+            Source::StartUp => self.requests.copy_from_slice(told.wanted),
+            Source::Model | Source::Nobody => {}
+        }
+        self.running = told.source == Source::Model;
+        for (seen, (speed, position)) in self.seen.iter_mut().zip(&self.seen_at) {
+            let last = |at: &Option<usize>| {
+                let watched = &self.watched[(*at)?];
+                watched.since.map(|_| watched.last)
+            };
+            *seen = Seen { speed: last(speed), position: last(position) };
+        }
+        self.supervisor.judge(&self.requests, &self.seen)
+    }
+
+    /// Takes what was read, as far as it is credible; trips on what has been missing or odd for too long.
+    fn read(&mut self, readings: &[Reading], ticks: u32, armed: bool) {
+        for (i, (watched, reading)) in self.watched.iter_mut().zip(readings).enumerate() {
+            watched.since = watched.since.map(|since| since.saturating_add(ticks));
+            if reading.age == 0 {
+                let change = (reading.value - watched.last).abs();
+                let credible = match watched.since {
+                    Some(since) if armed => change <= watched.jump * f64::from(since),
+                    _ => reading.value.is_finite(),
+                };
+                if credible {
+                    (watched.last, watched.since, watched.odd) = (reading.value, Some(0), 0);
+                } else {
+                    watched.odd += 1;
+                }
+            } else if !armed {
+                watched.odd = 0;
+            }
+            if !armed {
+                continue;
+            }
+            if watched.timeout.is_some_and(|timeout| reading.age >= timeout) {
+                self.supervisor.trip(Cause::Lost(i));
+            }
+            if watched.odd >= ODD {
+                self.supervisor.trip(Cause::Implausible(i));
+            }
+        }
+    }
+
+    /// Brings the model to the end of this tick.
+    fn advance(&mut self, told: &Told) {
+        for (at, slot) in &self.inputs {
+            self.model.set(*slot, self.watched[*at].last);
+        }
+        let begin = if self.running { 0 } else { self.start() };
+        let steps = self.steps * u64::from(told.ticks.max(1));
+        let mut status = begin;
+        if begin == 0 {
+            status = if told.set.is_empty() { self.model.advance(steps) } else { self.change(told.set, steps) };
+        }
+        if status != 0 {
+            self.supervisor.trip(Cause::Guard(status));
+        }
+        let left = f64::from(self.blend.0) / f64::from(self.blend.1);
+        for ((request, slot), offset) in self.requests.iter_mut().zip(&self.outputs).zip(&self.offsets) {
+            *request = self.model.get(*slot);
+            if self.blend.0 > 0 {
+                *request += offset * left;
+            }
+        }
+        self.blend.0 = self.blend.0.saturating_sub(told.ticks);
+        if let Some(i) = self.stops.iter().position(|slot| self.model.get(*slot) != 0.0) {
+            self.supervisor.trip(Cause::Condition(i));
+        }
+    }
+
+    /// The model at its t = 0, as [`Instance::start`] does it, with nothing allocated.
+    fn start(&mut self) -> u64 {
+        self.model.set(Slot::TIME, 0.0);
+        self.model.set(Slot::COUNT, 0.0);
+        self.model.set(Slot::STEP, self.step);
+        let mut status = self.model.call(Function::Start);
+        if self.model.has(Function::Transitions) {
+            let range = self.model.description().layout.regimes.range();
+            let automata = &self.model.description().automata;
+            let most = automata.iter().map(|automaton| automaton.regimes.len()).max().unwrap_or(0);
+            for _ in 0..=most {
+                self.regimes.copy_from_slice(&self.model.block()[range.clone()]);
+                status = status.max(self.model.call(Function::Transitions));
+                if self.model.block()[range.clone()] == self.regimes[..] {
+                    break;
+                }
+            }
+        }
+        status.max(self.model.call(Function::Outputs))
+    }
+
+    /// Takes over a set of parameters, without a step in the outputs: their difference decays. A set with which the
+    /// model cannot go on is refused, and the model goes on without it.
+    fn change(&mut self, set: &[(Slot, f64)], steps: u64) -> u64 {
+        self.shadow.block_mut().copy_from_slice(self.model.block());
+        let old = self.shadow.advance(steps);
+        for (slot, value) in set {
+            self.model.set(*slot, *value);
+        }
+        let new = self.model.advance(steps);
+        let finite = self.model.block()[self.model.description().layout.states.range()].iter().all(|x| x.is_finite())
+            && self.outputs.iter().all(|slot| self.model.get(*slot).is_finite());
+        if old == 0 && (new != 0 || !finite) {
+            self.refused_sets += 1;
+            self.model.block_mut().copy_from_slice(self.shadow.block());
+            return old;
+        }
+        let left = f64::from(self.blend.0) / f64::from(self.blend.1);
+        for (offset, slot) in self.offsets.iter_mut().zip(&self.outputs) {
+            *offset = *offset * left + self.shadow.get(*slot) - self.model.get(*slot);
+        }
+        self.blend.0 = self.blend.1;
+        new
+    }
+
+    /// All that the next cycle depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        words.extend(self.model.block().iter().map(|x| x.to_bits()));
+        words.extend(self.requests.iter().chain(&self.offsets).map(|x| x.to_bits()));
+        words.extend([u64::from(self.blend.0), u64::from(self.running)]);
+        for watched in &self.watched {
+            let since = watched.since.map_or(u64::MAX, u64::from);
+            words.extend([watched.last.to_bits(), since, u64::from(watched.odd)]);
+        }
+        self.supervisor.save(words);
+    }
+
+    /// Takes over what [`Control::save`] gave. None if it does not fit this rig.
+    pub fn restore(&mut self, words: &[u64]) -> Option<()> {
+        let mut words = words.iter().copied();
+        for x in self.model.block_mut().iter_mut().chain(&mut self.requests).chain(&mut self.offsets) {
+            *x = f64::from_bits(words.next()?);
+        }
+        self.blend.0 = u32::try_from(words.next()?).ok()?;
+        self.running = words.next()? != 0;
+        for watched in &mut self.watched {
+            watched.last = f64::from_bits(words.next()?);
+            let since = words.next()?;
+            watched.since = if since == u64::MAX { None } else { Some(u32::try_from(since).ok()?) };
+            watched.odd = u32::try_from(words.next()?).ok()?;
+        }
+        self.supervisor.restore(&mut words)?;
+        words.next().is_none().then_some(())
+    }
+}
+
+/// Greatest torque and speed of a node: as the rig says, else as the drive says.
+fn bounds_of(rig: &Rig, node: usize, bounds: &[Bounds]) -> Bounds {
+    let read = bounds.get(node).copied().unwrap_or_default();
+    match &rig.nodes[node].kind {
+        Kind::Cia402(drive) => {
+            Bounds { torque: drive.max_torque.or(read.torque), speed: drive.max_speed.or(read.speed) }
+        }
+        Kind::Frames(_) => read,
+    }
+}
+
+/// What supervises a drive.
+fn drive_limits(rig: &Rig, node: usize, bounds: &[Bounds]) -> Result<DriveLimits, String> {
+    let name = &rig.nodes[node].name;
+    let Kind::Cia402(drive) = &rig.nodes[node].kind else {
+        let all = (f64::NEG_INFINITY, f64::INFINITY);
+        return Ok(DriveLimits { speed: f64::INFINITY, travel: all, power: f64::INFINITY });
+    };
+    let Bounds { torque, speed } = bounds_of(rig, node, bounds);
+    let speed = speed.filter(|speed| speed.is_finite() && *speed > 0.0).ok_or_else(|| {
+        format!("drive `{name}`: no greatest speed is known: give `speed_max`; the drive does not say (object 6080)")
+    })?;
+    let torque = torque.filter(|torque| torque.is_finite() && *torque > 0.0).ok_or_else(|| {
+        format!("drive `{name}`: no greatest torque is known: give `T_max`; the drive does not say (object 6072)")
+    })?;
+    let travel = drive.travel.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
+    Ok(DriveLimits { speed, travel, power: drive.max_power.unwrap_or(torque * speed) })
+}
+
+/// Limits of an output: those of the rig, within those of the drive.
+fn output_limits(
+    rig: &Rig,
+    output: &abi::rig::Output,
+    moving: &[usize],
+    bounds: &[Bounds],
+) -> Result<OutputLimits, String> {
+    let abi::rig::Output { signal, low, high, slew, safe, .. } = *output;
+    let drive = moving.iter().position(|node| *node == signal.node);
+    let (mut low, mut high, mut torque) = (low, high, false);
+    if let Kind::Cia402(described) = &rig.nodes[signal.node].kind {
+        let most = bounds_of(rig, signal.node, bounds);
+        torque = described.mode == Mode::Torque;
+        let (least, greatest) = match described.mode {
+            Mode::Torque => (most.torque.map(|most| -most), most.torque),
+            Mode::Speed => (most.speed.map(|most| -most), most.speed),
+            Mode::Position => (described.travel.map(|travel| travel.0), described.travel.map(|travel| travel.1)),
+        };
+        low = low.max(least.unwrap_or(f64::NEG_INFINITY));
+        high = high.min(greatest.unwrap_or(f64::INFINITY));
+        if !(low.is_finite() && high.is_finite()) {
+            let name = &rig.nodes[signal.node].name;
+            return Err(format!(
+                "drive `{name}`: its command has no bounds: give a `limit`, or `travel` for a position"
+            ));
+        }
+    }
+    Ok(OutputLimits { low, high, slew, safe, drive, torque })
+}
+
+/// Why the limits of a rig cannot be kept, in words.
+fn refusal(rig: &Rig, moving: &[usize], refused: Refused) -> String {
+    let output = |i: usize| {
+        let node: &str = &rig.nodes[rig.outputs[i].signal.node].name;
+        format!("the command of `{node}`")
+    };
+    match refused {
+        Refused::Range(i) => {
+            let abi::rig::Output { low, high, safe, .. } = rig.outputs[i];
+            format!("{}: its safe value {safe} is not within its limits {low} .. {high}", output(i))
+        }
+        Refused::Slew(i) => format!("{}: its slew is not above 0, so it could never be stopped", output(i)),
+        Refused::Unbounded(i) => format!("{}: it has no bounds: give a `limit`", output(i)),
+        Refused::NoDrive(i) => format!("{}: there is no such drive", output(i)),
+        Refused::Wider(i) => format!("{}: limits can only be narrowed", output(i)),
+        Refused::Drive(i) => {
+            format!("drive `{}`: a limit is negative or no number", rig.nodes[moving[i]].name)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hil::bench;
+
+    const FRESH: u32 = 0;
+
+    /// A rig under way: readings of position, speed and torque of its one drive.
+    struct Way {
+        control: Control,
+        readings: Vec<Reading>,
+    }
+
+    impl Way {
+        fn new(change: impl FnOnce(&mut Rig)) -> Way {
+            let (mut rig, model) = bench::rig();
+            change(&mut rig);
+            let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..Options::default() };
+            let mut control = Control::new(&rig, model, &[], options).unwrap();
+            assert!(control.supervisor_mut().arm());
+            let readings = control.signals().map(|_| Reading { value: 0.0, age: FRESH }).collect();
+            Way { control, readings }
+        }
+
+        fn set(&mut self, what: What, value: f64) {
+            let at = self.control.signals().position(|signal| signal.what == what).unwrap();
+            self.readings[at].value = value;
+        }
+
+        fn cycle(&mut self, ticks: u32, set: &[(Slot, f64)]) -> f64 {
+            let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
+            let told = Told { ticks, readings: &self.readings, source, wanted, causes, set };
+            self.control.cycle(&told);
+            self.control.supervisor().permitted()[0]
+        }
+    }
+
+    #[test]
+    fn the_model_steps_over_the_coming_period_with_the_newest_readings() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 2.0);
+        // A spring of 10 N·m/rad on what is turned: after k periods of 2 rad/s.
+        for k in 1..=5 {
+            let torque = way.cycle(1, &[]);
+            assert!((torque + 10.0 * 2.0 * 1e-3 * f64::from(k)).abs() < 1e-12, "cycle {k}: {torque}");
+        }
+    }
+
+    #[test]
+    fn a_missed_tick_is_made_up_for_and_too_many_stop_the_rig() {
+        let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(2));
+        way.set(What::Speed, 2.0);
+        way.cycle(1, &[]);
+        let torque = way.cycle(3, &[]);
+        assert!((torque + 10.0 * 2.0 * 4e-3).abs() < 1e-12, "{torque}");
+        way.cycle(4, &[]);
+        assert_eq!(way.control.supervisor().cause(), Some(Cause::Overrun(3)));
+        let mut strict = Way::new(|_| ());
+        strict.cycle(2, &[]);
+        assert_eq!(strict.control.supervisor().cause(), Some(Cause::Overrun(1)));
+    }
+
+    #[test]
+    fn a_reading_that_is_missing_is_held_and_then_lost() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 1.0);
+        way.cycle(1, &[]);
+        for age in 1..3 {
+            way.readings.iter_mut().for_each(|reading| *reading = Reading { value: 1.0, age });
+            way.cycle(1, &[]);
+            assert_eq!(way.control.supervisor().cause(), None, "age {age}");
+        }
+        way.readings.iter_mut().for_each(|reading| reading.age = 3);
+        way.cycle(1, &[]);
+        assert!(matches!(way.control.supervisor().cause(), Some(Cause::Lost(_))));
+    }
+
+    #[test]
+    fn a_glitch_is_not_believed_and_a_third_in_a_row_stops_the_rig() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 1.0);
+        let held = way.cycle(1, &[]);
+        for (cycle, cause) in [(1, None), (2, None), (3, Some(()))] {
+            way.set(What::Speed, 900.0);
+            let torque = way.cycle(1, &[]);
+            assert!((torque - held * f64::from(cycle + 1)).abs() < 1e-12 || cause.is_some(), "the old speed counts");
+            assert_eq!(way.control.supervisor().cause().map(|_| ()), cause, "cycle {cycle}");
+        }
+        assert!(matches!(way.control.supervisor().cause(), Some(Cause::Implausible(_))));
+    }
+
+    #[test]
+    fn a_set_of_parameters_makes_no_step_in_the_output() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 1.0);
+        for _ in 0..10 {
+            way.cycle(1, &[]);
+        }
+        let stiffness = way.control.model().description().layout.params.slot(0);
+        let mut last = way.cycle(1, &[]);
+        let mut greatest: f64 = 0.0;
+        for k in 0..12 {
+            let set = [(stiffness, 20.0)];
+            let now = way.cycle(1, if k == 0 { &set } else { &[] });
+            greatest = greatest.max((now - last).abs());
+            last = now;
+        }
+        // 0.12 N·m of difference spread over ten cycles, beside what the spring itself does.
+        assert!(greatest < 0.05, "a step of {greatest} N·m");
+        assert!((last + 20.0 * 23e-3).abs() < 1e-12, "{last}");
+    }
+
+    #[test]
+    fn a_set_with_which_the_model_cannot_go_on_is_refused() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 1.0);
+        let first = way.cycle(1, &[]);
+        let stiffness = way.control.model().description().layout.params.slot(0);
+        let second = way.cycle(1, &[(stiffness, f64::NAN)]);
+        assert!((second - 2.0 * first).abs() < 1e-12, "the old one holds: {second}");
+        assert_eq!((way.control.refused_sets(), way.control.supervisor().cause()), (1, None));
+    }
+
+    #[test]
+    fn what_the_model_cannot_compute_stops_the_rig() {
+        let mut way = Way::new(|_| ());
+        way.set(What::Speed, 1.0);
+        way.cycle(1, &[]);
+        let state = way.control.model.description().layout.states.slot(0);
+        way.control.model.set(state, f64::NAN);
+        way.cycle(1, &[]);
+        assert_eq!(way.control.supervisor().cause(), Some(Cause::NotFinite(0)));
+    }
+
+    #[test]
+    fn a_rig_without_bounds_is_refused_in_words() {
+        let (mut rig, model) = bench::rig();
+        let Kind::Cia402(drive) = &mut rig.nodes[0].kind else { unreachable!() };
+        drive.max_speed = None;
+        let why = |bounds: &[Bounds]| Control::new(&rig, model.clone(), bounds, Options::default()).err();
+        let missing =
+            "drive `load`: no greatest speed is known: give `speed_max`; the drive does not say (object 6080)";
+        assert_eq!(why(&[]).as_deref(), Some(missing));
+        assert_eq!(why(&[Bounds { torque: None, speed: Some(100.0) }]), None, "the drive says");
+    }
+
+    #[test]
+    fn what_is_saved_goes_on_as_before() {
+        let mut first = Way::new(|_| ());
+        for k in 0..50 {
+            first.set(What::Speed, f64::from(k % 5) * 0.1);
+            let mut words = Vec::new();
+            first.control.save(&mut words);
+            let mut second = Way::new(|_| ());
+            second.readings.clone_from(&first.readings);
+            assert_eq!(second.control.restore(&words), Some(()));
+            assert_eq!(first.cycle(1, &[]).to_bits(), second.cycle(1, &[]).to_bits(), "cycle {k}");
+        }
+    }
+}

@@ -1,0 +1,12 @@
+//! Hardware in the loop: the cycle that joins model, safety, drives and buses.
+//!
+//! In: a rig, its compiled programs, buses, a clock. Out: commands to drives, a log, and why it stopped. Knows neither
+//! the language nor the terminal.
+
+pub mod control;
+pub mod trace;
+pub mod replay;
+pub mod emergency;
+
+#[cfg(test)]
+mod bench;

@@ -1,0 +1,391 @@
+//! What a cycle leaves behind, as words: written by the cycle, read by replays and exports.
+//!
+//! In: the numbers of a cycle. Out: messages of a log, and the numbers again. Writing allocates nothing once its buffer
+//! has grown.
+
+use super::control::{Bounds, Control, Options, Reading, Source};
+use crate::can::Frame;
+use crate::safety::{Cause, Clamps, Order};
+use abi::Slot;
+use abi::rig::Rig;
+
+pub use crate::record::log::CYCLE;
+/// Kind of message: all that the next cycle depends on.
+pub const STATE: u32 = 2;
+/// Kind of message: frames of a cycle.
+pub const FRAMES: u32 = 3;
+
+/// One cycle.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Cycle {
+    /// Its number, from 0.
+    pub k: u64,
+    /// When its tick was due, ns since the start.
+    pub due_ns: u64,
+    /// How late it began, ns.
+    pub late_ns: u32,
+    /// Receiving, computing and sending, ns.
+    pub phases_ns: [u32; 3],
+    /// Ticks since the cycle before.
+    pub ticks: u32,
+    /// Who asked for outputs.
+    pub source: Source,
+    /// What the drives were told.
+    pub order: Order,
+    /// The outputs were given to whoever asks, just before this cycle.
+    pub arms: bool,
+    /// The operator reset a trip, just before this cycle.
+    pub resets: bool,
+    /// Where the start-up was.
+    pub step: u8,
+    /// Status word of each drive that moves.
+    pub statuses: Vec<u16>,
+    /// What was read.
+    pub readings: Vec<Reading>,
+    /// What the start-up asked for; empty if it did not ask.
+    pub wanted: Vec<f64>,
+    /// What was asked for.
+    pub requests: Vec<f64>,
+    /// What was permitted.
+    pub permitted: Vec<f64>,
+    /// Why it is not the same.
+    pub clamps: Vec<Clamps>,
+    /// What went wrong elsewhere.
+    pub causes: Vec<Cause>,
+    /// Parameters that changed.
+    pub set: Vec<(Slot, f64)>,
+    /// What the rig records besides, SI.
+    pub recorded: Vec<f64>,
+}
+
+/// How many of each a rig has: what the words of a cycle do not say.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Shape {
+    /// Signals that are read.
+    pub signals: usize,
+    /// Outputs.
+    pub outputs: usize,
+    /// Drives that move.
+    pub drives: usize,
+    /// Quantities that the rig records.
+    pub recorded: usize,
+}
+
+impl Shape {
+    /// That of a rig.
+    pub fn of(rig: &Rig, control: &Control) -> Shape {
+        Shape {
+            signals: control.signals().len(),
+            outputs: rig.outputs.len(),
+            drives: rig.nodes.iter().filter(|node| node.moves).count(),
+            recorded: rig.record.len(),
+        }
+    }
+}
+
+fn source_number(source: Source) -> u64 {
+    match source {
+        Source::Nobody => 0,
+        Source::StartUp => 1,
+        Source::Model => 2,
+    }
+}
+
+/// An order as a number.
+pub(super) fn order_number(order: Order) -> u64 {
+    match order {
+        Order::Wait => 0,
+        Order::Follow => 1,
+        Order::QuickStop => 2,
+        Order::Disable => 3,
+    }
+}
+
+/// Numbers of `bits` bits each, as many to a word as fit.
+fn pack(words: &mut Vec<u64>, bits: u32, numbers: impl Iterator<Item = u64>) {
+    let each = (64 / bits) as usize;
+    for (i, number) in numbers.enumerate() {
+        if i % each == 0 {
+            words.push(0);
+        }
+        *words.last_mut().expect("a word was just begun") |= number << (bits * (i % each) as u32);
+    }
+}
+
+impl Cycle {
+    /// An empty one of this shape, to be filled again and again.
+    pub fn new(shape: Shape) -> Cycle {
+        Cycle {
+            k: 0,
+            due_ns: 0,
+            late_ns: 0,
+            phases_ns: [0; 3],
+            ticks: 1,
+            source: Source::Nobody,
+            order: Order::Wait,
+            arms: false,
+            resets: false,
+            step: 0,
+            statuses: vec![0; shape.drives],
+            readings: vec![Reading { value: 0.0, age: Reading::NEVER }; shape.signals],
+            wanted: Vec::with_capacity(shape.outputs),
+            requests: vec![0.0; shape.outputs],
+            permitted: vec![0.0; shape.outputs],
+            clamps: vec![Clamps::default(); shape.outputs],
+            causes: Vec::with_capacity(64),
+            set: Vec::with_capacity(64),
+            recorded: vec![0.0; shape.recorded],
+        }
+    }
+
+    /// As words, appended.
+    pub fn write(&self, words: &mut Vec<u64>) {
+        let [receive, compute, send] = self.phases_ns.map(u64::from);
+        words.extend([self.k, self.due_ns, u64::from(self.late_ns) | u64::from(self.ticks) << 32]);
+        words.push(receive | compute << 32);
+        let begins = u64::from(self.arms) | u64::from(self.resets) << 1;
+        let (source, order) = (source_number(self.source), order_number(self.order));
+        words.push(send | source << 32 | order << 40 | u64::from(self.step) << 48 | begins << 56);
+        words.push(self.causes.len() as u64 | (self.set.len() as u64) << 16 | (self.wanted.len() as u64) << 32);
+        words.extend(self.readings.iter().map(|reading| reading.value.to_bits()));
+        let ages = self.readings.iter().map(|reading| match reading.age {
+            Reading::NEVER => 0xffff,
+            age => u64::from(age.min(0xfffe)),
+        });
+        pack(words, 16, ages);
+        pack(words, 16, self.statuses.iter().map(|status| u64::from(*status)));
+        let numbers = self.wanted.iter().chain(&self.requests).chain(&self.permitted).chain(&self.recorded);
+        words.extend(numbers.map(|value| value.to_bits()));
+        pack(words, 8, self.clamps.iter().map(|clamps| u64::from(clamps.0)));
+        words.extend(self.causes.iter().flat_map(|cause| cause.to_words()));
+        words.extend(self.set.iter().flat_map(|(slot, value)| [u64::from(slot.0), value.to_bits()]));
+    }
+
+    /// From words. None if they are not those of a cycle of this shape.
+    pub fn read(shape: Shape, words: &[u64]) -> Option<Cycle> {
+        let mut words = words.iter().copied();
+        let mut next = || words.next();
+        let (k, due_ns, third, fourth, fifth, counts) = (next()?, next()?, next()?, next()?, next()?, next()?);
+        let low = |word: u64| (word & 0xffff_ffff) as u32;
+        let high = |word: u64| (word >> 32) as u32;
+        let (n_causes, n_set, n_wanted) = (counts & 0xffff, counts >> 16 & 0xffff, counts >> 32 & 0xffff);
+        let values = (0..shape.signals).map(|_| next()).collect::<Option<Vec<u64>>>()?;
+        let ages = unpack(&mut next, 16, shape.signals)?;
+        let statuses = unpack(&mut next, 16, shape.drives)?;
+        let mut floats = |n: usize| (0..n).map(|_| next().map(f64::from_bits)).collect::<Option<Vec<f64>>>();
+        let (wanted, requests) = (floats(n_wanted as usize)?, floats(shape.outputs)?);
+        let (permitted, recorded) = (floats(shape.outputs)?, floats(shape.recorded)?);
+        let clamps = unpack(&mut next, 8, shape.outputs)?;
+        let causes = (0..n_causes).map(|_| Cause::from_words([next()?, next()?])).collect::<Option<_>>()?;
+        let set = (0..n_set)
+            .map(|_| Some((Slot(u32::try_from(next()?).ok()?), f64::from_bits(next()?))))
+            .collect::<Option<_>>()?;
+        let whole = Cycle {
+            k,
+            due_ns,
+            late_ns: low(third),
+            phases_ns: [low(fourth), high(fourth), low(fifth)],
+            ticks: high(third),
+            source: match fifth >> 32 & 0xff {
+                0 => Source::Nobody,
+                1 => Source::StartUp,
+                2 => Source::Model,
+                _ => return None,
+            },
+            order: match fifth >> 40 & 0xff {
+                0 => Order::Wait,
+                1 => Order::Follow,
+                2 => Order::QuickStop,
+                3 => Order::Disable,
+                _ => return None,
+            },
+            arms: fifth >> 56 & 1 == 1,
+            resets: fifth >> 57 & 1 == 1,
+            step: (fifth >> 48 & 0xff) as u8,
+            statuses: statuses.iter().map(|status| *status as u16).collect(),
+            readings: values
+                .iter()
+                .zip(ages)
+                .map(|(value, age)| Reading {
+                    value: f64::from_bits(*value),
+                    age: if age == 0xffff { Reading::NEVER } else { age as u32 },
+                })
+                .collect(),
+            wanted,
+            requests,
+            permitted,
+            clamps: clamps.iter().map(|bits| Clamps(*bits as u8)).collect(),
+            causes,
+            set,
+            recorded,
+        };
+        next().is_none().then_some(whole)
+    }
+}
+
+fn unpack(next: &mut impl FnMut() -> Option<u64>, bits: u32, n: usize) -> Option<Vec<u64>> {
+    let each = (64 / bits) as usize;
+    let mut out = Vec::with_capacity(n);
+    while out.len() < n {
+        let word = next()?;
+        for i in 0..each.min(n - out.len()) {
+            out.push(word >> (bits * i as u32) & ((1 << bits) - 1));
+        }
+    }
+    Some(out)
+}
+
+/// A frame on a bus of the rig.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Passed {
+    /// ns since the start.
+    pub stamp_ns: u64,
+    /// Index of the bus.
+    pub bus: u8,
+    /// From us, not to us.
+    pub sent: bool,
+    /// What passed.
+    pub frame: Frame,
+}
+
+impl Passed {
+    /// As three words, appended.
+    pub fn write(&self, words: &mut Vec<u64>) {
+        let frame = self.frame;
+        let flags = u64::from(frame.is_extended()) | u64::from(frame.is_remote()) << 1 | u64::from(self.sent) << 2;
+        let mut data = [0; 8];
+        data[..frame.data().len()].copy_from_slice(frame.data());
+        let length = u64::from(frame.length());
+        words.extend([
+            self.stamp_ns,
+            u64::from(frame.id()) | flags << 32 | length << 40 | u64::from(self.bus) << 48,
+            u64::from_le_bytes(data),
+        ]);
+    }
+
+    /// All frames of a message. None if they are none.
+    pub fn read(words: &[u64]) -> Option<Vec<Passed>> {
+        let (all, rest) = words.as_chunks::<3>();
+        let one = |[stamp_ns, head, data]: &[u64; 3]| {
+            let (id, length) = ((head & 0xffff_ffff) as u32, (head >> 40 & 0xff) as usize);
+            let [extended, remote, sent] = [0, 1, 2].map(|bit| head >> (32 + bit) & 1 == 1);
+            if length > 8 || id >= if extended { 1 << 29 } else { 0x800 } || (extended && remote) {
+                return None;
+            }
+            let bytes = data.to_le_bytes();
+            let frame = match (extended, remote) {
+                (false, false) => Frame::new(id, &bytes[..length]),
+                (true, _) => Frame::extended(id, &bytes[..length]),
+                (false, true) => Frame::remote(id, length as u8),
+            };
+            Some(Passed { stamp_ns: *stamp_ns, bus: (head >> 48) as u8, sent, frame })
+        };
+        rest.is_empty().then(|| all.iter().map(one).collect())?
+    }
+}
+
+/// The state before cycle `k`: its number, a hash, the words of [`Control::save`].
+pub fn write_state(k: u64, control: &Control, words: &mut Vec<u64>) {
+    let start = words.len();
+    words.extend([k, 0]);
+    control.save(words);
+    words[start + 1] = hash(&words[start + 2..]);
+}
+
+/// A hash of words, the same on every machine: FNV-1a over them.
+pub fn hash(words: &[u64]) -> u64 {
+    words.iter().fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0100_0000_01b3))
+}
+
+/// What a replay needs of the drives and of the options, as bytes for the head of a log.
+pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
+    let number = |value: Option<f64>| value.unwrap_or(f64::NAN).to_bits();
+    let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns } = *options;
+    let mut words = vec![ramp_ns, clamped_ns, standstill_ns, blend_ns, u64::from(count_overruns)];
+    words.extend(bounds.iter().flat_map(|bounds| [number(bounds.torque), number(bounds.speed)]));
+    words.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+/// The other way round.
+pub fn settings_from_bytes(bytes: &[u8]) -> Option<(Vec<Bounds>, Options)> {
+    let (words, rest) = bytes.as_chunks::<8>();
+    let words: Vec<u64> = words.iter().map(|word| u64::from_le_bytes(*word)).collect();
+    let ([ramp_ns, clamped_ns, standstill_ns, blend_ns, count], bounds) = words.split_first_chunk::<5>()?;
+    let (bounds, odd) = bounds.as_chunks::<2>();
+    let number = |word: u64| Some(f64::from_bits(word)).filter(|value| !value.is_nan());
+    let bounds = bounds.iter().map(|[torque, speed]| Bounds { torque: number(*torque), speed: number(*speed) });
+    let options = Options {
+        ramp_ns: *ramp_ns,
+        clamped_ns: *clamped_ns,
+        standstill_ns: *standstill_ns,
+        blend_ns: *blend_ns,
+        count_overruns: *count != 0,
+    };
+    (rest.is_empty() && odd.is_empty()).then(|| (bounds.collect(), options))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cycle_comes_back() {
+        let shape = Shape { signals: 5, outputs: 2, drives: 2, recorded: 3 };
+        let cycle = Cycle {
+            k: 7,
+            due_ns: 7_000_000,
+            late_ns: 3700,
+            phases_ns: [1, 2, u32::MAX],
+            ticks: 3,
+            source: Source::StartUp,
+            order: Order::QuickStop,
+            arms: true,
+            resets: false,
+            step: 11,
+            statuses: vec![0x1637, 0x0218],
+            readings: [0, 1, 5, 0xfffe, Reading::NEVER].map(|age| Reading { value: -0.1, age }).to_vec(),
+            wanted: vec![0.1, 0.2],
+            requests: vec![f64::INFINITY, -0.0],
+            permitted: vec![1.0, 2.0],
+            clamps: vec![Clamps::SLEW, Clamps(7)],
+            causes: vec![Cause::Speed(1, 9.5), Cause::Asked],
+            set: vec![(Slot(17), 0.3)],
+            recorded: vec![1e-300, 2.0, 3.0],
+        };
+        let mut words = Vec::new();
+        cycle.write(&mut words);
+        assert_eq!(Cycle::read(shape, &words), Some(cycle));
+        for cut in 0..words.len() {
+            assert_eq!(Cycle::read(shape, &words[..cut]), None, "cut at {cut}");
+        }
+        words.push(0);
+        assert_eq!(Cycle::read(shape, &words), None);
+    }
+
+    #[test]
+    fn frames_come_back() {
+        let frames = [
+            Frame::new(0x80, &[]),
+            Frame::new(0x7ff, &[1, 2, 3, 4, 5, 6, 7, 8]),
+            Frame::extended(0x1234_5678, &[9]),
+            Frame::remote(0x701, 1),
+        ];
+        let all: Vec<Passed> = (frames.iter().enumerate())
+            .map(|(i, frame)| Passed { stamp_ns: u64::MAX - i as u64, bus: i as u8, sent: i % 2 == 0, frame: *frame })
+            .collect();
+        let mut words = Vec::new();
+        all.iter().for_each(|passed| passed.write(&mut words));
+        assert_eq!(Passed::read(&words), Some(all));
+        assert_eq!(Passed::read(&words[1..]), None);
+        assert_eq!(Passed::read(&[0, 0x800, 0]), None, "an identifier of 12 bits");
+    }
+
+    #[test]
+    fn settings_come_back() {
+        let bounds = [Bounds { torque: Some(4.0), speed: None }, Bounds::default()];
+        let options = Options { count_overruns: true, ramp_ns: 5, ..Options::default() };
+        let bytes = settings_to_bytes(&bounds, &options);
+        assert_eq!(settings_from_bytes(&bytes), Some((bounds.to_vec(), options)));
+        assert_eq!(settings_from_bytes(&bytes[1..]), None);
+    }
+}

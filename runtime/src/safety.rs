@@ -1,0 +1,971 @@
+//! The last stage before the bus: what no output may exceed, and how a rig stops.
+//!
+//! In: what the model asks for, what was measured, what went wrong anywhere. Out: what is permitted, and whether the
+//! drives follow, stop quickly or are disabled. Knows neither buses nor models.
+//!
+//! It decides in the cycle in which it is told. A trip latches until the operator resets it. Limits can be narrowed
+//! while running and never widened. It allocates nothing after [`Supervisor::new`] and holds no unsafe code.
+//!
+//! Software is not the safety function of a machine: the emergency stop acts by wire on the safe torque off of the
+//! drives. This is the layer before.
+
+#![forbid(unsafe_code)]
+
+#[cfg(all(feature = "mutants", not(debug_assertions)))]
+compile_error!("mutants switch protections off: they are for tests, never for an optimised build");
+
+/// Limits of one output. Values are in its own unit, SI.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct OutputLimits {
+    /// Least permitted value.
+    pub low: f64,
+    /// Greatest permitted value.
+    pub high: f64,
+    /// Greatest change per second; infinite: none.
+    pub slew: f64,
+    /// Where it goes on any stop, between `low` and `high`.
+    pub safe: f64,
+    /// Index of the drive it moves, if it moves one.
+    pub drive: Option<usize>,
+    /// It is a torque in N·m: power is torque times speed.
+    pub torque: bool,
+}
+
+/// Limits of one drive; infinite where it has none.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct DriveLimits {
+    /// Greatest speed, rad/s.
+    pub speed: f64,
+    /// Permitted positions, rad.
+    pub travel: (f64, f64),
+    /// Greatest power, W.
+    pub power: f64,
+}
+
+/// What was measured of one drive, as far as it is known: SI.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Seen {
+    /// rad/s
+    pub speed: Option<f64>,
+    /// rad
+    pub position: Option<f64>,
+}
+
+/// How long what is borne, in cycles.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Patience {
+    /// Arming: the outputs come up from their safe values.
+    pub ramp: u32,
+    /// An output outside its limits without a break: then a controlled stop.
+    pub clamped: u32,
+    /// From a controlled stop to the quick stop, and from there to disabled, whatever is measured.
+    pub standstill: u32,
+}
+
+/// Why a rig stops.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Cause {
+    /// The operator or a signal of the system asked for it.
+    Asked,
+    /// The model's request for this output is not a number.
+    NotFinite(usize),
+    /// The model left a declared range: the number of its guard, from 1.
+    Guard(u64),
+    /// This output was outside its limits for too long.
+    Clamped(usize),
+    /// A condition of the rig holds.
+    Condition(usize),
+    /// So many ticks were missed.
+    Overrun(u32),
+    /// A drive is faster than permitted, rad/s.
+    Speed(usize, f64),
+    /// A drive is outside its travel, rad.
+    Travel(usize, f64),
+    /// The shaft gets faster against the torque on it; the drive that gained most.
+    RunAway(usize),
+    /// A signal did not come for too long; its index among those read.
+    Lost(usize),
+    /// A signal was not credible for too long.
+    Implausible(usize),
+    /// A drive shows another mode than asked for, or does not follow commands.
+    NotFollowing(usize),
+    /// A drive is in fault, stopped by itself, fell silent or started anew: see its status.
+    Drive(usize),
+    /// A bus does not carry: see its event.
+    Bus(usize),
+    /// Set-points are at risk: frames were lost by the bus.
+    Overload(usize),
+    /// Somebody else commands: the bus and the identifier of the frame.
+    Foreign(usize, u32),
+    /// More energy came back than a friction can hold.
+    Energy,
+    /// No cycle ended in time.
+    Watchdog,
+}
+
+/// What a cause leads to.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub enum Reaction {
+    /// Outputs go to their safe values within their slew, then as [`Reaction::Quick`].
+    Controlled,
+    /// Quick stop of all drives at once; disabled at standstill or after a time.
+    Quick,
+}
+
+impl Cause {
+    /// What it leads to.
+    pub fn reaction(self) -> Reaction {
+        match self {
+            Cause::Asked
+            | Cause::NotFinite(_)
+            | Cause::Guard(_)
+            | Cause::Clamped(_)
+            | Cause::Condition(_)
+            | Cause::Overrun(_)
+            | Cause::NotFollowing(_)
+            | Cause::Overload(_)
+            | Cause::Energy => Reaction::Controlled,
+            Cause::Speed(..)
+            | Cause::Travel(..)
+            | Cause::RunAway(_)
+            | Cause::Lost(_)
+            | Cause::Implausible(_)
+            | Cause::Drive(_)
+            | Cause::Bus(_)
+            | Cause::Foreign(..)
+            | Cause::Watchdog => Reaction::Quick,
+        }
+    }
+}
+
+impl Cause {
+    /// As two words, never both 0: kind and index, then a value.
+    pub fn to_words(self) -> [u64; 2] {
+        let (kind, index, value) = match self {
+            Cause::Asked => (1, 0, 0),
+            Cause::NotFinite(i) => (2, i, 0),
+            Cause::Guard(status) => (3, 0, status),
+            Cause::Clamped(i) => (4, i, 0),
+            Cause::Condition(i) => (5, i, 0),
+            Cause::Overrun(missed) => (6, 0, u64::from(missed)),
+            Cause::Speed(i, speed) => (7, i, speed.to_bits()),
+            Cause::Travel(i, position) => (8, i, position.to_bits()),
+            Cause::RunAway(i) => (9, i, 0),
+            Cause::Lost(i) => (10, i, 0),
+            Cause::Implausible(i) => (11, i, 0),
+            Cause::NotFollowing(i) => (12, i, 0),
+            Cause::Drive(i) => (13, i, 0),
+            Cause::Bus(i) => (14, i, 0),
+            Cause::Overload(i) => (15, i, 0),
+            Cause::Foreign(i, id) => (16, i, u64::from(id)),
+            Cause::Energy => (17, 0, 0),
+            Cause::Watchdog => (18, 0, 0),
+        };
+        [kind << 32 | index as u64, value]
+    }
+
+    /// The other way round. None if they stand for nothing.
+    pub fn from_words([first, value]: [u64; 2]) -> Option<Cause> {
+        let (i, small) = ((first & 0xffff_ffff) as usize, u32::try_from(value).ok());
+        Some(match first >> 32 {
+            1 => Cause::Asked,
+            2 => Cause::NotFinite(i),
+            3 => Cause::Guard(value),
+            4 => Cause::Clamped(i),
+            5 => Cause::Condition(i),
+            6 => Cause::Overrun(small?),
+            7 => Cause::Speed(i, f64::from_bits(value)),
+            8 => Cause::Travel(i, f64::from_bits(value)),
+            9 => Cause::RunAway(i),
+            10 => Cause::Lost(i),
+            11 => Cause::Implausible(i),
+            12 => Cause::NotFollowing(i),
+            13 => Cause::Drive(i),
+            14 => Cause::Bus(i),
+            15 => Cause::Overload(i),
+            16 => Cause::Foreign(i, small?),
+            17 => Cause::Energy,
+            18 => Cause::Watchdog,
+            _ => return None,
+        })
+    }
+}
+
+/// What drives are told.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Order {
+    /// Not armed: enabled drives get their safe values.
+    Wait,
+    /// Follow the permitted outputs.
+    Follow,
+    /// Quick stop.
+    QuickStop,
+    /// Take the power away.
+    Disable,
+}
+
+/// Why an output is not what was asked for. Several may hold at once.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Clamps(pub u8);
+
+impl Clamps {
+    /// Outside `low .. high`.
+    pub const RANGE: Clamps = Clamps(1);
+    /// Faster than the slew.
+    pub const SLEW: Clamps = Clamps(2);
+    /// More than the power.
+    pub const POWER: Clamps = Clamps(4);
+
+    /// Whether one of these holds.
+    pub fn has(self, other: Clamps) -> bool {
+        self.0 & other.0 != 0
+    }
+
+    fn add(&mut self, other: Clamps) {
+        self.0 |= other.0;
+    }
+}
+
+/// Why a set of limits is refused.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Refused {
+    /// Not `low <= safe <= high`, or one of them is not a number.
+    Range(usize),
+    /// The slew of an output is not above 0: it could never be stopped.
+    Slew(usize),
+    /// Speed, travel or power of a drive is negative or not a number.
+    Drive(usize),
+    /// A torque or another command of a drive has no bounds.
+    Unbounded(usize),
+    /// An output names a drive that is not there.
+    NoDrive(usize),
+    /// Wider than before.
+    Wider(usize),
+}
+
+/// Where a rig is between arming and standing still.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+enum Stage {
+    Idle,
+    /// For so many cycles.
+    Armed(u32),
+    /// For so many cycles.
+    Slewing(u32),
+    /// For so many cycles.
+    Quick(u32),
+    Disabled,
+}
+
+/// A protection, for tests that switch one off to see that it is missed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[allow(missing_docs)]
+pub enum Protection {
+    Finite,
+    Range,
+    Slew,
+    Power,
+    Speed,
+    Travel,
+    RunAway,
+    Clamped,
+    Ramp,
+    Latch,
+    Narrow,
+    Report,
+}
+
+impl Protection {
+    /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
+    pub const ALL: [(&'static str, Protection); 12] = [
+        ("finite", Protection::Finite),
+        ("range", Protection::Range),
+        ("slew", Protection::Slew),
+        ("power", Protection::Power),
+        ("speed", Protection::Speed),
+        ("travel", Protection::Travel),
+        ("run-away", Protection::RunAway),
+        ("clamped", Protection::Clamped),
+        ("ramp", Protection::Ramp),
+        ("latch", Protection::Latch),
+        ("narrow", Protection::Narrow),
+        ("report", Protection::Report),
+    ];
+}
+
+/// Part of the speed limit that a shaft may gain against its torque before it counts as a run-away.
+const RUN_AWAY: f64 = 0.1;
+/// Part of the speed limit below which a drive counts as standing.
+const STANDSTILL: f64 = 0.01;
+
+/// Watches over the outputs of one rig.
+pub struct Supervisor {
+    outputs: Vec<OutputLimits>,
+    drives: Vec<DriveLimits>,
+    patience: Patience,
+    /// Cycle in s.
+    period: f64,
+    stage: Stage,
+    cause: Option<Cause>,
+    permitted: Vec<f64>,
+    clamps: Vec<Clamps>,
+    /// Cycles for which each output has been outside its range or power without a break.
+    clamped: Vec<u32>,
+    /// Least speed of each drive since torque began to brake the shaft, as part of its limit.
+    least: Vec<f64>,
+    #[cfg(feature = "mutants")]
+    missing: Option<Protection>,
+}
+
+impl Supervisor {
+    /// Watches over outputs and drives at a period in ns.
+    ///
+    /// # Errors
+    /// Limits that cannot be kept.
+    pub fn new(
+        outputs: &[OutputLimits],
+        drives: &[DriveLimits],
+        patience: Patience,
+        period_ns: u64,
+    ) -> Result<Supervisor, Refused> {
+        for (i, drive) in drives.iter().enumerate() {
+            let (low, high) = drive.travel;
+            if !(drive.speed >= 0.0 && drive.power >= 0.0 && low <= high) {
+                return Err(Refused::Drive(i));
+            }
+        }
+        for (i, output) in outputs.iter().enumerate() {
+            let OutputLimits { low, high, slew, safe, drive, .. } = *output;
+            if !(low <= safe && safe <= high && safe.is_finite()) {
+                return Err(Refused::Range(i));
+            }
+            if slew.is_nan() || slew <= 0.0 {
+                return Err(Refused::Slew(i));
+            }
+            if drive.is_some() && !(low.is_finite() && high.is_finite()) {
+                return Err(Refused::Unbounded(i));
+            }
+            if drive.is_some_and(|drive| drive >= drives.len()) {
+                return Err(Refused::NoDrive(i));
+            }
+        }
+        Ok(Supervisor {
+            permitted: outputs.iter().map(|output| output.safe).collect(),
+            clamps: vec![Clamps::default(); outputs.len()],
+            clamped: vec![0; outputs.len()],
+            least: vec![f64::INFINITY; drives.len()],
+            outputs: outputs.to_vec(),
+            drives: drives.to_vec(),
+            patience,
+            period: period_ns as f64 * 1e-9,
+            stage: Stage::Idle,
+            cause: None,
+            #[cfg(feature = "mutants")]
+            missing: missing(),
+        })
+    }
+
+    /// What may be sent, one value an output.
+    pub fn permitted(&self) -> &[f64] {
+        &self.permitted
+    }
+
+    /// Why outputs are not what was asked for, one an output.
+    pub fn clamps(&self) -> &[Clamps] {
+        &self.clamps
+    }
+
+    /// The limits in force.
+    pub fn outputs(&self) -> &[OutputLimits] {
+        &self.outputs
+    }
+
+    /// Why the rig stops or has stopped: the first cause.
+    pub fn cause(&self) -> Option<Cause> {
+        self.cause
+    }
+
+    /// Whether the model has the outputs.
+    pub fn is_armed(&self) -> bool {
+        matches!(self.stage, Stage::Armed(_))
+    }
+
+    /// Whether the stop is over.
+    pub fn is_disabled(&self) -> bool {
+        self.stage == Stage::Disabled
+    }
+
+    /// Gives the outputs to whoever asks from now on: they come up anew. Refused while a trip is latched.
+    pub fn arm(&mut self) -> bool {
+        let free = matches!(self.stage, Stage::Idle | Stage::Armed(_)) && self.cause.is_none();
+        if free {
+            self.stage = Stage::Armed(0);
+        }
+        free
+    }
+
+    /// The operator has seen why the rig stopped: back to where arming begins. Only after the stop is over.
+    pub fn reset(&mut self) -> bool {
+        let over = self.stage == Stage::Disabled;
+        if over {
+            self.stage = Stage::Idle;
+            self.cause = None;
+        }
+        over
+    }
+
+    /// Narrows the limits of an output.
+    ///
+    /// # Errors
+    /// Limits that are wider than those in force anywhere, or leave no room for the safe value.
+    pub fn narrow(&mut self, i: usize, low: f64, high: f64, slew: f64) -> Result<(), Refused> {
+        let now = self.outputs[i];
+        if !(low <= now.safe && now.safe <= high) {
+            return Err(Refused::Range(i));
+        }
+        if slew.is_nan() || slew <= 0.0 {
+            return Err(Refused::Slew(i));
+        }
+        if (low < now.low || high > now.high || slew > now.slew) && self.on(Protection::Narrow) {
+            return Err(Refused::Wider(i));
+        }
+        self.outputs[i] = OutputLimits { low, high, slew, ..now };
+        Ok(())
+    }
+
+    /// Stops the rig, in this cycle. The first cause is kept; a graver reaction replaces the one under way.
+    pub fn trip(&mut self, cause: Cause) {
+        if !self.on(Protection::Report) {
+            return;
+        }
+        let stage = match (self.stage, cause.reaction()) {
+            (Stage::Idle, _) => Stage::Quick(0),
+            (Stage::Armed(_), Reaction::Controlled) => Stage::Slewing(0),
+            (Stage::Armed(_) | Stage::Slewing(_), Reaction::Quick) => Stage::Quick(0),
+            (Stage::Slewing(_) | Stage::Quick(_) | Stage::Disabled, _) => self.stage,
+        };
+        self.stage = stage;
+        self.cause = self.cause.or(Some(cause));
+    }
+
+    /// One cycle: judges what was measured and asked for, and leaves in [`Supervisor::permitted`] what may be sent.
+    ///
+    /// `requests`: one value an output. `seen`: one entry a drive.
+    pub fn judge(&mut self, requests: &[f64], seen: &[Seen]) -> Order {
+        assert_eq!((requests.len(), seen.len()), (self.outputs.len(), self.drives.len()), "outputs and drives");
+        if !self.on(Protection::Latch) && matches!(self.stage, Stage::Slewing(_) | Stage::Quick(_)) {
+            self.stage = Stage::Armed(self.patience.ramp);
+        }
+        self.watch(seen);
+        if let Stage::Armed(for_cycles) = self.stage {
+            if self.on(Protection::Finite)
+                && let Some(i) = requests.iter().position(|request| !request.is_finite())
+            {
+                self.trip(Cause::NotFinite(i));
+            } else {
+                self.stage = Stage::Armed(for_cycles.saturating_add(1));
+                self.follow(requests, seen, for_cycles);
+            }
+        }
+        match self.stage {
+            Stage::Idle => {
+                self.rest();
+                Order::Wait
+            }
+            Stage::Armed(_) => Order::Follow,
+            Stage::Slewing(for_cycles) => {
+                let over = self.slew_to_safe() || for_cycles >= self.patience.standstill;
+                self.stage = if over { Stage::Quick(0) } else { Stage::Slewing(for_cycles + 1) };
+                Order::Follow
+            }
+            Stage::Quick(for_cycles) => {
+                self.rest();
+                let still = self.drives.iter().zip(seen).all(|(limits, seen)| {
+                    seen.speed.is_some_and(|speed| limits.speed.is_finite() && speed.abs() <= STANDSTILL * limits.speed)
+                });
+                let over = for_cycles > 0 && still || for_cycles >= self.patience.standstill;
+                self.stage = if over { Stage::Disabled } else { Stage::Quick(for_cycles + 1) };
+                Order::QuickStop
+            }
+            Stage::Disabled => {
+                self.rest();
+                Order::Disable
+            }
+        }
+    }
+
+    /// Trips on what was measured.
+    fn watch(&mut self, seen: &[Seen]) {
+        for (i, seen) in seen.iter().enumerate() {
+            let limits = self.drives[i];
+            if let Some(speed) = seen.speed
+                && !(speed.abs() <= limits.speed)
+                && self.on(Protection::Speed)
+            {
+                self.trip(Cause::Speed(i, speed));
+            }
+            if let Some(position) = seen.position
+                && !(limits.travel.0 <= position && position <= limits.travel.1)
+                && self.on(Protection::Travel)
+            {
+                self.trip(Cause::Travel(i, position));
+            }
+        }
+        if self.is_armed() && self.on(Protection::RunAway) {
+            self.watch_run_away(seen);
+        }
+    }
+
+    /// Torque that takes power out of the shaft cannot make it faster, unless a sign is wrong.
+    ///
+    /// The sum of torque times speed over all drives of the shaft does not depend on which way each of them counts.
+    fn watch_run_away(&mut self, seen: &[Seen]) {
+        let power: f64 = (self.outputs.iter().zip(&self.permitted))
+            .filter(|(output, _)| output.torque)
+            .filter_map(|(output, torque)| Some(torque * seen[output.drive?].speed?))
+            .sum();
+        for i in 0..self.drives.len() {
+            let limit = self.drives[i].speed;
+            let Some(speed) = seen[i].speed.filter(|_| limit.is_finite()) else { continue };
+            let part = speed.abs() / limit;
+            self.least[i] = if power < 0.0 { part.min(self.least[i]) } else { part };
+            if part > self.least[i] + RUN_AWAY {
+                self.trip(Cause::RunAway(i));
+            }
+        }
+    }
+
+    /// What was asked for, within its limits.
+    fn follow(&mut self, requests: &[f64], seen: &[Seen], for_cycles: u32) {
+        if let Some(i) = self.clamped.iter().position(|cycles| *cycles > self.patience.clamped)
+            && self.on(Protection::Clamped)
+        {
+            return self.trip(Cause::Clamped(i));
+        }
+        for i in 0..requests.len() {
+            let (limits, last) = (self.outputs[i], self.permitted[i]);
+            let mut clamps = Clamps::default();
+            let mut value = requests[i];
+            if for_cycles < self.patience.ramp && self.on(Protection::Ramp) {
+                value = limits.safe + (value - limits.safe) * f64::from(for_cycles) / f64::from(self.patience.ramp);
+            }
+            if self.on(Protection::Range) && !(limits.low <= value && value <= limits.high) {
+                clamps.add(Clamps::RANGE);
+                value = value.clamp(limits.low, limits.high);
+            }
+            let most = limits.slew * self.period;
+            if self.on(Protection::Slew) && (value - last).abs() > most {
+                clamps.add(Clamps::SLEW);
+                value = if value > last { last + most } else { last - most };
+            }
+            if let Some(most) = self.power_limit(limits, seen)
+                && value.abs() > most
+                && self.on(Protection::Power)
+            {
+                clamps.add(Clamps::POWER);
+                value = most.copysign(value);
+            }
+            if self.on(Protection::Range) {
+                // Limits may have been narrowed around the last value: the range wins over the slew.
+                value = value.clamp(limits.low, limits.high);
+            }
+            self.permitted[i] = value;
+            self.clamps[i] = clamps;
+            let beyond = clamps.has(Clamps::RANGE) || clamps.has(Clamps::POWER);
+            self.clamped[i] = if beyond { self.clamped[i].saturating_add(1) } else { 0 };
+        }
+    }
+
+    /// Greatest torque at the speed of the drive of this output, N·m.
+    fn power_limit(&self, limits: OutputLimits, seen: &[Seen]) -> Option<f64> {
+        let drive = limits.drive.filter(|_| limits.torque)?;
+        Some(self.drives[drive].power / seen[drive].speed?.abs())
+    }
+
+    /// Towards the safe values within the slew; says whether all are there.
+    fn slew_to_safe(&mut self) -> bool {
+        let mut there = true;
+        for (i, limits) in self.outputs.iter().enumerate() {
+            let most = limits.slew * self.period;
+            let way = limits.safe - self.permitted[i];
+            let step = if way.abs() > most { most.copysign(way) } else { way };
+            self.permitted[i] = if step == way { limits.safe } else { self.permitted[i] + step };
+            self.clamps[i] = Clamps::default();
+            there &= self.permitted[i] == limits.safe;
+        }
+        there
+    }
+
+    /// All outputs at their safe values.
+    fn rest(&mut self) {
+        for (i, limits) in self.outputs.iter().enumerate() {
+            self.permitted[i] = limits.safe;
+            self.clamps[i] = Clamps::default();
+            self.clamped[i] = 0;
+        }
+    }
+
+    /// All that the next cycle depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        let (stage, cycles) = match self.stage {
+            Stage::Idle => (0, 0),
+            Stage::Armed(cycles) => (1, cycles),
+            Stage::Slewing(cycles) => (2, cycles),
+            Stage::Quick(cycles) => (3, cycles),
+            Stage::Disabled => (4, 0),
+        };
+        words.extend([stage, u64::from(cycles)]);
+        words.extend(self.cause.map_or([0, 0], Cause::to_words));
+        words.extend(self.permitted.iter().chain(&self.least).map(|x| x.to_bits()));
+        words.extend(self.clamped.iter().map(|cycles| u64::from(*cycles)));
+    }
+
+    /// Takes over what [`Supervisor::save`] gave; limits are not among it. None if it does not fit.
+    pub fn restore(&mut self, words: &mut dyn Iterator<Item = u64>) -> Option<()> {
+        let (stage, cycles) = (words.next()?, u32::try_from(words.next()?).ok()?);
+        self.stage = match stage {
+            0 => Stage::Idle,
+            1 => Stage::Armed(cycles),
+            2 => Stage::Slewing(cycles),
+            3 => Stage::Quick(cycles),
+            4 => Stage::Disabled,
+            _ => return None,
+        };
+        self.cause = match [words.next()?, words.next()?] {
+            [0, 0] => None,
+            words => Some(Cause::from_words(words)?),
+        };
+        for x in self.permitted.iter_mut().chain(&mut self.least) {
+            *x = f64::from_bits(words.next()?);
+        }
+        for cycles in &mut self.clamped {
+            *cycles = u32::try_from(words.next()?).ok()?;
+        }
+        Some(())
+    }
+
+    /// Whether a protection is there: always, but for a test of the tests.
+    #[cfg(not(feature = "mutants"))]
+    #[allow(clippy::unused_self)]
+    fn on(&self, _: Protection) -> bool {
+        true
+    }
+
+    #[cfg(feature = "mutants")]
+    fn on(&self, protection: Protection) -> bool {
+        self.missing != Some(protection)
+    }
+}
+
+/// The protection that `FRIC_MUTANT` takes away.
+///
+/// # Panics
+/// If it names none: a test that takes nothing away would prove nothing.
+#[cfg(feature = "mutants")]
+fn missing() -> Option<Protection> {
+    let name = std::env::var("FRIC_MUTANT").ok()?;
+    let found = Protection::ALL.iter().find(|(known, _)| *known == name);
+    Some(found.unwrap_or_else(|| panic!("FRIC_MUTANT={name} names no protection")).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LIMITS: OutputLimits =
+        OutputLimits { low: -1.0, high: 2.0, slew: 100.0, safe: 0.0, drive: Some(0), torque: true };
+    const FREE: OutputLimits = OutputLimits { slew: f64::INFINITY, ..LIMITS };
+    const DRIVE: DriveLimits = DriveLimits { speed: 100.0, travel: (-10.0, 10.0), power: 50.0 };
+    const PATIENCE: Patience = Patience { ramp: 0, clamped: 3, standstill: 5 };
+
+    /// Armed, one output, one drive, 1 ms.
+    fn armed(output: OutputLimits, patience: Patience) -> Supervisor {
+        let mut supervisor = Supervisor::new(&[output], &[DRIVE], patience, 1_000_000).unwrap();
+        assert!(supervisor.arm());
+        supervisor
+    }
+
+    fn at(speed: f64) -> [Seen; 1] {
+        [Seen { speed: Some(speed), position: Some(0.0) }]
+    }
+
+    /// Judges one request at a speed; what is permitted.
+    fn sent(supervisor: &mut Supervisor, request: f64, speed: f64) -> f64 {
+        supervisor.judge(&[request], &at(speed));
+        supervisor.permitted()[0]
+    }
+
+    #[test]
+    fn nothing_but_safe_values_leaves_before_arming() {
+        let mut supervisor = Supervisor::new(&[LIMITS], &[DRIVE], PATIENCE, 1_000_000).unwrap();
+        assert_eq!(supervisor.judge(&[1.5], &at(0.0)), Order::Wait);
+        assert_eq!(supervisor.permitted(), [0.0]);
+        assert!(!supervisor.is_armed());
+    }
+
+    #[test]
+    fn a_request_within_its_limits_passes_to_the_bit() {
+        let odd = OutputLimits { safe: 0.1, ..FREE };
+        let mut supervisor = armed(odd, PATIENCE);
+        for request in [0.3, -0.999, 1.0 / 3.0, 2.0, -1.0, f64::MIN_POSITIVE] {
+            assert_eq!(sent(&mut supervisor, request, 1.0).to_bits(), request.to_bits());
+            assert_eq!(supervisor.clamps(), [Clamps::default()]);
+        }
+    }
+
+    #[test]
+    fn range_slew_and_power_bind() {
+        let mut free = armed(FREE, PATIENCE);
+        assert_eq!(sent(&mut free, 5.0, 0.0), 2.0);
+        assert!(free.clamps()[0].has(Clamps::RANGE));
+        assert_eq!(sent(&mut free, -5.0, 0.0), -1.0);
+        assert_eq!(sent(&mut free, 2.0, -50.0), 1.0);
+        assert_eq!(free.clamps()[0], Clamps::POWER);
+        assert_eq!(sent(&mut free, -1.0, 100.0), -0.5);
+        let mut slow = armed(LIMITS, PATIENCE);
+        assert_eq!(sent(&mut slow, 1.0, 0.0), 0.1);
+        assert_eq!(slow.clamps()[0], Clamps::SLEW);
+        assert_eq!(sent(&mut slow, 0.15, 0.0), 0.15);
+        assert_eq!(sent(&mut slow, -1.0, 0.0), 0.15 - 0.1);
+        let mut unmeasured = armed(FREE, PATIENCE);
+        unmeasured.judge(&[2.0], &[Seen::default()]);
+        assert_eq!(unmeasured.permitted(), [2.0], "no speed, no power");
+    }
+
+    #[test]
+    fn outputs_come_up_from_safe() {
+        let patience = Patience { ramp: 4, ..PATIENCE };
+        let mut supervisor = armed(FREE, patience);
+        let seen: Vec<f64> = (0..6).map(|_| sent(&mut supervisor, 1.0, 0.0)).collect();
+        assert_eq!(seen, [0.0, 0.25, 0.5, 0.75, 1.0, 1.0]);
+    }
+
+    #[test]
+    fn what_is_not_a_number_stops_the_rig_in_the_same_cycle() {
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let mut supervisor = armed(LIMITS, PATIENCE);
+            sent(&mut supervisor, 0.1, 0.0);
+            sent(&mut supervisor, 0.15, 0.0);
+            assert_eq!(supervisor.judge(&[bad], &at(0.0)), Order::Follow);
+            assert_eq!(supervisor.permitted(), [0.15 - 0.1], "on its way to safe within its slew");
+            assert_eq!(supervisor.cause(), Some(Cause::NotFinite(0)));
+            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), Order::Follow);
+            assert_eq!(supervisor.permitted(), [0.0]);
+            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), Order::QuickStop);
+        }
+    }
+
+    #[test]
+    fn too_fast_too_far_or_not_a_number_is_a_quick_stop() {
+        let mut fast = armed(FREE, PATIENCE);
+        assert_eq!(fast.judge(&[1.0], &at(-100.1)), Order::QuickStop);
+        assert_eq!((fast.permitted(), fast.cause()), (&[0.0][..], Some(Cause::Speed(0, -100.1))));
+        let mut far = armed(FREE, PATIENCE);
+        assert_eq!(far.judge(&[1.0], &[Seen { position: Some(10.1), speed: None }]), Order::QuickStop);
+        assert_eq!(far.cause(), Some(Cause::Travel(0, 10.1)));
+        let mut odd = armed(FREE, PATIENCE);
+        assert_eq!(odd.judge(&[1.0], &at(f64::NAN)), Order::QuickStop);
+    }
+
+    #[test]
+    fn speed_that_grows_against_the_torque_is_a_run_away() {
+        let mut supervisor = armed(FREE, PATIENCE);
+        let mut last = Order::Follow;
+        let mut speed = 1.0;
+        while last == Order::Follow {
+            last = supervisor.judge(&[-0.5], &at(speed));
+            speed += 1.0;
+            assert!(speed < 100.0, "never noticed");
+        }
+        assert_eq!(supervisor.cause(), Some(Cause::RunAway(0)));
+        // Torque is on from the first cycle, counts from the second: 2 → 12 rad/s is a tenth of the limit.
+        assert!(speed < 15.0, "noticed at {speed}");
+        let mut pushed = armed(FREE, PATIENCE);
+        for speed in 0..99 {
+            assert_eq!(pushed.judge(&[0.5], &at(f64::from(speed))), Order::Follow, "with the torque is no run-away");
+        }
+        for speed in (1..99).rev() {
+            assert_eq!(pushed.judge(&[-0.5], &at(f64::from(speed))), Order::Follow, "braking is no run-away");
+        }
+    }
+
+    #[test]
+    fn a_load_that_brakes_what_a_servo_drives_is_no_run_away() {
+        let outputs = [FREE, OutputLimits { drive: Some(1), ..FREE }];
+        let mut supervisor = Supervisor::new(&outputs, &[DRIVE, DRIVE], PATIENCE, 1_000_000).unwrap();
+        supervisor.arm();
+        for speed in 0..50 {
+            // The second drive counts the other way round.
+            let seen = [at(f64::from(speed))[0], at(-f64::from(speed))[0]];
+            assert_eq!(supervisor.judge(&[0.6, 0.4], &seen), Order::Follow);
+        }
+    }
+
+    #[test]
+    fn what_is_clamped_too_long_is_stopped() {
+        let mut supervisor = armed(LIMITS, PATIENCE);
+        for _ in 0..4 {
+            assert_eq!(supervisor.judge(&[9.0], &at(0.0)), Order::Follow);
+        }
+        assert_eq!(supervisor.permitted(), [0.4]);
+        supervisor.judge(&[9.0], &at(0.0));
+        assert_eq!(supervisor.cause(), Some(Cause::Clamped(0)));
+        assert!((supervisor.permitted()[0] - 0.3).abs() < 1e-15, "{:?}", supervisor.permitted());
+        let mut now_and_then = armed(FREE, PATIENCE);
+        for k in 0..40 {
+            let request = if k % 3 == 0 { 1.0 } else { 9.0 };
+            assert_eq!(now_and_then.judge(&[request], &at(0.0)), Order::Follow);
+        }
+    }
+
+    #[test]
+    fn a_trip_latches_until_the_operator_resets_it() {
+        let mut supervisor = armed(FREE, PATIENCE);
+        supervisor.trip(Cause::Lost(3));
+        for cycle in 0..6 {
+            assert!(!supervisor.arm() && !supervisor.reset());
+            assert_eq!(supervisor.judge(&[1.0], &at(50.0)), Order::QuickStop, "cycle {cycle}");
+            assert_eq!(supervisor.permitted(), [0.0]);
+        }
+        assert_eq!(supervisor.judge(&[1.0], &at(50.0)), Order::Disable, "after its time, still turning");
+        assert!(!supervisor.arm(), "latched");
+        supervisor.trip(Cause::Bus(0));
+        assert_eq!(supervisor.cause(), Some(Cause::Lost(3)), "the first cause is kept");
+        assert!(supervisor.is_disabled() && supervisor.reset());
+        assert_eq!(supervisor.cause(), None);
+        assert!(supervisor.arm());
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+    }
+
+    #[test]
+    fn standing_drives_are_disabled_at_once() {
+        let mut supervisor = armed(FREE, PATIENCE);
+        supervisor.trip(Cause::Drive(0));
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::QuickStop);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::QuickStop, "two stop frames at least");
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::Disable);
+    }
+
+    #[test]
+    fn a_graver_cause_overtakes_a_controlled_stop() {
+        let mut supervisor = armed(LIMITS, PATIENCE);
+        for _ in 0..10 {
+            sent(&mut supervisor, 1.0, 0.0);
+        }
+        supervisor.trip(Cause::Asked);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+        assert!(supervisor.permitted()[0] > 0.8);
+        supervisor.trip(Cause::Energy);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+        supervisor.trip(Cause::Foreign(0, 0x80));
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::QuickStop);
+        assert_eq!(supervisor.cause(), Some(Cause::Asked));
+    }
+
+    #[test]
+    fn a_slew_that_would_take_for_ever_does_not() {
+        let mut supervisor = armed(OutputLimits { slew: 1e-3, ..LIMITS }, PATIENCE);
+        supervisor.outputs[0].slew = f64::INFINITY;
+        sent(&mut supervisor, 1.0, 0.0);
+        supervisor.outputs[0].slew = 1e-3;
+        supervisor.trip(Cause::Asked);
+        let orders: Vec<Order> = (0..8).map(|_| supervisor.judge(&[1.0], &at(0.0))).collect();
+        assert_eq!(orders[..6], [Order::Follow; 6]);
+        assert_eq!(orders[6..], [Order::QuickStop; 2]);
+    }
+
+    #[test]
+    fn a_trip_before_arming_stops_too() {
+        let mut supervisor = Supervisor::new(&[LIMITS], &[DRIVE], PATIENCE, 1_000_000).unwrap();
+        supervisor.trip(Cause::Watchdog);
+        assert!(!supervisor.arm());
+        assert_eq!(supervisor.judge(&[0.0], &at(0.0)), Order::QuickStop);
+    }
+
+    #[test]
+    fn limits_are_narrowed_and_never_widened() {
+        let mut supervisor = armed(FREE, PATIENCE);
+        assert_eq!(sent(&mut supervisor, 1.9, 0.0), 1.9);
+        assert_eq!(supervisor.narrow(0, -0.5, 0.5, 10.0), Ok(()));
+        assert_eq!(sent(&mut supervisor, 1.9, 0.0), 0.5, "the new range wins over the new slew");
+        for (low, high, slew) in [(-0.6, 0.5, 10.0), (-0.5, 0.6, 10.0), (-0.5, 0.5, 11.0)] {
+            assert_eq!(supervisor.narrow(0, low, high, slew), Err(Refused::Wider(0)));
+        }
+        for (low, high) in [(0.1, 0.5), (-0.5, -0.1), (f64::NAN, 0.5), (-0.5, f64::NAN)] {
+            assert_eq!(supervisor.narrow(0, low, high, 10.0), Err(Refused::Range(0)));
+        }
+        for slew in [0.0, -1.0, f64::NAN] {
+            assert_eq!(supervisor.narrow(0, -0.5, 0.5, slew), Err(Refused::Slew(0)));
+        }
+        assert_eq!(supervisor.outputs()[0], OutputLimits { low: -0.5, high: 0.5, slew: 10.0, ..FREE });
+    }
+
+    #[test]
+    fn limits_that_cannot_be_kept_are_refused() {
+        let refused = |output, drive| Supervisor::new(&[output], &[drive], PATIENCE, 1_000_000).err();
+        let range = |low, high, safe| refused(OutputLimits { low, high, safe, ..LIMITS }, DRIVE);
+        assert_eq!(range(1.0, -1.0, 0.0), Some(Refused::Range(0)));
+        assert_eq!(range(-1.0, 1.0, 2.0), Some(Refused::Range(0)));
+        assert_eq!(range(f64::NAN, 1.0, 0.0), Some(Refused::Range(0)));
+        assert_eq!(range(-1.0, f64::INFINITY, 0.0), Some(Refused::Unbounded(0)));
+        assert_eq!(refused(OutputLimits { slew: 0.0, ..LIMITS }, DRIVE), Some(Refused::Slew(0)));
+        assert_eq!(refused(OutputLimits { slew: f64::NAN, ..LIMITS }, DRIVE), Some(Refused::Slew(0)));
+        assert_eq!(refused(OutputLimits { drive: Some(1), ..LIMITS }, DRIVE), Some(Refused::NoDrive(0)));
+        assert_eq!(refused(LIMITS, DriveLimits { speed: f64::NAN, ..DRIVE }), Some(Refused::Drive(0)));
+        assert_eq!(refused(LIMITS, DriveLimits { power: -1.0, ..DRIVE }), Some(Refused::Drive(0)));
+        assert_eq!(refused(LIMITS, DriveLimits { travel: (1.0, 0.0), ..DRIVE }), Some(Refused::Drive(0)));
+        let lamp = OutputLimits { low: f64::NEG_INFINITY, high: f64::INFINITY, drive: None, torque: false, ..LIMITS };
+        assert_eq!(refused(lamp, DRIVE), None, "a lamp needs no bounds");
+    }
+
+    #[test]
+    fn what_is_saved_goes_on_as_before() {
+        let mut first = armed(LIMITS, PATIENCE);
+        for k in 0..40 {
+            let mut words = Vec::new();
+            first.save(&mut words);
+            let mut second = armed(LIMITS, PATIENCE);
+            assert_eq!(second.restore(&mut words.iter().copied()), Some(()));
+            assert_eq!(second.restore(&mut words[1..].iter().copied()), None, "short of a word");
+            if k == 20 {
+                first.trip(Cause::Travel(0, 1.5));
+                second.trip(Cause::Travel(0, 1.5));
+            }
+            let request = f64::from(k % 7);
+            assert_eq!(first.judge(&[request], &at(30.0)), second.judge(&[request], &at(30.0)), "cycle {k}");
+            assert_eq!((first.permitted(), first.cause()), (second.permitted(), second.cause()));
+        }
+        assert!(first.is_disabled());
+    }
+
+    #[test]
+    fn every_cause_has_one_reaction() {
+        let quick = [
+            Cause::Speed(0, 1.0),
+            Cause::Travel(0, 1.0),
+            Cause::RunAway(0),
+            Cause::Lost(0),
+            Cause::Implausible(0),
+            Cause::Drive(0),
+            Cause::Bus(0),
+            Cause::Foreign(0, 0),
+            Cause::Watchdog,
+        ];
+        let controlled = [
+            Cause::Asked,
+            Cause::NotFinite(0),
+            Cause::Guard(1),
+            Cause::Clamped(0),
+            Cause::Condition(0),
+            Cause::Overrun(1),
+            Cause::NotFollowing(0),
+            Cause::Overload(0),
+            Cause::Energy,
+        ];
+        for cause in quick.iter().chain(&controlled) {
+            assert_eq!(Cause::from_words(cause.to_words()), Some(*cause));
+        }
+        assert_eq!(Cause::from_words([0, 0]), None);
+        assert!(quick.iter().all(|cause| cause.reaction() == Reaction::Quick));
+        assert!(controlled.iter().all(|cause| cause.reaction() == Reaction::Controlled));
+    }
+}

@@ -1,0 +1,691 @@
+//! `fric`, `fric repl`: a session at the prompt.
+
+use super::End;
+use crate::args::{Characterise, Repl};
+use crate::compile::Explanation;
+use crate::plot::{self, Axis, Curve, Figure, Panel};
+use crate::repl::{self, COMMANDS, Command, Cut, Editor, Fault, Input, Line, Ran, Session, Value, plain};
+use crate::terminal::{Style, Terminal};
+use crate::{diagram, equations, figure, project, report, results, value};
+use abi::Slot;
+use abi::unit::Unit;
+use runtime::engine::{Cause, Continue};
+use std::cell::RefCell;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Set by Ctrl-C, taken back before each line.
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Whether Ctrl-C was pressed since the line began.
+pub(super) fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}
+
+/// Lets Ctrl-C stop what runs instead of the process.
+pub(super) fn catch_interrupts() {
+    INTERRUPTED.store(false, Ordering::Relaxed);
+    // Set once for the process; a second call has nothing to add.
+    let _ = ctrlc::set_handler(|| INTERRUPTED.store(true, Ordering::Relaxed));
+}
+
+pub(super) fn watch(_: f64) -> Continue {
+    if interrupted() { Continue::Break(()) } else { Continue::Continue(()) }
+}
+
+pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
+    let session = Rc::new(RefCell::new(Session::default()));
+    let typed = std::io::stdin().is_terminal();
+    let mut end = End::Fine;
+    if let Some(file) = &args.file {
+        let shown = session.borrow_mut().add_file(&file.display().to_string());
+        match shown {
+            Ok(words) => terminal.line(&words),
+            Err(fault) => {
+                tell_fault(&fault, terminal);
+                end = End::Failed;
+                if !typed && !args.keep_going {
+                    return end;
+                }
+            }
+        }
+    }
+    let editor = if typed { Editor::terminal(session.clone(), terminal.colour()) } else { Ok(Editor::piped()) };
+    let mut editor = match editor {
+        Ok(editor) => editor,
+        Err(why) => {
+            terminal.error(&format!("cannot use this terminal: {why}"));
+            return End::Failed;
+        }
+    };
+    if typed {
+        terminal.line(&format!("fric {}; `help` lists commands, Ctrl-D ends", env!("CARGO_PKG_VERSION")));
+    }
+    catch_interrupts();
+    loop {
+        let text = match editor.read() {
+            Ok(Input::Text(text)) => text,
+            Ok(Input::Interrupted) => continue,
+            // What was wrong in a session that somebody typed has been seen.
+            Ok(Input::End) => return if typed { End::Fine } else { end },
+            Err(why) => {
+                terminal.error(&format!("cannot read on: {why}"));
+                return End::Failed;
+            }
+        };
+        INTERRUPTED.store(false, Ordering::Relaxed);
+        if args.echo && !typed {
+            terminal.print(&repl::as_typed(&text));
+        }
+        let mut at = Prompt { session: &mut session.borrow_mut(), terminal };
+        match at.line(&text) {
+            Ok(Next::Quit) => return if typed { End::Fine } else { end },
+            Ok(Next::Line) => {}
+            Ok(Next::Missed) => end = End::Failed,
+            Err(fault) => {
+                tell_fault(&fault, terminal);
+                end = End::Failed;
+            }
+        }
+        if end == End::Failed && !typed && !args.keep_going {
+            return end;
+        }
+    }
+}
+
+/// Says what is wrong.
+pub(super) fn tell_fault(fault: &Fault, terminal: &Terminal) {
+    match fault {
+        Fault::Found(files, diagnostics) => {
+            terminal.report(&report::full(files, diagnostics, terminal.error_colour()));
+        }
+        Fault::Words(words) => terminal.error(words),
+        Fault::Stopped(failure) => terminal.error(&failure.to_string()),
+    }
+}
+
+/// What comes after a line.
+enum Next {
+    Line,
+    /// An expectation did not hold.
+    Missed,
+    Quit,
+}
+
+/// Does lines.
+struct Prompt<'a> {
+    session: &'a mut Session,
+    terminal: &'a mut Terminal,
+}
+
+impl Prompt<'_> {
+    fn line(&mut self, text: &str) -> Result<Next, Fault> {
+        let text = text.trim_end();
+        let line = repl::read(text);
+        let brings = match &line {
+            Line::Nothing => return Ok(Next::Line),
+            Line::Command(command, _) => matches!(
+                command,
+                Command::Run | Command::Explain | Command::Doc | Command::Diagram | Command::Plot | Command::Expect
+            ),
+            Line::Item | Line::Instance(..) | Line::Setting(..) => true,
+            Line::Expression => false,
+        };
+        if brings {
+            let brought = self.session.bring_in(text);
+            if !brought.is_empty() {
+                self.terminal.line(&format!("(uses {})", brought.join(", ")));
+            }
+        }
+        match line {
+            Line::Nothing => {}
+            Line::Item => {
+                if let Some(warnings) = self.session.add_item(text)? {
+                    tell_fault(&warnings, self.terminal);
+                }
+            }
+            Line::Instance(name, begin) => {
+                let words = self.session.add_part(&name, &text[begin..])?;
+                self.terminal.line(&words);
+            }
+            Line::Setting(path, _) => self.session.set(&path, text)?,
+            Line::Expression => {
+                if let Some(near) = self.misspelt(text) {
+                    return Err(Fault::Words(near));
+                }
+                let value = self.session.value(text)?;
+                self.session.answer(&value);
+                self.terminal.line(&plain(&value));
+            }
+            Line::Command(command, rest) => return self.command(command, rest.trim()),
+        }
+        Ok(Next::Line)
+    }
+
+    /// Two words one behind the other are no expression: a command was meant.
+    fn misspelt(&self, text: &str) -> Option<String> {
+        let mut words = text.split_whitespace();
+        let (first, second) = (words.next()?, words.next());
+        let word = |word: &str| word.chars().all(|c| c.is_alphanumeric() || c == '_' || c == '.' || c == '"');
+        let command = word(first) && first.starts_with(char::is_alphabetic) && second.is_none_or(word);
+        let near = repl::meant(first).filter(|_| command)?;
+        let known = self.session.quantities().any(|q| q.path == first)
+            || self.session.instances().iter().any(|(name, _)| name == first);
+        (!known && (second.is_some() || near.len() > 3))
+            .then(|| format!("there is no command `{first}`; did you mean `{near}`? (`help` lists them)"))
+    }
+
+    fn command(&mut self, command: Command, rest: &str) -> Result<Next, Fault> {
+        match command {
+            Command::Quit => return Ok(Next::Quit),
+            Command::Help => self.help(rest)?,
+            Command::Use => {
+                let words = self.session.add_file(rest)?;
+                self.terminal.line(&words);
+            }
+            Command::Run => return self.run(rest),
+            Command::Step => self.step(rest)?,
+            Command::Plot => self.plot(rest)?,
+            Command::Expect => return self.expect(rest),
+            Command::Explain => self.explain(rest)?,
+            Command::Unit => self.unit(rest)?,
+            Command::Doc => self.doc(rest)?,
+            Command::Deps => self.deps(rest)?,
+            Command::Diagram => self.diagram(rest)?,
+            Command::Names => self.names(),
+            Command::Lints => self.lints(),
+            Command::Why => match super::explain::page(&rest.to_uppercase()) {
+                Some(page) => self.terminal.print(page),
+                None => return Err(Fault::Words(format!("there is no page about `{rest}`; codes look like E0101"))),
+            },
+            Command::Watch => {
+                let (file, name) = split_file(rest);
+                if file.is_empty() {
+                    return Err("watch what? `watch \"FILE.fric\" [EXPERIMENT]`".into());
+                }
+                return match super::watch::follow(&file, &name, false, self.session, self.terminal) {
+                    End::Fine => Ok(Next::Line),
+                    End::Failed | End::Misused => Ok(Next::Missed),
+                };
+            }
+            Command::Characterise => self.characterise(rest)?,
+            Command::Save => self.save(rest)?,
+        }
+        Ok(Next::Line)
+    }
+
+    fn help(&mut self, rest: &str) -> Result<(), Fault> {
+        let mut last = "";
+        let wanted = |name: &str| rest.is_empty() || name == rest;
+        let mut lines = Vec::new();
+        for (name, usage, words) in COMMANDS {
+            last = if name.is_empty() { last } else { name };
+            if wanted(last) {
+                lines.push((*usage, *words));
+            }
+        }
+        if lines.is_empty() {
+            return Err(Fault::Words(format!("there is no command `{rest}`; `help` lists them")));
+        }
+        let width = lines.iter().map(|(usage, _)| usage.chars().count()).max().unwrap_or(0);
+        if rest.is_empty() {
+            self.terminal
+                .line("A line is an expression, a setting, an instance, an item of the language, or a command:");
+            for (example, words) in [
+                ("10 mm * 2 N/m", "its value, with its unit; `ans` is the last one"),
+                ("f = LuGre(vd = 10 mm/s)", "an instance of a model, of yours or of the library"),
+                ("f.Fs = 1 N", "sets a parameter, an input or a slot"),
+                ("model M { … }", "any item; a bracket that is open goes on on the next line"),
+            ] {
+                self.terminal.line(&format!("  {example:width$}  {words}"));
+            }
+            self.terminal.line("");
+        }
+        for (usage, words) in lines {
+            self.terminal.line(&format!("  {usage:width$}  {words}"));
+        }
+        Ok(())
+    }
+
+    fn run(&mut self, rest: &str) -> Result<Next, Fault> {
+        let (name, length) = match rest.rsplit_once(" for ") {
+            Some((name, length)) => (name.trim(), Some(length)),
+            None => match rest.strip_prefix("for ") {
+                Some(length) => ("", Some(length)),
+                None => (rest, None),
+            },
+        };
+        let duration = length.map(|length| self.time(length, "run NAME for 20 s")).transpose()?;
+        let ran = self.session.run(name, duration, &watch)?;
+        let held = show_run(&ran, true, self.terminal);
+        stopped(&ran)?;
+        Ok(if held { Next::Line } else { Next::Missed })
+    }
+
+    /// A positive time, as typed.
+    fn time(&mut self, text: &str, example: &str) -> Result<f64, Fault> {
+        let value = self.session.value(text)?;
+        let second = Unit::parse("s").expect("the second is known");
+        if value.boolean || value.unit.dimension != second.dimension {
+            let unit = if value.unit.dimension.is_none() { "a number".into() } else { value.unit.dimension.describe() };
+            return Err(Fault::Words(format!("a time is needed, not {unit}: `{example}`")));
+        }
+        match value.si {
+            t if t > 0.0 && t.is_finite() => Ok(t),
+            _ => Err(Fault::Words(format!("a time greater than 0 is needed: `{example}`"))),
+        }
+    }
+
+    fn step(&mut self, rest: &str) -> Result<(), Fault> {
+        if rest.is_empty() {
+            return Err("a step of what length? `step 1 ms`".into());
+        }
+        let h = self.time(rest, "step 1 ms")?;
+        let (time, all) = self.session.step(h)?;
+        self.terminal.line(&format!("t = {}", runtime::show::time(time)));
+        let width = all.iter().map(|shown| shown.path.chars().count()).max().unwrap_or(0);
+        for shown in all {
+            let now = plain(&shown.now);
+            let kind = shown.kind;
+            let line = match &shown.before {
+                Some(before) if plain(before) != now => {
+                    format!("  {kind:<6} {:width$}  {} → {now}", shown.path, plain(before))
+                }
+                _ => format!("  {kind:<6} {:width$}  {now}", shown.path),
+            };
+            self.terminal.line(&line);
+        }
+        Ok(())
+    }
+
+    fn plot(&mut self, rest: &str) -> Result<(), Fault> {
+        if rest.is_empty() {
+            return Err("plot what? `plot f.F`, `plot f.F against f.v = -5 mm/s .. 5 mm/s steady`".into());
+        }
+        let (what, file) = repl::cut_to(rest)?;
+        let drawn = match over(what) {
+            Some((shows, path, from, to, steady)) => {
+                let cut = self.session.cut(shows, &path, (from, to), steady, &mut watch)?;
+                cut_figure(&cut, steady)
+            }
+            None => {
+                let ran = self.session.again(&format!("plot {what}"), false, &watch)?;
+                stopped(&ran)?;
+                run_figure(&ran, true).ok_or("there is nothing to draw")?
+            }
+        };
+        match file {
+            Some(file) => {
+                let path = PathBuf::from(file);
+                let png = path.extension().is_some_and(|extension| extension == "png");
+                let bytes = if png { plot::png(&drawn) } else { plot::svg(&drawn).into_bytes() };
+                project::write(&path, &bytes).map_err(|error| format!("cannot write {file}: {error}"))?;
+                self.terminal.line(&format!("wrote {file}"));
+            }
+            None => self.terminal.print(&plot::terminal(&drawn, self.terminal.width(), self.terminal.colour())),
+        }
+        Ok(())
+    }
+
+    fn expect(&mut self, rest: &str) -> Result<Next, Fault> {
+        if rest.is_empty() {
+            return Err("expect what? `expect max(x) < 1 mm`".into());
+        }
+        let ran = self.session.again(&format!("expect {rest}"), true, &watch)?;
+        stopped(&ran)?;
+        let mut held = true;
+        for (case, result) in ran.cases.iter().zip(&ran.results) {
+            let Ok(outcome) = result else { continue };
+            let last = &outcome.verdicts[outcome.verdicts.len().saturating_sub(1)..];
+            if !case.label.is_empty() {
+                self.terminal.line(&format!("  {}", case.label));
+            }
+            held &= last.iter().all(|verdict| verdict.holds);
+            let words = results::verdicts(self.terminal, last, "");
+            self.terminal.print(&words);
+        }
+        Ok(if held { Next::Line } else { Next::Missed })
+    }
+
+    fn explain(&mut self, rest: &str) -> Result<(), Fault> {
+        if rest.is_empty() {
+            return Err("explain what? `explain f.z`, `explain LuGre`, `why E0401`".into());
+        }
+        let (explanation, path) = self.session.explained(rest)?;
+        match path {
+            Some(path) if !path.is_empty() => self.quantity(&explanation, &path),
+            _ => super::explain::tell(&explanation, self.terminal),
+        }
+        Ok(())
+    }
+
+    /// One quantity: what it is, where its value comes from, how it is stepped.
+    fn quantity(&mut self, explanation: &Explanation, path: &str) {
+        let Some(q) = explanation.quantities.iter().find(|q| q.path == path) else { return };
+        let unit = if q.unit.is_empty() { String::new() } else { format!(" [{}]", q.unit) };
+        let range = q.range.as_ref().map_or(String::new(), |range| format!(", in {range}"));
+        let doc = q.doc.as_ref().map_or(String::new(), |doc| format!("   {}", doc.lines().next().unwrap_or_default()));
+        self.terminal.line(&format!("{path}: {}{unit}{range}{doc}", q.kind));
+        let (owner, name) = path.rsplit_once('.').map_or(("", path), |(owner, name)| (owner, name));
+        let derivative = if owner.is_empty() { format!("d{name}/") } else { format!("{owner}.d{name}/") };
+        for (left, right) in
+            explanation.equations.iter().filter(|(left, _)| left == path || left.starts_with(&derivative))
+        {
+            let left = left.strip_prefix(owner).map_or(left.as_str(), |left| left.trim_start_matches('.'));
+            self.terminal.line(&format!("  {left} = {right}"));
+        }
+        for state in explanation.states.iter().filter(|state| state.path == path) {
+            self.terminal.line(&format!("  {}", state.words()));
+        }
+        if let Ok(value) = self.session.value(path) {
+            self.terminal.line(&format!("  now {}", plain(&value)));
+        }
+    }
+
+    fn unit(&mut self, rest: &str) -> Result<(), Fault> {
+        if rest.is_empty() {
+            return Err("the unit of what? `unit f.g`, `unit 2 N/m * 1 mm`".into());
+        }
+        let value = self.session.value(rest)?;
+        let words = match value {
+            Value { boolean: true, .. } => "true or false".to_string(),
+            Value { unit, .. } if unit.text.is_empty() => format!("1   {}", unit.dimension.describe()),
+            Value { unit, .. } => format!("{unit}   {}", unit.dimension.describe()),
+        };
+        self.terminal.line(&words);
+        Ok(())
+    }
+
+    fn doc(&mut self, rest: &str) -> Result<(), Fault> {
+        let Some(model) = self.session.model(rest) else {
+            return Err(Fault::Words(format!("there is no model `{rest}`; `names` shows what there is")));
+        };
+        self.terminal.line(&self.terminal.styled(Style::Bold, &model.name.text));
+        for line in model.doc.iter().flat_map(|doc| doc.lines()) {
+            self.terminal.line(&format!("  {line}"));
+        }
+        let all = equations::equations(&model);
+        let width = all.iter().map(|(left, _)| left.chars().count()).max().unwrap_or(0);
+        self.terminal.line("");
+        for (left, right) in all {
+            let line = if right.is_empty() { format!("  {left}") } else { format!("    {left:width$} = {right}") };
+            self.terminal.line(&line);
+        }
+        let (explanation, _) = self.session.explained(&model.name.text.clone())?;
+        let shown: Vec<_> =
+            explanation.quantities.iter().filter(|q| q.kind != "let" && !q.path.contains('.')).collect();
+        let width = shown.iter().map(|q| q.path.chars().count()).max().unwrap_or(0);
+        let units = shown.iter().map(|q| q.unit.chars().count()).max().unwrap_or(0);
+        self.terminal.line("");
+        for q in shown {
+            let doc = q.doc.as_deref().unwrap_or_default().lines().next().unwrap_or_default();
+            let line = format!("  {:<6} {:width$}  {:units$}  {doc}", q.kind, q.path, q.unit);
+            self.terminal.line(line.trim_end());
+        }
+        Ok(())
+    }
+
+    fn deps(&mut self, rest: &str) -> Result<(), Fault> {
+        let (explanation, path) = self.session.explained(rest)?;
+        let Some(path) = path.filter(|path| !path.is_empty()) else {
+            return Err(Fault::Words(format!("`{rest}` is a whole: name a quantity of it, as in `deps {rest}.F`")));
+        };
+        let mut shown = Vec::new();
+        self.needs(&explanation, &path, 0, &mut shown);
+        Ok(())
+    }
+
+    /// A quantity and, indented below it, what it needs; each is opened once.
+    fn needs(&mut self, explanation: &Explanation, path: &str, depth: usize, shown: &mut Vec<String>) {
+        let q = explanation.quantities.iter().find(|q| q.path == path);
+        let (kind, unit) = q.map_or(("", ""), |q| (q.kind, q.unit.as_str()));
+        let again = shown.iter().any(|other| other == path);
+        let needs = explanation.needs.iter().find(|(of, _)| of == path).map_or(&[][..], |(_, needs)| needs);
+        let mark = if again && !needs.is_empty() { "  …" } else { "" };
+        let unit = if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
+        self.terminal.line(&format!("{}{path}  {kind}{unit}{mark}", "  ".repeat(depth)));
+        if again {
+            return;
+        }
+        shown.push(path.into());
+        for needed in needs {
+            self.needs(explanation, needed, depth + 1, shown);
+        }
+    }
+
+    fn diagram(&mut self, rest: &str) -> Result<(), Fault> {
+        let (name, file) = repl::cut_to(rest)?;
+        let Some(model) = self.session.model(name) else {
+            return Err(Fault::Words(format!("there is no model `{name}`; `names` shows what there is")));
+        };
+        match file {
+            None => self.terminal.print(&diagram::text(&model)),
+            Some(file) if file.ends_with(".svg") => {
+                project::write(Path::new(file), diagram::svg(&model).as_bytes())
+                    .map_err(|error| format!("cannot write {file}: {error}"))?;
+                self.terminal.line(&format!("wrote {file}"));
+            }
+            Some(_) => return Err("a diagram is written as .svg".into()),
+        }
+        Ok(())
+    }
+
+    fn names(&mut self) {
+        let instances = self.session.instances();
+        for (name, instance) in &instances {
+            self.terminal.line(&format!("{name} = {instance}"));
+        }
+        let (models, experiments) = (self.session.models(), self.session.experiments());
+        if !models.is_empty() {
+            self.terminal.line(&format!("models: {}", models.join(", ")));
+        }
+        if !experiments.is_empty() {
+            self.terminal.line(&format!("experiments: {}", experiments.join(", ")));
+        }
+        if instances.is_empty() && models.is_empty() {
+            self.terminal.line("nothing yet: `f = LuGre()` makes an instance, `use \"FILE.fric\"` brings a file");
+        }
+    }
+
+    fn lints(&mut self) {
+        let all = self.session.lints();
+        if all.is_empty() {
+            self.terminal.line("no warnings");
+        }
+        for (files, found) in all {
+            let shown = report::full(&files, &found, self.terminal.colour());
+            self.terminal.print(&shown);
+        }
+    }
+
+    fn characterise(&mut self, rest: &str) -> Result<(), Fault> {
+        let instance = self.session.instances().into_iter().find(|(name, _)| name == rest).map(|(_, what)| what);
+        let what = instance.unwrap_or_else(|| rest.to_string());
+        if what.is_empty() {
+            return Err("characterise what? `characterise LuGre(vd = 10 mm/s)`".into());
+        }
+        let name = what.trim_start_matches("rotary ").split('(').next().unwrap_or_default().trim().to_string();
+        let args = match self.session.origin(&name) {
+            Some(file) => Characterise { what: file, models: vec![what], set: Vec::new(), out: None, json: false },
+            None => Characterise { what, models: Vec::new(), set: Vec::new(), out: None, json: false },
+        };
+        match super::characterise::characterise(&args, self.terminal) {
+            End::Fine => Ok(()),
+            End::Failed | End::Misused => Err("it could not be characterised".into()),
+        }
+    }
+
+    fn save(&mut self, rest: &str) -> Result<(), Fault> {
+        let name = rest.trim_matches('"');
+        let path = Path::new(name);
+        if !name.ends_with(".fric") {
+            return Err("save to which file? `save try.fric`".into());
+        }
+        if path.exists() {
+            return Err(Fault::Words(format!("{name} is there already: choose another name, or remove it first")));
+        }
+        let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+        let legal: String = stem.chars().map(|c| if c.is_ascii_alphanumeric() || c == '_' { c } else { '_' }).collect();
+        let legal = if legal.starts_with(|c: char| c.is_ascii_alphabetic()) { legal } else { format!("s{legal}") };
+        let text = self.session.written(&legal.to_ascii_lowercase())?;
+        project::write(path, text.as_bytes()).map_err(|error| format!("cannot write {name}: {error}"))?;
+        self.terminal.line(&format!("wrote {name}; `fric test {name}` runs it"));
+        Ok(())
+    }
+}
+
+/// File and what follows it, quoted or not.
+fn split_file(rest: &str) -> (String, String) {
+    let cut = match rest.strip_prefix('"') {
+        Some(rest) => rest.split_once('"'),
+        None => rest.split_once(' '),
+    };
+    let (file, name) = cut.unwrap_or((rest.trim_matches('"'), ""));
+    (file.trim().into(), name.trim().into())
+}
+
+/// `EXPR against PATH = A .. B [steady]`: its pieces, if a line is one.
+fn over(text: &str) -> Option<(&str, String, &str, &str, bool)> {
+    let tokens: Vec<_> = grammar::tokens::tokens(text).into_iter().filter(|token| !token.is_trivia()).collect();
+    let at = |word: &str, from: usize| (from..tokens.len()).find(|k| tokens[*k].text(text) == word);
+    let against = at("against", 0)?;
+    let equals = at("=", against)?;
+    let dots = at("..", equals)?;
+    let last = tokens.last()?;
+    let steady = last.text(text) == "steady";
+    let end = if steady { last.start } else { text.len() };
+    let path = text[tokens[against].end..tokens[equals].start].split_whitespace().collect();
+    let from = text[tokens[equals].end..tokens[dots].start].trim();
+    Some((text[..tokens[against].start].trim(), path, from, text[tokens[dots].end..end].trim(), steady))
+}
+
+/// A failed run as a fault; stopping it is none.
+fn stopped(ran: &Ran) -> Result<(), Fault> {
+    match ran.results.iter().find_map(|result| result.as_ref().err()) {
+        Some(failure) if failure.cause == Cause::Stopped => {
+            Err(Fault::Words(format!("stopped at {}; the session goes on", runtime::show::time(failure.time))))
+        }
+        Some(failure) => Err(Fault::Stopped(Box::new(failure.clone()))),
+        None => Ok(()),
+    }
+}
+
+/// Says what a run did, draws its plots, judges its expectations; returns whether they hold.
+pub(super) fn show_run(ran: &Ran, draw: bool, terminal: &mut Terminal) -> bool {
+    if let Some(warnings) = &ran.warnings {
+        tell_fault(warnings, terminal);
+    }
+    let Some(first) = ran.cases.first() else { return true };
+    let outcomes: Vec<_> = ran.results.iter().filter_map(|result| result.as_ref().ok()).collect();
+    let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
+    let cases = if ran.cases.len() > 1 { format!(", {} cases", ran.cases.len()) } else { String::new() };
+    let second = Unit::parse("s").expect("the second is known");
+    terminal.line(&format!(
+        "{}: {}{cases}, {} steps for {}",
+        terminal.styled(Style::Bold, &ran.name),
+        results::solver(&first.experiment.solver),
+        value::count(steps),
+        value::show(first.experiment.duration, &second, 6),
+    ));
+    for note in first.notes.iter().chain(outcomes.iter().flat_map(|outcome| &outcome.notes)) {
+        terminal.line(&format!("  note: {note}"));
+    }
+    if let Some(drawn) = run_figure(ran, false).filter(|_| draw) {
+        terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
+    } else if let ([outcome], true) = (outcomes.as_slice(), draw) {
+        let width = outcome.finals.iter().map(|end| end.path.chars().count()).max().unwrap_or(0);
+        for end in &outcome.finals {
+            let value = Value { si: end.value, unit: end.unit.clone(), boolean: end.boolean };
+            terminal.line(&format!("  {:width$}  {} at the end", end.path, plain(&value)));
+        }
+    }
+    let mut held = true;
+    for (case, result) in ran.cases.iter().zip(&ran.results) {
+        let Ok(outcome) = result else { continue };
+        if !case.label.is_empty() && !outcome.verdicts.is_empty() {
+            terminal.line(&format!("  {}", case.label));
+        }
+        held &= outcome.verdicts.iter().all(|verdict| verdict.holds);
+        let words = results::verdicts(terminal, &outcome.verdicts, "  ");
+        terminal.print(&words);
+    }
+    held
+}
+
+/// The plots of a run in one figure; `last`: only the plot that was added last.
+pub(super) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
+    let first = ran.cases.first()?;
+    let plots = &first.experiment.plots;
+    let plots = if last { &plots[plots.len().saturating_sub(1)..] } else { &plots[..] };
+    if plots.is_empty() {
+        return None;
+    }
+    let cases: Vec<figure::Recorded> = ran
+        .cases
+        .iter()
+        .zip(&ran.results)
+        .map(|(case, result)| {
+            let recording = match result {
+                Ok(outcome) => &outcome.recording,
+                Err(failure) => &failure.recording,
+            };
+            (case.label.as_str(), recording)
+        })
+        .collect();
+    let subtitle = results::solver(&first.experiment.solver);
+    Some(figure::figure(&ran.name, &subtitle, plots, &cases))
+}
+
+/// A curve over an input or a parameter as a figure: quantities of one unit share axes.
+fn cut_figure(cut: &Cut, steady: bool) -> Figure {
+    let (name, unit) = &cut.over;
+    let x = Axis { name: name.clone(), unit: unit.text.clone(), ..Axis::default() };
+    let mut panels: Vec<Panel> = Vec::new();
+    for (series, points) in cut.series.iter().zip(&cut.curves) {
+        let points = points.iter().map(|(x, y)| (unit.from_si(*x), series.unit.from_si(*y))).collect();
+        let curve = Curve { name: series.label.clone(), points, ..Curve::default() };
+        let own = series.unit.text.clone();
+        match panels.iter_mut().find(|panel| panel.y.unit == own && !series.boolean) {
+            Some(panel) => {
+                panel.y.name += &format!(", {}", series.label);
+                panel.curves.push(curve);
+            }
+            None => {
+                let y = Axis { name: series.label.clone(), unit: own, ..Axis::default() };
+                panels.push(Panel { x: x.clone(), y, curves: vec![curve], ..Panel::default() });
+            }
+        }
+    }
+    let labels: Vec<&str> = cut.series.iter().map(|series| series.label.as_str()).collect();
+    let subtitle = if steady { "each point at rest" } else { "states as they are" };
+    Figure { title: format!("{} against {name}", labels.join(", ")), subtitle: subtitle.into(), panels }
+}
+
+/// Time of an instance, for those who go on from it.
+pub(super) fn time_of(instance: &abi::Instance) -> f64 {
+    instance.get(Slot::TIME)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_over_something_are_told_from_curves_over_time() {
+        let read = over("f.F against f.v = -5 mm/s .. 5 mm/s steady");
+        assert_eq!(read, Some(("f.F", "f.v".to_string(), "-5 mm/s", "5 mm/s", true)));
+        let read = over("f.F, f.g against f.Fs = 1 N .. 2 N");
+        assert_eq!(read, Some(("f.F, f.g", "f.Fs".to_string(), "1 N", "2 N", false)));
+        assert_eq!(over("fr.F [N] against body.v [mm/s]"), None);
+        assert_eq!(over("x"), None);
+    }
+
+    #[test]
+    fn files_may_be_quoted() {
+        assert_eq!(split_file("\"a b.fric\" pull"), ("a b.fric".into(), "pull".into()));
+        assert_eq!(split_file("a.fric pull"), ("a.fric".into(), "pull".into()));
+        assert_eq!(split_file("a.fric"), ("a.fric".into(), String::new()));
+    }
+}

@@ -1,0 +1,132 @@
+//! `fric watch`: runs an experiment again whenever its text is saved. States go on by name and unit.
+
+use super::End;
+use super::repl::{
+    catch_interrupts, interrupted, run_figure, show_run, tell_fault, time_of, watch as stop_on_interrupt,
+};
+use crate::args::Watch;
+use crate::plot;
+use crate::repl::Session;
+use crate::terminal::Terminal;
+use abi::Instance;
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime};
+
+/// How often files are looked at: short against the time a hand takes, long against the work of looking.
+const LOOK: Duration = Duration::from_millis(50);
+
+pub fn watch(args: &Watch, terminal: &mut Terminal) -> End {
+    catch_interrupts();
+    let file = args.file.display().to_string();
+    let name = args.experiment.clone().unwrap_or_default();
+    follow(&file, &name, args.restart, &mut Session::default(), terminal)
+}
+
+/// Runs an experiment of a file on each save until Ctrl-C; the only one, if none is named. `restart`: from the start
+/// each time.
+pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Session, terminal: &mut Terminal) -> End {
+    if let Err(fault) = session.add_file(file) {
+        tell_fault(&fault, terminal);
+        return End::Failed;
+    }
+    let name = match chosen(session, file, name) {
+        Ok(name) => name,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let mut live: Option<Instance> = None;
+    let mut passed = 0.0;
+    loop {
+        let files = session.files_of(file);
+        let stamps = stamps(&files);
+        let from = live.as_ref().filter(|_| !restart);
+        let begun = Instant::now();
+        match session.run_on(&name, from, &stop_on_interrupt) {
+            Ok((ran, at)) => {
+                let draws = run_figure(&ran, false);
+                show_run(&ran, false, terminal);
+                if let Some(carried) = &ran.carried {
+                    terminal.line(&format!("  goes on from t = {}{}", runtime::show::time(passed), told(carried)));
+                }
+                if let Some(drawn) = draws {
+                    terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
+                }
+                if let Some(failure) = ran.results.iter().find_map(|result| result.as_ref().err()) {
+                    if interrupted() {
+                        return End::Fine;
+                    }
+                    terminal.error(&failure.to_string());
+                } else {
+                    passed = if from.is_some() { passed } else { 0.0 } + at.as_ref().map_or(0.0, time_of);
+                    live = at;
+                }
+                let took = crate::value::duration(begun.elapsed().as_secs_f64());
+                terminal.line(&format!("  {took} from text to plot; waiting for {file} (Ctrl-C ends)"));
+            }
+            // What ran before stays as it is: the next save may be better.
+            Err(fault) => tell_fault(&fault, terminal),
+        }
+        loop {
+            let mut now = stamps.clone();
+            while now == stamps {
+                if interrupted() {
+                    return End::Fine;
+                }
+                std::thread::sleep(LOOK);
+                now = self::stamps(&files);
+            }
+            match session.reload() {
+                Ok(()) => break,
+                Err(fault) => tell_fault(&fault, terminal),
+            }
+            // Wait until the file that is wrong changes.
+            while self::stamps(&files) == now {
+                if interrupted() {
+                    return End::Fine;
+                }
+                std::thread::sleep(LOOK);
+            }
+            if session.reload().is_ok() {
+                break;
+            }
+        }
+    }
+}
+
+/// The experiment to run.
+fn chosen(session: &Session, file: &str, name: &str) -> Result<String, String> {
+    let all = session.experiments_of(file);
+    match all.as_slice() {
+        [] => Err(format!("{file} has no experiment to run")),
+        [only] if name.is_empty() => Ok(only.clone()),
+        _ if name.is_empty() => Err(format!("which one? {file} has {}", all.join(", "))),
+        _ if all.iter().any(|one| one == name) => Ok(name.into()),
+        _ => match crate::compile::nearest(name, all.iter().map(String::as_str)) {
+            Some(near) => Err(format!("{file} has no experiment `{name}`; did you mean `{near}`?")),
+            None => Err(format!("{file} has no experiment `{name}`; it has {}", all.join(", "))),
+        },
+    }
+}
+
+/// `; anew: fr.z; gone: fr.w`
+fn told(carried: &abi::instance::Carried) -> String {
+    let mut words = String::new();
+    for (what, paths) in [("anew", &carried.fresh), ("gone", &carried.lost)] {
+        if !paths.is_empty() {
+            words += &format!("; {what}: {}", paths.join(", "));
+        }
+    }
+    words
+}
+
+/// When each file was written last, and how long it is.
+fn stamps(files: &[String]) -> Vec<Option<(SystemTime, u64)>> {
+    let of = |file: &String| {
+        let metadata = fs::metadata(Path::new(file)).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
+    };
+    files.iter().map(of).collect()
+}

@@ -1,0 +1,361 @@
+//! A session as somebody types it, in a pseudo-terminal: prompt, completion, plots, errors, history, Ctrl-C; and as a
+//! script pipes it.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+/// The longest that anything may take on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A folder of its own for one test, empty at its start.
+fn folder(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("repl-{name}"));
+    let _ = fs::remove_dir_all(&path);
+    fs::create_dir_all(&path).unwrap();
+    path
+}
+
+fn fric(folder: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
+    command.current_dir(folder).env("XDG_STATE_HOME", folder.join("state")).env("TERM", "xterm");
+    command.env_remove("NO_COLOR");
+    command
+}
+
+/// A session at a terminal of 100 columns.
+struct Terminal {
+    child: Child,
+    keys: File,
+    screen: Receiver<Vec<u8>>,
+    /// All that came, without colours and movements of the cursor.
+    seen: String,
+    /// Up to where it has been looked at.
+    at: usize,
+}
+
+impl Terminal {
+    fn new(folder: &Path, args: &[&str]) -> Terminal {
+        let size = nix::pty::Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
+        let pair = nix::pty::openpty(Some(&size), None).unwrap();
+        let inner = || Stdio::from(pair.slave.try_clone().unwrap());
+        let mut command = fric(folder);
+        command.args(args).stdin(inner()).stdout(inner()).stderr(inner());
+        // SAFETY: only system calls that are allowed between fork and exec: a session of its own with this terminal, so
+        // that Ctrl-C reaches it.
+        unsafe {
+            command.pre_exec(|| {
+                nix::unistd::setsid()?;
+                if nix::libc::ioctl(0, nix::libc::TIOCSCTTY, 0) != 0 {
+                    return Err(std::io::Error::last_os_error());
+                }
+                Ok(())
+            });
+        }
+        let child = command.spawn().unwrap();
+        drop(command);
+        drop(pair.slave);
+        let keys = File::from(pair.master);
+        let mut output = keys.try_clone().unwrap();
+        let (send, screen) = channel();
+        std::thread::spawn(move || {
+            let mut bytes = [0; 4096];
+            while let Ok(n) = output.read(&mut bytes) {
+                if n == 0 || send.send(bytes[..n].to_vec()).is_err() {
+                    break;
+                }
+            }
+        });
+        Terminal { child, keys, screen, seen: String::new(), at: 0 }
+    }
+
+    fn send(&mut self, keys: &str) {
+        self.keys.write_all(keys.as_bytes()).unwrap();
+    }
+
+    /// Waits until a text appears behind what was waited for before; gives what came up to it.
+    #[track_caller]
+    fn wait(&mut self, text: &str) -> String {
+        let begun = Instant::now();
+        loop {
+            if let Some(found) = self.seen[self.at..].find(text) {
+                let passed = self.seen[self.at..self.at + found].to_string();
+                self.at += found + text.len();
+                return passed;
+            }
+            let left = PATIENCE.saturating_sub(begun.elapsed());
+            match self.screen.recv_timeout(left) {
+                Ok(bytes) => self.seen += &plain(&String::from_utf8_lossy(&bytes)),
+                Err(_) => panic!("`{text}` did not come; this came:\n{}", &self.seen[self.at..]),
+            }
+        }
+    }
+
+    /// Types a line and waits for the prompt behind what it gives.
+    #[track_caller]
+    fn line(&mut self, text: &str) -> String {
+        self.send(&format!("{text}\r"));
+        self.wait("\n");
+        self.wait("fric> ")
+    }
+
+    /// Waits for the end; gives the exit code.
+    fn end(mut self) -> Option<i32> {
+        let begun = Instant::now();
+        while begun.elapsed() < PATIENCE {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status.code();
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        panic!("it did not end; this came:\n{}", &self.seen[self.at..]);
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The text without escape sequences and carriage returns.
+fn plain(text: &str) -> String {
+    let mut out = String::new();
+    let mut rest = text.chars().peekable();
+    while let Some(c) = rest.next() {
+        match c {
+            '\x1b' => {
+                if rest.next() == Some('[') {
+                    while rest.next().is_some_and(|c| !c.is_ascii_alphabetic()) {}
+                }
+            }
+            '\r' => {}
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+#[test]
+fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
+    let folder = folder("typed");
+    let mut at = Terminal::new(&folder, &[]);
+    at.wait("fric> ");
+    assert!(at.line("10 mm * 2 N/m").contains("20 mN"));
+    assert!(at.line("ans / 2").contains("10 mN"));
+    let made = at.line("f = LuGre(vd = 10 mm/s)");
+    assert!(made.contains("f: LuGre, 1 state, 7 parameters"), "{made}");
+
+    // Completion: one candidate is put in, several are listed, those whose unit fits first.
+    at.send("expl\t");
+    at.wait("explain");
+    at.send(" f.z\r");
+    at.wait("\n");
+    let explained = at.wait("fric> ");
+    assert!(explained.contains("dz/dt = v - sigma0 * abs(v) / g * z"), "{explained}");
+    at.send("f.F + f.\t");
+    at.wait("Coulomb friction");
+    at.send("\x03");
+    at.wait("\n");
+    at.wait("fric> ");
+
+    let plot = at.line("plot f.F against f.v = -5 mm/s .. 5 mm/s steady");
+    assert!(plot.contains("f.F [N]") && plot.contains("f.v [mm/s]") && plot.contains('⣀'), "{plot}");
+    assert!(at.line("plot f.F against f.v = 0 mm/s .. 5 mm/s steady to stribeck.svg").contains("wrote stribeck.svg"));
+    assert!(fs::read_to_string(folder.join("stribeck.svg")).unwrap().contains("f.F against f.v"));
+
+    let wrong = at.line("f.F + 1 m/s");
+    assert!(wrong.contains("E0101") && wrong.contains("cannot add a force and a velocity"), "{wrong}");
+    assert!(wrong.contains("[input:1:1]") && wrong.contains("1 │ f.F + 1 m/s"), "{wrong}");
+    assert!(at.line("f.Fs = 0.5 N").contains("stiction must not be below Coulomb friction"));
+    assert!(at.line("f.Fs").contains("1.5 N"), "a refused setting changes nothing");
+    assert!(at.line("1 N + 1 N").contains("2 N"));
+
+    // An open bracket goes on on the next line.
+    at.send("model Damper {\r");
+    at.send("input v [m/s]\r");
+    at.send("output F [N] = 2 N·s/m * v\r");
+    at.send("allow creep \"a damper\"\r");
+    at.wait("a damper");
+    at.wait("\n");
+    at.line("}");
+    assert!(at.line("d = Damper(v = 3 m/s)").contains("d: Damper, 0 states"));
+    assert!(at.line("d.F").contains("6 N"));
+
+    at.send("\x04");
+    assert_eq!(at.end(), Some(0));
+}
+
+#[test]
+fn history_is_there_in_the_next_session() {
+    let folder = folder("history");
+    let mut first = Terminal::new(&folder, &[]);
+    first.wait("fric> ");
+    assert!(first.line("21 mm * 2").contains("42 mm"));
+    first.send("quit\r");
+    assert_eq!(first.end(), Some(0));
+    let history = fs::read_to_string(folder.join("state/fric/history")).unwrap();
+    assert!(history.contains("21 mm * 2"), "{history}");
+    let mut second = Terminal::new(&folder, &[]);
+    second.wait("fric> ");
+    // Up twice, over `quit`.
+    second.send("\x1b[A");
+    second.wait("quit");
+    second.send("\x1b[A");
+    second.wait("21 mm * 2");
+    second.send("\r");
+    second.wait("42 mm");
+}
+
+#[test]
+fn an_interrupt_stops_a_run_and_keeps_the_session() {
+    let folder = folder("interrupt");
+    fs::write(
+        folder.join("long.fric"),
+        "model Long {\n  state x [m] = 0\n  dx/dt = 1 mm/s * cos(x / 1 m)\n}\n\
+         experiment long {\n  run Long() for 10000000 s\n  solver rk4 step 10 us\n}\n",
+    )
+    .unwrap();
+    let mut at = Terminal::new(&folder, &["repl", "long.fric"]);
+    at.wait("fric> ");
+    at.line("7 N");
+    at.send("run long\r");
+    at.wait("\n");
+    // The run has begun when the terminal echoes again; the interrupt is sent until it is taken.
+    let begun = Instant::now();
+    let stopped = loop {
+        std::thread::sleep(Duration::from_millis(200));
+        at.send("\x03");
+        if let Ok(bytes) = at.screen.recv_timeout(Duration::from_millis(500)) {
+            at.seen += &plain(&String::from_utf8_lossy(&bytes));
+        }
+        if at.seen[at.at..].contains("the session goes on") {
+            break true;
+        }
+        if begun.elapsed() > PATIENCE {
+            break false;
+        }
+    };
+    assert!(stopped, "{}", &at.seen[at.at..]);
+    at.send("ans + 1 N\r");
+    at.wait("8 N\n");
+}
+
+/// What a script gives.
+fn piped(folder: &Path, args: &[&str], script: &str) -> Output {
+    let mut command = fric(folder);
+    let mut child =
+        command.args(args).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    child.stdin.take().unwrap().write_all(script.as_bytes()).unwrap();
+    child.wait_with_output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn a_script_ends_at_its_first_error_unless_told_otherwise() {
+    let folder = folder("script");
+    let script = "1 N + 1 m\n2 N + 2 N\n";
+    let ended = piped(&folder, &["repl"], script);
+    assert_eq!(ended.status.code(), Some(1));
+    assert_eq!(text(&ended.stdout), "");
+    assert!(text(&ended.stderr).contains("E0101"));
+    let went_on = piped(&folder, &["repl", "--keep-going"], script);
+    assert_eq!((went_on.status.code(), text(&went_on.stdout)), (Some(1), "4 N\n".into()));
+    let fine = piped(&folder, &[], "2 N + 2 N\nquit\nnonsense");
+    assert_eq!((fine.status.code(), text(&fine.stdout)), (Some(0), "4 N\n".into()));
+    let missed = piped(&folder, &["repl"], "f = LuGre()\nrun f for 1 ms\nexpect max(f.F) > 1 N\n1 N\n");
+    assert_eq!(missed.status.code(), Some(1));
+    assert!(
+        text(&missed.stdout).contains("✗ max(f.F) > 1 N") && !text(&missed.stdout).ends_with("1 N\n"),
+        "{}",
+        text(&missed.stdout)
+    );
+}
+
+/// What is wrong, in one line each: the first line of each report.
+#[track_caller]
+fn says(script: &str, expected: &str) {
+    let folder = folder("errors");
+    let output = piped(&folder, &["repl", "--keep-going"], script);
+    let told = text(&output.stderr);
+    assert!(told.contains(expected), "{script}\n{told}\n{}", text(&output.stdout));
+    assert_eq!(output.status.code(), Some(1), "{script}");
+}
+
+#[test]
+fn mistakes_are_named_with_their_remedy() {
+    says("run", "for how long? `run f for 2 s`");
+    says("run nothing", "there is no experiment or instance `nothing`");
+    says("f = LuGre()\nrun f for 2 N", "a time is needed, not a force: `run NAME for 20 s`");
+    says("f = LuGre()\nrun f for 0 s", "a time greater than 0 is needed");
+    says("step", "a step of what length? `step 1 ms`");
+    says("step 1 ms", "there is nothing to step: `f = LuGre()` makes an instance");
+    says("plot x", "nothing has been run yet");
+    says("f = LuGre()\nplot f.F against f.w = 0 m/s .. 1 m/s", "there is no `f.w` here; did you mean `f.v`?");
+    says("f = LuGre()\nplot f.F against f.v = 0 m .. 1 m", "`f.v` is a velocity, in m/s, and 0 m is a length");
+    says("f = LuGre()\nplot f.F against f.z = 0 um .. 1 um", "`f.z` is computed: a curve goes over an input");
+    says("f = LuGre()\nplot f.F against f.Fs = 0 N .. 2 N", "stiction must not be below Coulomb friction");
+    says("f = LuGre(Fss = 1 N)", "did you mean `Fs`");
+    says("f = LuGree()", "did you mean `LuGre`?");
+    says("f.Fs = 1 N", "there is no `f` here to set");
+    says("use \"nowhere.fric\"", "there is no such file");
+    says("use std.frictoin", "did you mean `std.friction`?");
+    says("explain Nothing", "there is no model `Nothing`");
+    says("ans", "there is no `ans` yet");
+    says("save try.txt", "`save try.fric`");
+    says("save try.fric", "there is nothing to save yet");
+    says("f = LuGre()\nplot f.F against f.v = 0 m/s .. 1 m/s to x.gif", "ends in .svg or .png");
+    says("why E9999", "there is no page about `E9999`");
+    says("watch", "watch what?");
+}
+
+#[test]
+fn a_session_is_saved_as_an_experiment_that_holds() {
+    let folder = folder("saved");
+    let script =
+        "f = LuGre(vd = 10 mm/s)\nf.v = 2 mm/s\nf.Fs = 1.2 N\nrun f for 50 ms\nexpect max(f.F) < 2 N\nsave try.fric\n";
+    let output = piped(&folder, &["repl"], script);
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    let saved = fs::read_to_string(folder.join("try.fric")).unwrap();
+    assert!(saved.contains("import std.friction.lugre") && saved.contains("expect max(f.F) < 2 N"), "{saved}");
+    assert!(saved.contains("f.Fs = 1.2 N"), "{saved}");
+    let tested = fric(&folder).args(["test", "try.fric"]).output().unwrap();
+    assert!(tested.status.success(), "{}", text(&tested.stderr));
+    assert!(text(&tested.stdout).ends_with("1 passed, 0 failed\n"), "{}", text(&tested.stdout));
+}
+
+#[test]
+fn a_saved_file_is_run_again_where_it_was() {
+    let folder = folder("watch");
+    let model = |rate: &str, more: &str| {
+        format!(
+            "model Fill {{\n  state x [m] = 0\n{more}  dx/dt = {rate}\n  output y [m] = x\n}}\n\
+             experiment fill {{\n  run Fill() for 1 s\n  plot y\n  expect final(y) > 0 m\n}}\n"
+        )
+    };
+    fs::write(folder.join("fill.fric"), model("1 m/s", "")).unwrap();
+    let mut at = Terminal::new(&folder, &["watch", "fill.fric"]);
+    at.wait("final(y) > 0 m");
+    at.wait("1 m, margin 1 m");
+    at.wait("waiting for fill.fric");
+    fs::write(folder.join("fill.fric"), model("2 m/s", "")).unwrap();
+    // It goes on from 1 m.
+    at.wait("3 m, margin 3 m");
+    at.wait("waiting for fill.fric");
+    fs::write(folder.join("fill.fric"), model("2 N", "")).unwrap();
+    at.wait("E0101");
+    fs::write(folder.join("fill.fric"), model("1 m/s", "  state w [m] = 0\n  dw/dt = 1 m/s\n")).unwrap();
+    at.wait("4 m, margin 4 m");
+    at.wait("anew: w");
+    at.wait("waiting for fill.fric");
+    at.send("\x03");
+    assert_eq!(at.end(), Some(0));
+}
