@@ -2,9 +2,9 @@
 //! hand with `gcc -O3 -march=native`, side by side in one run. Ratios are medians over interleaved rounds.
 
 use abi::description::Guard;
+use abi::lanes::Batch;
 use abi::plan::Method;
 use abi::unit::Unit;
-use abi::lanes::Batch;
 use abi::{Code, Description, Function, Layout, Slot};
 use compiler::backend::interp::Interpreter;
 use compiler::backend::jit::compile;

@@ -1,7 +1,7 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
 use abi::image::Target;
-use abi::plan::Method;
+pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
 use compiler::backend::{blob, c};
 pub use compiler::explain::{Explanation, Listed};
@@ -11,11 +11,9 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, SourceFile, Sources, build, check, compile, dissipation, explain,
-    explain_in, explain_run, linear, load, quantities, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile, dissipation,
+    explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
-#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
-pub use compiler::{Ready, rig};
 use std::time::Instant;
 
 /// What `fric build` makes of a model.

@@ -293,7 +293,11 @@ mod tests {
     #[test]
     fn instructions_have_the_bytes_of_the_manual() {
         // vaddpd zmm17, zmm2, zmm30
-        check(Width::Avx512, |c| c.vector(ADD, 17, 2, Place::Register(30), None), &[0x62, 0x81, 0xed, 0x48, 0x58, 0xce]);
+        check(
+            Width::Avx512,
+            |c| c.vector(ADD, 17, 2, Place::Register(30), None),
+            &[0x62, 0x81, 0xed, 0x48, 0x58, 0xce],
+        );
         // vfmadd231pd ymm9, ymm1, [r8+0x100]
         check(
             Width::Avx2,
@@ -309,11 +313,7 @@ mod tests {
         // vgatherqpd ymm1, [rsi+ymm10*8+0x40], ymm3
         check(Width::Avx2, |c| c.gather(1, 10, 3, 0x40), &[0xc4, 0xa2, 0xe5, 0x93, 0x8c, 0xd6, 0x40, 0, 0, 0]);
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
-        check(
-            Width::Avx512,
-            |c| c.gather(17, 26, 2, 0x200),
-            &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0],
-        );
+        check(Width::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9
         check(
             Width::Avx512,

@@ -25,8 +25,8 @@ use crate::ir::verify::{Stage, verify};
 use abi::lanes::{Lanes, LanesEntry};
 use abi::{Layout, Slot};
 use body::{Body, Home};
-use encode::{Assembler, Base};
 pub use encode::Width;
+use encode::{Assembler, Base};
 use encode::{Place, instructions};
 use select::{Node, Nodes, What, select};
 use std::collections::{HashMap, HashSet};
@@ -142,7 +142,9 @@ fn generate(func: &Func, layout: &Layout, width: Width, vectors: usize) -> Resul
         code.jump(&[0x0f, 0x84]) // jz
     };
     let mut most = 0;
-    let store_once = |node: Node| once.iter().position(|known| *known == node).map(|index| Home { base: Base::Block, begin: once_at, index });
+    let store_once = |node: Node| {
+        once.iter().position(|known| *known == node).map(|index| Home { base: Base::Block, begin: once_at, index })
+    };
     let mut body = Body::new(&mut code, &nodes, &before, &homes, width, vectors, spills_at);
     body.write(&|node| store_once(node).into_iter().collect(), &[]);
     most = most.max(body.spilled());

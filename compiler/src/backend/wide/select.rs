@@ -32,7 +32,12 @@ pub enum What {
     /// An instruction of one operand, with an immediate.
     One(Instruction, Option<u8>, Node),
     /// ±a · b + c
-    Fma { negated: bool, a: Node, b: Node, c: Node },
+    Fma {
+        negated: bool,
+        a: Node,
+        b: Node,
+        c: Node,
+    },
     /// Left, right, or right with the sign, by a constant.
     Shift(Direction, Node, u8),
     /// Comparison of reals: LT, LE or EQ of the manual, quiet.
@@ -49,7 +54,10 @@ pub enum What {
     /// The same of masks.
     MaskSelect(Node, Node, Node),
     /// Entries of the table at `base`, at indices that lie inside.
-    Gather { base: u32, index: Node },
+    Gather {
+        base: u32,
+        index: Node,
+    },
 }
 
 /// Of a shift.
@@ -84,11 +92,7 @@ impl What {
     pub fn is_mask(self, width: Width) -> bool {
         match self {
             What::Compare(..) | What::CompareInt(..) => width == Width::Avx512,
-            What::Mask(_)
-            | What::MaskAnd(..)
-            | What::MaskOr(..)
-            | What::MaskNot(_)
-            | What::MaskSelect(..) => true,
+            What::Mask(_) | What::MaskAnd(..) | What::MaskOr(..) | What::MaskNot(_) | What::MaskSelect(..) => true,
             What::Load(_)
             | What::Constant(_)
             | What::Two(..)
