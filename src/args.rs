@@ -36,15 +36,12 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
-<<<<<<< HEAD
     /// Make C or machine code of a model, to take away
     Build(Build),
-=======
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
     /// Compute a rig's log again and compare every output to the bit
     Replay(Replay),
->>>>>>> main
     /// Find mistakes without running anything
     Check(Check),
     /// Rewrite files in the one canonical layout
@@ -72,13 +69,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-<<<<<<< HEAD
-            "run", "test", "sweep", "linearise", "build", "check", "fmt", "explain", "characterise", "compare", "doc", "repl",
-            "watch", "new", "completions",
-=======
-            "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "new", "completions",
->>>>>>> main
+            "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
+            "compare", "doc", "repl", "watch", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -240,7 +232,6 @@ pub struct Linearise {
     pub out: Option<PathBuf>,
 }
 
-<<<<<<< HEAD
 /// `fric build`
 #[derive(clap::Args, Debug)]
 pub struct Build {
@@ -268,7 +259,8 @@ pub struct Build {
     /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
     #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
-=======
+}
+
 /// `fric hil`
 #[derive(clap::Args, Debug)]
 #[command(after_help = HIL_HELP)]
@@ -346,7 +338,6 @@ pub struct Replay {
     /// Interpret instead of making machine code: the bits are the same
     #[arg(long)]
     pub interpret: bool,
->>>>>>> main
 }
 
 /// `fric check`

@@ -50,12 +50,9 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
-<<<<<<< HEAD
         Command::Build(build) => build::build(build, terminal),
-=======
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
->>>>>>> main
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),
