@@ -144,17 +144,17 @@ fn error_frames_are_events_and_never_frames() {
         (event, bus.health())
     };
     let controller = |flags: u8| [0, flags, 0, 0, 0, 0, 0, 0];
-    assert_eq!(say(libc::CAN_ERR_CRTL as u32, controller(0x0C)).0, Event::Warning);
-    let (event, health) = say(libc::CAN_ERR_CRTL as u32 | 0x200, [0, 0x30, 0, 0, 0, 0, 130, 140]);
+    assert_eq!(say(libc::CAN_ERR_CRTL, controller(0x0C)).0, Event::Warning);
+    let (event, health) = say(libc::CAN_ERR_CRTL | 0x200, [0, 0x30, 0, 0, 0, 0, 130, 140]);
     assert_eq!((event, health.state), (Event::Passive, State::Passive));
     assert_eq!((health.transmit_errors, health.receive_errors), (130, 140));
-    assert_eq!(say(libc::CAN_ERR_ACK as u32, [0; 8]).0, Event::NotAcknowledged);
-    assert_eq!(say(libc::CAN_ERR_PROT as u32, [0; 8]).0, Event::Error);
-    let (event, health) = say(libc::CAN_ERR_CRTL as u32, controller(0x01));
+    assert_eq!(say(libc::CAN_ERR_ACK, [0; 8]).0, Event::NotAcknowledged);
+    assert_eq!(say(libc::CAN_ERR_PROT, [0; 8]).0, Event::Error);
+    let (event, health) = say(libc::CAN_ERR_CRTL, controller(0x01));
     assert_eq!((event, health.lost), (Event::Lost(1), 1));
-    let (event, health) = say(libc::CAN_ERR_BUSOFF as u32, [0; 8]);
+    let (event, health) = say(libc::CAN_ERR_BUSOFF, [0; 8]);
     assert_eq!((event, health.state), (Event::BusOff, State::BusOff));
-    let (event, health) = say(libc::CAN_ERR_RESTARTED as u32, [0; 8]);
+    let (event, health) = say(libc::CAN_ERR_RESTARTED, [0; 8]);
     assert_eq!((event, health.state, health.lost), (Event::Restarted, State::Active, 1));
 }
 

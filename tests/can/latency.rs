@@ -13,7 +13,6 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fs::File;
 use std::io::Write;
-use std::os::fd::AsRawFd;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Once};
 use std::time::Duration;
@@ -64,7 +63,7 @@ impl Outcome {
 #[derive(Clone, Copy, PartialEq)]
 enum Planted {
     Nothing,
-    /// A lock that a thread without priority holds for two periods.
+    /// A lock that a thread without priority holds for three periods, again and again.
     Lock,
     Allocation,
     /// A line of a log.
@@ -104,9 +103,7 @@ fn run(plan: &Plan) -> Outcome {
             while !over.load(Ordering::Relaxed) {
                 let mut held = lock.lock().expect("nobody panics");
                 *held += 1;
-                std::thread::sleep(2 * period);
-                drop(held);
-                std::thread::sleep(period);
+                std::thread::sleep(3 * period);
             }
         })
     });

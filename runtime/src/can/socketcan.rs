@@ -6,7 +6,7 @@
 use super::descriptor;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
 use crate::clock::{Clock, Monotonic};
-use socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl};
+use ::socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl};
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};
 
@@ -77,7 +77,7 @@ pub fn make_virtual(name: &str) -> Result<(), String> {
 
 /// Sets the bit rate of an interface and takes it up: needs CAP_NET_ADMIN.
 pub fn take_up(name: &str, bit_rate: Option<u32>) -> Result<(), String> {
-    let set = || -> Result<(), socketcan::Error> {
+    let set = || -> Result<(), ::socketcan::Error> {
         let interface = CanInterface::open(name)?;
         if let Some(bit_rate) = bit_rate {
             interface.set_bitrate(bit_rate, None)?;
