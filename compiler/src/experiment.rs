@@ -11,7 +11,7 @@ use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
-use crate::{causality, checks};
+use crate::{causality, checks, delays};
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -515,8 +515,13 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request =
-        Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
+    let request = Request {
+        instance: Instance::Written(&parts.run.instance, root),
+        overrides,
+        observed,
+        data: data.to_vec(),
+        frame: None,
+    };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
@@ -563,6 +568,7 @@ fn variant(
     if solver.method != Method::Adaptive {
         let at = step.map(|at| system.span(nodes[at]));
         checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+        delays::fits(&system, solver.step, at, &mut reader.diagnostics);
         if duration / solver.step > MOST_STEPS {
             let steps = units::three_digits(duration / solver.step);
             let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
@@ -595,6 +601,9 @@ fn variant(
     warnings.extend(diagnostics);
     on_stage("lower");
     let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);
+    if solver.method != Method::Adaptive {
+        program.size_rings(solver.step);
+    }
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
         root.text = surface_text(loaded, &root.text);
@@ -635,7 +644,8 @@ fn variant(
     let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
-    let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };
+    let experiment =
+        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners };
     let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
         let quantity = program.description.quantity(moved)?;
         Some((path.clone(), quantity.slot))

@@ -186,6 +186,7 @@ impl Model {
             quantities,
             ticks: ticks.collect(),
             automata: automata.collect(),
+            delays: Vec::new(),
             guards,
             roots: self.roots.iter().map(|text| Root { text: (*text).into(), decides: true }).collect(),
             pool: Arc::new([]),
@@ -330,7 +331,15 @@ pub fn slot(instance: &Instance, path: &str) -> Slot {
 /// An experiment that neither draws nor expects.
 pub fn fixed(duration: f64, step: f64) -> Experiment {
     let solver = Solver { method: Method::Rk4, step, tol: 0.0 };
-    Experiment { name: "test".into(), duration, solver, plots: Vec::new(), expects: Vec::new(), corners: Vec::new() }
+    Experiment {
+        name: "test".into(),
+        duration,
+        solver,
+        bench: None,
+        plots: Vec::new(),
+        expects: Vec::new(),
+        corners: Vec::new(),
+    }
 }
 
 /// An adaptive experiment that neither draws nor expects.

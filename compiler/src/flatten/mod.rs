@@ -5,6 +5,7 @@
 
 mod equations;
 mod expressions;
+mod frame;
 mod instances;
 
 use crate::names::nearest;
@@ -18,8 +19,14 @@ use grammar::span::{FileId, Span};
 use std::collections::HashMap;
 use std::rc::Rc;
 
+pub use frame::{Frame, Framed, Node as BusNode, Scope};
+
 /// Most quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;
+/// Most operations of one instance with all its parts.
+pub const MOST_NODES: usize = 2_000_000;
+/// Most operations of a function on its own.
+const MOST_NODES_OF_ITEM: usize = 100_000;
 /// For so many unknown names a suggestion is looked for; the rest is hardly read.
 const MOST_SUGGESTIONS: usize = 50;
 /// Deepest nesting of parts in parts, and of functions in functions.
@@ -35,6 +42,8 @@ pub struct Request<'a> {
     pub observed: Vec<&'a Expr>,
     /// Recordings that may be read as `data.NAME`: the number of the table.
     pub data: Vec<(String, Table, Unit)>,
+    /// The rig around the instance.
+    pub frame: Option<Frame<'a>>,
 }
 
 /// The instance of a [`Request`].
@@ -71,6 +80,8 @@ pub struct Flat {
     pub system: System,
     /// One node for each observed expression.
     pub observed: Vec<ExprId>,
+    /// Where the rig came to lie.
+    pub framed: Option<Framed>,
     /// What is wrong.
     pub diagnostics: Vec<Diagnostic>,
 }
@@ -88,6 +99,15 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         .iter()
         .map(|o| Change { path: &o.path.segments, span: o.path.span, value: o.value, env: Env::file(o.file) })
         .collect();
+    // A change of a drive or of a part of the rig is none of the instance.
+    let of_frame = |change: &Change| {
+        let head = &change.path[0].name.text;
+        request.frame.as_ref().is_some_and(|frame| {
+            frame.nodes.iter().any(|node| node.name.text == *head)
+                || frame.parts.iter().any(|part| part.name.text == *head)
+        })
+    };
+    let (around, overrides): (Vec<Change>, Vec<Change>) = overrides.into_iter().partition(of_frame);
     match &request.instance {
         Instance::Written(instance, file) => {
             let env = Env::file(*file);
@@ -99,8 +119,17 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             f.instantiate(model, *file, made, true);
         }
     }
+    let mut framed = match (&request.frame, f.instances.is_empty()) {
+        (Some(frame), false) => Some(f.surround(frame, &around)),
+        _ => None,
+    };
     for index in 0..f.instances.len() {
-        f.define(InstanceId(index as u32));
+        if !f.instances[index].scope {
+            f.define(InstanceId(index as u32));
+        }
+    }
+    if let (Some(frame), Some(framed)) = (&request.frame, &mut framed) {
+        f.framed(frame, framed);
     }
     for arg in std::mem::take(&mut f.dropped) {
         if let ArgValue::Expr(expr) = arg.value {
@@ -112,17 +141,22 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             let file = match &request.instance {
                 Instance::Written(_, file) | Instance::Alone(_, file) => *file,
             };
-            let env = Env { instance: Some(InstanceId(0)), outside: true, ..Env::file(file) };
+            let instance = framed.as_ref().map_or(InstanceId(0), |framed| framed.rig);
+            let env = Env { instance: Some(instance), outside: true, ..Env::file(file) };
             request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
         }
         None => Vec::new(),
     };
-    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+    if f.too_large {
+        // Nobody looks at what is refused.
+        f.system = System::default();
+    }
+    Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
 }
 
 /// Reads a function, constant or table on its own: a function's arguments come from outside.
 pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
-    let mut f = Flattener::new(loaded, sources);
+    let mut f = Flattener { most_nodes: MOST_NODES_OF_ITEM, ..Flattener::new(loaded, sources) };
     let env = Env::file(file);
     let observed = match item {
         Item::Function(function) => {
@@ -159,7 +193,10 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
         }
         _ => Vec::new(),
     };
-    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+    if f.too_large {
+        f.system = System::default();
+    }
+    Flat { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
 }
 
 struct Flattener<'a> {
@@ -183,6 +220,9 @@ struct Flattener<'a> {
     unknowns: usize,
     /// Wiring of slots that the present model has no port for: another model may read it.
     dropped: Vec<Arg<'a>>,
+    /// Most operations, and whether it has been reported that there are more.
+    most_nodes: usize,
+    too_large: bool,
     /// Parts whose name is taken, and reported.
     refused_parts: Vec<Span>,
     /// Quantities whose definition was refused, and reported.
@@ -197,6 +237,10 @@ struct Tree<'a> {
     names: HashMap<&'a str, Binding>,
     args: Vec<Arg<'a>>,
     alone: bool,
+    /// A drive or device: inputs come from the bus.
+    on_bus: bool,
+    /// A rig, which only lends its names.
+    scope: bool,
     locals: Locals,
 }
 
@@ -292,6 +336,8 @@ impl<'a> Flattener<'a> {
             models: Vec::new(),
             refused: Vec::new(),
             unknowns: 0,
+            most_nodes: MOST_NODES,
+            too_large: false,
             refused_parts: Vec::new(),
             dropped: Vec::new(),
             data: HashMap::new(),
@@ -300,6 +346,23 @@ impl<'a> Flattener<'a> {
 
     fn report(&mut self, diagnostic: Diagnostic) {
         self.diagnostics.push(diagnostic);
+    }
+
+    /// Whether the program has grown too large to go on: reported once, at a place where it grows.
+    fn full(&mut self, span: Span) -> bool {
+        let made = self.system.vars.len() + self.system.instances.len();
+        let (most, what) = match () {
+            () if made > MOST_VARS => (MOST_VARS, "quantities and parts"),
+            () if self.system.nodes.len() > self.most_nodes => (self.most_nodes, "operations"),
+            () => return false,
+        };
+        if !std::mem::replace(&mut self.too_large, true) {
+            let error = Diagnostic::error("E0502", format!("more than {most} {what}"))
+                .label(span, "it is still growing here")
+                .help("a program of this size is refused: use fewer parts, or let each do more");
+            self.report(error);
+        }
+        true
     }
 }
 
