@@ -121,6 +121,9 @@ const SIGN: u64 = 1 << 63;
 /// # Errors
 /// If a width has no instructions for an operation.
 pub fn select(func: &Func, width: Width) -> Result<Nodes, Unsupported> {
+    if !func.writes.is_empty() {
+        return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
+    }
     let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
     let types = verify::types(func).expect("the function is sound");
     let live = func.live();
@@ -192,6 +195,7 @@ impl Selection {
                 let index = self.inside(func, index, len, of);
                 What::Gather { base, index }
             }
+            Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
             Op::Add(a, b) => What::Two(i::ADD, true, at(a), at(b)),
             Op::Sub(a, b) => What::Two(i::SUB, false, at(a), at(b)),
             Op::Mul(a, b) => What::Two(i::MUL, true, at(a), at(b)),
