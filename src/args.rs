@@ -76,13 +76,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-<<<<<<< HEAD
             "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
-            "compare", "doc", "repl", "watch", "new", "completions",
-=======
-            "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
->>>>>>> main
+            "compare", "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
