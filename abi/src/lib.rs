@@ -10,6 +10,7 @@ pub mod rodas5p;
 pub mod table;
 pub mod series;
 pub mod instance;
+pub mod lanes;
 pub mod rig;
 pub mod plan;
 pub mod encode;
