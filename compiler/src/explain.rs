@@ -39,7 +39,7 @@ pub struct Explanation {
     /// The largest step, in s, that is stable at the bounds of the declared ranges, of each method of which it is known;
     /// at most 1 s.
     pub stable: Vec<(Method, f64)>,
-    /// Bytes of the block of one instance, without room for adaptive steps.
+    /// Bytes of the block of one instance that takes fixed steps.
     pub bytes: usize,
     /// What is stored, as written: for models that say it.
     pub storage: Vec<String>,
@@ -134,7 +134,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
             .filter(|method| *method != Method::Adaptive)
             .filter_map(|method| Some((method, stability::largest(&program, method)?)))
             .collect(),
-        bytes: 8 * (program.description.layout.size() - program.description.layout.trial.len as usize),
+        bytes: 8 * program.description.layout.size(),
         storage: system.storages.iter().map(|(_, energy)| one_line(files, system.span(*energy))).collect(),
         rate_independent: rate_independent(system),
         dissipation: friction::dissipation(system, types),
