@@ -197,7 +197,6 @@ fn bound(state: &Quantity) -> (f64, bool) {
 /// The step of a method and the equations, with their derivatives along the states.
 struct Map<'p> {
     program: &'p Program,
-    method: Method,
     start: Func,
     /// Writes d(step)/dx into the segment `jacobian`.
     step: Func,
@@ -234,7 +233,7 @@ impl<'p> Map<'p> {
         block[layout.params.range()].copy_from_slice(&program.params);
         // Twenty products of matrices for each of two spectral radii.
         let cost = step.ops.len() + rates.ops.len() + 60 * n * n * n;
-        Some(Map { program, method, start: expand(&program.start), step, rates, block, cost })
+        Some(Map { program, start: expand(&program.start), step, rates, block, cost })
     }
 
     fn state(&self, i: usize) -> Option<&'p Quantity> {
