@@ -37,6 +37,8 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
+    /// Time the step of an experiment: alone, in lanes, on all cores
+    Bench(Bench),
     /// Make C or machine code of a model, to take away
     Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
@@ -76,7 +78,7 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
+            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
             "compare", "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
@@ -237,6 +239,28 @@ pub struct Linearise {
     /// Write A, B, C, D to a file: .npz, .mat or .json
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
     pub out: Option<PathBuf>,
+}
+
+/// `fric bench`
+#[derive(clap::Args, Debug)]
+pub struct Bench {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The experiment in it to time
+    pub experiment: String,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Print a JSON object
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `fric build`

@@ -1,5 +1,6 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod bench;
 mod bench_rt;
 mod build;
 mod bus;
@@ -53,6 +54,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Bench(args) => bench::bench(args, terminal),
         Command::Build(build) => build::build(build, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
