@@ -17,7 +17,9 @@ pub mod fieldbus;
 pub mod hooks;
 pub mod simulated;
 pub mod bench;
+pub mod attend;
 
+pub use attend::attend;
 pub use bench::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 pub use hooks::{Effect, Hook, Start};

@@ -160,6 +160,11 @@ fn approach(x: f64) -> f64 {
     1.0 - power
 }
 
+/// `x`, or where it tends to once it is as good as there: what is left must not linger as ever smaller numbers.
+fn near(x: f64, end: f64) -> f64 {
+    if (x - end).abs() < 1e-12 { end } else { x }
+}
+
 /// A wave between −1 and 1 with period 1.
 fn triangle(x: f64) -> f64 {
     4.0 * (x - (x + 0.5).floor()).abs() - 1.0
@@ -608,7 +613,7 @@ impl SimulatedDrive {
             self.shares = (h, lag, approach(h / self.profile.speed_lag));
         }
         let (_, lag, filter) = self.shares;
-        self.speed_filtered += (shaft.1 - self.speed_filtered) * filter;
+        self.speed_filtered = near(self.speed_filtered + (shaft.1 - self.speed_filtered) * filter, shaft.1);
         let refresh = self.profile.refresh_ns;
         if refresh == 0 || t_ns % refresh < (h * 1e9) as u64 {
             while self.waiting > 0 && self.queue[self.first].0 <= t_ns {
@@ -626,8 +631,8 @@ impl SimulatedDrive {
         };
         let permitted = wanted.clamp(self.parameters.low, self.parameters.high);
         self.limited = permitted != wanted;
-        self.torque += (permitted - self.torque) * lag;
-        if self.wrong.torque_off || !self.machine.state().powered() && permitted == 0.0 && self.torque.abs() < 1e-9 {
+        self.torque = near(self.torque + (permitted - self.torque) * lag, permitted);
+        if self.wrong.torque_off {
             self.torque = 0.0;
         }
     }

@@ -537,3 +537,50 @@ fn hooks_are_read_or_refused_in_words() {
         assert!(error.contains(word), "{text}: {error}");
     }
 }
+
+/// The start-up over a bus with its bit times: what the table does at once takes its time here.
+#[test]
+fn two_drives_start_up_over_a_bus() {
+    use crate::can::sim::Simulation;
+    use crate::can::{Bus, Received};
+    use crate::clock::Clock;
+    let rig = rig(Mode::Torque);
+    let simulation = Simulation::new();
+    let bus = simulation.bus("can0", 1_000_000);
+    let mut master = bus.port("fric");
+    let bench = Bench::new(&rig, Some(shaft(0.012, 0.001)), 7).unwrap();
+    let bench = attend(&simulation, &[bus], &rig, bench);
+    let mut fieldbus = Fieldbus::new(&rig, Options::default()).unwrap();
+    let (mut tick, mut late) = (0, 0);
+    while fieldbus.step() != Step::Armed {
+        tick += 1;
+        assert!(tick < 20_000, "stays at {:?}", fieldbus.step());
+        let start_ns = tick * rig.period_ns;
+        simulation.sleep_until(start_ns);
+        fieldbus.begin(start_ns, &mut |_, frame| master.send(frame).unwrap());
+        for share in [60, 95] {
+            simulation.sleep_until(start_ns + rig.period_ns * share / 100);
+            while let Some(received) = master.receive() {
+                let Received::Frame(frame, stamp_ns) = received else { panic!("{received:?}") };
+                late +=
+                    u64::from(share == 95 && fieldbus.step() == Step::AwaitArm && (0x180..0x300).contains(&frame.id()));
+                fieldbus.receive(0, &frame, stamp_ns, &mut |_, frame| master.send(frame).unwrap());
+            }
+            if share == 60 {
+                for output in &rig.outputs {
+                    fieldbus.command(output.signal, fieldbus.wanted(output.signal));
+                }
+                fieldbus.end(simulation.now_ns(), &mut |_, frame| master.send(frame).unwrap());
+            }
+        }
+        match fieldbus.step() {
+            Step::AwaitEnable => _ = fieldbus.request(Request::Enable),
+            Step::AwaitArm => _ = fieldbus.request(Request::Arm),
+            Step::Refused => panic!("{}", fieldbus.explain(fieldbus.refusal().unwrap())),
+            _ => {}
+        }
+    }
+    assert_eq!(late, 0, "all answers come in the first 0.6 of the period");
+    assert_eq!(bench.borrow().shaft(LOAD).torque, 0.0);
+    assert_eq!(master.health().lost, 0);
+}
