@@ -4,6 +4,7 @@ mod characterise;
 mod check;
 mod cross;
 mod doc;
+mod drives;
 mod explain;
 mod fmt;
 mod linearise;
@@ -51,6 +52,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
         Command::New(new) => new::new(new, terminal),

@@ -6,6 +6,7 @@
 
 use super::Send;
 use super::device::Device;
+use super::identify::{self, Identified, Steps};
 use super::master::{Drive, Limits, Setting, Status};
 use super::profiles::{self, Transport};
 use super::script::Watching;
@@ -33,6 +34,8 @@ pub struct Options {
     pub timeout_test: bool,
     /// The drives are simulated, whatever their transport.
     pub simulated: bool,
+    /// After the first motion, torque drives are measured.
+    pub identify: bool,
 }
 
 impl Default for Options {
@@ -44,6 +47,7 @@ impl Default for Options {
             sign_test: SignTest::Push,
             timeout_test: true,
             simulated: false,
+            identify: false,
         }
     }
 }
@@ -75,6 +79,8 @@ pub enum Step {
     Reenable,
     /// The first motion.
     SignTest,
+    /// Delay, lag and inertia are measured.
+    Identify,
     /// Waits for the operator's [`Request::Arm`].
     AwaitArm,
     /// Commands act.
@@ -100,6 +106,7 @@ impl fmt::Display for Step {
             Step::TimeoutTest => "testing the time-outs",
             Step::Reenable => "enabling again",
             Step::SignTest => "testing signs and scales",
+            Step::Identify => "measuring the drives",
             Step::AwaitArm => "waiting to be armed",
             Step::Armed => "armed",
             Step::Stopped => "stopped",
@@ -172,6 +179,11 @@ pub struct Fieldbus {
     missed: Vec<u32>,
     answers: u32,
     push: Option<(usize, Push)>,
+    steps: Option<(usize, Steps)>,
+    identified: Vec<Option<Identified>>,
+    /// When SYNC and commands went out last.
+    began_ns: u64,
+    sent_ns: u64,
     wanted: Vec<f64>,
     troubles: [Option<Trouble>; TROUBLES],
     lost_troubles: u64,
@@ -243,6 +255,10 @@ impl Fieldbus {
             refusal: None,
             answers: 0,
             push: None,
+            steps: None,
+            identified: vec![None; rig.nodes.len()],
+            began_ns: 0,
+            sent_ns: 0,
             troubles: [None; TROUBLES],
             lost_troubles: 0,
         };
@@ -461,7 +477,7 @@ impl Fieldbus {
         (self.step, self.since_ns, self.silent_since_ns) = (step, None, None);
         self.done.fill(false);
         self.wanted.fill(0.0);
-        self.push = None;
+        (self.push, self.steps) = (None, None);
     }
 
     fn aim(&mut self, goal: Goal, resets: bool) {
@@ -506,7 +522,8 @@ impl Fieldbus {
     }
 
     /// A tick begins: SYNC goes out, and everything known is a tick older.
-    pub fn begin(&mut self, _now_ns: u64, send: Send) {
+    pub fn begin(&mut self, now_ns: u64, send: Send) {
+        self.began_ns = now_ns;
         for node in &mut self.nodes {
             match node {
                 Node::Drive(drive) => drive.begin(),
@@ -546,6 +563,7 @@ impl Fieldbus {
         }
         self.live(now_ns, send);
         self.start(now_ns, send);
+        self.sent_ns = now_ns;
     }
 
     /// Our heartbeat and guard requests, unless a test holds them back.
@@ -665,7 +683,8 @@ impl Fieldbus {
             Step::AwaitEnable | Step::AwaitArm | Step::Armed | Step::Stopped | Step::Refused => {}
             Step::Enable | Step::Reenable => self.enable(lasted_ns, send),
             Step::TimeoutTest => self.test_timeouts(now_ns, lasted_ns, send),
-            Step::SignTest => self.test_signs(send),
+            Step::SignTest => self.test_signs(),
+            Step::Identify => self.identify(),
         }
     }
 
@@ -702,6 +721,7 @@ impl Fieldbus {
             }
             return self.go(match (again, self.options.timeout_test) {
                 (false, true) => Step::TimeoutTest,
+                _ if self.options.sign_test == SignTest::Skip && self.options.identify => Step::Identify,
                 _ if self.options.sign_test == SignTest::Skip => Step::AwaitArm,
                 _ => Step::SignTest,
             });
@@ -751,15 +771,12 @@ impl Fieldbus {
     }
 
     /// One drive after the other.
-    fn test_signs(&mut self, _send: Send) {
+    fn test_signs(&mut self) {
         let by_hand = self.options.sign_test == SignTest::ByHand;
         if self.push.is_none() {
             let next = (0..self.nodes.len()).find(|at| drive_of(&self.nodes[*at]).is_some() && !self.done[*at]);
             let Some(at) = next else {
-                for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
-                    drive.rest();
-                }
-                return self.go(Step::AwaitArm);
+                return self.moved();
             };
             let drive = drive_of(&self.nodes[at]).expect("found as one");
             if drive.reading(What::Position).is_none() {
@@ -772,13 +789,7 @@ impl Fieldbus {
         let Some((at, push)) = &mut self.push else { return };
         let at = *at;
         let drive = drive_of(&self.nodes[at]).expect("found as one");
-        let value = |what| drive.reading(what).map(|reading| reading.value);
-        let sample = Sample {
-            position: value(What::Position).unwrap_or(0.0),
-            speed: value(What::Speed),
-            torque: value(What::Torque),
-        };
-        match push.tick(sample, self.period_ns as f64 * 1e-9) {
+        match push.tick(sample(drive), self.period_ns as f64 * 1e-9) {
             Verdict::Wants(command) => self.wanted[at] = command,
             Verdict::Right => {
                 (self.done[at], self.wanted[at], self.push) = (true, 0.0, None);
@@ -786,6 +797,47 @@ impl Fieldbus {
             Verdict::Wrong(why) => self.refuse(Some(at), why),
         }
     }
+
+    /// The motions of the start-up are over: angles count from here.
+    fn moved(&mut self) {
+        for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
+            drive.rest();
+        }
+        let measured = self.step == Step::Identify || !self.options.identify;
+        self.go(if measured { Step::AwaitArm } else { Step::Identify });
+    }
+
+    /// One torque drive after the other.
+    fn identify(&mut self) {
+        let torque = |node: &Node| drive_of(node).is_some_and(|drive| drive.config().mode == Mode::Torque);
+        if self.steps.is_none() {
+            let next = (0..self.nodes.len()).find(|at| torque(&self.nodes[*at]) && !self.done[*at]);
+            let Some(at) = next else { return self.moved() };
+            let limits = drive_of(&self.nodes[at]).expect("found as one").limits();
+            self.steps = Some((at, Steps::new(0.3 * limits.torque, 2.0, 0.3 * limits.speed)));
+        }
+        let Some((at, steps)) = &mut self.steps else { return };
+        let at = *at;
+        let drive = drive_of(&self.nodes[at]).expect("found as one");
+        match steps.tick(sample(drive), self.began_ns, self.sent_ns, self.period_ns as f64 * 1e-9) {
+            identify::Progress::Wants(command) => self.wanted[at] = command,
+            identify::Progress::Done(found) => {
+                (self.identified[at], self.done[at], self.wanted[at], self.steps) = (Some(found), true, 0.0, None);
+            }
+            identify::Progress::Wrong(why) => self.refuse(Some(at), why),
+        }
+    }
+
+    /// What was measured of a drive, if [`Options::identify`] asked for it.
+    pub fn identified(&self, node: usize) -> Option<Identified> {
+        self.identified[node]
+    }
+}
+
+/// What a drive says.
+fn sample(drive: &Drive) -> Sample {
+    let value = |what| drive.reading(what).map(|reading| reading.value);
+    Sample { position: value(What::Position).unwrap_or(0.0), speed: value(What::Speed), torque: value(What::Torque) }
 }
 
 /// What the first motion of a drive may use.

@@ -11,6 +11,7 @@ pub mod frames;
 pub mod trouble;
 pub mod script;
 pub mod sign;
+pub mod identify;
 pub mod master;
 pub mod device;
 pub mod fieldbus;
@@ -23,6 +24,7 @@ pub use attend::attend;
 pub use bench::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 pub use hooks::{Effect, Hook, Start};
+pub use identify::Identified;
 pub use master::{Limits, Status};
 pub use trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 

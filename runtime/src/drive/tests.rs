@@ -584,3 +584,24 @@ fn two_drives_start_up_over_a_bus() {
     assert_eq!(bench.borrow().shaft(LOAD).torque, 0.0);
     assert_eq!(master.health().lost, 0);
 }
+
+#[test]
+fn delay_lag_and_inertia_are_measured() {
+    for (delay, lag, inertia) in [(0.8e-3, 0.6e-3, 0.012), (2.3e-3, 1.5e-3, 0.03), (0.2e-3, 0.4e-3, 0.006)] {
+        let mut rig = rig(Mode::Torque);
+        for node in [LOAD, SERVO] {
+            (rig.nodes[node].delay, rig.nodes[node].lag) = (delay, lag);
+        }
+        let options = Options { identify: true, ..Options::default() };
+        let mut table = Table::new(&rig, Some(shaft(inertia, 0.001)), options);
+        table.arm();
+        for node in [LOAD, SERVO] {
+            let found = table.fieldbus.identified(node).expect("measured");
+            assert!((found.delay - delay).abs() < 0.05e-3, "{found:?} for {delay}");
+            assert!((found.lag.expect("seen") / lag - 1.0).abs() < 0.1, "{found:?} for {lag}");
+            assert!((found.inertia.expect("turned") / inertia - 1.0).abs() < 0.02, "{found:?} for {inertia}");
+        }
+        let shaft = table.bench.shaft(LOAD);
+        assert!(shaft.speed.abs() < 0.5, "{shaft:?}");
+    }
+}
