@@ -12,6 +12,7 @@ mod compile;
 mod diagram;
 mod equations;
 mod figure;
+mod kept;
 mod matrices;
 mod plot;
 mod project;
@@ -32,5 +33,6 @@ fn main() -> ExitCode {
         End::Fine => ExitCode::SUCCESS,
         End::Failed => ExitCode::from(1),
         End::Misused => ExitCode::from(2),
+        End::Stopped => ExitCode::from(3),
     }
 }

@@ -207,7 +207,7 @@ impl Prompt<'_> {
                 }
                 return match super::watch::follow(&file, &name, false, self.session, self.terminal) {
                     End::Fine => Ok(Next::Line),
-                    End::Failed | End::Misused => Ok(Next::Missed),
+                    End::Failed | End::Misused | End::Stopped => Ok(Next::Missed),
                 };
             }
             Command::Characterise => self.characterise(rest)?,
@@ -356,7 +356,7 @@ impl Prompt<'_> {
         let (explanation, path) = self.session.explained(rest)?;
         match path {
             Some(path) if !path.is_empty() => self.quantity(&explanation, &path),
-            _ => super::explain::tell(&explanation, self.terminal),
+            _ => super::explain::tell(&explanation, &[], self.terminal),
         }
         Ok(())
     }
@@ -513,7 +513,7 @@ impl Prompt<'_> {
         };
         match super::characterise::characterise(&args, self.terminal) {
             End::Fine => Ok(()),
-            End::Failed | End::Misused => Err("it could not be characterised".into()),
+            End::Failed | End::Misused | End::Stopped => Err("it could not be characterised".into()),
         }
     }
 
