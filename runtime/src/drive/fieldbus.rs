@@ -146,6 +146,8 @@ const CONFIGURE_NS: u64 = 20_000_000_000;
 const START_NS: u64 = 1_000_000_000;
 const MODE_NS: u64 = 1_000_000_000;
 const ENABLE_NS: u64 = 5_000_000_000;
+/// Angle by which a shaft is turned from outside, rad.
+const BY_HAND: f64 = 0.2;
 /// How long our life sign goes on at rest before it stops.
 const CALM_NS: u64 = 50_000_000;
 
@@ -178,7 +180,8 @@ pub struct Fieldbus {
     done: Vec<bool>,
     missed: Vec<u32>,
     answers: u32,
-    push: Option<(usize, Push)>,
+    /// The drive under test; the drive that turns it where it can't turn by itself.
+    push: Option<(usize, Push, Option<usize>)>,
     steps: Option<(usize, Steps)>,
     identified: Vec<Option<Identified>>,
     /// When SYNC and commands went out last.
@@ -213,6 +216,7 @@ impl Fieldbus {
                         watchdog_ns: rig.watchdog_ns,
                         slew: outputs().map(|output| output.slew).fold(f64::INFINITY, f64::min),
                         safe: outputs().next().map_or(0.0, |output| output.safe),
+                        most: outputs().map(|output| output.high.min(-output.low)).fold(f64::INFINITY, f64::min),
                     };
                     Drive::new(config, profile, setting).map(|drive| Node::Drive(Box::new(drive)))
                 }
@@ -784,14 +788,34 @@ impl Fieldbus {
                 self.done[at] = true;
                 return;
             }
-            self.push = Some((at, Push::new(bounds(drive), by_hand)));
+            // A torque can't turn a shaft whose speed or position another drive holds: that one turns it.
+            let holds =
+                |at: &usize| drive_of(&self.nodes[*at]).is_some_and(|drive| drive.config().mode != Mode::Torque);
+            let holder = (0..self.nodes.len()).find(holds).filter(|_| drive.config().mode == Mode::Torque && !by_hand);
+            let (mut bounds, turned) = (bounds(drive), by_hand || holder.is_some());
+            if turned {
+                bounds.angle = BY_HAND.max(bounds.angle);
+            }
+            self.push = Some((at, Push::new(bounds, turned), holder));
         }
-        let Some((at, push)) = &mut self.push else { return };
-        let at = *at;
+        let turning = |drive: &Drive| match drive.config().mode {
+            Mode::Position => 1.5 * BY_HAND,
+            Mode::Torque | Mode::Speed => bounds(drive).command,
+        };
+        let Some((at, push, holder)) = &mut self.push else { return };
+        let (at, holder) = (*at, *holder);
         let drive = drive_of(&self.nodes[at]).expect("found as one");
         match push.tick(sample(drive), self.period_ns as f64 * 1e-9) {
-            Verdict::Wants(command) => self.wanted[at] = command,
+            Verdict::Wants(command) => {
+                self.wanted[at] = command;
+                if let Some(holder) = holder {
+                    self.wanted[holder] = drive_of(&self.nodes[holder]).map_or(0.0, turning);
+                }
+            }
             Verdict::Right => {
+                if let Some(holder) = holder {
+                    self.wanted[holder] = 0.0;
+                }
                 (self.done[at], self.wanted[at], self.push) = (true, 0.0, None);
             }
             Verdict::Wrong(why) => self.refuse(Some(at), why),
@@ -813,8 +837,9 @@ impl Fieldbus {
         if self.steps.is_none() {
             let next = (0..self.nodes.len()).find(|at| torque(&self.nodes[*at]) && !self.done[*at]);
             let Some(at) = next else { return self.moved() };
-            let limits = drive_of(&self.nodes[at]).expect("found as one").limits();
-            self.steps = Some((at, Steps::new(0.3 * limits.torque, 2.0, 0.3 * limits.speed)));
+            let drive = drive_of(&self.nodes[at]).expect("found as one");
+            let (limits, most) = (drive.limits(), drive.most());
+            self.steps = Some((at, Steps::new(0.3 * most, 2.0, 0.3 * limits.speed)));
         }
         let Some((at, steps)) = &mut self.steps else { return };
         let at = *at;
@@ -844,8 +869,8 @@ fn sample(drive: &Drive) -> Sample {
 fn bounds(drive: &Drive) -> Bounds {
     let (config, limits) = (drive.config(), drive.limits());
     let command = match config.mode {
-        Mode::Torque => 0.3 * limits.torque,
-        Mode::Speed => (0.01 * limits.speed).max(4.0 * config.speed_unit),
+        Mode::Torque => 0.3 * drive.most(),
+        Mode::Speed => (0.01 * drive.most()).max(4.0 * config.speed_unit),
         Mode::Position => 0.0,
     };
     Bounds {

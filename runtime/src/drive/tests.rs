@@ -605,3 +605,31 @@ fn delay_lag_and_inertia_are_measured() {
         assert!(shaft.speed.abs() < 0.5, "{shaft:?}");
     }
 }
+
+#[test]
+fn a_drive_that_holds_speed_turns_the_other_for_its_test() {
+    let mut rig = rig(Mode::Torque);
+    config(&mut rig, SERVO).mode = Mode::Speed;
+    rig.outputs[SERVO].signal.what = What::Speed;
+    (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-1.0, 1.0);
+    table(&rig).arm();
+    let mut table = table(&rig);
+    table.bench.hook(hooks::read("load speed scale -1 at 0 s", &rig).unwrap());
+    let refusal = table.refused();
+    assert!(refusal.starts_with("load (node 3): by its position it turned by"), "{refusal}");
+}
+
+#[test]
+fn the_first_motion_keeps_to_the_rigs_limit() {
+    let mut rig = rig(Mode::Torque);
+    (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-0.1, 0.5);
+    let mut table = table(&rig);
+    table.until(Step::AwaitEnable);
+    table.fieldbus.request(Request::Enable);
+    let mut most = 0.0f64;
+    while table.fieldbus.step() != Step::AwaitArm {
+        table.tick();
+        most = most.max(table.fieldbus.wanted(rig.outputs[LOAD].signal).abs());
+    }
+    assert!((0.005..=0.03).contains(&most), "{most} N·m");
+}
