@@ -565,9 +565,9 @@ impl Fieldbus {
                 Node::Device(device) => device.send_commands(now_ns, &mut send),
             }
         }
+        self.sent_ns = now_ns;
         self.live(now_ns, send);
         self.start(now_ns, send);
-        self.sent_ns = now_ns;
     }
 
     /// Our heartbeat and guard requests, unless a test holds them back.
