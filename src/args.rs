@@ -57,6 +57,8 @@ pub enum Command {
     Compare(Compare),
     /// Write the page of all models of the library, from its own text
     Doc(Doc),
+    /// Simulate the drives and devices of a rig on a bus that other programs can reach
+    Drives(Drives),
     /// Explore at a prompt; also what `fric` alone does
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
@@ -78,8 +80,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
-            "compare", "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
+            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
+            "characterise", "compare", "doc", "repl", "watch", "drives", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -458,6 +460,40 @@ pub struct Doc {
     /// Write nothing; fail if the page would change
     #[arg(long)]
     pub check: bool,
+}
+
+/// `fric drives`
+#[derive(clap::Args, Debug)]
+pub struct Drives {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in it; the only one if none is named
+    pub rig: Option<String>,
+    /// Serve them on another bus: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
+    #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
+    pub bus: Vec<(String, String)>,
+    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
+    pub pty: Vec<PathBuf>,
+    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    #[arg(long, value_name = "PORT")]
+    pub tcp: Option<u16>,
+    /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
+    #[arg(long, value_name = "FAULT")]
+    pub inject: Vec<String>,
+    /// Change a parameter: `m=0.02kg.m^2`, `load.delay=2ms`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// From which all that is random follows
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// End after this time, such as 10s [default: Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+    /// Don't tell how their states change
+    #[arg(long, short)]
+    pub quiet: bool,
 }
 
 /// `fric repl`

@@ -8,6 +8,7 @@ mod characterise;
 mod check;
 mod cross;
 mod doc;
+mod drives;
 mod doctor;
 mod explain;
 mod fmt;
@@ -64,6 +65,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
         Command::Bus(args) => bus::bus(args, terminal),
