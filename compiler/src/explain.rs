@@ -14,8 +14,8 @@ use crate::opt::regroup::regroup;
 use crate::program::Program;
 use crate::source::Files;
 use crate::system::*;
-use crate::units::{Types, seconds, three_digits};
-use crate::{derive, discretize, stability};
+use crate::units::{Types, three_digits};
+use crate::{derive, discretize};
 use abi::description::Slot;
 use abi::plan::Method;
 use grammar::ast::BinaryOp;
@@ -36,10 +36,7 @@ pub struct Explanation {
     pub states: Vec<Stepped>,
     /// What the fixed steps cost.
     pub steps: Vec<StepCost>,
-    /// The largest step, in s, that is stable at the bounds of the declared ranges, of each method of which it is known;
-    /// at most 1 s.
-    pub stable: Vec<(Method, f64)>,
-    /// Bytes of the block of one instance that takes fixed steps.
+    /// Bytes of the block of one instance.
     pub bytes: usize,
     /// What is stored, as written: for models that say it.
     pub storage: Vec<String>,
@@ -129,11 +126,6 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
         needs: needs(system),
         states: states(system, &program),
         steps: steps.to_vec(),
-        stable: Method::ALL
-            .into_iter()
-            .filter(|method| *method != Method::Adaptive)
-            .filter_map(|method| Some((method, stability::largest(&program, method)?)))
-            .collect(),
         bytes: 8 * program.description.layout.size(),
         storage: system.storages.iter().map(|(_, energy)| one_line(files, system.span(*energy))).collect(),
         rate_independent: rate_independent(system),
@@ -421,10 +413,21 @@ impl Stepped {
             text += &format!(
                 "; own rate {} 1/s{at}, where euler needs steps below {} and rk4 below {}",
                 three_digits(rate),
-                seconds(2.0 / rate),
-                seconds(2.785 / rate)
+                time(2.0 / rate),
+                time(2.785 / rate)
             );
         }
         text
     }
+}
+
+/// A time with a handy prefix.
+fn time(t: f64) -> String {
+    let (scale, unit) = match t {
+        t if t < 1e-6 => (1e-9, "ns"),
+        t if t < 1e-3 => (1e-6, "us"),
+        t if t < 1.0 => (1e-3, "ms"),
+        _ => (1.0, "s"),
+    };
+    format!("{} {unit}", three_digits(t / scale))
 }

@@ -13,7 +13,6 @@ pub mod elimination;
 pub mod discretize;
 pub mod rosenbrock;
 pub mod backend;
-pub mod stability;
 
 pub mod names;
 pub mod source;
@@ -536,10 +535,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();
                 match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
-                    Ok(variants) => {
-                        all.extend(warnings);
-                        all.extend(fixed_step(experiment, &variants));
-                    }
+                    Ok(_) => all.extend(warnings),
                     Err(errors) => all.extend(errors),
                 }
             }
@@ -568,32 +564,6 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
         all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
     }
     once(all)
-}
-
-/// What is to be said of the fixed step of an experiment, once for all its combinations.
-fn fixed_step(experiment: &grammar::ast::Experiment, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
-    let span = experiment.body.iter().find_map(|statement| match statement {
-        grammar::ast::ExperimentStatement::Solver(solver) => Some(solver.span),
-        _ => None,
-    });
-    // Combinations differ in a value or a part: the first few show what there is to see.
-    let (Some(span), Some(some)) = (span, variants.get(..variants.len().min(4))) else { return Vec::new() };
-    let of = |variant: &experiment::Variant| {
-        let mut found = lints::fixed_step(&variant.program, &variant.experiment.solver, span);
-        lints::silence(&variant.system, &mut found);
-        found.retain(|diagnostic| diagnostic.is_error() || !allows(experiment, diagnostic.code));
-        found
-    };
-    some.iter().map(of).find(|found| !found.is_empty()).unwrap_or_default()
-}
-
-/// Whether an experiment allows this warning.
-fn allows(experiment: &grammar::ast::Experiment, code: &str) -> bool {
-    let name = system::LINTS.iter().find(|(_, lint)| *lint == code).map(|(name, _)| *name);
-    experiment.body.iter().any(|statement| match statement {
-        grammar::ast::ExperimentStatement::Allow(allow) => Some(allow.lint.text.as_str()) == name,
-        _ => false,
-    })
 }
 
 /// Checks the models of a loaded text, each on its own, but for the physics of friction: what a run should know, in no

@@ -2,16 +2,12 @@
 //! physics of friction. Each has a name and can be silenced by `allow NAME "reason"`.
 
 use crate::domains::Prover;
-use crate::program::Program;
+use crate::friction;
 use crate::source::Files;
 use crate::system::*;
-use crate::units::{Types, seconds, three_digits};
-use crate::{friction, stability};
-use abi::description::Quantity;
-use abi::plan::{Method, Solver};
+use crate::units::Types;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
-use grammar::span::Span;
 
 /// All warnings of a model on its own; `physics`: those of friction too, which take longer.
 pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Vec<Diagnostic> {
@@ -22,59 +18,6 @@ pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Ve
         friction::check(system, types, &mut found);
     }
     found
-}
-
-/// What a fixed step makes of an experiment: E0702 and W0704, a step that is not stable; W0705, a jump it cannot settle
-/// on. `at`: the solver in the text.
-pub fn fixed_step(program: &Program, solver: &Solver, at: Span) -> Vec<Diagnostic> {
-    let Solver { method, step, .. } = *solver;
-    if method == Method::Adaptive {
-        return Vec::new();
-    }
-    let mut found = Vec::new();
-    if let Some(unstable) = stability::unstable(program, method, step) {
-        found.push(not_stable(&unstable, method, step, at));
-    }
-    if let Some(chatter) = stability::chatter(program) {
-        let stability::Chatter { condition, state, rate } = chatter;
-        let warning = Diagnostic::warning("W0705", format!("with a fixed step, `{condition}` goes to and fro"))
-            .label(at, format!("`{}` swings by {}", state.path, value(rate * step, &state)))
-            .help(
-                "the equations push towards it from both sides, where the contact would stick: use KFM or Karnopp,\n\
-                 a smooth sign, `tanh(v / v0)`, or `allow chatter \"...\"`",
-            );
-        found.push(warning);
-    }
-    found
-}
-
-fn not_stable(unstable: &stability::Unstable, method: Method, step: f64, at: Span) -> Diagnostic {
-    let stability::Unstable { state, limit, bound, declared, largest, instead } = unstable;
-    let (name, step) = (method.name(), seconds(step));
-    let looked = value(*bound, state);
-    let holds = match *limit > 0.0 {
-        true => format!("stable at {step} only for |{}| <= {}", state.path, value(*limit, state)),
-        false => format!("not stable at {step} at any `{}`", state.path),
-    };
-    let need = match *largest > 0.0 {
-        true => format!("for |{}| up to {looked} {name} needs a step of {}", state.path, seconds(*largest)),
-        false => format!("no step of {name} is stable there"),
-    };
-    let instead =
-        instead.map_or(String::new(), |method| format!(";\n`solver {} step {step}` is stable there", method.name()));
-    let (message, help) = (format!("{name} at {step} is not stable for this model"), format!("{need}{instead}"));
-    match declared {
-        true => Diagnostic::error("E0702", message).label(at, holds).help(help),
-        false => Diagnostic::warning("W0704", message).label(at, holds).help(format!(
-            "{help};\nif `{}` stays below, declare its range, or `allow large-step \"...\"`",
-            state.path
-        )),
-    }
-}
-
-/// A value of a state in its unit, to three digits.
-fn value(x: f64, state: &Quantity) -> String {
-    format!("{} {}", three_digits(state.unit.from_si(x)), state.unit).trim_end().to_string()
 }
 
 /// Takes out warnings that the model allows.

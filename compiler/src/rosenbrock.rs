@@ -25,8 +25,15 @@ use std::sync::OnceLock;
 /// more.
 const LEAST_PIVOT: f64 = 1e-6;
 
-/// The step; none of a model whose layout has no room for it.
+/// Operations of the derivatives, before functions are expanded, up to which a step is unrolled: it holds them eight times
+/// and must pay for being compiled.
+const MOST_OPERATIONS: usize = 400;
+
+/// The step; none of a model whose layout has no room for it, or whose equations are many.
 pub fn rosenbrock(program: &Program) -> Option<Func> {
+    if program.derivatives.ops.len() > MOST_OPERATIONS {
+        return None;
+    }
     let trial = Trial::of(&program.description.layout)?;
     let build = Shared::new(Build::new("rosenbrock").with_pool(program.description.pool.clone()));
     let singular = Step { program, build: &build, trial }.build();

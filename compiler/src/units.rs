@@ -978,17 +978,6 @@ pub fn literal(system: &System, id: ExprId) -> Option<f64> {
     }
 }
 
-/// A time with a handy prefix.
-pub fn seconds(t: f64) -> String {
-    let (scale, unit) = match t {
-        t if t < 1e-6 => (1e-9, "ns"),
-        t if t < 1e-3 => (1e-6, "us"),
-        t if t < 1.0 => (1e-3, "ms"),
-        _ => (1.0, "s"),
-    };
-    format!("{} {unit}", three_digits(t / scale))
-}
-
 /// A number with three digits, as messages show it.
 pub fn three_digits(x: f64) -> String {
     if x == 0.0 || !x.is_finite() {

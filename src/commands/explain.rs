@@ -95,13 +95,8 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
         let code = step.code.map_or("no machine code here".into(), |(instructions, bytes)| {
             format!("{instructions} instructions in {bytes} bytes")
         });
-        let stable = explanation.stable.iter().find(|(of, _)| *of == step.method);
-        let stable = stable.map_or(String::new(), |(_, step)| match *step < 1.0 {
-            true => format!("; stable up to {}", crate::value::duration(*step)),
-            false => "; stable at any step".into(),
-        });
         terminal.line(&format!(
-            "    {:<8} {code}; {} operations ({} before functions are expanded), {} divisions and roots{stable}",
+            "    {:<8} {code}; {} operations ({} before functions are expanded), {} divisions and roots",
             step.method.name(),
             step.operations,
             step.plain,
