@@ -49,6 +49,18 @@ pub enum Command {
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
     Watch(Watch),
+    /// Show everything in a package, and verify it
+    Inspect(Inspect),
+    /// Make keys to sign packages with
+    Key {
+        /// What to do
+        #[command(subcommand)]
+        command: Key,
+    },
+    /// Put a rig onto the computer that runs it: build, copy, check there, swap at once
+    Deploy(Deploy),
+    /// Bring recordings back from the computer that runs a rig
+    FetchLog(FetchLog),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -61,7 +73,7 @@ pub enum Command {
         /// Such as run
         #[arg(value_parser = [
             "run", "test", "sweep", "linearise", "check", "fmt", "explain", "characterise", "compare", "doc", "repl",
-            "watch", "new", "completions",
+            "watch", "inspect", "key", "deploy", "fetch-log", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -336,6 +348,94 @@ pub struct Watch {
     pub restart: bool,
 }
 
+/// `fric inspect`
+#[derive(clap::Args, Debug)]
+pub struct Inspect {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub package: PathBuf,
+    /// Folder with public keys: the package must be signed by one of them
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub trusted: Option<PathBuf>,
+    /// Print the texts it was made from
+    #[arg(long)]
+    pub sources: bool,
+    /// Write all its sections into a folder
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub extract: Option<PathBuf>,
+}
+
+/// `fric key`
+#[derive(Subcommand, Debug)]
+pub enum Key {
+    /// Make a pair: NAME.key to sign with, NAME.pub to be trusted
+    New(KeyNew),
+}
+
+/// `fric key new`
+#[derive(clap::Args, Debug)]
+pub struct KeyNew {
+    /// Name of the two files, without their endings
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub name: PathBuf,
+}
+
+/// Another computer, and where things lie there.
+#[derive(clap::Args, Debug)]
+pub struct Host {
+    /// As ssh takes it
+    #[arg(value_name = "USER@HOST", value_hint = ValueHint::Hostname, value_parser = host)]
+    pub host: String,
+    /// Option for ssh and scp, such as Port=2222
+    #[arg(short = 'o', value_name = "NAME=VALUE")]
+    pub options: Vec<String>,
+    /// The program there
+    #[arg(long, value_name = "COMMAND", default_value = "fric-rig")]
+    pub rig: String,
+    /// Folder of packages and logs there
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/fric")]
+    pub dir: String,
+}
+
+/// `fric deploy`
+#[derive(clap::Args, Debug)]
+pub struct Deploy {
+    /// Where to
+    #[command(flatten)]
+    pub host: Host,
+    /// A text with a rig, or a package
+    #[arg(value_name = "RIG.fric|FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in the text; not needed if it is the only one
+    #[arg(value_name = "RIG")]
+    pub name: Option<String>,
+    /// Sign the package with a secret key
+    #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
+    pub sign: Option<PathBuf>,
+    /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
+    #[arg(long, value_name = "DIR")]
+    pub trusted: Option<String>,
+    /// Start it there, and go back to the package before if it refuses
+    #[arg(long)]
+    pub start: bool,
+}
+
+/// `fric fetch-log`
+#[derive(clap::Args, Debug)]
+pub struct FetchLog {
+    /// Where from
+    #[command(flatten)]
+    pub host: Host,
+    /// Which one [default: the newest]
+    pub log: Option<String>,
+    /// All of them
+    #[arg(long, conflicts_with = "log")]
+    pub all: bool,
+    /// Folder to write to
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = "out")]
+    pub out: PathBuf,
+}
+
 /// `fric new`
 #[derive(clap::Args, Debug)]
 pub struct New {
@@ -351,6 +451,11 @@ fn setting(text: &str) -> Result<(String, String), String> {
         return Err("write it as PATH=VALUE, for example fr.Fs=2N".into());
     }
     Ok((path.into(), value.into()))
+}
+
+/// What begins with a dash would be an option of ssh.
+fn host(text: &str) -> Result<String, String> {
+    if text.is_empty() || text.starts_with('-') { Err("write it as USER@HOST".into()) } else { Ok(text.into()) }
 }
 
 fn solver(text: &str) -> Result<Method, String> {

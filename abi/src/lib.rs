@@ -10,6 +10,7 @@ pub mod plan;
 pub mod rig;
 pub mod instance;
 pub mod encode;
+pub mod packing;
 pub mod image;
 
 pub use description::{Description, Layout, Slot};

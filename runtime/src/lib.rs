@@ -21,6 +21,7 @@ pub mod steady;
 pub mod sweep;
 
 pub mod blob;
+pub mod package;
 
 pub mod modes;
 

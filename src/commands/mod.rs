@@ -3,18 +3,22 @@
 mod characterise;
 mod check;
 mod cross;
+mod deploy;
 mod doc;
 mod explain;
 mod fmt;
+mod inspect;
+mod key;
 mod linearise;
 mod new;
+mod pack;
 mod repl;
 mod run;
 mod sweep;
 mod test;
 mod watch;
 
-use crate::args::{Args, Command, Repl};
+use crate::args::{Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
@@ -53,6 +57,10 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Doc(args) => doc::doc(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
+        Command::Inspect(args) => inspect::inspect(args, terminal),
+        Command::Key { command: Key::New(args) } => key::new(args, terminal),
+        Command::Deploy(args) => deploy::deploy(args, terminal),
+        Command::FetchLog(args) => deploy::fetch_log(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();
