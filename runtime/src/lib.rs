@@ -31,6 +31,10 @@ pub mod realtime;
 
 pub mod can;
 
+pub mod canopen;
+
+pub mod drive;
+
 pub mod safety;
 
 pub mod hil;

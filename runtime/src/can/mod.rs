@@ -2,10 +2,25 @@
 //!
 //! In: addresses and frames. Out: frames, stamps and events of the bus. Knows no drive and no model.
 
-pub mod sim;
 pub mod wire;
 
+pub mod sim;
+
+pub mod address;
+pub mod descriptor;
+pub mod slcan;
+pub mod socketcan;
+pub mod socketcand;
+
+pub mod log;
+pub mod replay;
+
+pub mod hub;
+
+use address::Address;
+use sim::{Join, Simulation};
 use std::fmt;
+use std::os::fd::RawFd;
 
 /// One classical CAN frame.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
@@ -43,6 +58,15 @@ impl Frame {
     pub fn remote(id: u32, length: u8) -> Frame {
         assert!(id < 0x800 && length <= 8, "identifier {id:#x} or length {length} is too long");
         Frame { id, extended: false, remote: true, length, data: [0; 8] }
+    }
+
+    /// A remote frame with a 29-bit identifier that asks for `length` bytes.
+    ///
+    /// # Panics
+    /// If the identifier or the length is too long: a mistake of the caller.
+    pub fn remote_extended(id: u32, length: u8) -> Frame {
+        assert!(id < 1 << 29 && length <= 8, "identifier {id:#x} or length {length} is too long");
+        Frame { id, extended: true, remote: true, length, data: [0; 8] }
     }
 
     fn any(id: u32, extended: bool, bytes: &[u8]) -> Frame {
@@ -159,6 +183,8 @@ pub enum Refused {
     Full,
     /// Bus-off, interface down, other end gone.
     Down,
+    /// Nothing that this bus carries: a remote frame over socketcand, anything over one that only listens.
+    Unable,
 }
 
 /// How a bus is.
@@ -200,4 +226,101 @@ pub trait Bus {
 
     /// How it is.
     fn health(&self) -> Health;
+
+    /// What becomes readable when something came; none where no kernel is involved.
+    fn descriptor(&self) -> Option<RawFd> {
+        None
+    }
+
+    /// A frame made ready to be sent by another thread or by a signal handler, whatever this bus is in the middle of. None
+    /// where no kernel is involved.
+    fn prepare(&self, frame: Frame) -> Option<Prepared> {
+        let _ = frame;
+        None
+    }
+}
+
+/// A frame as the bytes that one write(2) sends. Valid as long as the bus that made it.
+#[derive(Clone, Copy, Debug)]
+pub struct Prepared {
+    fd: RawFd,
+    bytes: [u8; 64],
+    length: u8,
+}
+
+impl Prepared {
+    fn new(fd: RawFd, from: &[u8]) -> Prepared {
+        let mut bytes = [0; 64];
+        bytes[..from.len()].copy_from_slice(from);
+        Prepared { fd, bytes, length: from.len() as u8 }
+    }
+
+    /// Sends it: one system call that is allowed in a signal handler, no allocation, no lock. False if it was not taken.
+    pub fn send(&self) -> bool {
+        let bytes = &self.bytes[..usize::from(self.length)];
+        descriptor::write(self.fd, bytes) == descriptor::Moved::Bytes(bytes.len())
+    }
+}
+
+/// How a bus is opened.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Options {
+    /// Bits a second: what a simulated bus gets and an adapter is told. An interface of the kernel is compared with it
+    /// and never set.
+    pub bit_rate: Option<u32>,
+    /// What is received.
+    pub filter: Filter,
+    /// Never to send.
+    pub listen_only: bool,
+}
+
+/// Why a bus can't be opened.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct CannotOpen {
+    /// Which one.
+    pub address: String,
+    /// What is wrong.
+    pub reason: String,
+    /// What to do about it.
+    pub remedy: Option<String>,
+}
+
+/// The first line says what is wrong, the second what mends it.
+impl fmt::Display for CannotOpen {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}: {}", self.address, self.reason)?;
+        self.remedy.iter().try_for_each(|remedy| write!(f, "\n  mend: {remedy}"))
+    }
+}
+
+/// Bits a second of a simulated bus that nobody gave any.
+const BIT_RATE: u32 = 1_000_000;
+
+/// Opens a bus, whatever its kind. `name` is how the node is called on a simulated one.
+///
+/// Real buses stamp with the clock of the world, which therefore must be real: a simulated time can't wait for them.
+pub fn open(address: &Address, options: &Options, world: &Simulation, name: &str) -> Result<Box<dyn Bus>, CannotOpen> {
+    let clock = || {
+        world.monotonic().ok_or_else(|| CannotOpen {
+            address: address.to_string(),
+            reason: "a real bus does not wait for simulated time".into(),
+            remedy: Some("sim:NAME, or real time".into()),
+        })
+    };
+    Ok(match address {
+        Address::Sim(bus) => {
+            let bus = world.bus(bus, options.bit_rate.unwrap_or(BIT_RATE));
+            let Options { bit_rate, filter, listen_only } = options.clone();
+            Box::new(bus.join(name, Join { bit_rate, filter, listen_only }))
+        }
+        Address::SocketCan(interface) => Box::new(socketcan::SocketCan::open(interface, options, clock()?)?),
+        Address::Slcan { path, bit_rate } => {
+            let options = Options { bit_rate: bit_rate.or(options.bit_rate), ..options.clone() };
+            Box::new(slcan::Slcan::open(path, &options, clock()?)?)
+        }
+        Address::Socketcand { host, port, interface } => {
+            Box::new(socketcand::Client::open(host, *port, interface, options, clock()?)?)
+        }
+        Address::Replay(path) => Box::new(replay::Replay::open(path, options, world.clone())?),
+    })
 }

@@ -243,7 +243,10 @@ impl Line {
 
     pub fn send(&mut self, at: usize, frame: Frame, now_ns: u64) -> Result<(), Refused> {
         let (node, chance) = (&mut self.nodes[at], &mut self.chance);
-        if node.listen_only || matches!(node.health.state, State::BusOff | State::Down) {
+        if node.listen_only {
+            return Err(Refused::Unable);
+        }
+        if matches!(node.health.state, State::BusOff | State::Down) {
             node.health.refused += 1;
             return Err(Refused::Down);
         }

@@ -15,7 +15,7 @@
 mod fault;
 mod line;
 
-use super::{Bus, Filter, Frame, Health, Received, Refused};
+use super::{Bus, Filter, Frame, Health, Received, Refused, descriptor};
 use crate::clock::{Clock, Monotonic, Simulated};
 pub use fault::{Fault, Kind};
 use line::Line;
@@ -92,6 +92,20 @@ impl Simulation {
         self.0.actors.borrow_mut().push(actor);
     }
 
+    /// The machine's clock, where that is its time.
+    pub fn monotonic(&self) -> Option<Monotonic> {
+        match &self.0.time {
+            Time::Simulated(_) => None,
+            Time::Real(clock) => Some(*clock),
+        }
+    }
+
+    /// Does what is due, then waits for what comes next: on a bus, by an actor, at one of the descriptors, or the time
+    /// `until_ns`. Simulated time does not wait for descriptors.
+    pub fn step(&self, until_ns: u64, watched: &mut [libc::pollfd]) {
+        self.0.step(until_ns, watched, || false);
+    }
+
     /// Moves on to a time, or goes until then.
     pub fn run_to(&self, until_ns: u64) {
         self.0.run(until_ns, || false);
@@ -124,30 +138,37 @@ impl World {
 
     /// From event to event until the time has come or `enough` says so; gives what that said last.
     fn run(&self, until_ns: u64, enough: impl Fn() -> bool) -> bool {
-        loop {
-            let now_ns = self.now_ns();
-            let buses = self.buses.borrow();
-            buses.iter().for_each(|bus| bus.line.borrow_mut().run_to(now_ns, false));
-            let mut actors = self.actors.try_borrow_mut().expect("an actor does not wait");
-            let wake_ns = actors.iter_mut().map(|actor| actor.act(now_ns)).min().unwrap_or(u64::MAX);
-            assert!(wake_ns > now_ns, "an actor wants to act again at {wake_ns} ns, and it is {now_ns} ns already");
-            drop(actors);
-            if enough() || now_ns >= until_ns {
-                return enough();
-            }
-            // Whoever wanted to send at this instant has done so.
-            let settle = |bus: &SimBus| {
-                let mut line = bus.line.borrow_mut();
-                line.run_to(now_ns, true);
-                line.next_ns()
-            };
-            let line_ns = buses.iter().map(settle).min().unwrap_or(u64::MAX);
-            let next_ns = until_ns.min(wake_ns).min(line_ns);
-            match &self.time {
-                Time::Simulated(clock) => clock.advance_to(next_ns),
-                Time::Real(clock) => clock.sleep_until(next_ns),
-            }
+        while !self.step(until_ns, &mut [], &enough) {}
+        enough()
+    }
+
+    /// Lets everybody act at this instant. Then, unless that is `enough` or the time has come, goes on to the next one.
+    /// Says whether it stayed.
+    fn step(&self, until_ns: u64, watched: &mut [libc::pollfd], enough: impl Fn() -> bool) -> bool {
+        let now_ns = self.now_ns();
+        let buses = self.buses.borrow();
+        buses.iter().for_each(|bus| bus.line.borrow_mut().run_to(now_ns, false));
+        let mut actors = self.actors.try_borrow_mut().expect("an actor does not wait");
+        let wake_ns = actors.iter_mut().map(|actor| actor.act(now_ns)).min().unwrap_or(u64::MAX);
+        assert!(wake_ns > now_ns, "an actor wants to act again at {wake_ns} ns, and it is {now_ns} ns already");
+        drop(actors);
+        if enough() || now_ns >= until_ns {
+            return true;
         }
+        // Whoever wanted to send at this instant has done so.
+        let settle = |bus: &SimBus| {
+            let mut line = bus.line.borrow_mut();
+            line.run_to(now_ns, true);
+            line.next_ns()
+        };
+        let line_ns = buses.iter().map(settle).min().unwrap_or(u64::MAX);
+        let next_ns = until_ns.min(wake_ns).min(line_ns);
+        match &self.time {
+            Time::Simulated(clock) => clock.advance_to(next_ns),
+            Time::Real(clock) if watched.is_empty() => clock.sleep_until(next_ns),
+            Time::Real(clock) => drop(descriptor::wait(watched, clock, next_ns)),
+        }
+        false
     }
 }
 

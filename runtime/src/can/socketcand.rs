@@ -1,0 +1,508 @@
+//! Frames as messages of text over TCP, as socketcand speaks them.
+//!
+//! In: frames. Out: frames, stamped when they were read. Both ends are here: [`Client`] speaks to a gateway, [`Server`] is
+//! one. The protocol knows no remote frames and tells nothing of errors on the bus behind it.
+//!
+//! The server greets `< hi >`; the client says `< open can0 >` and `< rawmode >`, each answered `< ok >`; then frames go as
+//! `< send 123 2 aa b >` and come as `< frame 123 1700000000.123456 AABB >`.
+
+use super::descriptor::{self, Incoming, Moved, Outgoing};
+use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
+use crate::clock::{Clock, Monotonic};
+use std::io::{self, Cursor, Read, Write};
+use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use std::os::fd::{AsRawFd, RawFd};
+use std::time::{Duration, SystemTime};
+
+/// Bytes on their way out: beyond what the kernel takes, a few hundred frames.
+const OUTGOING: usize = 16 * 1024;
+
+/// Bytes read and not yet understood: a burst of 2,000 frames fits.
+const INCOMING: usize = 256 * 1024;
+
+/// An unfinished message of this length is thrown away, as socketcand does.
+const UNFINISHED: usize = 200;
+
+/// The longest message is that of a frame with 8 bytes.
+const MESSAGE: usize = 80;
+
+/// How long a gateway may take to answer.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// How long after rawmode a client may still be busy reading the answer: some take each answer with one read and compare
+/// it whole, so that a frame behind it breaks the handshake.
+const PAUSE_NS: u64 = 20_000_000;
+
+/// A stream, with what both ends need.
+struct Stream {
+    tcp: TcpStream,
+    clock: Monotonic,
+    incoming: Incoming,
+    outgoing: Outgoing,
+    health: Health,
+    down_told: bool,
+}
+
+impl Stream {
+    fn new(tcp: TcpStream, clock: Monotonic) -> io::Result<Stream> {
+        tcp.set_nonblocking(true)?;
+        tcp.set_nodelay(true)?;
+        let (incoming, outgoing) = (Incoming::new(INCOMING), Outgoing::new(OUTGOING));
+        let stream = Stream { tcp, clock, incoming, outgoing, health: Health::default(), down_told: false };
+        stream.acknowledge_at_once();
+        Ok(stream)
+    }
+
+    /// The other end may hold its next message back until this one is acknowledged, and the kernel takes its time for that
+    /// unless told again after every read: 44 ms become 0.3.
+    fn acknowledge_at_once(&self) {
+        let on: libc::c_int = 1;
+        // SAFETY: the option is valid for its length and outlives the call. A refusal costs time only.
+        unsafe {
+            libc::setsockopt(
+                self.tcp.as_raw_fd(),
+                libc::IPPROTO_TCP,
+                libc::TCP_QUICKACK,
+                (&raw const on).cast(),
+                size_of_val(&on) as libc::socklen_t,
+            )
+        };
+    }
+
+    /// Reads more; what a read cannot have is told as an event.
+    fn fill(&mut self) -> Result<bool, Option<Received>> {
+        match self.incoming.fill(self.tcp.as_raw_fd()) {
+            Moved::Bytes(_) => {
+                self.acknowledge_at_once();
+                Ok(true)
+            }
+            Moved::Later => Ok(false),
+            Moved::Gone => Err(self.down()),
+        }
+    }
+
+    /// Throws away what can't become a message any more.
+    fn tidy(&mut self) -> Option<Received> {
+        (self.incoming.unfinished() > UNFINISHED).then(|| {
+            self.incoming.discard();
+            self.health.lost += 1;
+            Received::Event(Event::Lost(1), self.clock.now_ns())
+        })
+    }
+
+    fn down(&mut self) -> Option<Received> {
+        self.health.state = State::Down;
+        let told = std::mem::replace(&mut self.down_told, true);
+        (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
+    }
+
+    /// Sends all of a message or nothing of it.
+    fn say(&mut self, message: &[u8]) -> Result<(), Refused> {
+        let fd = self.tcp.as_raw_fd();
+        let there = self.outgoing.flush(fd);
+        let taken = there && self.outgoing.push(message);
+        if !there || !self.outgoing.flush(fd) {
+            self.health.state = State::Down;
+            self.health.refused += 1;
+            return Err(Refused::Down);
+        }
+        if !taken {
+            self.health.refused += 1;
+            return Err(Refused::Full);
+        }
+        Ok(())
+    }
+
+    fn wait(&mut self, until_ns: u64) -> bool {
+        if self.down_told {
+            self.clock.sleep_until(until_ns);
+            return false;
+        }
+        self.incoming.has_message(|byte| byte == b'>')
+            || descriptor::wait_stream(self.tcp.as_raw_fd(), &mut self.outgoing, &self.clock, until_ns)
+    }
+}
+
+/// A connection to a gateway.
+pub struct Client {
+    stream: Stream,
+    filter: Filter,
+    listen_only: bool,
+    /// A second connection, on which nothing else is ever half said.
+    emergency: TcpStream,
+}
+
+impl Client {
+    /// Connects to a gateway and opens its bus.
+    pub fn open(
+        host: &str,
+        port: u16,
+        interface: &str,
+        options: &Options,
+        clock: Monotonic,
+    ) -> Result<Client, CannotOpen> {
+        let connect = || -> Result<Client, String> {
+            let stream = greeted(host, port, interface, true)?;
+            let emergency = greeted(host, port, interface, false)?;
+            let quiet = |error: io::Error| error.to_string();
+            emergency.set_nodelay(true).map_err(quiet)?;
+            emergency.set_nonblocking(true).map_err(quiet)?;
+            let stream = Stream::new(stream, clock).map_err(quiet)?;
+            Ok(Client { stream, filter: options.filter.clone(), listen_only: options.listen_only, emergency })
+        };
+        connect().map_err(|reason| CannotOpen {
+            address: format!("socketcand:{host}:{port}/{interface}"),
+            reason,
+            remedy: Some(format!(
+                "a gateway there: `socketcand -i {interface}` or `fric bus {interface} --tcp {port}`"
+            )),
+        })
+    }
+}
+
+/// Connects and goes through the greetings.
+fn greeted(host: &str, port: u16, interface: &str, raw: bool) -> Result<TcpStream, String> {
+    let addresses = (host, port).to_socket_addrs().map_err(|error| error.to_string())?;
+    let mut tried = Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
+    for address in addresses {
+        tried = TcpStream::connect_timeout(&address, PATIENCE);
+        if tried.is_ok() {
+            break;
+        }
+    }
+    let mut tcp = tried.map_err(|error| error.to_string())?;
+    tcp.set_read_timeout(Some(PATIENCE)).map_err(|error| error.to_string())?;
+    let mut expect = |say: &str, answer: &str| {
+        tcp.write_all(say.as_bytes()).map_err(|error| error.to_string())?;
+        let mut heard = Vec::new();
+        let mut byte = [0];
+        // One byte at a time: what comes behind the answer is not ours to read yet.
+        while !heard.ends_with(b">") && heard.len() < UNFINISHED {
+            match tcp.read(&mut byte) {
+                Ok(0) => return Err("it closed the connection".to_string()),
+                Ok(_) => heard.push(byte[0]),
+                Err(_) => return Err(format!("it does not say `{answer}` within 2 s")),
+            }
+        }
+        let heard = String::from_utf8_lossy(&heard);
+        if heard.trim() == answer { Ok(()) } else { Err(format!("it says `{}` in place of `{answer}`", heard.trim())) }
+    };
+    expect("", "< hi >")?;
+    expect(&format!("< open {interface} >"), "< ok >")?;
+    if raw {
+        expect("< rawmode >", "< ok >")?;
+    }
+    Ok(tcp)
+}
+
+impl Bus for Client {
+    fn send(&mut self, frame: Frame) -> Result<(), Refused> {
+        if frame.is_remote() || self.listen_only {
+            return Err(Refused::Unable);
+        }
+        let mut message = [0; MESSAGE];
+        let length = encode_send(&frame, &mut message);
+        self.stream.say(&message[..length])
+    }
+
+    fn receive(&mut self) -> Option<Received> {
+        loop {
+            while let Some(message) = self.stream.incoming.message(|byte| byte == b'>') {
+                if let Some(frame) = decode_frame(message).filter(|frame| self.filter.accepts(frame)) {
+                    return Some(Received::Frame(frame, self.stream.clock.now_ns()));
+                }
+            }
+            if let Some(lost) = self.stream.tidy() {
+                return Some(lost);
+            }
+            match self.stream.fill() {
+                Ok(true) => {}
+                Ok(false) => return None,
+                Err(gone) => return gone,
+            }
+        }
+    }
+
+    fn wait(&mut self, until_ns: u64) -> bool {
+        self.stream.wait(until_ns)
+    }
+
+    fn health(&self) -> Health {
+        self.stream.health
+    }
+
+    fn descriptor(&self) -> Option<RawFd> {
+        Some(self.stream.tcp.as_raw_fd())
+    }
+
+    fn prepare(&self, frame: Frame) -> Option<Prepared> {
+        let mut message = [0; MESSAGE];
+        let length = encode_send(&frame, &mut message);
+        (!frame.is_remote()).then(|| Prepared::new(self.emergency.as_raw_fd(), &message[..length]))
+    }
+}
+
+/// A gateway that waits for clients.
+pub struct Server {
+    listener: TcpListener,
+    clock: Monotonic,
+}
+
+impl Server {
+    /// Listens on a port of this machine, 0 for a free one; on all its networks if `everywhere`.
+    pub fn listen(port: u16, everywhere: bool, clock: Monotonic) -> Result<Server, CannotOpen> {
+        let host = if everywhere { "0.0.0.0" } else { "127.0.0.1" };
+        let listener = TcpListener::bind((host, port)).and_then(|listener| {
+            listener.set_nonblocking(true)?;
+            Ok(listener)
+        });
+        let listener = listener.map_err(|error| CannotOpen {
+            address: format!("TCP port {port}"),
+            reason: error.to_string(),
+            remedy: Some("another port, or 0 for any that is free".into()),
+        })?;
+        Ok(Server { listener, clock })
+    }
+
+    /// The port it listens on.
+    pub fn port(&self) -> u16 {
+        self.listener.local_addr().map_or(0, |address| address.port())
+    }
+
+    /// Readable when a client comes.
+    pub fn descriptor(&self) -> RawFd {
+        self.listener.as_raw_fd()
+    }
+
+    /// The next client, if one has come.
+    pub fn accept(&mut self) -> Option<Connection> {
+        let (tcp, _) = self.listener.accept().ok()?;
+        let mut stream = Stream::new(tcp, self.clock).ok()?;
+        stream.say(b"< hi >").ok()?;
+        Some(Connection { stream, stage: Stage::Greeted })
+    }
+}
+
+/// A client of ours.
+pub struct Connection {
+    stream: Stream,
+    stage: Stage,
+}
+
+/// How far the greetings have come.
+#[derive(Clone, Copy, PartialEq)]
+enum Stage {
+    Greeted,
+    /// It may send, and hears nothing.
+    Opened,
+    /// It hears all frames from this time on.
+    Raw(u64),
+}
+
+impl Connection {
+    /// Does what a message says; gives its frame.
+    fn heard(&mut self) -> Option<Option<Frame>> {
+        let now_ns = self.stream.clock.now_ns();
+        let message = self.stream.incoming.message(|byte| byte == b'>')?;
+        let text = std::str::from_utf8(message).unwrap_or_default().trim_start_matches(['<', ' ', '\n', '\r']);
+        let mut words = text.split_ascii_whitespace();
+        let answer: &[u8] = match (words.next(), self.stage) {
+            (Some("open"), Stage::Greeted) if words.next().is_some() => {
+                self.stage = Stage::Opened;
+                b"< ok >"
+            }
+            (Some("rawmode"), Stage::Opened) => {
+                self.stage = Stage::Raw(now_ns + PAUSE_NS);
+                b"< ok >"
+            }
+            (Some("echo"), _) => b"< echo >",
+            (Some("send"), Stage::Opened | Stage::Raw(_)) => match decode_send(words) {
+                Some(frame) => return Some(Some(frame)),
+                None => b"< error could not send frame >",
+            },
+            _ => b"< error unknown command >",
+        };
+        // An answer that does not fit is one to a client that reads nothing.
+        let _ = self.stream.say(answer);
+        Some(None)
+    }
+}
+
+impl Bus for Connection {
+    fn send(&mut self, frame: Frame) -> Result<(), Refused> {
+        match self.stage {
+            Stage::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
+            // It does not listen yet.
+            Stage::Greeted | Stage::Opened | Stage::Raw(_) => return Ok(()),
+        }
+        if frame.is_remote() {
+            return Err(Refused::Unable);
+        }
+        let mut message = [0; MESSAGE];
+        let length = encode_frame(&frame, &mut message);
+        self.stream.say(&message[..length])
+    }
+
+    fn receive(&mut self) -> Option<Received> {
+        loop {
+            while let Some(heard) = self.heard() {
+                if let Some(frame) = heard {
+                    return Some(Received::Frame(frame, self.stream.clock.now_ns()));
+                }
+            }
+            if let Some(lost) = self.stream.tidy() {
+                return Some(lost);
+            }
+            match self.stream.fill() {
+                Ok(true) => {}
+                Ok(false) => {
+                    self.stream.outgoing.flush(self.stream.tcp.as_raw_fd());
+                    return None;
+                }
+                Err(gone) => return gone,
+            }
+        }
+    }
+
+    fn wait(&mut self, until_ns: u64) -> bool {
+        self.stream.wait(until_ns)
+    }
+
+    fn health(&self) -> Health {
+        self.stream.health
+    }
+
+    fn descriptor(&self) -> Option<RawFd> {
+        Some(self.stream.tcp.as_raw_fd())
+    }
+}
+
+/// `< send 123 2 aa b >`, bytes without leading zeros; the length of it.
+fn encode_send(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
+    let mut text = Cursor::new(&mut message[..]);
+    let id = frame.id();
+    let mut put = || -> io::Result<()> {
+        if frame.is_extended() {
+            write!(text, "< send {id:08X} ")?
+        } else {
+            write!(text, "< send {id:03X} ")?
+        }
+        write!(text, "{} ", frame.data().len())?;
+        frame.data().iter().try_for_each(|byte| write!(text, "{byte:x} "))?;
+        write!(text, ">")
+    };
+    put().expect("the longest message fits");
+    text.position() as usize
+}
+
+/// `< frame 123 1700000000.123456 AABB >`; without data the field is empty, two spaces. The length of it.
+fn encode_frame(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
+    let mut text = Cursor::new(&mut message[..]);
+    let id = frame.id();
+    let day = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let mut put = || -> io::Result<()> {
+        if frame.is_extended() {
+            write!(text, "< frame {id:08X} ")?
+        } else {
+            write!(text, "< frame {id:03X} ")?
+        }
+        write!(text, "{}.{:06} ", day.as_secs(), day.subsec_micros())?;
+        frame.data().iter().try_for_each(|byte| write!(text, "{byte:02X}"))?;
+        write!(text, " >")
+    };
+    put().expect("the longest message fits");
+    text.position() as usize
+}
+
+/// The frame of `123 2 aa b`.
+fn decode_send<'t>(mut words: impl Iterator<Item = &'t str>) -> Option<Frame> {
+    let id = words.next()?;
+    let length: usize = words.next()?.parse().ok().filter(|&length| length <= 8)?;
+    let mut data = [0; 8];
+    for byte in &mut data[..length] {
+        *byte = u8::from_str_radix(words.next()?, 16).ok()?;
+    }
+    if words.next().is_some() {
+        return None;
+    }
+    identified(id, &data[..length])
+}
+
+/// The frame of `< frame 123 1700000000.123456 AABB `.
+fn decode_frame(message: &[u8]) -> Option<Frame> {
+    let text = std::str::from_utf8(message).ok()?.trim_start_matches(['<', ' ', '\n', '\r']);
+    let mut words = text.split_ascii_whitespace();
+    if words.next() != Some("frame") {
+        return None;
+    }
+    let (id, _stamp) = (words.next()?, words.next()?);
+    let (mut data, mut length) = ([0; 8], 0);
+    for digits in words.flat_map(|word| word.as_bytes().chunks(2)) {
+        *data.get_mut(length)? = u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?;
+        length += 1;
+    }
+    identified(id, &data[..length])
+}
+
+/// Three digits of identifier are 11 bits, eight are 29.
+fn identified(digits: &str, data: &[u8]) -> Option<Frame> {
+    let id = u32::from_str_radix(digits, 16).ok()?;
+    match digits.len() {
+        8 => (id < 1 << 29).then(|| Frame::extended(id, data)),
+        _ => (id < 0x800).then(|| Frame::new(id, data)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_messages_both_ways() {
+        for (frame, sent) in [
+            (Frame::new(0x123, &[0xAA, 0x0B]), "< send 123 2 aa b >"),
+            (Frame::new(0x080, &[]), "< send 080 0 >"),
+            (Frame::extended(0x1234, &[0]), "< send 00001234 1 0 >"),
+        ] {
+            let mut message = [0; MESSAGE];
+            let length = encode_send(&frame, &mut message);
+            assert_eq!(String::from_utf8_lossy(&message[..length]), sent);
+            assert_eq!(decode_send(sent.trim_end_matches('>').split_ascii_whitespace().skip(2)), Some(frame));
+            let length = encode_frame(&frame, &mut message);
+            assert_eq!(decode_frame(&message[..length - 1]), Some(frame));
+        }
+        let mut message = [0; MESSAGE];
+        let length = encode_frame(&Frame::new(0x080, &[]), &mut message);
+        assert!(message[..length].ends_with(b"  >"), "an empty field keeps its space");
+    }
+
+    #[test]
+    fn what_is_no_frame_is_none() {
+        for text in [
+            "< frame 123 1.0 AABBCCDDEEFF00112 ",
+            "< frame XYZ 1.0 AA ",
+            "< frame 1234 1.0 AA ",
+            "< ok ",
+            "< frame 123",
+        ] {
+            assert_eq!(decode_frame(text.as_bytes()), None, "{text}");
+        }
+        for text in ["123 2 aa", "123 9 1 2 3 4 5 6 7 8 9", "123 1 100", "800 0", "123 1 a b", "FFFFFFFF 0"] {
+            assert_eq!(decode_send(text.split(' ')), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_gateway_that_says_other_things_is_refused() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).expect("a port");
+        let port = listener.local_addr().expect("an address").port();
+        let other = std::thread::spawn(move || {
+            let (mut tcp, _) = listener.accept().expect("a client");
+            tcp.write_all(b"< hello >").expect("written");
+        });
+        let refused =
+            Client::open("127.0.0.1", port, "can0", &Options::default(), Monotonic::new()).err().expect("refused");
+        assert!(refused.to_string().contains("it says `< hello >` in place of `< hi >`"), "{refused}");
+        other.join().expect("it ends");
+    }
+}

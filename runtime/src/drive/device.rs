@@ -1,0 +1,155 @@
+//! A node that speaks in described frames: transducers, switches, boxes without a drive profile.
+//!
+//! In: its frames, commands. Out: its signals, the frames to send.
+
+use super::frames;
+use super::trouble::{Reading, TroubleKind};
+use crate::can::Frame;
+use crate::canopen::Send;
+use abi::rig::Message;
+
+/// Longest time between two frames of ours where nobody names one.
+const PERIOD_NS: u64 = 100_000_000;
+
+/// One message with its values.
+#[derive(Clone, Debug)]
+struct Line {
+    message: Message,
+    values: Vec<Reading>,
+    /// Values on any stop, SI.
+    safe: Vec<f64>,
+    /// What was sent last.
+    sent: [u8; 8],
+    due_ns: u64,
+    fresh: bool,
+}
+
+/// A device.
+#[derive(Clone, Debug)]
+pub struct Device {
+    lines: Vec<Line>,
+    moves: bool,
+}
+
+fn frame(message: &Message, data: &[u8; 8]) -> Frame {
+    let data = &data[..message.length.into()];
+    if message.extended { Frame::extended(message.id, data) } else { Frame::new(message.id, data) }
+}
+
+impl Device {
+    /// A device of a rig. `moves`: it is a drive, and hears from us each tick. `safe`: its safe values, by message and
+    /// field.
+    pub fn new(messages: &[Message], moves: bool, safe: &[(usize, usize, f64)]) -> Result<Device, String> {
+        for message in messages {
+            if message.length > 8 || message.id >= if message.extended { 1 << 29 } else { 0x800 } {
+                return Err(format!("message `{}` has no possible identifier or length", message.name));
+            }
+            for field in &message.fields {
+                let last = if field.big_endian {
+                    (field.start_bit / 8) * 8 + (7 - field.start_bit % 8) + field.bits
+                } else {
+                    field.start_bit + field.bits
+                };
+                if field.bits == 0 || field.bits > 64 || last > u16::from(message.length) * 8 {
+                    return Err(format!("signal `{}` does not fit message `{}`", field.name, message.name));
+                }
+            }
+        }
+        let line = |(at, message): (usize, &Message)| {
+            let mut safe_values: Vec<f64> = message.fields.iter().map(|field| field.start).collect();
+            for &(_, field, value) in safe.iter().filter(|(message, ..)| *message == at) {
+                safe_values[field] = value;
+            }
+            Line {
+                message: message.clone(),
+                values: message.fields.iter().map(|field| Reading::none(field.start)).collect(),
+                safe: safe_values,
+                sent: [0; 8],
+                due_ns: 0,
+                fresh: false,
+            }
+        };
+        Ok(Device { lines: messages.iter().enumerate().map(line).collect(), moves })
+    }
+
+    /// Whether a frame is one of its messages.
+    pub fn owns(&self, frame: &Frame) -> bool {
+        self.lines.iter().any(|line| line.message.id == frame.id() && line.message.extended == frame.is_extended())
+    }
+
+    /// Takes a frame of its bus.
+    pub(super) fn receive(&mut self, frame: &Frame, stamp_ns: u64, tell: &mut dyn FnMut(TroubleKind)) {
+        for line in &mut self.lines {
+            let message = &line.message;
+            if message.send || message.id != frame.id() || message.extended != frame.is_extended() {
+                continue;
+            }
+            if frame.data().len() < message.length.into() {
+                tell(TroubleKind::Short(frame.id()));
+            }
+            for field in 0..message.fields.len() {
+                // A field that is not in this frame, or holds no number, keeps its value and grows old.
+                if let Some(value) = frames::read(message, field, frame.data()) {
+                    line.values[field] = Reading { value, stamp_ns, age: 0 };
+                }
+            }
+        }
+    }
+
+    /// A signal of it.
+    pub fn reading(&self, message: usize, field: usize) -> Option<Reading> {
+        self.lines.get(message)?.values.get(field).copied()
+    }
+
+    /// A safe value of it.
+    pub(super) fn safe(&self, message: usize, field: usize) -> f64 {
+        self.lines.get(message).and_then(|line| line.safe.get(field)).copied().unwrap_or(0.0)
+    }
+
+    /// Everything is a tick older.
+    pub(super) fn begin(&mut self) {
+        for reading in self.lines.iter_mut().flat_map(|line| &mut line.values) {
+            reading.age = reading.age.saturating_add(1);
+        }
+    }
+
+    /// The value of a signal that is sent, SI.
+    pub fn command(&mut self, message: usize, field: usize, value: f64) {
+        self.lines[message].values[field].value = value;
+    }
+
+    /// To the safe values.
+    pub(super) fn rest(&mut self) {
+        for line in self.lines.iter_mut().filter(|line| line.message.send) {
+            for (reading, safe) in line.values.iter_mut().zip(&line.safe) {
+                reading.value = *safe;
+            }
+        }
+    }
+
+    /// Sends what has changed or is due; a drive hears from us each tick.
+    pub(super) fn send_commands(&mut self, now_ns: u64, send: Send) {
+        for line in self.lines.iter_mut().filter(|line| line.message.send) {
+            let mut data = [0; 8];
+            for (field, reading) in line.message.fields.iter().zip(&line.values) {
+                frames::write(field, reading.value, &mut data);
+            }
+            if self.moves || data != line.sent || now_ns >= line.due_ns || !line.fresh {
+                let period = if line.message.period_ns > 0 { line.message.period_ns } else { PERIOD_NS };
+                (line.sent, line.due_ns, line.fresh) = (data, now_ns + period, true);
+                send(frame(&line.message, &data));
+            }
+        }
+    }
+
+    /// The frames with the safe values.
+    pub(super) fn stop_frames(&self) -> impl Iterator<Item = Frame> + '_ {
+        self.lines.iter().filter(|line| line.message.send).map(|line| {
+            let mut data = [0; 8];
+            for (field, safe) in line.message.fields.iter().zip(&line.safe) {
+                frames::write(field, *safe, &mut data);
+            }
+            frame(&line.message, &data)
+        })
+    }
+}

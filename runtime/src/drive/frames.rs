@@ -1,0 +1,157 @@
+//! Signals in frames that are described field by field, by hand or by a DBC file.
+//!
+//! In: a [`Field`] and the data of a frame. Out: its value, SI, and back. Source of the numbering of bits: the DBC
+//! format, little-endian ("Intel") and big-endian ("Motorola").
+
+use abi::rig::{Field, Format, Message};
+
+/// Where the k-th bit of a field lies, k counted from its least significant one: byte, and bit in the byte.
+fn place(field: &Field, k: u16) -> (usize, u16) {
+    if !field.big_endian {
+        let bit = field.start_bit + k;
+        return ((bit / 8).into(), bit % 8);
+    }
+    // A big-endian field starts at its most significant bit and goes down in a byte, then to the top of the next one.
+    let from_start = field.bits - 1 - k;
+    let linear = (field.start_bit / 8) * 8 + (7 - field.start_bit % 8) + from_start;
+    ((linear / 8).into(), 7 - linear % 8)
+}
+
+/// The bits of a field, least significant first; nothing if the frame is too short for it.
+fn raw(field: &Field, data: &[u8]) -> Option<u64> {
+    let mut raw = 0;
+    for k in 0..field.bits {
+        let (byte, bit) = place(field, k);
+        raw |= u64::from(data.get(byte)? >> bit & 1) << k;
+    }
+    Some(raw)
+}
+
+/// The value of a field, SI; nothing if the frame is too short, if the field is not in it (multiplexing), or if what
+/// it holds is no number.
+pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
+    let field = &message.fields[field];
+    if let Some((selector, value)) = field.multiplexed
+        && raw(&message.fields[selector], data)? != value
+    {
+        return None;
+    }
+    let raw = raw(field, data)?;
+    let number = match field.format {
+        Format::Unsigned => raw as f64,
+        Format::Signed => {
+            let unused = 64 - u32::from(field.bits);
+            ((raw << unused) as i64 >> unused) as f64
+        }
+        Format::Float32 => f32::from_bits(raw as u32).into(),
+        Format::Float64 => f64::from_bits(raw),
+    };
+    let value = number * field.scale + field.offset;
+    value.is_finite().then_some(value)
+}
+
+/// Puts a value, SI, into the data of a frame: rounded to the nearest step, clamped to what the bits can hold.
+pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
+    let steps = (value - field.offset) / field.scale;
+    let unused = 64 - u32::from(field.bits);
+    let raw = match field.format {
+        // A cast of a float clamps, and makes 0 of what is no number.
+        Format::Unsigned => (steps.round() as u64).min(u64::MAX >> unused),
+        Format::Signed => (steps.round() as i64).clamp(i64::MIN >> unused, i64::MAX >> unused) as u64,
+        Format::Float32 => u64::from((steps as f32).to_bits()),
+        Format::Float64 => steps.to_bits(),
+    };
+    for k in 0..field.bits {
+        let (byte, bit) = place(field, k);
+        if let Some(byte) = data.get_mut(byte) {
+            *byte = *byte & !(1 << bit) | ((raw >> k & 1) as u8) << bit;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use abi::unit::Unit;
+
+    fn field(start_bit: u16, bits: u16, big_endian: bool, format: Format) -> Field {
+        Field {
+            name: String::new(),
+            start_bit,
+            bits,
+            big_endian,
+            format,
+            scale: 1.0,
+            offset: 0.0,
+            start: 0.0,
+            unit: Unit::none(),
+            multiplexed: None,
+        }
+    }
+
+    fn message(fields: Vec<Field>) -> Message {
+        Message { name: String::new(), id: 1, extended: false, length: 8, send: false, period_ns: 0, fields }
+    }
+
+    fn value(field: Field, data: &[u8]) -> Option<f64> {
+        read(&message(vec![field]), 0, data)
+    }
+
+    #[test]
+    fn bits_lie_where_the_formats_say() {
+        let data = [0x12, 0x34, 0x56, 0x78, 0x9A, 0xBC, 0xDE, 0xF0];
+        let unsigned = |start, bits, big| value(field(start, bits, big, Format::Unsigned), &data);
+        assert_eq!(unsigned(0, 16, false), Some(f64::from(0x3412)));
+        assert_eq!(unsigned(7, 16, true), Some(f64::from(0x1234)));
+        assert_eq!(unsigned(4, 12, false), Some(f64::from(0x341)));
+        assert_eq!(unsigned(3, 12, true), Some(f64::from(0x234)));
+        assert_eq!(unsigned(11, 10, true), Some(f64::from(0x456 >> 2)));
+        assert_eq!(unsigned(0, 1, false), Some(0.0));
+        assert_eq!(unsigned(1, 1, true), Some(1.0));
+        assert_eq!(unsigned(56, 8, false), Some(f64::from(0xF0)));
+        let signed = |start, bits, big| value(field(start, bits, big, Format::Signed), &data);
+        assert_eq!(signed(56, 8, false), Some(-16.0));
+        assert_eq!(signed(39, 16, true), Some(f64::from(0x9ABCu16 as i16)));
+        assert_eq!(value(field(0, 64, false, Format::Signed), &data), Some(0xF0DE_BC9A_7856_3412u64 as i64 as f64));
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        for big_endian in [false, true] {
+            for (bits, format) in
+                [(7, Format::Signed), (13, Format::Unsigned), (32, Format::Float32), (64, Format::Float64)]
+            {
+                let start = if big_endian { 7 } else { 0 };
+                let mut field = field(start, bits, big_endian, format);
+                (field.scale, field.offset) = (0.5, 10.0);
+                for wanted in [10.0, 11.5, 12.0, 20.5] {
+                    let mut data = [0xFF; 8];
+                    write(&field, wanted, &mut data);
+                    assert_eq!(value(field.clone(), &data), Some(wanted), "{bits} bits {format:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn neighbours_stay_and_values_are_clamped() {
+        let mut data = [0; 8];
+        write(&field(4, 8, false, Format::Signed), 1e9, &mut data);
+        assert_eq!(data[..2], [0xF0, 0x07]);
+        write(&field(4, 8, false, Format::Signed), -1e9, &mut data);
+        assert_eq!(data[..2], [0x00, 0x08]);
+        write(&field(0, 4, false, Format::Unsigned), f64::NAN, &mut data);
+        write(&field(12, 4, false, Format::Unsigned), 99.0, &mut data);
+        assert_eq!(data[..2], [0x00, 0xF8]);
+    }
+
+    #[test]
+    fn short_frames_and_other_multiplexers_have_no_value() {
+        let mut two = message(vec![field(0, 8, false, Format::Unsigned), field(8, 8, false, Format::Unsigned)]);
+        two.fields[1].multiplexed = Some((0, 2));
+        assert_eq!(read(&two, 1, &[2, 7]), Some(7.0));
+        assert_eq!(read(&two, 1, &[1, 7]), None);
+        assert_eq!(read(&two, 1, &[2]), None);
+        assert_eq!(value(field(0, 32, false, Format::Float32), &f32::NAN.to_bits().to_le_bytes()), None);
+    }
+}

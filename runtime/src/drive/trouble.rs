@@ -1,0 +1,238 @@
+//! What nodes tell, and what can be wrong with them, as values that carry no text.
+
+use super::state::State;
+use crate::canopen::sdo::Failure;
+use crate::canopen::service::Emergency;
+use crate::canopen::{NmtState, Object};
+use std::fmt;
+
+/// A signal as it was last received.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Reading {
+    /// SI.
+    pub value: f64,
+    /// When the frame came that carried it.
+    pub stamp_ns: u64,
+    /// Ticks since then; [`Reading::NEVER`] if it never came.
+    pub age: u32,
+}
+
+impl Reading {
+    /// Age of a signal that never came.
+    pub const NEVER: u32 = u32::MAX;
+
+    /// A signal that has not come yet.
+    pub fn none(value: f64) -> Reading {
+        Reading { value, stamp_ns: 0, age: Reading::NEVER }
+    }
+}
+
+/// Something a node did that the supervisor must know.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Trouble {
+    /// The node (index into the rig's nodes); none: somebody foreign.
+    pub node: Option<usize>,
+    /// What.
+    pub kind: TroubleKind,
+    /// When it was noticed.
+    pub stamp_ns: u64,
+}
+
+/// What can happen.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum TroubleKind {
+    /// It sent an emergency.
+    Emergency(Emergency),
+    /// Its status word shows a fault.
+    Fault,
+    /// It left "operation enabled" without being told to.
+    Left(State),
+    /// No heartbeat in time.
+    HeartbeatLost,
+    /// It booted: it was reset or lost its power.
+    BootUp,
+    /// Its heartbeat shows another state than "operational".
+    Nmt(NmtState),
+    /// It shows another mode than the one it was given.
+    Mode(i8),
+    /// It is enabled but does not follow commands.
+    NotFollowing,
+    /// A frame of it is shorter than agreed.
+    Short(u32),
+    /// A frame that only a master sends and that we didn't: its identifier.
+    ForeignMaster(u32),
+}
+
+impl fmt::Display for TroubleKind {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            TroubleKind::Emergency(emergency) => {
+                write!(f, "emergency 0x{:04X}: {}", emergency.code, emergency.meaning())
+            }
+            TroubleKind::Fault => f.write_str("it reports a fault"),
+            TroubleKind::Left(state) => write!(f, "it went to \"{state}\" by itself"),
+            TroubleKind::HeartbeatLost => f.write_str("its heartbeat has stopped"),
+            TroubleKind::BootUp => f.write_str("it has booted anew"),
+            TroubleKind::Nmt(state) => write!(f, "it is {state}"),
+            TroubleKind::Mode(mode) => write!(f, "it shows mode {mode}"),
+            TroubleKind::NotFollowing => f.write_str("it is enabled but does not follow commands"),
+            TroubleKind::Short(id) => write!(f, "frame 0x{id:03X} is shorter than agreed"),
+            TroubleKind::ForeignMaster(id) if id & 0x780 == 0x700 => stranger(f, *id),
+            TroubleKind::ForeignMaster(id) => write!(f, "somebody else sends frame 0x{id:03X}: a second master"),
+        }
+    }
+}
+
+fn stranger(f: &mut fmt::Formatter, id: u32) -> fmt::Result {
+    let node = id & 0x7F;
+    write!(
+        f,
+        "node {node}, which the rig does not name, is on the bus (frame 0x{id:03X}): a second master, or a forgotten \
+         drive"
+    )
+}
+
+/// Why a rig may not start.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Refusal {
+    /// The node (index into the rig's nodes), if it is one's fault.
+    pub node: Option<usize>,
+    /// Why.
+    pub why: Why,
+}
+
+/// Why.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Why {
+    /// Somebody else speaks as a master does: identifier of the frame.
+    ForeignMaster(u32),
+    /// No boot-up message or heartbeat after a reset.
+    Silent,
+    /// An object could not be read or written.
+    Sdo {
+        /// Which.
+        object: Object,
+        /// Whether it was being written.
+        write: bool,
+        /// What came of it.
+        failure: Failure,
+    },
+    /// An object holds something else than was written.
+    ReadBack {
+        /// Which.
+        object: Object,
+        /// What was written.
+        wanted: i64,
+        /// What it holds.
+        found: i64,
+    },
+    /// Object 1000 is none of the profile.
+    DeviceType(u32),
+    /// Rated torque, N·m: of the drive, of the rig.
+    RatedTorque(f64, f64),
+    /// Neither the rig nor the drive names this limit.
+    NoLimit(&'static str),
+    /// The drive can't follow this signal: object 6502.
+    NoMode(u32),
+    /// The period can't be told in object 60C2.
+    Period(u64),
+    /// No means to notice that we are gone.
+    NoTimeout,
+    /// It didn't become operational.
+    NotOperational(NmtState),
+    /// TPDOs missed, of how many.
+    Missed(u32, u32),
+    /// The mode it shows instead of the one it was given.
+    Mode {
+        /// Given.
+        wanted: i8,
+        /// Shown.
+        shown: i8,
+    },
+    /// It stays in this state instead of going to "operation enabled".
+    NotEnabled(State, u16),
+    /// It went on when our life sign stopped; ms waited.
+    TimeoutIgnored(u64),
+    /// It didn't move at this torque, N·m, or at this command.
+    Stuck(f64),
+    /// It moved the other way.
+    WrongSign,
+    /// It turned further or faster than the test allows: rad, rad/s.
+    Ran(f64, f64),
+    /// Position says that it turned by the first angle, its speed says by the second, rad.
+    Scale(f64, f64),
+    /// The torque it reports against the torque it was told, N·m.
+    Torque(f64, f64),
+    /// A fault during start-up.
+    Trouble(TroubleKind),
+}
+
+impl fmt::Display for Why {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match *self {
+            Why::ForeignMaster(id) if id & 0x780 == 0x700 => stranger(f, id),
+            Why::ForeignMaster(id) => write!(
+                f,
+                "somebody else sends frame 0x{id:03X}, which only a master sends; two masters on a bus fight: take \
+                 the other one off"
+            ),
+            Why::Silent => write!(
+                f,
+                "it does not answer a reset of communication: is it powered, has it this node id, is the bit rate right?"
+            ),
+            Why::Sdo { object, write, failure } => {
+                write!(f, "object {object} could not be {}: {failure}", if write { "written" } else { "read" })
+            }
+            Why::ReadBack { object, wanted, found } => {
+                write!(f, "object {object} was set to {wanted} (0x{wanted:X}) and holds {found} (0x{found:X})")
+            }
+            Why::DeviceType(found) => {
+                write!(f, "object 1000 is 0x{found:08X}: no drive with profile 402 (0x....0192)")
+            }
+            Why::RatedTorque(drive, rig) => write!(
+                f,
+                "its rated torque is {drive} N·m (object 6076), the rig says {rig} N·m: correct `T_rated`, or the \
+                 node id"
+            ),
+            Why::NoLimit(which) => {
+                write!(f, "neither the rig nor the drive says its greatest {which}: give `{which}_max`")
+            }
+            Why::NoMode(modes) => write!(f, "it offers no mode for this command (object 6502 is 0x{modes:08X})"),
+            Why::Period(period_ns) => write!(
+                f,
+                "a period of {} µs can't be told to it (object 60C2 takes 1 to 255 times a power of ten)",
+                period_ns as f64 / 1e3
+            ),
+            Why::NoTimeout => write!(
+                f,
+                "it has no means to notice that we are gone: neither heartbeat consumer (1016) nor node guarding (100C)"
+            ),
+            Why::NotOperational(state) => write!(f, "it was started and is {state}"),
+            Why::Missed(missed, of) => write!(f, "{missed} of {of} answers to SYNC were late or missing"),
+            Why::Mode { wanted, shown } => write!(f, "it was given mode {wanted} and shows mode {shown}"),
+            Why::NotEnabled(state, 0) => write!(f, "it stays in \"{state}\""),
+            Why::NotEnabled(state, code) => {
+                let text = crate::canopen::service::error_meaning(code);
+                write!(f, "it stays in \"{state}\", error 0x{code:04X}: {text}")
+            }
+            Why::TimeoutIgnored(ms) => {
+                write!(f, "our life sign had stopped for {ms} ms and it was still enabled: its time-out does not work")
+            }
+            Why::Stuck(command) => write!(f, "it did not move at {command:.3}: is it blocked, or its brake closed?"),
+            Why::WrongSign => write!(f, "it turned against the command: sign of torque or of position is swapped"),
+            Why::Ran(angle, speed) => {
+                write!(f, "the first motion went too far: {angle:.3} rad at {speed:.2} rad/s")
+            }
+            Why::Scale(position, speed) => write!(
+                f,
+                "by its position it turned by {position:.4} rad, by its speed by {speed:.4} rad: `count` or \
+                 `speed_unit` is wrong"
+            ),
+            Why::Torque(told, applied) => write!(
+                f,
+                "it was told {told:.4} N·m s and reports {applied:.4} N·m s: scale or sign of its torque is wrong"
+            ),
+            Why::Trouble(kind) => kind.fmt(f),
+        }
+    }
+}
