@@ -12,6 +12,8 @@ pub use compiler::{
     Case, Changes, Loaded, Options, SourceFile, Sources, check, compile, dissipation, explain, explain_in, explain_run,
     linear, load, quantities, varying,
 };
+#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
+pub use compiler::{Ready, rig};
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;
 

@@ -6,9 +6,10 @@
 pub mod unit;
 pub mod description;
 pub mod table;
-pub mod plan;
-pub mod rig;
+pub mod series;
 pub mod instance;
+pub mod rig;
+pub mod plan;
 pub mod encode;
 pub mod packing;
 pub mod image;

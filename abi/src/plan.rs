@@ -1,50 +1,9 @@
 //! What to run, as plain data. Every expression in it is a quantity of the program already: a plan holds slots.
 
 use crate::description::Slot;
+use crate::rig::Bench;
+pub use crate::series::{Method, Series, Solver};
 use crate::unit::Unit;
-
-/// How time is stepped.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-#[allow(missing_docs)]
-pub enum Method {
-    Euler,
-    Rk4,
-    Expo,
-    Implicit,
-    Adaptive,
-}
-
-impl Method {
-    /// All of them.
-    pub const ALL: [Method; 5] = [Method::Adaptive, Method::Expo, Method::Implicit, Method::Rk4, Method::Euler];
-
-    /// As written behind `solver`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Method::Euler => "euler",
-            Method::Rk4 => "rk4",
-            Method::Expo => "expo",
-            Method::Implicit => "implicit",
-            Method::Adaptive => "adaptive",
-        }
-    }
-
-    /// The method of this name.
-    pub fn named(name: &str) -> Option<Method> {
-        Method::ALL.into_iter().find(|method| method.name() == name)
-    }
-}
-
-/// The solver of an experiment.
-#[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Solver {
-    /// The method.
-    pub method: Method,
-    /// Fixed step in s; of an adaptive run 0.
-    pub step: f64,
-    /// Relative tolerance of an adaptive run.
-    pub tol: f64,
-}
 
 /// One experiment on one instance.
 #[derive(Clone, PartialEq, Debug)]
@@ -53,27 +12,16 @@ pub struct Experiment {
     pub name: String,
     /// Simulated time in s.
     pub duration: f64,
-    /// How.
+    /// How. In a dry run: how the crossed-out part is stepped, while the rig says how the rest is.
     pub solver: Solver,
+    /// A dry run: the instance is the control program of a rig, and this what stands around it.
+    pub bench: Option<Box<Bench>>,
     /// What is drawn and written.
     pub plots: Vec<Plot>,
     /// What must hold.
     pub expects: Vec<Expect>,
     /// Instants in s, ascending, at which a signal or a recording has a corner.
     pub corners: Vec<f64>,
-}
-
-/// A drawn quantity.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Series {
-    /// As written: `body.v`.
-    pub label: String,
-    /// Where its value lies after a step, in SI.
-    pub slot: Slot,
-    /// The unit it is shown in.
-    pub unit: Unit,
-    /// True or false rather than a quantity.
-    pub boolean: bool,
 }
 
 /// One plot.

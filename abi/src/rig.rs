@@ -6,8 +6,10 @@
 //! giving what their encoders see: it stands in where there is no hardware.
 
 use crate::description::Slot;
-use crate::plan::{Method, Series};
+use crate::instance::Instance;
+use crate::series::{Method, Series};
 use crate::unit::Unit;
+use std::fmt;
 
 /// One rig.
 #[derive(Clone, PartialEq, Debug)]
@@ -259,4 +261,25 @@ pub struct Plant {
     pub seen: Vec<(Signal, Slot)>,
     /// Moment of inertia of the shaft, kg·m², where the compiler could find it; for prediction and its checks.
     pub inertia: Option<f64>,
+}
+
+/// What stands around the control program of a rig in a dry run: all but the hardware.
+#[derive(Clone)]
+pub struct Bench {
+    /// The rig.
+    pub rig: Rig,
+    /// The crossed-out part, at its start.
+    pub plant: Instance,
+}
+
+impl PartialEq for Bench {
+    fn eq(&self, other: &Bench) -> bool {
+        self.rig == other.rig && self.plant.block() == other.plant.block()
+    }
+}
+
+impl fmt::Debug for Bench {
+    fn fmt(&self, out: &mut fmt::Formatter) -> fmt::Result {
+        write!(out, "Bench of {}", self.rig.name)
+    }
 }

@@ -515,8 +515,13 @@ fn variant(
             before: expect.before.as_ref().map(&mut add),
         })
         .collect();
-    let request =
-        Request { instance: Instance::Written(&parts.run.instance, root), overrides, observed, data: data.to_vec() };
+    let request = Request {
+        instance: Instance::Written(&parts.run.instance, root),
+        overrides,
+        observed,
+        data: data.to_vec(),
+        frame: None,
+    };
     on_stage("flatten");
     let flat = flatten(loaded, sources, &request);
     let (mut system, nodes, mut diagnostics) = (flat.system, flat.observed, flat.diagnostics);
@@ -635,7 +640,8 @@ fn variant(
     let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
-    let experiment = plan::Experiment { name: name.to_string(), duration, solver, plots, expects, corners };
+    let experiment =
+        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners };
     let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
         let quantity = program.description.quantity(moved)?;
         Some((path.clone(), quantity.slot))

@@ -28,6 +28,7 @@ pub mod friction;
 pub mod lints;
 pub mod explain;
 pub mod linearise;
+pub mod rig;
 pub mod experiment;
 pub mod vary;
 
@@ -144,6 +145,7 @@ pub fn linear(
         overrides: overrides.iter().map(|change| change.override_in(root)).collect(),
         observed: Vec::new(),
         data: Vec::new(),
+        frame: None,
     };
     let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
     let ports = options.changes.ports.clone().unwrap_or_default();
@@ -172,6 +174,66 @@ pub fn linear(
     let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
     Ok(linearise::Linear::new(&program, instance, None, &ports))
+}
+
+/// A rig, ready to run.
+pub struct Ready {
+    /// Its plan.
+    pub rig: abi::rig::Rig,
+    /// The control program: parameters set, not started.
+    pub control: Instance,
+    /// The crossed-out part: its own `Step`, by `expo`.
+    pub plant: Instance,
+    /// The control program before it was compiled: for derivatives of its step.
+    pub program: program::Program,
+    /// The plant program before it was compiled.
+    pub plant_program: program::Program,
+    /// What the user should know: a processor without what machine code needs.
+    pub notes: Vec<String>,
+}
+
+/// Compiles a rig of a loaded text. Of the changes in `options` only `set` counts.
+///
+/// # Errors
+/// Everything that is wrong with the rig and the models it runs.
+pub fn rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Ready, Vec<Diagnostic>> {
+    let lowered = lowered_rig(loaded, sources, name, options, warnings)?;
+    let rig::Lowered { rig, control, plant } = lowered;
+    let both = [(&control, rig.method), (&plant, Method::Expo)].map(|(program, method)| {
+        let (code, notes) = code(&functions(program, method), &program.description, options.interpret);
+        (Instance::new(Arc::new(program.description.clone()), code, &program.params), notes)
+    });
+    let [(control_made, notes), (plant_made, _)] = both;
+    Ok(Ready { rig, control: control_made, plant: plant_made, program: control, plant_program: plant, notes })
+}
+
+/// A rig up to its programs.
+fn lowered_rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    options: &Options,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<rig::Lowered, Vec<Diagnostic>> {
+    let mut diagnostics = Vec::new();
+    let overrides = experiment::overrides(loaded, &options.changes, &mut diagnostics);
+    let root = loaded.root();
+    let called = grammar::ast::Name { text: name.into(), span: grammar::span::Span::new(root, 0, 0) };
+    let item = rig::find(loaded, root, &called).map_err(|error| vec![error])?;
+    let prepared = rig::prepare(loaded, sources, item);
+    let changes = overrides.iter().map(|change| change.override_in(root)).collect();
+    let cut = rig::read(loaded, sources, &prepared, changes, Vec::new(), Vec::new(), &mut diagnostics);
+    let Some(cut) = cut.filter(|_| !diagnostics.iter().any(Diagnostic::is_error)) else {
+        return Err(once(diagnostics));
+    };
+    warnings.extend(diagnostics);
+    Ok(cut.lowered(warnings))
 }
 
 /// Code of the last case, and what it was made from.
@@ -365,6 +427,7 @@ fn alone(
         overrides,
         observed: Vec::new(),
         data: Vec::new(),
+        frame: None,
     };
     let flat = flatten::flatten(loaded, sources, &request);
     let mut diagnostics = flat.diagnostics;
@@ -415,7 +478,14 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                 let error = Diagnostic::error("E0905", format!("`fit {}` is not available yet", fit.name.text));
                 all.push(error.label(fit.name.span, "reserved for the fitting of parameters"));
             }
-            Item::Import(_) | Item::Interface(_) | Item::Device(_) | Item::Rig(_) => {}
+            Item::Rig(rig) => {
+                let mut warnings = Vec::new();
+                match lowered_rig(loaded, sources, &rig.name.text, &Options::default(), &mut warnings) {
+                    Ok(_) => all.extend(warnings),
+                    Err(errors) => all.extend(errors),
+                }
+            }
+            Item::Import(_) | Item::Interface(_) | Item::Device(_) => {}
         }
     }
     // What cannot be read elsewhere is missing here: say the cause.

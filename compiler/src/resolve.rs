@@ -134,6 +134,15 @@ impl Loaded {
         self.files.get(self.root()).ast.items.iter().filter_map(experiment).collect()
     }
 
+    /// Rigs of the asked-for file, in order.
+    pub fn rigs(&self) -> Vec<&ast::Rig> {
+        let rig = |item| match item {
+            &Item::Rig(ref rig) => Some(rig),
+            _ => None,
+        };
+        self.files.get(self.root()).ast.items.iter().filter_map(rig).collect()
+    }
+
     /// Models of the asked-for file, in order.
     pub fn models(&self) -> Vec<&ast::Model> {
         self.files

@@ -805,7 +805,9 @@ impl<'t> Reader<'t> {
             Rule::rate => RigStatement::Rate(self.value(&mut children), span),
             Rule::solver => RigStatement::Solver(self.solver(pair)),
             Rule::bus => {
-                let (name, kind) = (self.name(children.one()), self.name(children.one()));
+                let name = self.name(children.one());
+                children.maybe(Rule::eq);
+                let kind = self.name(children.one());
                 let args = children.all(Rule::bus_arg).into_iter().map(|arg| {
                     let inner = Children::of(arg).one();
                     match inner.as_rule() {
@@ -818,8 +820,9 @@ impl<'t> Reader<'t> {
             }
             Rule::drive => {
                 let moves = says(&pair, Rule::kw_drive);
-                let (name, kind, bus) =
-                    (self.name(children.one()), self.name(children.one()), self.name(children.one()));
+                let name = self.name(children.one());
+                children.maybe(Rule::eq);
+                let (kind, bus) = (self.name(children.one()), self.name(children.one()));
                 let args = children.all(Rule::drive_arg).into_iter().map(|arg| self.drive_argument(arg)).collect();
                 RigStatement::Drive(DriveDecl { moves, name, kind, bus, args, span })
             }

@@ -330,7 +330,15 @@ pub fn slot(instance: &Instance, path: &str) -> Slot {
 /// An experiment that neither draws nor expects.
 pub fn fixed(duration: f64, step: f64) -> Experiment {
     let solver = Solver { method: Method::Rk4, step, tol: 0.0 };
-    Experiment { name: "test".into(), duration, solver, plots: Vec::new(), expects: Vec::new(), corners: Vec::new() }
+    Experiment {
+        name: "test".into(),
+        duration,
+        solver,
+        bench: None,
+        plots: Vec::new(),
+        expects: Vec::new(),
+        corners: Vec::new(),
+    }
 }
 
 /// An adaptive experiment that neither draws nor expects.

@@ -65,7 +65,8 @@ pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Contin
         }
         let solver = Solver { method: Method::Adaptive, step: 0.0, tol };
         let (plots, expects, corners) = (Vec::new(), Vec::new(), Vec::new());
-        let experiment = Experiment { name: String::new(), duration: *wait, solver, plots, expects, corners };
+        let experiment =
+            Experiment { name: String::new(), duration: *wait, solver, bench: None, plots, expects, corners };
         let before = now.clone();
         let mut begin = |instance: &mut Instance| {
             instance.carry(&before);

@@ -100,6 +100,7 @@ impl<'a> Flattener<'a> {
             }
             (Some(_), _) => Definition::Missing, // Reported with the arguments.
             (None, _) if declaration.kind == DeclarationKind::Input && self.tree(id).alone => Definition::Free,
+            (None, _) if declaration.kind == DeclarationKind::Input && self.tree(id).on_bus => Definition::Free,
             (None, Some(value)) => {
                 let value = match declaration.kind {
                     DeclarationKind::Output | DeclarationKind::Let => {

@@ -116,7 +116,8 @@ impl<'a> Flattener<'a> {
                 _ => deeper.push(change),
             }
         }
-        self.instances.push(Tree { model, file, names: HashMap::new(), args, alone, locals: Rc::default() });
+        let (names, locals) = (HashMap::new(), Rc::default());
+        self.instances.push(Tree { model, file, names, args, alone, on_bus: false, scope: false, locals });
         self.declare(id);
         self.parts(id, deeper);
         self.check_arguments(id);

@@ -5,6 +5,7 @@
 
 mod equations;
 mod expressions;
+mod frame;
 mod instances;
 
 use crate::names::nearest;
@@ -17,6 +18,8 @@ use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::collections::HashMap;
 use std::rc::Rc;
+
+pub use frame::{Frame, Framed, Node as BusNode, Scope};
 
 /// Most quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;
@@ -35,6 +38,8 @@ pub struct Request<'a> {
     pub observed: Vec<&'a Expr>,
     /// Recordings that may be read as `data.NAME`: the number of the table.
     pub data: Vec<(String, Table, Unit)>,
+    /// The rig around the instance.
+    pub frame: Option<Frame<'a>>,
 }
 
 /// The instance of a [`Request`].
@@ -71,6 +76,8 @@ pub struct Flat {
     pub system: System,
     /// One node for each observed expression.
     pub observed: Vec<ExprId>,
+    /// Where the rig came to lie.
+    pub framed: Option<Framed>,
     /// What is wrong.
     pub diagnostics: Vec<Diagnostic>,
 }
@@ -88,6 +95,15 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         .iter()
         .map(|o| Change { path: &o.path.segments, span: o.path.span, value: o.value, env: Env::file(o.file) })
         .collect();
+    // A change of a drive or of a part of the rig is none of the instance.
+    let of_frame = |change: &Change| {
+        let head = &change.path[0].name.text;
+        request.frame.as_ref().is_some_and(|frame| {
+            frame.nodes.iter().any(|node| node.name.text == *head)
+                || frame.parts.iter().any(|part| part.name.text == *head)
+        })
+    };
+    let (around, overrides): (Vec<Change>, Vec<Change>) = overrides.into_iter().partition(of_frame);
     match &request.instance {
         Instance::Written(instance, file) => {
             let env = Env::file(*file);
@@ -99,8 +115,17 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             f.instantiate(model, *file, made, true);
         }
     }
+    let mut framed = match (&request.frame, f.instances.is_empty()) {
+        (Some(frame), false) => Some(f.surround(frame, &around)),
+        _ => None,
+    };
     for index in 0..f.instances.len() {
-        f.define(InstanceId(index as u32));
+        if !f.instances[index].scope {
+            f.define(InstanceId(index as u32));
+        }
+    }
+    if let (Some(frame), Some(framed)) = (&request.frame, &mut framed) {
+        f.framed(frame, framed);
     }
     for arg in std::mem::take(&mut f.dropped) {
         if let ArgValue::Expr(expr) = arg.value {
@@ -112,12 +137,13 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             let file = match &request.instance {
                 Instance::Written(_, file) | Instance::Alone(_, file) => *file,
             };
-            let env = Env { instance: Some(InstanceId(0)), outside: true, ..Env::file(file) };
+            let instance = framed.as_ref().map_or(InstanceId(0), |framed| framed.rig);
+            let env = Env { instance: Some(instance), outside: true, ..Env::file(file) };
             request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
         }
         None => Vec::new(),
     };
-    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+    Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
 }
 
 /// Reads a function, constant or table on its own: a function's arguments come from outside.
@@ -159,7 +185,7 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
         }
         _ => Vec::new(),
     };
-    Flat { system: f.system, observed, diagnostics: f.diagnostics }
+    Flat { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
 }
 
 struct Flattener<'a> {
@@ -197,6 +223,10 @@ struct Tree<'a> {
     names: HashMap<&'a str, Binding>,
     args: Vec<Arg<'a>>,
     alone: bool,
+    /// A drive or device: inputs come from the bus.
+    on_bus: bool,
+    /// A rig, which only lends its names.
+    scope: bool,
     locals: Locals,
 }
 

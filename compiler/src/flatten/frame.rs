@@ -1,0 +1,150 @@
+//! A rig around the instance it runs: drives and devices with their signals, parts that only the rig needs, and
+//! expressions over all of them.
+
+use super::*;
+
+/// What a rig adds to the instance it runs.
+pub struct Frame<'a> {
+    /// The rig as a model, for its name and for suggestions; what stands in it is not read.
+    pub model: &'a ast::Model,
+    /// Where the rig stands.
+    pub file: FileId,
+    /// Drives and devices.
+    pub nodes: Vec<Node<'a>>,
+    /// Drives and devices whose description is wrong: reported.
+    pub broken: Vec<&'a Name>,
+    /// Observers and filters of the rig.
+    pub parts: Vec<&'a ast::Part>,
+    /// The part that is crossed out.
+    pub hardware: Option<&'a Name>,
+    /// Expressions of the rig.
+    pub expressions: Vec<(Scope, &'a Expr)>,
+}
+
+/// A drive or device: its inputs are the signals read from the bus.
+pub struct Node<'a> {
+    /// As the rig calls it.
+    pub name: &'a Name,
+    /// Its description.
+    pub model: &'a ast::Model,
+    /// Where that stands.
+    pub file: FileId,
+    /// What the rig says of it.
+    pub instance: &'a ast::Instance,
+}
+
+/// Whose names an expression of a rig may use, and what it wants to be.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Scope {
+    /// Drives, devices and parts of the rig, then those of the instance it runs.
+    Rig,
+    /// As `Rig`, in a condition in which crossings may stand.
+    Condition,
+    /// Those of the crossed-out part, then as `Rig`.
+    Part,
+}
+
+/// Where a frame came to lie in the system.
+pub struct Framed {
+    /// The rig itself.
+    pub rig: InstanceId,
+    /// Its drives and devices.
+    pub nodes: Vec<InstanceId>,
+    /// The crossed-out part; none if there is no such part, which is reported.
+    pub hardware: Option<InstanceId>,
+    /// One node for each expression.
+    pub expressions: Vec<ExprId>,
+}
+
+impl<'a> Flattener<'a> {
+    /// Makes the instances of a frame around the first instance.
+    pub(super) fn surround(&mut self, frame: &Frame<'a>, overrides: &[Change<'a>]) -> Framed {
+        let top = InstanceId(0);
+        let names = self.tree(top).names.clone();
+        let rig = self.scope(frame.model, frame.file, names);
+        let env = Env { instance: Some(rig), ..Env::file(frame.file) };
+        let mine = |name: &Name| -> Vec<Change<'a>> {
+            let to = overrides.iter().filter(|change| change.path[0].name.text == name.text);
+            to.map(|change| Change { path: &change.path[1..], ..change.clone() }).collect()
+        };
+        let mut nodes = Vec::new();
+        for node in &frame.nodes {
+            let made = Making {
+                path: node.name.text.clone(),
+                rotary: false,
+                span: node.instance.model.span,
+                args: args_of(&node.instance.args, &env),
+                overrides: mine(node.name).into_iter().filter(|change| !change.path.is_empty()).collect(),
+            };
+            let id = self.instantiate(node.model, node.file, made, false);
+            self.instances[id.0 as usize].on_bus = true;
+            self.bind(rig, &node.name.text, Binding::Part(id));
+            nodes.push(id);
+        }
+        for name in &frame.broken {
+            self.bind(rig, &name.text, Binding::Broken);
+        }
+        for part in &frame.parts {
+            if let Some(id) = self.part(rig, part, &env, String::new(), mine(&part.name)) {
+                self.bind(rig, &part.name.text, Binding::Part(id));
+            }
+        }
+        let hardware = frame.hardware.and_then(|name| match self.tree(top).names.get(name.text.as_str()) {
+            Some(Binding::Part(part)) => Some(*part),
+            Some(Binding::Broken) => None,
+            _ => {
+                self.unknown_part(top, name);
+                None
+            }
+        });
+        Framed { rig, nodes, hardware, expressions: Vec::new() }
+    }
+
+    /// An instance without quantities of its own, whose names are these.
+    fn scope(&mut self, model: &'a ast::Model, file: FileId, names: HashMap<&'a str, Binding>) -> InstanceId {
+        let id = InstanceId(self.system.instances.len() as u32);
+        let info = InstanceInfo {
+            path: String::new(),
+            model: model.name.text.clone(),
+            rotary: false,
+            span: model.name.span,
+            allows: Vec::new(),
+        };
+        self.system.instances.push(info);
+        let tree = Tree {
+            model,
+            file,
+            names,
+            args: Vec::new(),
+            alone: false,
+            on_bus: false,
+            scope: true,
+            locals: Rc::default(),
+        };
+        self.instances.push(tree);
+        id
+    }
+
+    /// Reads the expressions of a frame.
+    pub(super) fn framed(&mut self, frame: &Frame<'a>, framed: &mut Framed) {
+        let rig = Env { instance: Some(framed.rig), ..Env::file(frame.file) };
+        let inside = match framed.hardware {
+            Some(part) => {
+                let mut names = self.tree(framed.rig).names.clone();
+                names.extend(self.tree(part).names.iter().map(|(name, binding)| (*name, binding.clone())));
+                let model = self.tree(part).model;
+                Env { instance: Some(self.scope(model, frame.file, names)), ..rig.clone() }
+            }
+            None => rig.clone(),
+        };
+        for (scope, expr) in &frame.expressions {
+            let env = match scope {
+                Scope::Rig => &rig,
+                Scope::Condition => &Env { instants: true, ..rig.clone() },
+                Scope::Part => &inside,
+            };
+            let read = self.expr(expr, env);
+            framed.expressions.push(read);
+        }
+    }
+}

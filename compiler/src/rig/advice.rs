@@ -1,0 +1,204 @@
+//! What deserves a look before a rig moves: contacts too stiff for the delay of the loop, and steps of encoder, speed and
+//! torque too coarse for the model.
+//!
+//! In: both programs and the plan. Out: warnings, and the inertia that the plan tells. The law of the delay is the one for
+//! the hand (docs/prediction.md); `fric predict` computes it from the compiled step.
+
+use super::Places;
+use crate::backend::interp::Interpreter;
+use crate::linearise::{Linear, Matrices, PortSlots};
+use crate::program::Program;
+use crate::units::three_digits;
+use abi::description::{Kind as QuantityKind, Quantity};
+use abi::rig::{Kind, Mode, Rig, Signal, What};
+use abi::series::Method;
+use abi::table::Code;
+use abi::unit::{Angle, Dimension, Unit};
+use abi::{Instance, Slot};
+use grammar::diagnostic::Diagnostic;
+use std::sync::Arc;
+
+/// Fewest counts in the range of a state.
+const COUNTS: f64 = 20.0;
+/// Greatest share of the smallest speed that one step of the speed may be.
+const SPEED_SHARE: f64 = 0.2;
+/// Greatest share of the smallest force that one step of the torque may be.
+const TORQUE_SHARE: f64 = 0.02;
+
+const SPEED: Dimension = Dimension::of([0, 0, -1, 0, 0]);
+const TORQUE: Dimension = Dimension::of([1, 2, -2, 0, 0]);
+
+/// The derivatives of a program at its start, between slots.
+fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
+    let description = Arc::new(program.description.clone());
+    let functions = crate::functions(program, Method::Adaptive);
+    let interpreter = Interpreter::new(&functions, &description.layout, description.pool.len());
+    let mut instance = Instance::new(description.clone(), Code::Interpreted(Arc::new(interpreter)), &program.params);
+    instance.start(0.0);
+    let named = |slots: &[Slot]| slots.iter().map(|slot| (String::new(), *slot)).collect::<Vec<_>>();
+    let ports: PortSlots = (named(inputs), named(outputs));
+    let mut linear = Linear::new(program, instance, None, &ports);
+    let fits = linear.inputs.len() == inputs.len() && linear.outputs.len() == outputs.len();
+    let states = linear.states.len();
+    fits.then(|| (linear.at(), states))
+}
+
+/// The moment of inertia that a torque moves, kg·m²: from the derivatives of the plant at its start. None where no torque
+/// is applied, or it does not turn what is seen at once.
+pub fn inertia(rig: &Rig, plant: &Program) -> Option<f64> {
+    let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| signal.what == What::Torque)?;
+    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
+    let (m, n) = linear(plant, &[*torque], &[*speed])?;
+    let gain: f64 = (0..n).map(|i| m.c[i] * m.b[i]).sum();
+    (gain != 0.0 && gain.is_finite()).then(|| 1.0 / gain.abs())
+}
+
+/// All warnings of a rig.
+pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &Places) -> Vec<Diagnostic> {
+    let mut found = Vec::new();
+    emulation(rig, control, plant, places, &mut found);
+    resolution(rig, control, places, &mut found);
+    found
+}
+
+/// How a command answers a signal near rest: stiffness K in N·m/rad and damping B in N·m·s/rad, both resisting.
+struct Contact {
+    stiffness: f64,
+    damping: f64,
+}
+
+/// The greatest ω_n τ at which a spring and a damper emulated τ late are stable.
+///
+/// `zeta`: damping ratio B / (2 √(K J)). Source: the crossing of the imaginary axis of J s² + (B s + K) e^{−s τ}.
+#[allow(clippy::disallowed_methods, reason = "a warning's limit: shown with three digits, decides nothing that runs")]
+pub fn stable_up_to(zeta: f64) -> f64 {
+    let w = (2.0 * zeta * zeta + (4.0 * zeta.powi(4) + 1.0).sqrt()).sqrt();
+    (2.0 * zeta * w).atan() / w
+}
+
+fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
+    let Some(inertia) = rig.plant.inertia else { return };
+    let period = rig.period_ns as f64 * 1e-9;
+    for (k, output) in rig.outputs.iter().enumerate() {
+        let node = &rig.nodes[output.signal.node];
+        let Kind::Cia402(drive) = &node.kind else { continue };
+        if drive.mode != Mode::Torque || rig.predict == Some(output.signal.node) {
+            continue;
+        }
+        let tau = 0.5 * period + node.delay + node.lag + if drive.at_sync { period } else { 0.0 };
+        let Some(contact) = contact(rig, control, plant, output.signal, output.slot, tau) else { continue };
+        if contact.stiffness <= 0.0 {
+            continue;
+        }
+        let natural = (contact.stiffness / inertia).sqrt();
+        let zeta = 0.5 * contact.damping / (contact.stiffness * inertia).sqrt();
+        let limit = stable_up_to(zeta.max(0.0)) / natural;
+        if tau < limit {
+            continue;
+        }
+        let ms = |seconds: f64| three_digits(1e3 * seconds);
+        let message = format!("`{}` emulates a contact that is too stiff for the delay of its loop", node.name);
+        let most = inertia * (0.74 / tau) * (0.74 / tau);
+        let help = format!(
+            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms. At {} ms a stiffness up to {} N·m/rad can be \
+             rendered, best with a damping ratio of 0.64; or write `predict {}`",
+            three_digits(contact.stiffness),
+            three_digits(inertia),
+            ms(limit),
+            ms(tau),
+            three_digits(most),
+            node.name
+        );
+        let warning = Diagnostic::warning("W0801", message)
+            .label(places.wires.get(k).copied().unwrap_or(places.name), format!("acts {} ms late", ms(tau)));
+        found.push(warning.help(help));
+    }
+}
+
+/// The answer of one command to speed and position at rest, as resistance of the shaft.
+fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot: Slot, tau: f64) -> Option<Contact> {
+    let of = |what: What| rig.inputs.iter().filter(move |input| input.signal.what == what).map(|input| input.slot);
+    let (speeds, positions): (Vec<Slot>, Vec<Slot>) = (of(What::Speed).collect(), of(What::Position).collect());
+    let inputs: Vec<Slot> = speeds.iter().chain(&positions).copied().collect();
+    let (m, n) = linear(control, &inputs, &[slot])?;
+    let width = inputs.len();
+    let (mut stiffness, mut damping) = (0.0, 0.0);
+    for j in 0..width {
+        let direct = m.d[j];
+        // What integrates the speed is a spring; what forgets it within the delay is none.
+        let held = |i: usize| m.a[i * n + i] > -0.1 / tau;
+        let stored: f64 = (0..n).filter(|i| held(*i)).map(|i| m.c[i] * m.b[i * width + j]).sum();
+        match j < speeds.len() {
+            true => (stiffness, damping) = (stiffness - stored, damping - direct),
+            false => stiffness -= direct,
+        }
+    }
+    // The sign with which this drive turns what is seen.
+    let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| *signal == command)?;
+    let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
+    let (p, states) = linear(plant, &[*torque], &[*speed])?;
+    let gain: f64 = (0..states).map(|i| p.c[i] * p.b[i]).sum();
+    let sign = if gain < 0.0 { -1.0 } else { 1.0 };
+    Some(Contact { stiffness: sign * stiffness, damping: sign * damping })
+}
+
+fn resolution(rig: &Rig, control: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
+    let quantities = &control.description.quantities;
+    let shown = |value: f64, unit: &Unit| format!("{} {unit}", three_digits(unit.from_si(value)));
+    let used = |what: What, node: usize| rig.inputs.iter().any(|input| input.signal == Signal { node, what });
+    let params = |dimension: Dimension, angular: bool| {
+        let all = quantities.iter().filter(move |q| {
+            q.kind == QuantityKind::Param && q.unit.dimension == dimension && (!angular || q.unit.angle == Angle::Angle)
+        });
+        let value = |q: &&Quantity| {
+            let layout = &control.description.layout;
+            control.params.get(q.slot.index().wrapping_sub(layout.params.start as usize)).copied()
+        };
+        let positive = all.filter_map(|q| Some((q, value(&q)?))).filter(|(_, value)| *value > 0.0 && value.is_finite());
+        positive.min_by(|a, b| a.1.total_cmp(&b.1)).map(|(q, value)| (q.clone(), value))
+    };
+    for (k, node) in rig.nodes.iter().enumerate() {
+        let Kind::Cia402(drive) = &node.kind else { continue };
+        let place = places.nodes.get(k).copied().unwrap_or(places.name);
+        let sees = used(What::Position, k) || used(What::Speed, k);
+        let narrow = quantities
+            .iter()
+            .filter(|q| q.kind == QuantityKind::State && q.unit.dimension.is_none() && q.unit.angle == Angle::Angle)
+            .map(|q| (q, (q.range.1 - q.range.0) / drive.count))
+            .filter(|(_, counts)| *counts < COUNTS)
+            .min_by(|a, b| a.1.total_cmp(&b.1));
+        if let Some((state, counts)) = narrow.filter(|_| sees) {
+            let message = format!("the encoder of `{}` is too coarse for `{}`", node.name, state.path);
+            let warning = Diagnostic::warning("W0802", message)
+                .label(place, format!("the range of the state spans {} counts", three_digits(counts)));
+            let most = (state.range.1 - state.range.0) / COUNTS;
+            let help =
+                format!("a count of at most {} shows it; or observe the shaft with a `part`", shown(most, &state.unit));
+            found.push(warning.help(help));
+        }
+        if let Some((param, value)) = params(SPEED, true).filter(|_| used(What::Speed, k))
+            && drive.speed_unit > SPEED_SHARE * value
+        {
+            let message = format!("the speed of `{}` is too coarse for `{}`", node.name, param.path);
+            let step = three_digits(drive.speed_unit / value * 100.0);
+            let warning = Diagnostic::warning("W0803", message).label(place, format!("one step is {step} % of it"));
+            let help = format!(
+                "a `speed_unit` of at most {} would do; or take the speed from `position`, by a `part` that observes it",
+                shown(SPEED_SHARE * value, &param.unit)
+            );
+            found.push(warning.help(help));
+        }
+        let commanded = rig.outputs.iter().any(|output| output.signal == Signal { node: k, what: What::Torque });
+        if let Some((param, value)) = params(TORQUE, false).filter(|_| commanded)
+            && 1e-3 * drive.rated_torque > TORQUE_SHARE * value
+        {
+            let message = format!("the torque of `{}` is too coarse for `{}`", node.name, param.path);
+            let step = three_digits(0.1 * drive.rated_torque / value);
+            let warning = Diagnostic::warning("W0804", message)
+                .label(place, format!("one step, a thousandth of `T_rated`, is {step} % of it"));
+            let most = 1e3 * TORQUE_SHARE * value;
+            let help = format!("a drive of at most {} has steps fine enough", shown(most, &param.unit));
+            found.push(warning.help(help));
+        }
+    }
+}

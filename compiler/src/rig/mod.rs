@@ -1,0 +1,760 @@
+//! Reads a rig: the system with one part crossed out, the drives put in its place, and everything that is checked before
+//! anything moves.
+//!
+//! In: a rig's tree. Out: a [`Cut`]: two flat systems, *control* (the part gone, what drives measure as inputs, what they
+//! are told as outputs) and *plant* (the part alone, wires read backwards), and the plan of the rig. [`Cut::finish`] puts
+//! the slots of their programs into the plan. Knows no file and no bus.
+
+mod advice;
+mod cut;
+mod dbc;
+mod frames;
+mod nodes;
+mod plan;
+mod statements;
+mod wires;
+
+use crate::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
+use crate::lower::{Wanted, evaluate};
+use crate::program::Program;
+use crate::resolve::{ItemRef, Loaded, Lookup, Space};
+use crate::source::{Files, Sources};
+use crate::system::*;
+use crate::units::{self, Types};
+use crate::{causality, checks};
+use abi::Slot;
+use abi::description::Kind as QuantityKind;
+use abi::rig::{self, Mode, Overrun, Rig, Signal, What};
+use abi::series::{Method, Series};
+use abi::unit::{Dimension, Unit};
+use cut::{affine, lives, mentioned, nothing, one, pruned, solved};
+use grammar::ast::{self, Expr, Item, Name};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+use nodes::{Description, Read, Speaks};
+use statements::{Expressions, Statements};
+use std::sync::Arc;
+
+/// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.
+pub const PLANT_STEPS: u32 = 50;
+
+/// A rig with the descriptions of its drives and devices, which need texts of their own.
+pub struct Prepared {
+    ast: Arc<ast::File>,
+    item: ItemRef,
+    model: ast::Model,
+    descriptions: Vec<Description>,
+    diagnostics: Vec<Diagnostic>,
+}
+
+impl Prepared {
+    /// The rig as written.
+    pub fn rig(&self) -> &ast::Rig {
+        match &self.ast.items[self.item.index as usize] {
+            Item::Rig(rig) => rig,
+            _ => unreachable!("a rig was found here"),
+        }
+    }
+}
+
+/// Finds the rig that a file calls so.
+pub fn find(loaded: &Loaded, file: FileId, name: &Name) -> Result<ItemRef, Diagnostic> {
+    match loaded.find(file, Space::Rig, &name.text) {
+        Lookup::Found(item, _) => Ok(item),
+        Lookup::Ambiguous(..) => {
+            let error = Diagnostic::error("E0202", format!("two imports define `{}`", name.text));
+            Err(error.label(name.span, "which one?").help("import only one of them"))
+        }
+        Lookup::Missing => {
+            let error = Diagnostic::error("E0201", format!("there is no rig `{}`", name.text))
+                .label(name.span, "not declared and not imported");
+            let known = loaded.visible(file, Space::Rig);
+            Err(match crate::names::nearest(&name.text, known) {
+                Some(near) => error.help(format!("did you mean `{near}`?")),
+                None => error.help("models begin with a capital, rigs with a small letter"),
+            })
+        }
+    }
+}
+
+/// Reads the descriptions of a rig's drives and devices.
+pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Prepared {
+    let ast = loaded.files.get(item.file).ast.clone();
+    let Item::Rig(rig) = &ast.items[item.index as usize] else { unreachable!("a rig was found here") };
+    let mut diagnostics = Vec::new();
+    let descriptions = nodes::describe(loaded, sources, item.file, rig, &mut diagnostics);
+    // What a name in the rig may have meant.
+    let mut body: Vec<ast::Statement> = Vec::new();
+    for statement in &rig.body {
+        match statement {
+            ast::RigStatement::Part(part) => body.push(ast::Statement::Part(part.clone())),
+            ast::RigStatement::Run(run) => {
+                if let Lookup::Found(_, Item::Model(model)) =
+                    loaded.find(item.file, Space::Type, &run.instance.model.text)
+                {
+                    let names = model.body.iter().filter(|statement| {
+                        matches!(statement, ast::Statement::Declaration(_) | ast::Statement::Part(_))
+                    });
+                    body.extend(names.cloned());
+                }
+            }
+            ast::RigStatement::Drive(drive) => {
+                let instance =
+                    ast::Instance { rotary: false, model: drive.kind.clone(), args: Vec::new(), span: drive.span };
+                let name = drive.name.clone();
+                let part = ast::Part { name, repeat: None, slot: None, instance, doc: None, span: drive.span };
+                body.push(ast::Statement::Part(part));
+            }
+            _ => {}
+        }
+    }
+    let model = ast::Model { name: rig.name.clone(), body, doc: rig.doc.clone(), span: rig.span };
+    Prepared { ast: ast.clone(), item, model, descriptions, diagnostics }
+}
+
+/// A rig as two systems and a plan without slots.
+pub struct Cut {
+    /// The system with the part gone.
+    pub control: System,
+    /// Its types.
+    pub control_types: Types,
+    /// The part alone.
+    pub plant: System,
+    /// Its types.
+    pub plant_types: Types,
+    /// Expressions that were asked for, in the control system.
+    pub observed: Vec<ExprId>,
+    /// The plan; slots are those of neither program yet.
+    rig: Rig,
+    inputs: Vec<VarId>,
+    outputs: Vec<VarId>,
+    commands_read: Vec<ExprId>,
+    stops: Vec<ExprId>,
+    records: Vec<ExprId>,
+    applied: Vec<VarId>,
+    seen: Vec<VarId>,
+    seen_read: Vec<ExprId>,
+    /// Where messages about the rig point.
+    pub places: Places,
+}
+
+/// A rig as two programs and a plan.
+pub struct Lowered {
+    /// The plan.
+    pub rig: Rig,
+    /// The control program.
+    pub control: Program,
+    /// The plant program.
+    pub plant: Program,
+}
+
+/// Places of a rig for messages.
+#[derive(Clone, Default)]
+pub struct Places {
+    /// The name of the rig.
+    pub name: Span,
+    /// The period.
+    pub rate: Span,
+    /// Of each node its kind.
+    pub nodes: Vec<Span>,
+    /// Of each output its wire.
+    pub wires: Vec<Span>,
+    /// Lints that the rig allows.
+    pub allows: Vec<String>,
+}
+
+/// Reads a rig around the instance it runs. `overrides` win over what the text says; `observed` are read with the rig's
+/// names and those of the instance.
+///
+/// # Errors
+/// Everything that is wrong.
+pub fn read<'a>(
+    loaded: &'a Loaded,
+    sources: &'a dyn Sources,
+    prepared: &'a Prepared,
+    overrides: Vec<Override<'a>>,
+    observed: Vec<&'a Expr>,
+    data: Vec<(String, Table, Unit)>,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Cut> {
+    diagnostics.extend(prepared.diagnostics.iter().cloned());
+    let rig = prepared.rig();
+    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && within(rig.span, d.span()));
+    let statements = Statements::of(rig, misread, diagnostics)?;
+    let mut reader = Reader {
+        loaded,
+        files: &loaded.files,
+        rig,
+        descriptions: &prepared.descriptions,
+        statements: &statements,
+        diagnostics,
+        expressions: Expressions::default(),
+    };
+    reader.names();
+    let lists = reader.lists();
+    let expressions = std::mem::take(&mut reader.expressions);
+    let file = prepared.item.file;
+    let run = statements.run?;
+    let request = flatten::Request {
+        instance: Instance::Written(&run.instance, file),
+        overrides,
+        observed,
+        data,
+        frame: Some(Frame {
+            model: &prepared.model,
+            file,
+            nodes: prepared
+                .descriptions
+                .iter()
+                .map(|d| BusNode { name: &d.name, model: &d.model, file: d.file, instance: &d.instance })
+                .collect(),
+            broken: reader.broken(),
+            parts: statements.parts.clone(),
+            hardware: statements.hardware.map(|hardware| &hardware.part),
+            expressions: expressions.all.clone(),
+        }),
+    };
+    let flat = flatten(loaded, sources, &request);
+    reader.diagnostics.extend(flat.diagnostics);
+    let framed = flat.framed?;
+    reader.cut(flat.system, flat.observed, framed, expressions, lists)
+}
+
+/// Whether a place lies in another.
+fn within(outer: Span, inner: Span) -> bool {
+    inner.file == outer.file && outer.start <= inner.start && inner.end <= outer.end
+}
+
+/// Numbers of a rig's expressions among all that are read.
+#[derive(Default)]
+struct Lists {
+    rate: usize,
+    step: Option<usize>,
+    watchdog: Option<usize>,
+    overrun: Option<usize>,
+    /// Of each bus its bit rate.
+    bit_rates: Vec<Option<usize>>,
+    /// Commands.
+    sends: Vec<Send>,
+    /// What the part gives: the wire in `hardware`, and its value.
+    gives: Vec<(usize, usize)>,
+    stops: Vec<usize>,
+    records: Vec<usize>,
+}
+
+/// `drive.signal = expr limit a .. b slew r`
+struct Send {
+    node: usize,
+    read: Read,
+    unit: Unit,
+    /// In `hardware`, rather than beside it.
+    inside: bool,
+    value: usize,
+    limit: Option<(usize, usize)>,
+    slew: Option<usize>,
+    safe: Option<usize>,
+    path: Span,
+    span: Span,
+}
+
+struct Reader<'a, 'd> {
+    loaded: &'a Loaded,
+    files: &'a Files,
+    rig: &'a ast::Rig,
+    descriptions: &'a [Description],
+    statements: &'a Statements<'a>,
+    diagnostics: &'d mut Vec<Diagnostic>,
+    expressions: Expressions<'a>,
+}
+
+fn unit(text: &str) -> Unit {
+    Unit::parse(text).expect("a unit that is known")
+}
+
+impl<'a> Reader<'a, '_> {
+    fn report(&mut self, diagnostic: Diagnostic) {
+        self.diagnostics.push(diagnostic);
+    }
+
+    /// Names of buses, drives, devices and parts stand once.
+    fn names(&mut self) {
+        let mut first: Vec<&Name> = Vec::new();
+        let buses = self.statements.buses.iter().map(|bus| &bus.name);
+        let nodes = self.descriptions.iter().map(|node| &node.statement.name);
+        let parts = self.statements.parts.iter().map(|part| &part.name);
+        let mut found = Vec::new();
+        for name in buses.chain(nodes).chain(parts) {
+            match first.iter().find(|known| known.text == name.text) {
+                Some(before) => found.push(crate::resolve::declared_twice(name, before.span)),
+                None => first.push(name),
+            }
+        }
+        self.diagnostics.extend(found);
+    }
+
+    /// Names of drives and devices whose description is wrong.
+    fn broken(&self) -> Vec<&'a Name> {
+        let drives = self.rig.body.iter().filter_map(|statement| match statement {
+            ast::RigStatement::Drive(drive) => Some(&drive.name),
+            _ => None,
+        });
+        drives.filter(|name| self.node(&name.text).is_none()).collect()
+    }
+
+    fn node(&self, name: &str) -> Option<usize> {
+        self.descriptions.iter().position(|node| node.name.text == name)
+    }
+
+    /// E0204 for a drive or device that is not there.
+    fn no_node(&mut self, name: &Name, what: &str) {
+        let names = self.descriptions.iter().map(|node| node.name.text.as_str());
+        let near = crate::names::nearest(&name.text, names).map(str::to_string);
+        // A drive whose description is wrong has been reported.
+        let declared = self
+            .rig
+            .body
+            .iter()
+            .any(|one| matches!(one, ast::RigStatement::Drive(drive) if drive.name.text == name.text));
+        if declared {
+            return;
+        }
+        let error = Diagnostic::error("E0204", format!("there is no {what} `{}`", name.text))
+            .label(name.span, "not declared in this rig");
+        self.report(match near {
+            Some(near) => error.help(format!("did you mean `{near}`?")),
+            None => error.help(format!("add `drive {} = cia402(…)` or `device {} = …`", name.text, name.text)),
+        });
+    }
+
+    /// Everything that is read with the names of the rig.
+    fn lists(&mut self) -> Lists {
+        let mut lists = Lists::default();
+        let seconds = unit("s");
+        if let Some((expr, span)) = self.statements.rate {
+            lists.rate = self.expressions.constant(Scope::Rig, expr, "rate", seconds.clone(), span);
+        }
+        if let Some(solver) = self.statements.solver {
+            let step = solver.step.as_ref();
+            lists.step =
+                step.map(|step| self.expressions.constant(Scope::Rig, step, "the step", seconds.clone(), solver.span));
+        }
+        if let Some((expr, span)) = self.statements.watchdog {
+            lists.watchdog = Some(self.expressions.constant(Scope::Rig, expr, "watchdog", seconds, span));
+        }
+        if let Some((Some(count), span)) = self.statements.overrun {
+            lists.overrun = Some(self.expressions.constant(Scope::Rig, count, "hold", Unit::none(), span));
+        }
+        for bus in &self.statements.buses {
+            let rate = bus.args.iter().find_map(|arg| match arg {
+                ast::BusArg::Expr(expr) => Some(expr),
+                ast::BusArg::Text(_) => None,
+            });
+            let rate =
+                rate.map(|rate| self.expressions.constant(Scope::Rig, rate, "bit rate", unit("bit/s"), bus.span));
+            lists.bit_rates.push(rate);
+        }
+        if let Some(hardware) = self.statements.hardware {
+            for (k, wire) in hardware.wires.iter().enumerate() {
+                match wire.path.segments.as_slice() {
+                    [only] => {
+                        let value = self.expressions.read(Scope::Rig, &wire.value);
+                        lists.gives.push((k, value));
+                        if let Some(extra) = wire.limit.as_ref().map(|(low, high)| low.span.to(high.span)) {
+                            let message = format!("`{}` is measured: it has no limit", only.name.text);
+                            let error = Diagnostic::error("E0801", message).label(extra, "limits belong to commands");
+                            self.report(error.help("a range that must hold is a `stop when …`"));
+                        }
+                    }
+                    _ => self.send(wire, true, &mut lists),
+                }
+            }
+        }
+        for wire in &self.statements.wires {
+            self.send(wire, false, &mut lists);
+        }
+        self.safe(&mut lists);
+        for (condition, ..) in &self.statements.stops {
+            lists.stops.push(self.expressions.read(Scope::Condition, condition));
+        }
+        for show in &self.statements.records {
+            lists.records.push(self.expressions.read(Scope::Rig, &show.value));
+        }
+        lists
+    }
+
+    fn send(&mut self, wire: &'a ast::Wire, inside: bool, lists: &mut Lists) {
+        let scope = if inside { Scope::Part } else { Scope::Rig };
+        let [node, signal] = wire.path.segments.as_slice() else {
+            let error = Diagnostic::error("E0204", "a command goes to a signal of a drive or device")
+                .label(wire.path.span, "not `drive.signal`");
+            self.report(error.help("write `drive.torque = …`"));
+            return;
+        };
+        let Some(at) = self.node(&node.name.text) else {
+            self.no_node(&node.name, "drive or device");
+            return;
+        };
+        let description = &self.descriptions[at];
+        let (unit, read, declared) = match description.sends(&signal.name.text) {
+            Ok((unit, read, declared)) => (unit.unwrap_or_default(), read, declared),
+            Err(known) => {
+                let name = &signal.name.text;
+                let message = format!("`{name}` of `{}` cannot be commanded", node.name.text);
+                let mut error = Diagnostic::error("E0204", message).label(signal.name.span, "no such command");
+                let near = crate::names::nearest(name, known.iter().map(String::as_str));
+                error = match (near, &description.speaks) {
+                    (Some(near), _) => error.help(format!("did you mean `{near}`?")),
+                    (None, Speaks::Cia402 { .. }) => {
+                        error.help(format!("its `mode` says that it follows `{}`", known.join("")))
+                    }
+                    (None, _) if known.is_empty() => error.help("it only talks: nothing can be sent to it"),
+                    (None, _) => error.help(format!("what it takes is {}", known.join(", "))),
+                };
+                self.report(error);
+                return;
+            }
+        };
+        if let Some(first) = lists.sends.iter().find(|send| send.node == at && send.read == read) {
+            let path = self.files.slice(wire.path.span);
+            let error = Diagnostic::error("E0801", format!("`{path}` is commanded twice"))
+                .label(wire.path.span, "again here")
+                .label(first.path, "first here");
+            self.report(error.help("one drive follows one command: remove one, or add them up"));
+            return;
+        }
+        let value = self.expressions.read(scope, &wire.value);
+        let limit = wire.limit.as_ref().map(|(low, high)| {
+            let mut one = |expr| self.expressions.constant(scope, expr, "limit", unit.clone(), declared);
+            (one(low), one(high))
+        });
+        let per_second = Unit::si(unit.dimension.times(Dimension::of([0, 0, -1, 0, 0])));
+        let slew = wire.slew.as_ref();
+        let slew = slew.map(|slew| self.expressions.constant(scope, slew, "slew", per_second, declared));
+        let (path, span) = (wire.path.span, wire.span);
+        lists.sends.push(Send { node: at, read, unit, inside, value, limit, slew, safe: None, path, span });
+    }
+
+    fn safe(&mut self, lists: &mut Lists) {
+        for (path, value) in &self.statements.safe {
+            let text = self.files.slice(path.span);
+            let found = match path.segments.as_slice() {
+                [node, signal] => match self.node(&node.name.text) {
+                    None => {
+                        self.no_node(&node.name, "drive or device");
+                        continue;
+                    }
+                    Some(at) => {
+                        let read = self.descriptions[at].sends(&signal.name.text).ok().map(|(_, read, _)| read);
+                        lists.sends.iter().position(|send| send.node == at && Some(send.read) == read)
+                    }
+                },
+                _ => None,
+            };
+            let Some(found) = found else {
+                let error = Diagnostic::error("E0803", format!("nothing commands `{text}`"))
+                    .label(path.span, "a safe value of no command");
+                self.report(
+                    error.help("safe values are those of what the rig sends, as in `safe load.torque = 0 N·m`"),
+                );
+                continue;
+            };
+            if lists.sends[found].safe.is_some() {
+                let error =
+                    Diagnostic::error("E0301", format!("`{text}` has two safe values")).label(path.span, "again here");
+                self.report(error.help("remove one"));
+                continue;
+            }
+            let (unit, span) = (lists.sends[found].unit.clone(), lists.sends[found].path);
+            lists.sends[found].safe = Some(self.expressions.constant(Scope::Rig, value, "safe value", unit, span));
+        }
+    }
+
+    /// Crosses the part out, both ways, and checks everything.
+    fn cut(
+        &mut self,
+        mut system: System,
+        observed: Vec<ExprId>,
+        framed: Framed,
+        expressions: Expressions,
+        lists: Lists,
+    ) -> Option<Cut> {
+        let top_span = self.rig.span;
+        let part = framed.hardware;
+        let at = |number: usize| framed.expressions[number];
+        // Numbers that must be known become params, so that units and constancy are checked like those of params.
+        let mut constants = Vec::new();
+        for constant in &expressions.constants {
+            let value = at(constant.at);
+            let span = system.span(value);
+            let definition = Definition::Value(value, Origin::Equation(span));
+            let id = self.quantity(&mut system, framed.rig, VarKind::Let, &constant.name, span, definition);
+            system.vars[id.0 as usize].unit = Some((constant.unit.clone(), constant.span));
+            constants.push(id);
+        }
+        // Commands.
+        let mut commands = Vec::new();
+        for send in &lists.sends {
+            let node = framed.nodes[send.node];
+            let definition = Definition::Value(at(send.value), Origin::Equation(send.path));
+            let name = format!("{} command", self.files.slice(send.path).rsplit('.').next().unwrap_or_default());
+            let id = self.quantity(&mut system, node, VarKind::Output, &name, send.path, definition);
+            system.vars[id.0 as usize].unit = Some((send.unit.clone(), send.path));
+            commands.push(id);
+        }
+        let stops = self.latched(&mut system, &framed, &lists);
+        // Nodes that read what is wanted.
+        let commands_read: Vec<ExprId> = commands.iter().map(|id| system.push(Node::Var(*id), top_span)).collect();
+        let values: Vec<ExprId> = constants.iter().map(|id| system.push(Node::Var(*id), top_span)).collect();
+        let of_nodes = |id: &VarId| {
+            let var = system.var(*id);
+            framed.nodes.contains(&var.instance) && var.kind == VarKind::Param
+        };
+        let params: Vec<VarId> = system.var_ids().filter(of_nodes).collect();
+        let params: Vec<(VarId, ExprId)> =
+            params.into_iter().map(|id| (id, system.push(Node::Var(id), top_span))).collect();
+        let part = match part {
+            Some(part) => part,
+            None => {
+                self.check_whole(&system);
+                return None;
+            }
+        };
+        let path = system.instance(part).path.clone();
+        let inside: Vec<bool> = system
+            .instances
+            .iter()
+            .enumerate()
+            .map(|(k, info)| k == part.0 as usize || info.path.starts_with(&format!("{path}.")))
+            .collect();
+        let of_part = |system: &System, id: VarId| inside[system.var(id).instance.0 as usize];
+        let types = self.check_whole(&system)?;
+        let exprs: Vec<ExprId> = values.iter().chain(params.iter().map(|(_, node)| node)).copied().collect();
+        let numbers = evaluate(&system, &types, &exprs);
+        let (constants_values, param_values) = numbers.split_at(values.len());
+        for id in system.var_ids() {
+            if !types.boolean_vars[id.0 as usize] && system.var(id).unit.is_none() {
+                let span = system.var(id).span;
+                system.vars[id.0 as usize].unit = Some((types.units[id.0 as usize].clone(), span));
+            }
+        }
+        let before = self.errors();
+        let gives = self.gives(&mut system, &framed, &lists, part);
+        self.unsent(&system, &framed, &lists, part);
+        let plant = self.plant(&system, &framed, &lists, &commands, &gives, &of_part);
+
+        // The control system: what the part gives comes from signals, everything else of it is gone.
+        let mut control = system.clone();
+        for id in system.var_ids().filter(|id| of_part(&system, *id)) {
+            let var = &mut control.vars[id.0 as usize];
+            match (var.kind, gives.iter().find(|give| give.var == id)) {
+                (_, Some(give)) => {
+                    var.definition = Definition::Value(at(give.value), Origin::Equation(give.span));
+                    var.kind = VarKind::Output;
+                }
+                (VarKind::Param | VarKind::Input, None) => {}
+                (VarKind::Output | VarKind::State | VarKind::Let | VarKind::Observed, None) => {
+                    var.definition = Definition::Missing;
+                }
+            }
+        }
+        for automaton in control.automata.iter_mut().filter(|a| inside[a.instance.0 as usize]) {
+            automaton.regimes.iter_mut().for_each(|regime| regime.transitions.clear());
+        }
+        control.events.retain(|event| !inside[event.instance.0 as usize]);
+        control.storages.retain(|(instance, _)| !inside[instance.0 as usize]);
+        let records: Vec<ExprId> = lists.records.iter().map(|record| at(*record)).collect();
+        let wanted: Vec<ExprId> =
+            observed.iter().chain(&stops).chain(&records).chain(&commands_read).copied().collect();
+        let own = |id: &VarId| {
+            let var = system.var(*id);
+            let framing = var.instance == framed.rig || framed.nodes.contains(&var.instance);
+            !framing && !of_part(&system, *id)
+        };
+        let roots: Vec<VarId> = system.var_ids().filter(own).chain(commands.iter().copied()).collect();
+        let control = pruned(&control, roots.into_iter(), &wanted);
+        self.not_given(&control, &system, part, &of_part);
+        if let Some(automaton) = control.automata.iter().find(|a| inside[a.instance.0 as usize]) {
+            let regime = &automaton.regimes[0];
+            let error = Diagnostic::error("E0801", format!("a regime of the hardware part is used: `{}`", regime.name))
+                .label(self.statements.hardware.map_or(top_span, |hardware| hardware.part.span), "nothing measures it")
+                .label(regime.span, "inside of what is replaced");
+            self.report(error.help("use what is wired"));
+        }
+        if self.errors() > before {
+            return None;
+        }
+        let plant = plant?;
+        let mut found = Vec::new();
+        let control_types = units::check(&control, self.files, &mut found);
+        let plant_types = units::check(&plant.system, self.files, &mut found);
+        if !found.iter().any(Diagnostic::is_error) {
+            causality::check(&control, self.files, &mut found);
+        }
+        self.diagnostics.extend(found);
+        for stop in &stops {
+            if !control_types.boolean[stop.0 as usize] && control_types.nodes[stop.0 as usize].is_some() {
+                let error = Diagnostic::error("E0101", "`stop when` needs a condition")
+                    .label(control.span(*stop), "neither true nor false");
+                self.report(error.help("compare it: `stop when abs(body.v) > 150 rad/s, \"overspeed\"`"));
+            }
+        }
+        if self.errors() > before {
+            return None;
+        }
+        for (constant, value) in expressions.constants.iter().zip(constants_values) {
+            if value.is_nan() {
+                let span = system.span(at(constant.at));
+                let error = Diagnostic::error("E0502", format!("{} must be known before the rig runs", constant.name))
+                    .label(span, "not constant");
+                self.report(error.help("numbers, constants and params can be used here"));
+            }
+        }
+        let param = |node: usize, name: &str| -> f64 {
+            let instance = framed.nodes[node];
+            let found = params.iter().position(|(id, _)| {
+                let var = system.var(*id);
+                var.instance == instance && var.name == name
+            });
+            found.map_or(f64::NAN, |k| param_values[k])
+        };
+        let number = |at: usize| constants_values[at];
+        let plan = self.plan(&system, &framed, &lists, &number, &param)?;
+        checks::whole_periods(
+            &control,
+            &control_types,
+            plan.period_ns as f64 * 1e-9 / f64::from(plan.steps),
+            self.statements.rate.map(|(_, span)| span),
+            self.diagnostics,
+        );
+        checks::whole_periods(
+            &plant.system,
+            &plant_types,
+            plan.period_ns as f64 * 1e-9 / f64::from(PLANT_STEPS),
+            self.statements.rate.map(|(_, span)| span),
+            self.diagnostics,
+        );
+        let places = Places {
+            name: self.rig.name.span,
+            rate: self.statements.rate.map_or(self.rig.name.span, |(expr, _)| expr.span),
+            nodes: self.descriptions.iter().map(|node| node.statement.kind.span).collect(),
+            wires: lists.sends.iter().map(|send| send.span).collect(),
+            allows: self.statements.allows.iter().map(|allow| allow.lint.text.clone()).collect(),
+        };
+        let mut cut = Cut {
+            control,
+            control_types,
+            plant: plant.system,
+            plant_types,
+            observed,
+            rig: plan,
+            inputs: Vec::new(),
+            outputs: commands,
+            commands_read,
+            stops,
+            records,
+            applied: plant.applied,
+            seen: plant.seen,
+            seen_read: plant.seen_read,
+            places,
+        };
+        self.signals(&mut cut, &system, &framed, &gives, &at);
+        self.shows(&mut cut);
+        if self.errors() > before {
+            return None;
+        }
+        Some(cut)
+    }
+
+    fn errors(&self) -> usize {
+        self.diagnostics.iter().filter(|diagnostic| diagnostic.is_error()).count()
+    }
+
+    fn quantity(
+        &mut self,
+        system: &mut System,
+        instance: InstanceId,
+        kind: VarKind,
+        name: &str,
+        span: Span,
+        definition: Definition,
+    ) -> VarId {
+        let path = match system.instance(instance).path.as_str() {
+            "" => format!("{} {name}", self.rig.name.text),
+            path => format!("{path}.{name}"),
+        };
+        system.vars.push(Var {
+            path,
+            name: name.into(),
+            span,
+            instance,
+            kind,
+            unit: None,
+            unreadable: false,
+            shown: None,
+            range: VarRange::default(),
+            range_span: None,
+            definition,
+            doc: None,
+        });
+        VarId(system.vars.len() as u32 - 1)
+    }
+
+    /// What each `stop` looks at: its condition; of an instant a state that it sets, so that it is remembered.
+    fn latched(&mut self, system: &mut System, framed: &Framed, lists: &Lists) -> Vec<ExprId> {
+        let mut out = Vec::new();
+        for stop in &lists.stops {
+            let condition = framed.expressions[*stop];
+            if !has_crossing(system, condition) {
+                out.push(condition);
+                continue;
+            }
+            let span = system.span(condition);
+            let (initial, rate) = (system.push(nothing(), span), system.push(nothing(), span));
+            let definition = Definition::Continuous { initial, rate, path: None, span };
+            let name = format!("stop {}", out.len() + 1);
+            let state = self.quantity(system, framed.rig, VarKind::State, &name, span, definition);
+            system.vars[state.0 as usize].unit = Some((Unit::none(), span));
+            let set = system.push(one(), span);
+            system.events.push(Event { instance: framed.rig, condition, resets: vec![(state, set)], span });
+            let (value, reached) = (system.push(Node::Var(state), span), system.push(one(), span));
+            out.push(system.push(Node::Binary(ast::BinaryOp::GreaterEqual, value, reached), span));
+        }
+        out
+    }
+
+    /// The system before anything is crossed out: what is wrong with it is told as of any other.
+    fn check_whole(&mut self, system: &System) -> Option<Types> {
+        let mut found = Vec::new();
+        let types = units::check(system, self.files, &mut found);
+        let failed = |found: &[Diagnostic]| found.iter().any(Diagnostic::is_error);
+        if !failed(&found) {
+            causality::check(system, self.files, &mut found);
+        }
+        if !failed(&found) {
+            checks::values(system, &types, self.files, &mut found);
+        }
+        let stop = failed(&found) || self.errors() > 0 || self.loaded.has_errors();
+        self.diagnostics.extend(found);
+        (!stop).then_some(types)
+    }
+}
+
+/// Whether an instant stands in an expression.
+fn has_crossing(system: &System, id: ExprId) -> bool {
+    matches!(system.node(id), Node::Crossing(_)) || system.node(id).operands().any(|a| has_crossing(system, a))
+}
+
+/// `name = expr` of `hardware`.
+struct Give {
+    var: VarId,
+    value: usize,
+    span: Span,
+}
+
+/// The crossed-out part as a system.
+struct PlantSystem {
+    system: System,
+    applied: Vec<VarId>,
+    seen: Vec<VarId>,
+    seen_read: Vec<ExprId>,
+}

@@ -1,0 +1,102 @@
+//! Rigs: the two programs that a text becomes, and the plan that joins them.
+
+mod support;
+
+use abi::Slot;
+use abi::rig::{Kind, Mode, Overrun, Signal, What};
+use compiler::{Options, Ready};
+use std::fs;
+use support::{Texts, root};
+
+/// The example, with what it names beside it.
+fn texts() -> (String, Texts) {
+    let folder = root().join("examples/rtfs");
+    let read = |name: &str| fs::read_to_string(folder.join(name)).unwrap();
+    (read("rtfs.fric"), Texts(vec![("shaft.dbc".into(), read("shaft.dbc"))]))
+}
+
+fn ready(text: &str, sources: &Texts, name: &str) -> Ready {
+    let mut loaded = compiler::load("rig.fric", text, sources);
+    assert!(loaded.diagnostics.is_empty(), "{:?}", loaded.diagnostics);
+    let mut warnings = Vec::new();
+    let made = compiler::rig(&mut loaded, sources, name, &Options::default(), &mut warnings);
+    let made = made.unwrap_or_else(|errors| panic!("{errors:?}"));
+    assert!(warnings.is_empty(), "{warnings:?}");
+    made
+}
+
+fn path(instance: &abi::Instance, slot: Slot) -> String {
+    let found = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
+    found.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone())
+}
+
+#[test]
+fn the_example_becomes_two_programs_and_a_plan() {
+    let (text, sources) = texts();
+    let Ready { rig, control, plant, .. } = ready(&text, &sources, "rtfs");
+    assert_eq!((rig.period_ns, rig.steps, rig.watchdog_ns, rig.overrun), (1_000_000, 1, 5_000_000, Overrun::Hold(2)));
+    assert_eq!((rig.buses[0].address.as_str(), rig.buses[0].bit_rate), ("socketcan:can0", 1_000_000));
+    let names: Vec<&str> = rig.nodes.iter().map(|node| node.name.as_str()).collect();
+    assert_eq!(names, ["load", "servo", "shaft", "panel"]);
+    let Kind::Cia402(load) = &rig.nodes[0].kind else { panic!("a drive") };
+    assert_eq!((load.node, load.rated_torque, load.mode, load.at_sync), (3, 4.0, Mode::Torque, false));
+    assert_eq!(load.count, 2.0 * std::f64::consts::PI / 262_144.0);
+    assert_eq!((rig.nodes[0].delay, rig.nodes[0].lag, rig.nodes[0].timeout_ns), (0.8e-3, 0.6e-3, 3_000_000));
+    let Kind::Frames(messages) = &rig.nodes[2].kind else { panic!("frames") };
+    let torque = &messages[0].fields[0];
+    assert_eq!(
+        (messages[0].id, messages[0].length, messages[0].period_ns, messages[0].send),
+        (400, 4, 10_000_000, false)
+    );
+    assert_eq!((torque.name.as_str(), torque.scale, torque.start_bit, torque.bits), ("torque", 0.0005, 0, 16));
+    let temperature = &messages[0].fields[1];
+    assert_eq!((temperature.offset, temperature.unit.text.as_str()), (-40.0 + 273.15, "K"));
+    let Kind::Frames(messages) = &rig.nodes[3].kind else { panic!("frames") };
+    let ids: Vec<(u32, bool, u8)> = messages.iter().map(|message| (message.id, message.send, message.length)).collect();
+    assert_eq!(ids, [(0x1A0, false, 1), (0x220, true, 1)]);
+
+    // What is read, told and limited.
+    let read: Vec<(String, bool)> = rig.inputs.iter().map(|input| (path(&control, input.slot), input.needed)).collect();
+    let expected = [("load.speed", true), ("servo.position", true), ("shaft.torque", false), ("panel.enable", true)];
+    assert_eq!(read, expected.map(|(path, needed)| (path.to_string(), needed)));
+    let told: Vec<(String, f64, f64, f64)> =
+        rig.outputs.iter().map(|o| (path(&control, o.slot), o.low, o.high, o.slew)).collect();
+    let inf = f64::INFINITY;
+    let expected = [
+        ("servo.torque command", -2.0, 2.0, inf),
+        ("load.torque command", -1.0, 1.0, 200.0),
+        ("panel.lamp command", -inf, inf, inf),
+    ];
+    assert_eq!(told, expected.map(|(path, low, high, slew)| (path.to_string(), low, high, slew)));
+    let stops: Vec<&str> = rig.stops.iter().map(|stop| stop.why.as_str()).collect();
+    assert_eq!(stops, ["overspeed", "enabling switch released"]);
+    assert_eq!(
+        rig.record.iter().map(|series| series.label.as_str()).collect::<Vec<_>>(),
+        ["body.x", "body.v", "fr.F", "pid.u", "shaft.torque"]
+    );
+
+    // The part alone: what drives apply moves what encoders see.
+    let of = |node: usize, what: What| Signal { node, what };
+    let applied: Vec<Signal> = rig.plant.applied.iter().map(|(signal, _)| *signal).collect();
+    assert_eq!(applied, [of(1, What::Torque), of(0, What::Torque)]);
+    let seen: Vec<Signal> = rig.plant.seen.iter().map(|(signal, _)| *signal).collect();
+    assert_eq!(seen, [of(0, What::Speed), of(1, What::Position), of(1, What::Speed), of(0, What::Position)]);
+    assert!((rig.plant.inertia.unwrap() - 0.012).abs() < 1e-12, "{:?}", rig.plant.inertia);
+    let mut plant = plant;
+    assert_eq!(plant.start(20e-6), 0);
+    for (_, slot) in &rig.plant.applied {
+        plant.set(*slot, 0.03);
+    }
+    assert_eq!(plant.advance(50), 0);
+    let speed = rig.plant.seen[0].1;
+    assert!((plant.get(speed) - 0.06 / 0.012 * 1e-3).abs() < 1e-12, "{}", plant.get(speed));
+    // The control program has no state of the crossed-out part.
+    let states: Vec<&str> = control
+        .description()
+        .quantities
+        .iter()
+        .filter(|quantity| quantity.kind == abi::description::Kind::State)
+        .map(|quantity| quantity.path.as_str())
+        .collect();
+    assert_eq!(states, ["fr.z"]);
+}
