@@ -1,5 +1,6 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod build;
 mod characterise;
 mod check;
 mod cross;
@@ -49,6 +50,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Build(build) => build::build(build, terminal),
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),

@@ -1,12 +1,43 @@
 //! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
 
-use super::load;
+use super::{End, load};
+use crate::args::Build;
 use crate::compile::{self, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report, sign};
 use grammar::ast::Item;
-use runtime::package::Package;
+use runtime::package::signature::beside;
+use runtime::package::{Package, here};
 use std::path::Path;
+
+/// `fric build RIG.fric -o NAME.fricpkg`
+pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
+    let target = args.target.map_or_else(here, |target| format!("{}-linux", target.name()));
+    let out = args.out.as_deref().expect("a package has a name");
+    let key = args.sign.as_deref();
+    let (bytes, signature) = match packed(&args.file, args.name.as_deref(), &target, key, terminal) {
+        Ok(packed) => packed,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let beside = beside(out);
+    let written = match &signature {
+        Some(text) => project::write(&beside, text.as_bytes()),
+        // A signature of what was there before would be a wrong one.
+        None if beside.exists() => std::fs::remove_file(&beside),
+        None => Ok(()),
+    };
+    if let Err(error) = written.and_then(|()| project::write(out, &bytes)) {
+        terminal.error(&format!("cannot write {}: {error}", out.display()));
+        return End::Failed;
+    }
+    let signed = if signature.is_some() { format!(", signed beside it in {}", beside.display()) } else { String::new() };
+    let size = crate::value::count(bytes.len() as u64);
+    terminal.report(&format!("wrote {}, {size} bytes, for {target}{signed}\n", out.display()));
+    End::Fine
+}
 
 /// The bytes of a package and its signature.
 ///

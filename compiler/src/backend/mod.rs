@@ -7,5 +7,6 @@ mod clif;
 pub mod target;
 pub mod jit;
 pub mod blob;
+pub mod c;
 #[cfg(test)]
 mod agree;
