@@ -21,7 +21,8 @@ pub struct Args {
     pub command: Option<Command>,
 }
 
-const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage.\n\
+const EXIT_CODES: &str = "Exit codes: 0 fine, 1 the input or an expectation failed, 2 wrong usage,\n\
+    3 a rig was stopped by safety or a condition of its own.\n\
     Colour and progress appear on a terminal only; NO_COLOR=1 turns colour off.";
 
 /// One command.
@@ -37,6 +38,10 @@ pub enum Command {
     Linearise(Linearise),
     /// Make C or machine code of a model, to take away
     Build(Build),
+    /// Run a rig against the drives on its buses, or with --sim against simulated ones
+    Hil(Hil),
+    /// Compute a rig's log again and compare every output to the bit
+    Replay(Replay),
     /// Find mistakes without running anything
     Check(Check),
     /// Rewrite files in the one canonical layout
@@ -76,8 +81,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "build", "check", "fmt", "explain", "characterise", "compare", "doc",
-            "repl", "watch", "inspect", "key", "deploy", "fetch-log", "new", "completions",
+            "run", "test", "sweep", "linearise", "hil", "replay", "build", "check", "fmt", "explain", "characterise",
+            "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -269,6 +274,85 @@ pub struct Build {
     /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
     #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
+}
+
+/// `fric hil`
+#[derive(clap::Args, Debug)]
+#[command(after_help = HIL_HELP)]
+pub struct Hil {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in it; the only one if none is named
+    pub rig: Option<String>,
+    /// Time the model runs, such as 60s [default: until it is stopped]
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+    /// Simulate buses, drives and devices in the process; arms itself
+    #[arg(long)]
+    pub sim: bool,
+    /// Simulated time: as fast as it computes, the same bits every time
+    #[arg(long)]
+    pub fast: bool,
+    /// Put another bus under the rig: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
+    #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
+    pub bus: Vec<(String, String)>,
+    /// Change a parameter or a slot: `fr.Fs=2N.m`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Make simulated drives and devices fail: 'panel.enable = 0 at 5 s'
+    #[arg(long, value_name = "FAULT")]
+    pub inject: Vec<String>,
+    /// Do the checks of the start-up and stop before arming
+    #[arg(long)]
+    pub check: bool,
+    /// Enable and arm without being told: simulated drives only
+    #[arg(long)]
+    pub arm: bool,
+    /// Run although the loop is predicted to be unstable: simulated drives only
+    #[arg(long)]
+    pub accept_unstable: bool,
+    /// Run although the host gives no real time: simulated drives only
+    #[arg(long)]
+    pub accept_jitter: bool,
+    /// Count missed ticks and go on: simulated drives only
+    #[arg(long)]
+    pub count_overruns: bool,
+    /// The log [default: out/RIG.friclog]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub log: Option<PathBuf>,
+    /// Keep only the last ten seconds, written if the rig is stopped by safety
+    #[arg(long, conflicts_with = "log")]
+    pub no_log: bool,
+    /// From which all that is random in a simulation follows
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// Print failures only
+    #[arg(long, short)]
+    pub quiet: bool,
+    /// Interpret instead of making machine code: slow, for comparison
+    #[arg(long)]
+    pub interpret: bool,
+}
+
+const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, stop, reset.\n\
+    Exit codes: 0 ended as asked (Ctrl-C included), 1 refused or bad input, 2 wrong usage, 3 stopped by safety.";
+
+/// `fric replay`
+#[derive(clap::Args, Debug)]
+pub struct Replay {
+    /// A log of `fric hil`
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub log: PathBuf,
+    /// Write its cycles as a table
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub csv: Option<PathBuf>,
+    /// Write its frames as candump -L does; `replay:FILE` is a bus that reads it
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub candump: Option<PathBuf>,
+    /// Interpret instead of making machine code: the bits are the same
+    #[arg(long)]
+    pub interpret: bool,
 }
 
 /// `fric check`

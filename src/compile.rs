@@ -12,11 +12,9 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, SourceFile, Sources, build, check, compile, dissipation, explain, explain_in,
-    explain_run, linear, load, quantities, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, compile, dissipation, explain,
+    explain_in, explain_run, linear, load, quantities, rig, varying,
 };
-#[allow(unused_imports, reason = "the commands of rigs are yet to come")]
-pub use compiler::{Ready, rig};
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;
 

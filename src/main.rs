@@ -12,6 +12,7 @@ mod compile;
 mod diagram;
 mod equations;
 mod figure;
+mod kept;
 mod matrices;
 mod plot;
 mod project;
@@ -34,5 +35,6 @@ fn main() -> ExitCode {
         End::Fine => ExitCode::SUCCESS,
         End::Failed => ExitCode::from(1),
         End::Misused => ExitCode::from(2),
+        End::Stopped => ExitCode::from(3),
     }
 }

@@ -2,7 +2,10 @@
 //!
 //! In: a file, trusted keys. Out: an [`Open`] package, or why it is refused.
 
+use abi::Instance;
+use abi::encode::Encode;
 use abi::image::Image;
+use abi::rig::Rig;
 use runtime::package::signature::{Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
 use std::fs;
@@ -49,11 +52,33 @@ pub fn open(path: &Path, trusted: &Path) -> Result<Open, String> {
         let image = Image::read(bytes).map_err(|why| about(&format!("its program `{name}`: {why}")))?;
         image.fits().map_err(|why| about(&format!("its program `{name}`: {why}")))?;
     }
-    package.section("rig").map_err(|why| about(&why))?;
-    Ok(Open { bytes, signature, package, signer })
+    let open = Open { bytes, signature, package, signer };
+    open.rig().map_err(|why| about(&why))?;
+    Ok(open)
 }
 
 impl Open {
+    /// The plan of the rig.
+    ///
+    /// # Errors
+    /// Why its section makes no sense.
+    pub fn rig(&self) -> Result<Rig, String> {
+        let bytes = self.package.section("rig").map_err(|why| why.to_string())?;
+        Rig::from_bytes(bytes).map_err(|why| format!("the plan of its rig: {why}"))
+    }
+
+    /// One of its programs, ready to start: `control` or `plant`.
+    ///
+    /// # Errors
+    /// Why it cannot be loaded.
+    pub fn program(&self, name: &str) -> Result<Instance, String> {
+        let bytes = self.package.section(name).map_err(|why| why.to_string())?;
+        // SAFETY: the bytes are those that `fric build` wrote, as every hash says, and where keys are trusted as a
+        // signature says; who installs a package on a computer without keys vouches for it.
+        let model = unsafe { runtime::blob::load(bytes) };
+        model.map(|model| model.instance()).map_err(|why| format!("its program `{name}`: {why}"))
+    }
+
     /// In words.
     pub fn describe(&self) -> String {
         let Package { fric, target, rig, sections } = &self.package;

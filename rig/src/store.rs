@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 pub const DEFAULT: &str = "/var/lib/fric";
 
 /// A folder of packages.
+#[derive(Clone)]
 pub struct Store {
     dir: PathBuf,
 }
@@ -82,7 +83,22 @@ impl Store {
         Ok(format!("back to {}\n", previous.display()))
     }
 
-    /// What is installed.
+    /// The package that is current.
+    pub fn current(&self) -> PathBuf {
+        self.current_target().map_or_else(|| self.dir.join("current"), |target| self.dir.join(target))
+    }
+
+    /// Where the link of the current package points.
+    pub fn current_target(&self) -> Option<PathBuf> {
+        fs::read_link(self.dir.join("current")).ok()
+    }
+
+    /// Whether there is a package before the current one to go back to.
+    pub fn took_over(&self) -> bool {
+        fs::read_link(self.dir.join("previous")).is_ok_and(|before| Some(before) != self.current_target())
+    }
+
+    /// What is installed, and what runs.
     ///
     /// # Errors
     /// If nothing is.
@@ -92,6 +108,9 @@ impl Store {
             if let Ok(target) = fs::read_link(self.dir.join(name)) {
                 words += &format!("{name}: {}\n", target.display());
             }
+        }
+        if let Ok(state) = fs::read_to_string(self.dir.join("state")) {
+            words += &format!("runs: {state}");
         }
         if words.is_empty() { Err(format!("nothing is installed in {}", self.dir.display())) } else { Ok(words) }
     }

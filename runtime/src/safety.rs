@@ -496,18 +496,15 @@ impl Supervisor {
     /// Trips on what was measured.
     fn watch(&mut self, seen: &[Seen]) {
         for (i, seen) in seen.iter().enumerate() {
-            let limits = self.drives[i];
-            if let Some(speed) = seen.speed
-                && !(speed.abs() <= limits.speed)
-                && self.on(Protection::Speed)
-            {
-                self.trip(Cause::Speed(i, speed));
+            // Compared so that what is not a number is outside.
+            let DriveLimits { speed: most, travel: (low, high), .. } = self.drives[i];
+            let slow = seen.speed.is_none_or(|speed| speed.abs() <= most);
+            if !slow && self.on(Protection::Speed) {
+                self.trip(Cause::Speed(i, seen.speed.unwrap_or_default()));
             }
-            if let Some(position) = seen.position
-                && !(limits.travel.0 <= position && position <= limits.travel.1)
-                && self.on(Protection::Travel)
-            {
-                self.trip(Cause::Travel(i, position));
+            let inside = seen.position.is_none_or(|position| low <= position && position <= high);
+            if !inside && self.on(Protection::Travel) {
+                self.trip(Cause::Travel(i, seen.position.unwrap_or_default()));
             }
         }
         if self.is_armed() && self.on(Protection::RunAway) {
@@ -523,9 +520,9 @@ impl Supervisor {
             .filter(|(output, _)| output.torque)
             .filter_map(|(output, torque)| Some(torque * seen[output.drive?].speed?))
             .sum();
-        for i in 0..self.drives.len() {
+        for (i, seen) in seen.iter().enumerate() {
             let limit = self.drives[i].speed;
-            let Some(speed) = seen[i].speed.filter(|_| limit.is_finite()) else { continue };
+            let Some(speed) = seen.speed.filter(|_| limit.is_finite()) else { continue };
             let part = speed.abs() / limit;
             self.least[i] = if power < 0.0 { part.min(self.least[i]) } else { part };
             if part > self.least[i] + RUN_AWAY {
@@ -541,10 +538,10 @@ impl Supervisor {
         {
             return self.trip(Cause::Clamped(i));
         }
-        for i in 0..requests.len() {
+        for (i, request) in requests.iter().enumerate() {
             let (limits, last) = (self.outputs[i], self.permitted[i]);
             let mut clamps = Clamps::default();
-            let mut value = requests[i];
+            let mut value = *request;
             if for_cycles < self.patience.ramp && self.on(Protection::Ramp) {
                 value = limits.safe + (value - limits.safe) * f64::from(for_cycles) / f64::from(self.patience.ramp);
             }

@@ -8,7 +8,8 @@ use crate::terminal::Terminal;
 use grammar::diagnostic::Diagnostic;
 
 pub fn build(args: &Build, terminal: &mut Terminal) -> End {
-    let packs = args.out.as_ref().is_some_and(|out| out.extension().is_some_and(|it| it == runtime::package::EXTENSION));
+    let packs =
+        args.out.as_ref().is_some_and(|out| out.extension().is_some_and(|it| it == runtime::package::EXTENSION));
     let emit = match (args.emit, packs) {
         (None, true) => return super::pack::build(args, terminal),
         (Some(emit), false) if args.sign.is_none() => emit,
@@ -21,7 +22,8 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
         (None, false) => {
-            terminal.error("make what? --emit c, ir, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg");
+            terminal
+                .error("make what? --emit c, ir, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg");
             return End::Misused;
         }
     };

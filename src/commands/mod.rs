@@ -10,17 +10,19 @@ mod explain;
 mod fmt;
 mod inspect;
 mod key;
+mod hil;
 mod linearise;
 mod new;
 mod pack;
 mod repl;
+mod replay;
 mod run;
 mod sweep;
 mod test;
 mod watch;
 
 use crate::args::{Args, Command, Key, Repl};
-use crate::compile::{self, Case, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
 use clap::CommandFactory;
@@ -40,6 +42,8 @@ pub enum End {
     Failed,
     /// Wrong usage that only the input shows, such as one plot file for two experiments: exit code 2.
     Misused,
+    /// A rig was stopped by safety or by a condition of its own: exit code 3.
+    Stopped,
 }
 
 /// Does what was asked for.
@@ -51,6 +55,8 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
         Command::Build(build) => build::build(build, terminal),
+        Command::Hil(args) => hil::hil(args, terminal),
+        Command::Replay(args) => replay::replay(args, terminal),
         Command::Check(check) => check::check(check, terminal),
         Command::Fmt(fmt) => fmt::fmt(fmt, terminal),
         Command::Explain(explain) => explain::explain(explain, terminal),
@@ -87,6 +93,11 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
 
 /// Reads and loads a text; reports what is wrong with it. None if it cannot be used.
 fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
+    load_from(path, &project::Disk, terminal, watch)
+}
+
+/// The same with imports from elsewhere.
+fn load_from(path: &Path, sources: &dyn Sources, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
     let name = path.display().to_string();
     let text = match project::read(path) {
         Ok(text) => text,
@@ -95,8 +106,19 @@ fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loade
             return None;
         }
     };
+    load_text(&name, &text, sources, terminal, watch)
+}
+
+/// Loads a text that has been read; reports what is wrong with it. None if it cannot be used.
+fn load_text(
+    name: &str,
+    text: &str,
+    sources: &dyn Sources,
+    terminal: &Terminal,
+    watch: &mut Stopwatch,
+) -> Option<Loaded> {
     watch.stage("parse");
-    let loaded = compile::load(&name, &text, &project::Disk);
+    let loaded = compile::load(name, text, sources);
     let failed = loaded.diagnostics.iter().any(Diagnostic::is_error);
     if failed {
         terminal.report(&report::full(&loaded.files.0, &loaded.diagnostics, terminal.error_colour()));

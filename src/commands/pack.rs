@@ -1,13 +1,16 @@
 //! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
 
-use super::{End, load};
+use super::{End, load_from};
 use crate::args::Build;
 use crate::compile::{self, Stopwatch};
+use crate::kept::Keeping;
 use crate::terminal::Terminal;
 use crate::{project, report, sign};
+use abi::encode::Encode;
 use grammar::ast::Item;
 use runtime::package::signature::beside;
 use runtime::package::{Package, here};
+use runtime::record::log::Sections;
 use std::path::Path;
 
 /// `fric build RIG.fric -o NAME.fricpkg`
@@ -33,7 +36,8 @@ pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error(&format!("cannot write {}: {error}", out.display()));
         return End::Failed;
     }
-    let signed = if signature.is_some() { format!(", signed beside it in {}", beside.display()) } else { String::new() };
+    let signed =
+        if signature.is_some() { format!(", signed beside it in {}", beside.display()) } else { String::new() };
     let size = crate::value::count(bytes.len() as u64);
     terminal.report(&format!("wrote {}, {size} bytes, for {target}{signed}\n", out.display()));
     End::Fine
@@ -51,7 +55,8 @@ pub(super) fn packed(
     terminal: &mut Terminal,
 ) -> Result<(Vec<u8>, Option<String>), String> {
     let reported = || "the rig was not built".to_string();
-    let mut loaded = load(file, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
+    let keeping = Keeping::new(&project::Disk);
+    let mut loaded = load_from(file, &keeping, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
     let items = &loaded.files.get(loaded.root()).ast.items;
     let rigs: Vec<String> = items
         .iter()
@@ -74,7 +79,7 @@ pub(super) fn packed(
         (None, all) => return Err(format!("which rig of {}? It has {}", file.display(), all.join(", "))),
     };
     let mut found = Vec::new();
-    let built = compile::packed_rig(&mut loaded, &project::Disk, &name, target, &mut found);
+    let built = compile::packed_rig(&mut loaded, &keeping, &name, target, &mut found);
     if !found.is_empty() {
         terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
     }
@@ -84,6 +89,16 @@ pub(super) fn packed(
     package.add("rig", built.rig);
     package.add("control", built.control);
     package.add("plant", built.plant);
+    // The head of every log of it, so that a recording can be computed again wherever it is brought.
+    let root = loaded.files.get(loaded.root());
+    let head = Sections::default()
+        .with("fric", package.fric.as_str())
+        .with("target", target)
+        .with("rig", package.rig.as_str())
+        .with("file", root.name.as_str())
+        .with("source", root.text.as_bytes())
+        .with("set", "");
+    package.add("head", keeping.into(head).0.to_bytes());
     for source in loaded.files.0.iter().filter(|source| !source.name.starts_with("--")) {
         let name = format!("source/{}", tidy(&source.name));
         if package.section(&name).is_err() {

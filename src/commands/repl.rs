@@ -207,7 +207,7 @@ impl Prompt<'_> {
                 }
                 return match super::watch::follow(&file, &name, false, self.session, self.terminal) {
                     End::Fine => Ok(Next::Line),
-                    End::Failed | End::Misused => Ok(Next::Missed),
+                    End::Failed | End::Misused | End::Stopped => Ok(Next::Missed),
                 };
             }
             Command::Characterise => self.characterise(rest)?,
@@ -513,7 +513,7 @@ impl Prompt<'_> {
         };
         match super::characterise::characterise(&args, self.terminal) {
             End::Fine => Ok(()),
-            End::Failed | End::Misused => Err("it could not be characterised".into()),
+            End::Failed | End::Misused | End::Stopped => Err("it could not be characterised".into()),
         }
     }
 

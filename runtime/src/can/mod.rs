@@ -249,7 +249,7 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    fn new(fd: RawFd, from: &[u8]) -> Prepared {
+    pub(crate) fn new(fd: RawFd, from: &[u8]) -> Prepared {
         let mut bytes = [0; 64];
         bytes[..from.len()].copy_from_slice(from);
         Prepared { fd, bytes, length: from.len() as u8 }

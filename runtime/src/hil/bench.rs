@@ -1,8 +1,9 @@
 //! A rig written by hand, for tests: a drive that acts as a spring on whatever turns its shaft.
 
 use crate::models::Model;
-use abi::plan::Method;
+use abi::plan::{Method, Series};
 use abi::rig::{Bus, Cia402, Input, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What};
+use abi::unit::Unit;
 use abi::{Function, Instance};
 
 /// Period of the rig, ns.
@@ -70,4 +71,79 @@ pub fn rig() -> (Rig, Instance) {
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: Some(0.012) },
     };
     (rig, model)
+}
+
+/// Two drives on one shaft of 0.012 kg·m²: the servo swings it with 0.4 N·m at 1 Hz, the load brakes it like a damper of
+/// 0.05 N·m·s/rad. Rig, control program, plant program.
+pub fn pair() -> (Rig, Instance, Instance) {
+    let control = Model::new("Swing")
+        .param(0.4)
+        .param(0.05)
+        .inputs(2)
+        .state("angle", "rad")
+        .output("servo", "N·m")
+        .output("load", "N·m")
+        .output("v", "rad/s")
+        .body(Function::Derivatives, |view| view.set_dx(0, view.u(0)))
+        .body(Function::Outputs, |view| {
+            let swing = view.p(0) * (2.0 * std::f64::consts::PI * view.t()).sin();
+            view.set_y(0, swing);
+            view.set_y(1, -view.p(1) * view.u(0));
+            view.set_y(2, view.u(0));
+        })
+        .build();
+    let plant = Model::new("Shaft")
+        .inputs(2)
+        .state("x", "rad")
+        .state("v", "rad/s")
+        .output("position", "rad")
+        .output("speed", "rad/s")
+        .body(Function::Derivatives, |view| {
+            view.set_dx(0, view.x(1));
+            view.set_dx(1, (view.u(0) + view.u(1)) / 0.012);
+        })
+        .body(Function::Outputs, |view| {
+            view.set_y(0, view.x(0));
+            view.set_y(1, view.x(1));
+        })
+        .build();
+    let (inside, outside) = (control.description().layout.clone(), plant.description().layout.clone());
+    let signal = |node, what| Signal { node, what };
+    let output = |node, i, most: f64| Output {
+        signal: signal(node, What::Torque),
+        slot: inside.outputs.slot(i),
+        low: -most,
+        high: most,
+        slew: f64::INFINITY,
+        safe: 0.0,
+    };
+    let input =
+        |node, what, i| Input { signal: signal(node, what), slot: inside.inputs.slot(i), start: 0.0, needed: true };
+    let rig = Rig {
+        name: "pair".into(),
+        nodes: vec![drive("load", 3), drive("servo", 4)],
+        inputs: vec![input(0, What::Speed, 0), input(1, What::Position, 1)],
+        outputs: vec![output(1, 0, 2.0), output(0, 1, 1.0)],
+        record: vec![Series {
+            label: "v".into(),
+            slot: inside.outputs.slot(2),
+            unit: Unit::parse("rad/s").unwrap(),
+            boolean: false,
+        }],
+        plant: Plant {
+            applied: vec![
+                (signal(1, What::Torque), outside.inputs.slot(0)),
+                (signal(0, What::Torque), outside.inputs.slot(1)),
+            ],
+            seen: vec![
+                (signal(0, What::Position), outside.outputs.slot(0)),
+                (signal(0, What::Speed), outside.outputs.slot(1)),
+                (signal(1, What::Position), outside.outputs.slot(0)),
+                (signal(1, What::Speed), outside.outputs.slot(1)),
+            ],
+            inertia: Some(0.012),
+        },
+        ..rig().0
+    };
+    (rig, control, plant)
 }

@@ -248,8 +248,13 @@ impl Control {
     pub fn cycle(&mut self, told: &Told) -> Order {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;
+        if told.source != Source::Model {
+            for (slot, value) in told.set {
+                self.model.set(*slot, *value);
+            }
+        }
         told.causes.iter().for_each(|cause| self.supervisor.trip(*cause));
-        self.read(told.readings, told.ticks, armed);
+        self.read(told.readings, told.ticks, told.source);
         let missed = told.ticks.saturating_sub(1);
         let most = match self.overrun {
             Overrun::Stop => 0,
@@ -275,13 +280,15 @@ impl Control {
     }
 
     /// Takes what was read, as far as it is credible; trips on what has been missing or odd for too long.
-    fn read(&mut self, readings: &[Reading], ticks: u32, armed: bool) {
+    fn read(&mut self, readings: &[Reading], ticks: u32, source: Source) {
+        // The start-up counts positions anew as it goes: only what the model reads must be one movement.
+        let judged = source == Source::Model;
         for (i, (watched, reading)) in self.watched.iter_mut().zip(readings).enumerate() {
             watched.since = watched.since.map(|since| since.saturating_add(ticks));
             if reading.age == 0 {
                 let change = (reading.value - watched.last).abs();
                 let credible = match watched.since {
-                    Some(since) if armed => change <= watched.jump * f64::from(since),
+                    Some(since) if judged => change <= watched.jump * f64::from(since),
                     _ => reading.value.is_finite(),
                 };
                 if credible {
@@ -289,10 +296,9 @@ impl Control {
                 } else {
                     watched.odd += 1;
                 }
-            } else if !armed {
-                watched.odd = 0;
             }
-            if !armed {
+            if source == Source::Nobody {
+                watched.odd = 0;
                 continue;
             }
             if watched.timeout.is_some_and(|timeout| reading.age >= timeout) {

@@ -1,39 +1,35 @@
 //! Stop frames that are sent when nothing else works any more: by a thread of its own, by a panic, by a signal.
 //!
-//! In: byte strings built beforehand, each with the descriptor it is written to. Out: write(2), and nothing else, so
-//! that it is right in a signal handler too. Knows neither drives nor buses.
+//! In: frames made ready beforehand by their buses. Out: write(2), and nothing else, so that it is right in a signal
+//! handler too. Knows no drive.
 //!
 //! There is one rig in a process, hence one table.
 
-use std::os::fd::RawFd;
+use crate::can::Prepared;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, AtomicU32, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// What is written, in order: descriptor and bytes.
-pub type Writes = Vec<(RawFd, Vec<u8>)>;
-
 /// The table in force. It is never freed: a handler may be reading it.
-static TABLE: AtomicPtr<Writes> = AtomicPtr::new(std::ptr::null_mut());
+static TABLE: AtomicPtr<Vec<Prepared>> = AtomicPtr::new(std::ptr::null_mut());
 /// Number of the signal that asked for a stop, 0 for none.
 static ASKED: AtomicI32 = AtomicI32::new(0);
 /// How often the table was sent.
 static SENT: AtomicU32 = AtomicU32::new(0);
 
 /// Puts a table in force.
-pub fn prepare(writes: Writes) {
-    TABLE.store(Box::into_raw(Box::new(writes)), Ordering::Release);
+pub fn prepare(frames: Vec<Prepared>) {
+    TABLE.store(Box::into_raw(Box::new(frames)), Ordering::Release);
 }
 
 /// Sends the table, three times: a frame may be lost. Only write(2): safe wherever a rig may end.
 pub fn send() {
     let table = TABLE.load(Ordering::Acquire);
     // SAFETY: the pointer is null or came from `prepare`, which leaks it.
-    let Some(writes) = (unsafe { table.as_ref() }) else { return };
-    for (fd, bytes) in [writes, writes, writes].into_iter().flatten() {
-        // SAFETY: the bytes live as long as the process; a descriptor that was closed makes the call fail.
-        unsafe { libc::write(*fd, bytes.as_ptr().cast(), bytes.len()) };
+    let Some(frames) = (unsafe { table.as_ref() }) else { return };
+    for frame in [frames, frames, frames].into_iter().flatten() {
+        frame.send();
     }
     SENT.fetch_add(1, Ordering::Relaxed);
 }
@@ -194,14 +190,14 @@ mod tests {
     #[test]
     fn a_table_is_written_three_times_and_closed_descriptors_do_no_harm() {
         let (mut reader, writer) = std::io::pipe().unwrap();
-        prepare(vec![(writer.as_raw_fd(), b"stop;".to_vec()), (-1, b"nowhere".to_vec())]);
+        prepare(vec![Prepared::new(writer.as_raw_fd(), b"stop;"), Prepared::new(-1, b"nowhere")]);
         send();
         drop(writer);
         let mut text = String::new();
         reader.read_to_string(&mut text).unwrap();
         assert_eq!(text, "stop;stop;stop;");
         assert!(sent() >= 1);
-        prepare(vec![(File::open("/dev/null").unwrap().as_raw_fd(), b"closed".to_vec())]);
+        prepare(vec![Prepared::new(File::open("/dev/null").unwrap().as_raw_fd(), b"closed")]);
         send();
         prepare(Vec::new());
     }

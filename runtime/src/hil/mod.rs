@@ -7,6 +7,12 @@ pub mod control;
 pub mod trace;
 pub mod replay;
 pub mod emergency;
+pub mod cycle;
+pub mod words;
+pub mod simulated;
 
 #[cfg(test)]
 mod bench;
+
+#[cfg(test)]
+mod tests;

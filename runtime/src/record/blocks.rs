@@ -111,7 +111,7 @@ impl<R: Read> BlockReader<R> {
     ///
     /// # Errors
     /// Those of the file.
-    pub fn next(&mut self) -> io::Result<Option<Block>> {
+    pub fn block(&mut self) -> io::Result<Option<Block>> {
         if self.end.is_some() {
             return Ok(None);
         }
@@ -167,10 +167,10 @@ mod tests {
     fn read(mut file: &[u8]) -> Option<(Vec<Block>, End)> {
         let mut reader = BlockReader::new(&mut file).unwrap()?;
         let mut blocks = Vec::new();
-        while let Some(block) = reader.next().unwrap() {
+        while let Some(block) = reader.block().unwrap() {
             blocks.push(block);
         }
-        assert_eq!(reader.next().unwrap(), None, "an end stays one");
+        assert_eq!(reader.block().unwrap(), None, "an end stays one");
         Some((blocks, reader.end().unwrap()))
     }
 

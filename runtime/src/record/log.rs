@@ -365,7 +365,7 @@ impl Reader {
         })?;
         let blocks = BlockReader::new(BufReader::new(file)).map_err(|error| error.to_string())?;
         let Some(mut blocks) = blocks else { return Err("it is not a log of fric".into()) };
-        let first = blocks.next().map_err(|error| error.to_string())?;
+        let first = blocks.block().map_err(|error| error.to_string())?;
         let head = first.filter(|block| block.kind == HEAD).and_then(|block| Sections::read(&block.bytes));
         let Some(head) = head else { return Err("its head is cut off or damaged".into()) };
         Ok(Reader { blocks, head, tail: None, bytes: Vec::new(), at: 0 })
@@ -375,9 +375,9 @@ impl Reader {
     ///
     /// # Errors
     /// Those of the file.
-    pub fn next(&mut self) -> io::Result<Option<Message>> {
+    pub fn message(&mut self) -> io::Result<Option<Message>> {
         while self.at == self.bytes.len() {
-            match self.blocks.next()? {
+            match self.blocks.block()? {
                 None => return Ok(None),
                 Some(Block { kind: MESSAGES, bytes }) => (self.bytes, self.at) = (bytes, 0),
                 Some(Block { kind: TAIL, bytes }) => self.tail = Sections::read(&bytes),
@@ -423,7 +423,7 @@ mod tests {
     }
 
     fn messages(reader: &mut Reader) -> Vec<Message> {
-        std::iter::from_fn(|| reader.next().unwrap()).collect()
+        std::iter::from_fn(|| reader.message().unwrap()).collect()
     }
 
     #[test]

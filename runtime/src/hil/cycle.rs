@@ -1,0 +1,793 @@
+//! One rig under way: time, buses, drives, model and safety in one loop.
+//!
+//! In: a rig, its control program, a clock, a bus for each of its buses, what the operator commands. Out: frames, a log,
+//! gauges to look at, and at the end why it ended. Knows neither the language nor the terminal. The same code runs
+//! against real and simulated buses, in real and simulated time.
+//!
+//! One cycle, at its own pace and never in reaction to a frame: SYNC, the answers up to a fixed point of the period, the
+//! computing of [`Control`], the commands, housekeeping. From the moment the drives may move, a cycle does not allocate,
+//! lock or write anything but frames; what it leaves behind goes through queues that never wait.
+
+use super::control::{Bounds, Control, Reading, Source, Told};
+use super::trace::{self, Passed, Shape};
+use super::{control, emergency};
+use crate::can::{Bus, Event, Frame, Received};
+use crate::clock::Clock;
+use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind};
+use crate::histogram::Histogram;
+use crate::record::log::{self, Log, Sections};
+use crate::safety::{Cause, Clamps, Order, Supervisor};
+use abi::rig::{Kind, Rig, Signal};
+use abi::{Instance, Slot};
+use rtrb::{Consumer, Producer, RingBuffer};
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Frames of one bus that are taken at once.
+const MOST_FRAMES: usize = 64;
+/// Cycles in a row that lose frames until set-points count as at risk.
+const OVERLOAD: u32 = 3;
+/// Cycles between two states in the log.
+const STATE_EVERY: u64 = 1000;
+/// Parameters that can be changed at once.
+pub const SET_MOST: usize = 16;
+/// Time in which drives must lose their torque once they are told to.
+const REST_NS: u64 = 2_000_000_000;
+
+/// What an operator may ask for while the rig is under way.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Command {
+    /// Power on, at zero command.
+    Enable,
+    /// The outputs to the model.
+    Arm,
+    /// A controlled stop.
+    Stop,
+    /// After a stop: start anew.
+    Reset,
+    /// New values of parameters, as one set.
+    Set(Set),
+}
+
+/// A set of parameters. Their ranges have been checked.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Set {
+    slots: [(Slot, f64); SET_MOST],
+    len: usize,
+}
+
+impl Set {
+    /// A set of at most [`SET_MOST`] parameters; none if there are more.
+    pub fn new(values: &[(Slot, f64)]) -> Option<Set> {
+        let mut slots = [(Slot::TIME, 0.0); SET_MOST];
+        slots.get_mut(..values.len())?.copy_from_slice(values);
+        Some(Set { slots, len: values.len() })
+    }
+}
+
+/// How a rig is run.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Options {
+    /// What is not in its text.
+    pub control: control::Options,
+    /// How it is started.
+    pub start: drive::Options,
+    /// Enable and arm as soon as that can be: for simulated drives.
+    pub arms_itself: bool,
+    /// Stop when the start-up is through: nothing is armed.
+    pub checks_only: bool,
+    /// Refuse drives that are not simulated: why. They say vendor 0.
+    pub only_simulated: Option<String>,
+    /// From SYNC to the computing, ns; none: as the rig's kind of drives needs it.
+    pub collect_ns: Option<u64>,
+    /// Time the model runs, ns; none: until somebody stops it.
+    pub duration_ns: Option<u64>,
+}
+
+impl Default for Options {
+    fn default() -> Options {
+        Options {
+            control: control::Options::default(),
+            start: drive::Options::default(),
+            arms_itself: false,
+            checks_only: false,
+            only_simulated: None,
+            collect_ns: None,
+            duration_ns: None,
+        }
+    }
+}
+
+/// How it ended.
+#[derive(Clone, PartialEq, Debug)]
+pub enum End {
+    /// As asked: the time was over, or somebody stopped it.
+    Asked,
+    /// It was not started: why.
+    Refused(String),
+    /// By safety or a condition of the rig: why.
+    Stopped(Cause, String),
+}
+
+/// What was counted.
+#[derive(Clone, Default)]
+pub struct Counts {
+    /// Cycles in which the model ran.
+    pub cycles: u64,
+    /// Cycles of all kinds.
+    pub all: u64,
+    /// Times a cycle began a period late or more.
+    pub overruns: u64,
+    /// Ticks missed by them.
+    pub missed: u64,
+    /// Readings that a model's cycle had to hold.
+    pub stale: u64,
+    /// Frames lost before they were read.
+    pub lost_frames: u64,
+    /// Frames that a bus did not take.
+    pub refused_frames: u64,
+    /// Error frames, and warnings of buses.
+    pub bus_errors: u64,
+    /// Outputs clamped by range, slew, power.
+    pub clamped: [u64; 3],
+    /// Cycles the log dropped.
+    pub log_dropped: u64,
+    /// Sets of parameters that were refused.
+    pub refused_sets: u64,
+    /// How late cycles began.
+    pub late: Histogram,
+    /// From the begin of a cycle to the last answer read.
+    pub receive: Histogram,
+    /// Model and safety.
+    pub compute: Histogram,
+    /// Commands out.
+    pub send: Histogram,
+}
+
+/// Numbers to look at while the rig is under way: each is written by the cycle and may be read by anybody.
+#[derive(Debug, Default)]
+pub struct Gauges {
+    /// ns since the start.
+    pub now_ns: AtomicU64,
+    /// Cycles in which the model ran.
+    pub cycles: AtomicU64,
+    /// [`Step`] of the start-up as a number, then [`Order`] as a number from 100.
+    pub stage: AtomicU64,
+    /// How late the last cycle began, ns.
+    pub late_ns: AtomicU64,
+    /// How late one has begun at most, ns.
+    pub late_ns_max: AtomicU64,
+    /// Ticks missed.
+    pub missed: AtomicU64,
+    /// Permitted outputs, then recorded quantities: SI, as bits.
+    pub values: Vec<AtomicU64>,
+}
+
+/// The buses, and what happens on them in a cycle.
+struct Wires {
+    clock: Box<dyn Clock>,
+    buses: Vec<Box<dyn Bus>>,
+    watchdog: Option<emergency::Watchdog>,
+    /// The cycle knows that the watchdog has stopped the drives, and commands nothing else.
+    acknowledged: bool,
+    /// Words of the frames of this cycle.
+    frames: Vec<u64>,
+    /// What went wrong in this cycle.
+    causes: Vec<Cause>,
+    lossy: bool,
+    lost: u64,
+    refused: u64,
+    errors: u64,
+}
+
+impl Wires {
+    /// Hands a frame to a bus. After the watchdog has stopped the drives nothing leaves until the cycle stops them too.
+    fn send(&mut self, bus: usize, frame: Frame) {
+        let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten);
+        if bitten && !self.acknowledged {
+            return;
+        }
+        match self.buses[bus].send(frame) {
+            Ok(()) => self.pass(bus, true, frame, self.clock.now_ns()),
+            Err(_) => {
+                self.refused += 1;
+                self.report(Cause::Bus(bus));
+            }
+        }
+    }
+
+    fn pass(&mut self, bus: usize, sent: bool, frame: Frame, stamp_ns: u64) {
+        if self.frames.len() + 3 <= self.frames.capacity() {
+            Passed { stamp_ns, bus: bus as u8, sent, frame }.write(&mut self.frames);
+        }
+    }
+
+    fn report(&mut self, cause: Cause) {
+        if self.causes.len() < self.causes.capacity() && !self.causes.contains(&cause) {
+            self.causes.push(cause);
+        }
+    }
+
+    /// Takes what has come: at most [`MOST_FRAMES`] from each bus.
+    fn drain(&mut self, fieldbus: &mut Fieldbus) {
+        for bus in 0..self.buses.len() {
+            for n in 0.. {
+                if n == MOST_FRAMES {
+                    self.lossy = true;
+                    break;
+                }
+                match self.buses[bus].receive() {
+                    None => break,
+                    Some(Received::Frame(frame, stamp_ns)) => {
+                        self.pass(bus, false, frame, stamp_ns);
+                        fieldbus.receive(bus, &frame, stamp_ns, &mut |bus, frame| self.send(bus, frame));
+                    }
+                    Some(Received::Event(event, _)) => self.event(bus, event),
+                }
+            }
+        }
+    }
+
+    fn event(&mut self, bus: usize, event: Event) {
+        match event {
+            Event::Warning | Event::Passive | Event::Error | Event::Restarted => self.errors += 1,
+            Event::BusOff | Event::NotAcknowledged | Event::Down => {
+                self.errors += 1;
+                self.report(Cause::Bus(bus));
+            }
+            Event::Lost(frames) => {
+                self.lost += u64::from(frames);
+                self.lossy = true;
+            }
+        }
+    }
+}
+
+/// Where the operator's commands go in.
+pub type Operator = Producer<Command>;
+
+/// A rig under way.
+pub struct Hil {
+    rig: Rig,
+    options: Options,
+    wires: Wires,
+    fieldbus: Fieldbus,
+    model: Instance,
+    /// Once the drives have told their limits.
+    control: Option<Control>,
+    log_wanted: Option<(log::Settings, Sections)>,
+    log: Option<Log>,
+    gauges: Arc<Gauges>,
+    commands: Consumer<Command>,
+    due_ns: u64,
+    collect_ns: u64,
+    k: u64,
+    cycle: trace::Cycle,
+    signals: Vec<Signal>,
+    words: Vec<u64>,
+    order: Order,
+    overload: u32,
+    first_trouble: Option<Trouble>,
+    /// Cycles of the model that are left; none: no end.
+    left: Option<u64>,
+    /// The time of the model is over: a controlled stop comes with the next cycle.
+    over: bool,
+    /// Since when the drives have been told to give up their torque.
+    resting_ns: Option<u64>,
+    counts: Counts,
+    misuse: bool,
+    end: Option<End>,
+}
+
+impl Hil {
+    /// A rig that is about to start. `buses`: one for each of the rig's. Also gives the operator's end of the commands.
+    ///
+    /// # Errors
+    /// What the rig asks for that cannot be had, in words.
+    pub fn new(
+        rig: &Rig,
+        model: Instance,
+        clock: Box<dyn Clock>,
+        buses: Vec<Box<dyn Bus>>,
+        options: Options,
+        log: Option<(log::Settings, Sections)>,
+    ) -> Result<(Hil, Operator), String> {
+        assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
+        let fieldbus = Fieldbus::new(rig, options.start)?;
+        let (operator, commands) = RingBuffer::new(64);
+        let at_sync = |node: &abi::rig::Node| match &node.kind {
+            Kind::Cia402(drive) => !node.moves || drive.at_sync,
+            Kind::Frames(_) => true,
+        };
+        // All drives wait for the next SYNC: there is time. Otherwise the answers of some drives at 1 Mbit/s and 1 kHz.
+        let part = if rig.nodes.iter().all(at_sync) { 0.85 } else { 0.55 };
+        let collect_ns = options.collect_ns.unwrap_or((rig.period_ns as f64 * part) as u64);
+        let values = (0..rig.outputs.len() + rig.record.len()).map(|_| AtomicU64::new(0)).collect();
+        let due_ns = clock.now_ns() + rig.period_ns;
+        let empty = Shape { signals: 0, outputs: 0, drives: 0, recorded: 0 };
+        let hil = Hil {
+            rig: rig.clone(),
+            left: options.duration_ns.map(|ns| ns.div_ceil(rig.period_ns)),
+            options,
+            wires: Wires {
+                clock,
+                buses,
+                watchdog: None,
+                acknowledged: false,
+                frames: Vec::with_capacity(1 << 14),
+                causes: Vec::with_capacity(16),
+                lossy: false,
+                lost: 0,
+                refused: 0,
+                errors: 0,
+            },
+            fieldbus,
+            model,
+            control: None,
+            log_wanted: log,
+            log: None,
+            gauges: Arc::new(Gauges { values, ..Gauges::default() }),
+            commands,
+            due_ns,
+            collect_ns: collect_ns.min(rig.period_ns),
+            k: 0,
+            cycle: trace::Cycle::new(empty),
+            signals: Vec::new(),
+            words: Vec::with_capacity(1 << 14),
+            order: Order::Wait,
+            overload: 0,
+            first_trouble: None,
+            over: false,
+            resting_ns: None,
+            counts: Counts::default(),
+            misuse: false,
+            end: None,
+        };
+        Ok((hil, operator))
+    }
+
+    /// Stops the drives from a thread of its own if cycles stop.
+    pub fn watched_by(&mut self, watchdog: emergency::Watchdog) {
+        self.wires.watchdog = Some(watchdog);
+    }
+
+    /// What to look at from elsewhere.
+    pub fn gauges(&self) -> Arc<Gauges> {
+        self.gauges.clone()
+    }
+
+    /// Where the start-up is.
+    pub fn step(&self) -> Step {
+        self.fieldbus.step()
+    }
+
+    /// The computing part, once the drives have told their limits.
+    pub fn control(&self) -> Option<&Control> {
+        self.control.as_ref()
+    }
+
+    /// What watches over the outputs, to narrow its limits.
+    pub fn supervisor_mut(&mut self) -> Option<&mut Supervisor> {
+        self.control.as_mut().map(Control::supervisor_mut)
+    }
+
+    /// The nodes of the rig.
+    pub fn fieldbus(&self) -> &Fieldbus {
+        &self.fieldbus
+    }
+
+    /// What was counted until now.
+    pub fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// How it ended, once it has.
+    pub fn ended(&self) -> Option<&End> {
+        self.end.as_ref()
+    }
+
+    /// Whether it was refused for what only simulated drives bear.
+    pub fn is_misuse(&self) -> bool {
+        self.misuse
+    }
+
+    /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere.
+    pub fn prepare_emergency(&self) {
+        let buses = self.wires.buses.iter().enumerate();
+        let ready = buses.flat_map(|(i, bus)| {
+            let frames = self.fieldbus.stop_frames(i).iter().chain(self.fieldbus.off_frames(i));
+            frames.filter_map(|frame| bus.prepare(*frame))
+        });
+        emergency::prepare(ready.collect());
+    }
+
+    /// Runs until it ends.
+    pub fn run(&mut self) -> End {
+        loop {
+            self.cycle();
+            if let Some(end) = &self.end {
+                return end.clone();
+            }
+        }
+    }
+
+    /// One cycle, waiting for its tick included.
+    pub fn cycle(&mut self) {
+        self.wires.clock.sleep_until(self.due_ns);
+        let begin_ns = self.wires.clock.now_ns();
+        let late_ns = begin_ns.saturating_sub(self.due_ns);
+        // The phase is kept: whole periods are skipped.
+        let missed = late_ns / self.rig.period_ns;
+        self.due_ns += missed * self.rig.period_ns;
+        let ticks = u32::try_from(missed + 1).unwrap_or(u32::MAX);
+
+        self.wires.frames.clear();
+        self.wires.causes.clear();
+        self.wires.lossy = false;
+        self.operate();
+        self.wires.drain(&mut self.fieldbus);
+        let Hil { fieldbus, wires, .. } = self;
+        fieldbus.begin(begin_ns, &mut |bus, frame| wires.send(bus, frame));
+        wires.clock.sleep_until(self.due_ns + self.collect_ns);
+        wires.drain(fieldbus);
+        let read_ns = wires.clock.now_ns();
+
+        self.gather();
+        let order = self.compute(ticks);
+        let computed_ns = self.wires.clock.now_ns();
+        self.tell(order);
+        let Hil { fieldbus, wires, .. } = self;
+        fieldbus.end(computed_ns, &mut |bus, frame| wires.send(bus, frame));
+        let sent_ns = self.wires.clock.now_ns();
+
+        let short = |from: u64, to: u64| u32::try_from(to - from).unwrap_or(u32::MAX);
+        self.cycle.due_ns = self.due_ns;
+        self.cycle.late_ns = u32::try_from(late_ns).unwrap_or(u32::MAX);
+        self.cycle.phases_ns = [short(begin_ns, read_ns), short(read_ns, computed_ns), short(computed_ns, sent_ns)];
+        self.count(ticks);
+        self.leave_behind();
+        self.go_on(sent_ns);
+        if let Some(watchdog) = &self.wires.watchdog {
+            watchdog.watch(self.fieldbus.step() > Step::AwaitEnable && self.end.is_none());
+            watchdog.beat();
+        }
+        self.due_ns += self.rig.period_ns;
+    }
+
+    /// What the operator asked for since the last cycle.
+    fn operate(&mut self) {
+        self.cycle.arms = false;
+        self.cycle.resets = false;
+        self.cycle.set.clear();
+        if self.over || emergency::asked().is_some() {
+            self.stop();
+        }
+        while let Ok(command) = self.commands.pop() {
+            match command {
+                Command::Enable => {
+                    self.fieldbus.request(Request::Enable);
+                }
+                Command::Arm => {
+                    self.fieldbus.request(Request::Arm);
+                }
+                Command::Stop => self.stop(),
+                Command::Reset => self.reset(),
+                Command::Set(set) => {
+                    // Sets that come within one period act as one.
+                    if self.cycle.set.len() + set.len <= self.cycle.set.capacity() {
+                        self.cycle.set.extend_from_slice(&set.slots[..set.len]);
+                    }
+                }
+            }
+        }
+        if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
+            self.stop();
+        }
+        let arms_itself = self.options.arms_itself && self.end.is_none() && self.resting_ns.is_none();
+        if arms_itself && self.control.is_some() {
+            match self.fieldbus.step() {
+                Step::AwaitEnable => _ = self.fieldbus.request(Request::Enable),
+                Step::AwaitArm if !self.options.checks_only => _ = self.fieldbus.request(Request::Arm),
+                _ => {}
+            }
+        }
+    }
+
+    fn stop(&mut self) {
+        match &self.control {
+            Some(_) => self.wires.report(Cause::Asked),
+            None => self.end = Some(End::Asked),
+        }
+    }
+
+    fn reset(&mut self) {
+        let Some(control) = &mut self.control else { return };
+        if control.supervisor_mut().reset() && self.fieldbus.request(Request::Reset) {
+            self.cycle.resets = true;
+            self.first_trouble = None;
+            self.resting_ns = None;
+            self.overload = 0;
+            if let Some(watchdog) = &self.wires.watchdog {
+                watchdog.reset();
+                self.wires.acknowledged = false;
+            }
+        }
+    }
+
+    /// What the nodes and buses have said against going on.
+    fn gather(&mut self) {
+        self.overload = if self.wires.lossy { self.overload + 1 } else { 0 };
+        if self.overload >= OVERLOAD {
+            self.wires.report(Cause::Overload(0));
+        }
+        if self.wires.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten) && !self.wires.acknowledged {
+            self.wires.acknowledged = true;
+            self.wires.report(Cause::Watchdog);
+        }
+        while let Some(trouble) = self.fieldbus.trouble() {
+            self.first_trouble = self.first_trouble.or(Some(trouble));
+            let node = trouble.node.unwrap_or_default();
+            let cause = match trouble.kind {
+                TroubleKind::ForeignMaster(id) => Cause::Foreign(0, id),
+                TroubleKind::NotFollowing | TroubleKind::Mode(_) => Cause::NotFollowing(node),
+                // A frame that is too short is one that did not come.
+                TroubleKind::Short(_) => continue,
+                TroubleKind::Emergency(_)
+                | TroubleKind::Fault
+                | TroubleKind::Left(_)
+                | TroubleKind::HeartbeatLost
+                | TroubleKind::BootUp
+                | TroubleKind::Nmt(_) => Cause::Drive(node),
+            };
+            self.wires.report(cause);
+        }
+    }
+
+    /// Computes, once the drives have told their limits.
+    fn compute(&mut self, ticks: u32) -> Order {
+        let step = self.fieldbus.step();
+        if self.control.is_none() && step >= Step::AwaitEnable && step < Step::Stopped {
+            self.begin_control();
+        }
+        let Some(control) = &mut self.control else { return Order::Wait };
+        let cycle = &mut self.cycle;
+        // Before the drives are enabled a bus may be silent: the start-up judges that.
+        if step <= Step::AwaitEnable {
+            self.wires.causes.retain(|cause| *cause == Cause::Asked);
+        }
+        let source = match step {
+            Step::SignTest | Step::AwaitArm => Source::StartUp,
+            Step::Armed => Source::Model,
+            Step::Stopped => cycle.source,
+            _ => Source::Nobody,
+        };
+        if source != Source::Nobody && source != cycle.source {
+            cycle.arms = control.supervisor_mut().arm();
+        }
+        cycle.source = source;
+        cycle.ticks = ticks;
+        cycle.step = step as u8;
+        for (reading, signal) in cycle.readings.iter_mut().zip(&self.signals) {
+            let drive::Reading { value, age, .. } = self.fieldbus.reading(*signal);
+            *reading = Reading { value, age };
+        }
+        cycle.wanted.clear();
+        if source == Source::StartUp {
+            cycle.wanted.extend(self.rig.outputs.iter().map(|output| self.fieldbus.wanted(output.signal)));
+        }
+        cycle.causes.clear();
+        cycle.causes.extend_from_slice(&self.wires.causes);
+        let order = control.cycle(&Told {
+            ticks,
+            readings: &cycle.readings,
+            source,
+            wanted: &cycle.wanted,
+            causes: &cycle.causes,
+            set: &cycle.set,
+        });
+        cycle.order = order;
+        cycle.requests.copy_from_slice(control.requests());
+        cycle.permitted.copy_from_slice(control.supervisor().permitted());
+        cycle.clamps.copy_from_slice(control.supervisor().clamps());
+        for (value, series) in cycle.recorded.iter_mut().zip(&self.rig.record) {
+            *value = control.model().get(series.slot);
+        }
+        order
+    }
+
+    /// The drives have told their limits: what computes can be made, and the log begins. Nothing moves yet.
+    fn begin_control(&mut self) {
+        let bounds = (0..self.rig.nodes.len()).map(|node| {
+            let limits = self.fieldbus.limits(node);
+            Bounds { torque: limits.map(|limits| limits.torque), speed: limits.map(|limits| limits.speed) }
+        });
+        let bounds: Vec<Bounds> = bounds.collect();
+        let real = |node: &usize| self.fieldbus.status(*node).is_some_and(|status| status.identity[0] != Some(0));
+        if let Some(why) = &self.options.only_simulated
+            && let Some(node) = (0..self.rig.nodes.len()).find(real)
+        {
+            self.misuse = true;
+            return self.refuse(format!("{why}, and `{}` is none", self.rig.nodes[node].name));
+        }
+        let control = match Control::new(&self.rig, self.model.clone(), &bounds, self.options.control) {
+            Ok(control) => control,
+            Err(why) => return self.refuse(why),
+        };
+        let shape = Shape::of(&self.rig, &control);
+        self.signals = control.signals().collect();
+        if let Some(missing) = self.signals.iter().find(|signal| !self.fieldbus.has(**signal)) {
+            let name = &self.rig.nodes[missing.node].name;
+            return self.refuse(format!("`{name}` does not tell a signal that is needed ({:?})", missing.what));
+        }
+        self.cycle = trace::Cycle::new(shape);
+        if let Some((settings, head)) = self.log_wanted.take() {
+            let head = head.with("settings", trace::settings_to_bytes(&bounds, &self.options.control));
+            let head = head.with("drives", self.identities());
+            match Log::begin(settings, &head) {
+                Ok(log) => self.log = Some(log),
+                Err(error) => return self.refuse(format!("the log cannot be written: {error}")),
+            }
+        }
+        self.control = Some(control);
+    }
+
+    /// Who the drives are, a line each.
+    fn identities(&self) -> String {
+        let line = |node: usize| {
+            let status = self.fieldbus.status(node)?;
+            let number = |word: Option<u32>| word.map_or("-".into(), |word| format!("0x{word:08X}"));
+            let [vendor, product, revision, serial] = status.identity.map(number);
+            let name = &self.rig.nodes[node].name;
+            Some(format!("{name}: vendor {vendor}, product {product}, revision {revision}, serial {serial}\n"))
+        };
+        (0..self.rig.nodes.len()).filter_map(line).collect()
+    }
+
+    fn refuse(&mut self, why: String) {
+        self.end = Some(End::Refused(why));
+        self.fieldbus.request(Request::Disable);
+    }
+
+    /// Commands and orders to the nodes.
+    fn tell(&mut self, order: Order) {
+        let Hil { fieldbus, wires, control, rig, .. } = self;
+        let Some(control) = control else { return };
+        for (output, value) in rig.outputs.iter().zip(control.supervisor().permitted()) {
+            fieldbus.command(output.signal, *value);
+        }
+        if order != self.order {
+            match order {
+                Order::QuickStop => {
+                    for bus in 0..rig.buses.len() {
+                        fieldbus.stop_frames(bus).iter().for_each(|frame| wires.send(bus, *frame));
+                    }
+                    fieldbus.request(Request::QuickStop);
+                }
+                Order::Disable => {
+                    fieldbus.request(Request::Disable);
+                }
+                Order::Wait | Order::Follow => {}
+            }
+        }
+        self.order = order;
+    }
+
+    fn count(&mut self, ticks: u32) {
+        let counts = &mut self.counts;
+        counts.all += 1;
+        let runs = self.control.is_some() && self.cycle.source == Source::Model && self.order == Order::Follow;
+        if self.fieldbus.step() > Step::AwaitEnable && ticks > 1 {
+            counts.overruns += 1;
+            counts.missed += u64::from(ticks) - 1;
+        }
+        counts.lost_frames = self.wires.lost;
+        counts.refused_frames = self.wires.refused;
+        counts.bus_errors = self.wires.errors;
+        if runs {
+            counts.cycles += 1;
+            counts.late.count(u64::from(self.cycle.late_ns));
+            let [receive, compute, send] = self.cycle.phases_ns.map(u64::from);
+            counts.receive.count(receive);
+            counts.compute.count(compute);
+            counts.send.count(send);
+            counts.stale += self.cycle.readings.iter().filter(|reading| reading.age > 0).count() as u64;
+            for clamps in &self.cycle.clamps {
+                for (count, kind) in counts.clamped.iter_mut().zip([Clamps::RANGE, Clamps::SLEW, Clamps::POWER]) {
+                    *count += u64::from(clamps.has(kind));
+                }
+            }
+        }
+        counts.refused_sets = self.control.as_ref().map_or(0, |control| u64::from(control.refused_sets()));
+        let gauges = &self.gauges;
+        gauges.now_ns.store(self.due_ns, Ordering::Relaxed);
+        gauges.cycles.store(counts.cycles, Ordering::Relaxed);
+        gauges.late_ns.store(self.cycle.late_ns.into(), Ordering::Relaxed);
+        gauges.late_ns_max.fetch_max(if runs { self.cycle.late_ns.into() } else { 0 }, Ordering::Relaxed);
+        gauges.missed.store(counts.missed, Ordering::Relaxed);
+        let stage = match self.order {
+            Order::Wait | Order::Follow => self.fieldbus.step() as u64,
+            order => 100 + trace::order_number(order),
+        };
+        gauges.stage.store(stage, Ordering::Relaxed);
+        for (gauge, value) in gauges.values.iter().zip(self.cycle.permitted.iter().chain(&self.cycle.recorded)) {
+            gauge.store(value.to_bits(), Ordering::Relaxed);
+        }
+    }
+
+    /// The cycle goes to the log.
+    fn leave_behind(&mut self) {
+        let Some(control) = &self.control else { return };
+        let moving = (0..self.rig.nodes.len()).filter(|node| self.rig.nodes[*node].moves);
+        for (word, node) in self.cycle.statuses.iter_mut().zip(moving) {
+            *word = self.fieldbus.status(node).map_or(0, |status| status.word);
+        }
+        self.cycle.k = self.k;
+        self.k += 1;
+        let Some(log) = &mut self.log else { return };
+        self.words.clear();
+        self.cycle.write(&mut self.words);
+        log.push(log::CYCLE, &self.words);
+        log.push(trace::FRAMES, &self.wires.frames);
+        if self.k.is_multiple_of(STATE_EVERY) {
+            self.words.clear();
+            trace::write_state(self.k, control, &mut self.words);
+            log.push(trace::STATE, &self.words);
+        }
+        self.counts.log_dropped = log.dropped();
+    }
+
+    /// Ends the run when it is over.
+    fn go_on(&mut self, now_ns: u64) {
+        if let Some(left) = &mut self.left
+            && self.cycle.source == Source::Model
+            && self.order == Order::Follow
+        {
+            *left = left.saturating_sub(u64::from(self.cycle.ticks));
+            self.over = *left == 0;
+        }
+        if self.end.is_some() {
+            return;
+        }
+        if let Some(refusal) = self.fieldbus.refusal() {
+            let why = self.fieldbus.explain(refusal);
+            let since = *self.resting_ns.get_or_insert(now_ns);
+            if self.fieldbus.at_rest() || now_ns - since > REST_NS {
+                self.end = Some(End::Refused(why));
+            }
+            return;
+        }
+        let Some(control) = &self.control else { return };
+        if control.supervisor().is_disabled() {
+            let since = *self.resting_ns.get_or_insert(now_ns);
+            if self.fieldbus.at_rest() || now_ns - since > REST_NS {
+                self.end = Some(match control.supervisor().cause() {
+                    None | Some(Cause::Asked) => End::Asked,
+                    Some(cause) => End::Stopped(cause, self.explain(cause)),
+                });
+            }
+        }
+    }
+
+    /// Why it stopped, in words.
+    pub fn explain(&self, cause: Cause) -> String {
+        let trouble = self.first_trouble.map(|trouble| self.fieldbus.tell(&trouble));
+        super::words::cause(&self.rig, self.model.description(), &self.signals, cause, trouble.as_deref())
+    }
+
+    /// Ends the log: what was counted goes into its tail.
+    ///
+    /// # Errors
+    /// What kept it from being written.
+    pub fn finish(mut self) -> io::Result<Option<log::Summary>> {
+        let Some(log) = self.log.take() else { return Ok(None) };
+        let end = self.end.clone().unwrap_or(End::Asked);
+        let (end, stopped) = match end {
+            End::Asked => ("as asked".to_string(), false),
+            End::Refused(why) => (format!("refused: {why}"), true),
+            End::Stopped(_, why) => (format!("stopped: {why}"), true),
+        };
+        let tail = Sections::default().with("end", end).with("counts", super::words::counts(&self.counts));
+        log.end(&tail, stopped).map(Some)
+    }
+}

@@ -1,0 +1,119 @@
+//! A whole rig in simulated time: start, run, stop, log and replay.
+
+use super::bench;
+use super::control::{self, Control};
+use super::cycle::{End, Hil, Options};
+use super::replay::{Replay, Stopped};
+use super::simulated::{Pace, World};
+use super::trace;
+use crate::record::log::{Reader, Sections, Settings, Sink};
+use std::path::Path;
+
+const SECOND_NS: u64 = 1_000_000_000;
+
+fn options(seconds: f64) -> Options {
+    Options { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..Options::default() }
+}
+
+/// Runs the pair of drives for a time; leaves a log.
+fn run(seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
+    let (rig, model, plant) = bench::pair();
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+    let masters = world.masters();
+    let settings = log.map(|path| {
+        let settings = Settings { sink: Sink::File(path.into()), cycles_per_block: 100, patient: true };
+        (settings, Sections::default().with("rig", "pair"))
+    });
+    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options(seconds), settings).unwrap();
+    let end = hil.run();
+    (end, hil, world)
+}
+
+fn replay(path: &Path, change: impl Fn(&mut crate::record::log::Message)) -> Result<u64, Stopped> {
+    let (rig, model, _) = bench::pair();
+    let mut reader = Reader::open(path).unwrap();
+    let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
+    let control = Control::new(&rig, model, &bounds, options).unwrap();
+    let mut replay = Replay::new(&rig, control);
+    while let Some(mut message) = reader.message().unwrap() {
+        change(&mut message);
+        replay.message(&message)?;
+    }
+    assert_eq!((replay.found().skipped, replay.found().lost), (0, 0));
+    Ok(replay.found().cycles)
+}
+
+#[test]
+fn a_rig_starts_runs_and_ends_as_asked() {
+    let (end, hil, world) = run(2.0, None);
+    assert_eq!(end, End::Asked, "{:?}", hil.step());
+    let counts = hil.counts();
+    assert_eq!((counts.cycles, counts.missed, counts.refused_frames, counts.lost_frames), (2000, 0, 0, 0));
+    let shaft = world.bench().shaft(0);
+    assert!(shaft.position.abs() > 0.1, "it turned: {shaft:?}");
+}
+
+#[test]
+fn a_log_replays_to_the_bit_and_names_what_differs() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pair.friclog");
+    let (end, hil, _) = run(3.0, Some(&path));
+    assert_eq!(end, End::Asked);
+    let all = hil.counts().all;
+    let summary = hil.finish().unwrap().unwrap();
+    assert_eq!(summary.dropped, 0);
+    let cycles = replay(&path, |_| ()).unwrap();
+    assert!(cycles > 3000 && cycles <= all, "{cycles} of {all}");
+    // One bit of one reading, in one cycle.
+    let flipped = replay(&path, |message| {
+        if message.kind == trace::CYCLE && message.words[0] == 2500 {
+            message.words[6] ^= 1 << 40;
+        }
+    });
+    let Err(Stopped::Differs(difference)) = flipped else { panic!("{flipped:?}") };
+    assert!(difference.k == 2500, "{difference:?}");
+}
+
+#[test]
+fn two_equal_runs_leave_equal_logs() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = |name: &str| {
+        let path = folder.path().join(name);
+        let (_, hil, _) = run(1.0, Some(&path));
+        hil.finish().unwrap();
+        std::fs::read(path).unwrap()
+    };
+    assert!(log("a") == log("b"), "the logs differ");
+}
+
+#[test]
+fn a_rig_whose_drives_are_not_there_is_refused() {
+    let (rig, model, plant) = bench::pair();
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+    world.bus(0).unplug(super::simulated::BENCH, 0, u64::MAX);
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options(1.0), None).unwrap();
+    let End::Refused(why) = hil.run() else { panic!("it started") };
+    assert!(why.contains("servo") || why.contains("load"), "{why}");
+    assert!(world.clock().now_ns() < 20 * SECOND_NS);
+    let _ = control::Options::default();
+}
+
+#[test]
+fn debug_start() {
+    let (rig, model, plant) = bench::pair();
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options(1.0), None).unwrap();
+    let mut last = None;
+    while hil.ended().is_none() {
+        hil.cycle();
+        if last != Some(hil.step()) {
+            last = Some(hil.step());
+            eprintln!("{:.4} {:?}", world.clock().now_ns() as f64 * 1e-9, hil.step());
+        }
+        if hil.step() == crate::drive::Step::Refused {
+            break;
+        }
+    }
+}

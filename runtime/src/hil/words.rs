@@ -1,0 +1,128 @@
+//! What a rig has to say, in words.
+
+use super::cycle::Counts;
+use crate::drive::Step;
+use crate::histogram::Histogram;
+use crate::safety::Cause;
+use crate::show;
+use abi::Description;
+use abi::rig::{Kind, Rig, Signal, What};
+use std::fmt::Write;
+
+/// A signal as the text of a rig names it: `load.speed`.
+pub fn signal(rig: &Rig, signal: Signal) -> String {
+    let node = &rig.nodes[signal.node];
+    let name = match (signal.what, &node.kind) {
+        (What::Torque, _) => "torque",
+        (What::Speed, _) => "speed",
+        (What::Position, _) => "position",
+        (What::Enabled, _) => "enabled",
+        (What::Fault, _) => "fault",
+        (What::Limited, _) => "limited",
+        (What::Field(message, field), Kind::Frames(messages)) => &messages[message].fields[field].name,
+        (What::Field(..), Kind::Cia402(_)) => "?",
+    };
+    format!("{}.{name}", node.name)
+}
+
+/// Why a rig stopped. `trouble`: what a node said of itself, if that was the beginning.
+pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, trouble: Option<&str>) -> String {
+    let output = |i: usize| signal(rig, rig.outputs[i].signal);
+    let drive = |i: usize| {
+        let moving = rig.nodes.iter().filter(|node| node.moves).nth(i);
+        moving.map_or("a drive".into(), |node| format!("`{}`", node.name))
+    };
+    let bus = |i: usize| rig.buses.get(i).map_or("a bus".into(), |bus| format!("bus `{}`", bus.name));
+    let read = |i: usize| signals.get(i).map_or("a signal".into(), |at| signal(rig, *at));
+    match cause {
+        Cause::Asked => "asked to stop".into(),
+        Cause::NotFinite(i) => format!("the model gave no number for {}", output(i)),
+        Cause::Guard(status) => match model.guards.get(usize::try_from(status).unwrap_or(0).wrapping_sub(1)) {
+            Some(guard) => {
+                let bound = |value: f64| show::quantity(value, &guard.unit);
+                format!("{} left its range {} .. {}", guard.path, bound(guard.range.0), bound(guard.range.1))
+            }
+            None => format!("the model could not go on (status {status})"),
+        },
+        Cause::Clamped(i) => format!("{} was outside its limits for too long", output(i)),
+        Cause::Condition(i) => match rig.stops.get(i) {
+            Some(stop) => format!("{} ({})", stop.why, stop.condition),
+            None => "a condition of the rig holds".into(),
+        },
+        Cause::Overrun(missed) => {
+            format!("the computer was too late: {missed} tick{} missed", if missed == 1 { "" } else { "s" })
+        }
+        Cause::Speed(i, speed) => format!("{} is too fast: {speed:.4} rad/s", drive(i)),
+        Cause::Travel(i, position) => format!("{} is outside its travel: at {position:.4} rad", drive(i)),
+        Cause::RunAway(i) => {
+            format!("{} ran away: it got faster against the torque. Is a sign wrong?", drive(i))
+        }
+        Cause::Lost(i) => format!("{} no longer comes", read(i)),
+        Cause::Implausible(i) => format!("{} jumps further than anything on this shaft can", read(i)),
+        Cause::NotFollowing(_) | Cause::Drive(_) | Cause::Foreign(..) if trouble.is_some() => {
+            trouble.unwrap_or_default().into()
+        }
+        Cause::NotFollowing(node) => format!("`{}` does not follow commands", rig.nodes[node].name),
+        Cause::Drive(node) => format!("`{}` stopped by itself", rig.nodes[node].name),
+        Cause::Foreign(i, id) => format!("{}: somebody else sends frame 0x{id:03X}", bus(i)),
+        Cause::Bus(i) => format!("{} does not carry: is the cable in, is anybody there?", bus(i)),
+        Cause::Overload(_) => "frames were lost: the bus carries more than can be read".into(),
+        Cause::Energy => "more energy came back than the friction can hold: the loop is not stable".into(),
+        Cause::Watchdog => "no cycle ended in time: the watchdog stopped the drives".into(),
+    }
+}
+
+const STEPS: [Step; 16] = [
+    Step::Listen,
+    Step::Reset,
+    Step::Identity,
+    Step::Configure,
+    Step::Start,
+    Step::Sync,
+    Step::Mode,
+    Step::AwaitEnable,
+    Step::Enable,
+    Step::TimeoutTest,
+    Step::Reenable,
+    Step::SignTest,
+    Step::AwaitArm,
+    Step::Armed,
+    Step::Stopped,
+    Step::Refused,
+];
+
+/// The stage that a gauge shows.
+pub fn stage(number: u64) -> String {
+    match number {
+        102 => "quick stop".into(),
+        103 => "torque off".into(),
+        step => STEPS.iter().find(|known| **known as u64 == step).map_or("?".into(), Step::to_string),
+    }
+}
+
+/// What was counted, a line for each group.
+pub fn counts(counts: &Counts) -> String {
+    let mut out = String::new();
+    let micro = |ns: u64| ns as f64 * 1e-3;
+    let quantiles = |h: &Histogram| {
+        let [p50, p99] = [0.5, 0.99].map(|part| micro(h.quantile_ns(part)));
+        format!("p50 {p50:.1}  p99 {p99:.1}  max {:.1}", micro(h.max_ns()))
+    };
+    let Counts { cycles, missed, overruns, stale, lost_frames, refused_frames, bus_errors, clamped, .. } = counts;
+    let _ = writeln!(out, "cycles   {cycles}, {missed} missed in {overruns} overruns");
+    if counts.late.total() > 0 {
+        let _ = writeln!(out, "late µs  {}", quantiles(&counts.late));
+        let each = [("receive", &counts.receive), ("compute", &counts.compute), ("send", &counts.send)];
+        let phases =
+            each.map(|(name, h)| format!("{name} {:.1} / {:.1}", micro(h.quantile_ns(0.5)), micro(h.max_ns())));
+        let _ = writeln!(out, "phases µs  {}  (p50 / max)", phases.join("   "));
+    }
+    let [range, slew, power] = clamped;
+    let _ = writeln!(out, "clamped  range {range}, slew {slew}, power {power}");
+    let _ = writeln!(
+        out,
+        "frames   {stale} readings held, {lost_frames} lost, {refused_frames} not taken, {bus_errors} bus errors"
+    );
+    let _ = writeln!(out, "log      {} messages dropped", counts.log_dropped);
+    out
+}

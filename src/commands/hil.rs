@@ -1,0 +1,438 @@
+//! `fric hil`: runs a rig against drives on its buses, real or simulated.
+
+use super::{End, load_from};
+use crate::args::Hil as Args;
+use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::kept::Keeping;
+use crate::terminal::{Style, Terminal};
+use crate::{project, report, value};
+use abi::Description;
+use abi::description::Kind;
+use grammar::ast::Item;
+use runtime::can::address::Address;
+use runtime::can::sim::Simulation;
+use runtime::can::{self, Bus};
+use runtime::clock::Clock;
+use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
+use runtime::hil::simulated::{MASTER, Pace, World};
+use runtime::hil::{cycle, emergency, words};
+use runtime::realtime::{self, Wishes};
+use runtime::record::log::{Sections, Settings, Sink};
+use std::io::{BufRead, IsTerminal};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+/// Cycles whose loss a killed process may cost, as a time.
+const BLOCK_NS: u64 = 100_000_000;
+/// What a black box holds.
+const BLACK_BOX_NS: u64 = 10_000_000_000;
+
+pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
+    let keeping = Keeping::new(&project::Disk);
+    let mut watch = Stopwatch::start("read");
+    let Some(mut loaded) = load_from(&args.file, &keeping, terminal, &mut watch) else { return End::Failed };
+    let name = match chosen(args, &loaded) {
+        Ok(name) => name,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: args.interpret };
+    let mut found = Vec::new();
+    let ready = compile::rig(&mut loaded, &keeping, &name, &options, &mut found);
+    found.extend(ready.as_ref().err().into_iter().flatten().cloned());
+    if !found.is_empty() && (!args.quiet || ready.is_err()) {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+    }
+    let Ok(mut ready) = ready else { return End::Failed };
+    for (bus, address) in &args.bus {
+        let Some(there) = ready.rig.buses.iter_mut().find(|known| known.name == *bus) else {
+            let names: Vec<&str> = ready.rig.buses.iter().map(|bus| bus.name.as_str()).collect();
+            terminal.error(&format!("rig `{name}` has no bus `{bus}`; it has {}", names.join(", ")));
+            return End::Misused;
+        };
+        there.address.clone_from(address);
+    }
+    let simulated = args.sim || ready.rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
+    if let Err(why) = usage(args, &ready, simulated) {
+        terminal.error(&why);
+        return End::Misused;
+    }
+    let root = loaded.files.get(loaded.root());
+    let head = Sections::default()
+        .with("fric", env!("CARGO_PKG_VERSION"))
+        .with("target", format!("{} {}", std::env::consts::ARCH, std::env::consts::OS))
+        .with("rig", name.as_str())
+        .with("file", root.name.as_str())
+        .with("source", root.text.as_bytes())
+        .with("set", set.join("\n"))
+        .with("started", started(simulated && args.fast));
+    drop(loaded);
+    let head = keeping.into(head);
+    let log = match log_settings(args, &name, &ready, simulated) {
+        Ok(settings) => settings.map(|settings| (settings, head)),
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    emergency::guard();
+    if simulated { in_process(args, ready, log, terminal) } else { on_buses(args, ready, log, terminal) }
+}
+
+/// The rig to run: the one named, or the only one.
+fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
+    let items = &loaded.files.get(loaded.root()).ast.items;
+    let rigs = items.iter().filter_map(|item| match item {
+        Item::Rig(rig) => Some(rig.name.text.clone()),
+        _ => None,
+    });
+    let rigs: Vec<String> = rigs.collect();
+    let file = args.file.display();
+    match (&args.rig, rigs.as_slice()) {
+        (_, []) => Err(format!("{file} has no rig")),
+        (Some(name), all) if all.contains(name) => Ok(name.clone()),
+        (Some(name), all) => {
+            let near = compile::nearest(name, all.iter().map(String::as_str));
+            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
+            Err(format!("{file} has no rig `{name}`; {help}"))
+        }
+        (None, [one]) => Ok(one.clone()),
+        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
+    }
+}
+
+/// What cannot be asked for together.
+fn usage(args: &Args, ready: &Ready, simulated: bool) -> Result<(), String> {
+    if simulated {
+        return Ok(());
+    }
+    if args.fast {
+        return Err("--fast needs --sim: real drives have their own time".into());
+    }
+    if !args.inject.is_empty() {
+        return Err("--inject needs --sim: it makes simulated drives and devices fail".into());
+    }
+    if let Some(bus) = ready.rig.buses.iter().find(|bus| bus.address.starts_with("sim:")) {
+        return Err(format!("bus `{}` is simulated and others are not: a rig is one or the other", bus.name));
+    }
+    Ok(())
+}
+
+/// Options that only simulated drives bear.
+fn daring(args: &Args) -> Option<&'static str> {
+    let all = [
+        (args.arm, "--arm"),
+        (args.accept_unstable, "--accept-unstable"),
+        (args.accept_jitter, "--accept-jitter"),
+        (args.count_overruns, "--count-overruns"),
+    ];
+    all.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+}
+
+/// When the run was started, for the log; nothing where two equal runs leave equal logs.
+fn started(repeatable: bool) -> String {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) }
+}
+
+fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Result<Option<Settings>, String> {
+    let cycles = |ns: u64| u32::try_from((ns / ready.rig.period_ns).max(1)).unwrap_or(u32::MAX);
+    let path = args.log.clone().unwrap_or_else(|| PathBuf::from("out").join(format!("{name}.friclog")));
+    let sink = if args.no_log {
+        let path = PathBuf::from("out").join(format!("{name}.blackbox.friclog"));
+        Sink::BlackBox(path, (BLACK_BOX_NS / BLOCK_NS) as usize)
+    } else {
+        Sink::File(path)
+    };
+    let (Sink::File(path) | Sink::BlackBox(path, _)) = &sink;
+    project::make_folder_of(path).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+    let cycles_per_block = cycles(BLOCK_NS);
+    // Where time stands meanwhile, the log may take its time.
+    Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
+}
+
+fn hil_options(args: &Args, simulated: bool) -> HilOptions {
+    let mut options = HilOptions::default();
+    options.control.count_overruns = args.count_overruns;
+    options.start.simulated = simulated;
+    options.arms_itself = args.sim || simulated || args.arm;
+    options.checks_only = args.check;
+    options.duration_ns = args.duration.map(|seconds| (seconds * 1e9).round() as u64);
+    options
+}
+
+type Log = Option<(Settings, Sections)>;
+
+/// Buses, drives and devices in this process.
+fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+    let pace = if args.fast { Pace::Fast } else { Pace::Wall };
+    let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
+    let mut world = match world {
+        Ok(world) => world,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    for text in &args.inject {
+        match runtime::drive::hooks::read(text, &ready.rig) {
+            Ok(hook) => world.bench().hook(hook),
+            Err(why) => {
+                terminal.error(&format!("--inject '{text}': {why}"));
+                return End::Misused;
+            }
+        }
+    }
+    let (clock, masters) = (world.clock(), world.masters());
+    run(args, ready, clock, masters, true, log, terminal)
+}
+
+/// Buses of this machine.
+fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+    let world = Simulation::real_time();
+    let mut buses: Vec<Box<dyn Bus>> = Vec::new();
+    for bus in &ready.rig.buses {
+        let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
+        let open = bus
+            .address
+            .parse::<Address>()
+            .map_err(|why| why.to_string())
+            .and_then(|address| can::open(&address, &options, &world, MASTER).map_err(|why| why.to_string()));
+        match open {
+            Ok(open) => buses.push(open),
+            Err(why) => {
+                terminal.error(&format!("bus `{}`: {why}", bus.name));
+                terminal.report(&format!(
+                    "  `fric hil --sim` runs the rig with simulated drives; --bus {}=ADDRESS puts another bus under it\n",
+                    bus.name
+                ));
+                return End::Failed;
+            }
+        }
+    }
+    run(args, ready, Box::new(world), buses, false, log, terminal)
+}
+
+fn run(
+    args: &Args,
+    ready: Ready,
+    clock: Box<dyn Clock>,
+    buses: Vec<Box<dyn Bus>>,
+    simulated: bool,
+    log: Log,
+    terminal: &mut Terminal,
+) -> End {
+    let Ready { rig, control, notes, .. } = ready;
+    let description = control.description().clone();
+    let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
+        Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
+    });
+    let fast = simulated && args.fast;
+    let mut options = hil_options(args, simulated);
+    let real_time = (!fast)
+        .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
+    let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
+    if !simulated {
+        options.only_simulated = daring(args).map(|option| format!("{option} is for simulated drives only"));
+        if !refusals.is_empty() && options.only_simulated.is_none() {
+            options.only_simulated = Some("this host gives no real time, see above".into());
+        }
+    }
+    let (mut hil, operator) = match Hil::new(&rig, control, clock, buses, options, log) {
+        Ok(made) => made,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    if !fast {
+        let patience = Duration::from_nanos(rig.watchdog_ns);
+        match emergency::Watchdog::new(patience, emergency::send) {
+            Ok(watchdog) => hil.watched_by(watchdog),
+            Err(error) => {
+                terminal.error(&format!("no watchdog: {error}"));
+                return End::Failed;
+            }
+        }
+        hil.prepare_emergency();
+    }
+    if !args.quiet {
+        begin(&rig, simulated, fast, &refusals, &notes, terminal);
+    }
+    let over = Arc::new(AtomicBool::new(false));
+    let view = (!args.quiet && !fast && std::io::stdout().is_terminal()).then(|| {
+        let (gauges, rig, over) = (hil.gauges(), rig.clone(), over.clone());
+        std::thread::spawn(move || view(&gauges, &rig, &over))
+    });
+    if !fast {
+        std::thread::spawn(move || prompt(operator, &description));
+    }
+    let end = hil.run();
+    over.store(true, Ordering::Relaxed);
+    if let Some(view) = view {
+        let _ = view.join();
+    }
+    drop(real_time);
+    finish(args, hil, end, log_path, terminal)
+}
+
+/// What the host refused, and the remedy.
+fn said(refusal: &realtime::Refusal) -> String {
+    format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
+}
+
+fn begin(
+    rig: &abi::rig::Rig,
+    simulated: bool,
+    fast: bool,
+    refusals: &[String],
+    notes: &[String],
+    terminal: &mut Terminal,
+) {
+    let rate = 1e9 / rig.period_ns as f64;
+    let kind = match (simulated, fast) {
+        (false, _) => "drives on their buses",
+        (true, false) => "simulated drives, wall-clock time",
+        (true, true) => "simulated drives, simulated time",
+    };
+    terminal.line(&format!("{}  {} Hz, {kind}", terminal.styled(Style::Bold, &rig.name), value::significant(rate, 4)));
+    for note in notes {
+        terminal.line(&format!("  note: {note}"));
+    }
+    if !refusals.is_empty() {
+        terminal.line("  not real time on this host:");
+        refusals.iter().for_each(|refusal| terminal.line(&format!("    {refusal}")));
+    }
+}
+
+/// Tells how it ended, after the log was closed.
+fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
+    let counts = words::counts(hil.counts());
+    let misuse = hil.is_misuse();
+    let written = hil.finish();
+    if !args.quiet {
+        for line in counts.lines() {
+            terminal.line(&format!("  {line}"));
+        }
+    }
+    let mut code = match end {
+        cycle::End::Asked => End::Fine,
+        cycle::End::Refused(why) => {
+            terminal.error(&format!("refused: {why}"));
+            if misuse { End::Misused } else { End::Failed }
+        }
+        cycle::End::Stopped(_, why) => {
+            terminal.error(&format!("stopped: {why}"));
+            End::Stopped
+        }
+    };
+    match (written, log) {
+        (Ok(Some(summary)), Some(path)) if path.exists() && !args.quiet => {
+            terminal.line(&format!("  wrote {} ({:.1} MB)", path.display(), summary.bytes as f64 * 1e-6));
+        }
+        (Err(error), path) => {
+            let path = path.map_or(String::new(), |path| path.display().to_string());
+            terminal.error(&format!("the log {path} is not whole: {error}"));
+            if code == End::Fine {
+                code = End::Failed;
+            }
+        }
+        _ => {}
+    }
+    code
+}
+
+/// Shows the gauges, some times a second, until it is over.
+fn view(gauges: &Gauges, rig: &abi::rig::Rig, over: &AtomicBool) {
+    let mut terminal = Terminal::new();
+    let names: Vec<String> = (rig.outputs.iter())
+        .map(|output| words::signal(rig, output.signal))
+        .chain(rig.record.iter().map(|series| series.label.clone()))
+        .collect();
+    let width = names.iter().map(String::len).max().unwrap_or(0);
+    let mut lines = 0;
+    loop {
+        let last = over.load(Ordering::Relaxed);
+        let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
+        let micro = |ns: u64| value::significant(ns as f64 * 1e-3, 3);
+        let mut text = format!(
+            "\x1b[2K  {:<32} {:>9.3} s   late {} µs, at most {} µs   {} missed\n",
+            words::stage(number(&gauges.stage)),
+            number(&gauges.cycles) as f64 * rig.period_ns as f64 * 1e-9,
+            micro(number(&gauges.late_ns)),
+            micro(number(&gauges.late_ns_max)),
+            number(&gauges.missed),
+        );
+        for (i, (name, gauge)) in names.iter().zip(&gauges.values).enumerate() {
+            let si = f64::from_bits(number(gauge));
+            let shown = match i.checked_sub(rig.outputs.len()) {
+                Some(k) => value::show(si, &rig.record[k].unit, 4),
+                None => value::significant(si, 4),
+            };
+            text += &format!("\x1b[2K    {name:<width$}  {shown}\n");
+        }
+        let up = if lines > 0 { format!("\x1b[{lines}A") } else { String::new() };
+        lines = names.len() + 1;
+        terminal.print(&(up + &text));
+        if last {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+/// Reads what the operator types, a line at a time.
+fn prompt(mut operator: runtime::hil::cycle::Operator, description: &Description) {
+    let terminal = Terminal::new();
+    for line in std::io::stdin().lock().lines() {
+        let Ok(line) = line else { return };
+        let line = line.trim();
+        let command = match line {
+            "" => continue,
+            "enable" => Ok(Command::Enable),
+            "arm" => Ok(Command::Arm),
+            "stop" | "quit" => Ok(Command::Stop),
+            "reset" => Ok(Command::Reset),
+            _ => match line.strip_prefix("set ") {
+                Some(set) => change(set, description).map(Command::Set),
+                None => Err("type enable, arm, set PATH = VALUE, stop or reset".to_string()),
+            },
+        };
+        match command {
+            Ok(command) if operator.push(command).is_err() => terminal.error("too much at once: say it again"),
+            Ok(_) => {}
+            Err(why) => terminal.error(&why),
+        }
+    }
+}
+
+/// Reads `fr.Fs = 2 N, fr.Fc = 1.5 N`: one set, checked against units and ranges.
+fn change(text: &str, description: &Description) -> Result<Set, String> {
+    let mut values = Vec::new();
+    for one in text.split(',') {
+        let (path, value) = one.split_once('=').ok_or("write it as: set PATH = VALUE, for example set fr.Fs = 2 N")?;
+        let path = path.trim();
+        let params = || description.quantities.iter().filter(|quantity| quantity.kind == Kind::Param);
+        let Some(param) = params().find(|quantity| quantity.path == path) else {
+            let near = compile::nearest(path, params().map(|quantity| quantity.path.as_str()));
+            let help = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
+            return Err(format!("there is no parameter `{path}`{help}"));
+        };
+        let (si, unit) = value::parse(value)?;
+        if unit.dimension != param.unit.dimension {
+            return Err(format!("`{path}` is {}, not {}", param.unit.dimension.describe(), unit.dimension.describe()));
+        }
+        let (low, high) = param.range;
+        if !(low <= si && si <= high) {
+            let bound = |si: f64| value::show(si, &param.unit, 6);
+            return Err(format!("`{path}` must lie in {} .. {}", bound(low), bound(high)));
+        }
+        values.push((param.slot, si));
+    }
+    Set::new(&values).ok_or_else(|| format!("at most {SET_MOST} parameters change at once"))
+}

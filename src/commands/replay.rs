@@ -1,0 +1,191 @@
+//! `fric replay`: a rig's log computed again, and its exports.
+
+use super::{End, load_text};
+use crate::args::Replay as Args;
+use crate::compile::{self, Changes, Options, Stopwatch};
+use crate::kept::Kept;
+use crate::terminal::Terminal;
+use crate::{project, report, value};
+use abi::rig::{Rig, Signal};
+use runtime::hil::control::Control;
+use runtime::hil::replay::{Replay, Stopped, What};
+use runtime::hil::trace::{self, Cycle, Passed, Shape};
+use runtime::hil::words;
+use runtime::record::blocks::End as LogEnd;
+use runtime::record::log::{Message, Reader};
+use std::fmt::Write;
+
+pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
+    let name = args.log.display().to_string();
+    let fail = |terminal: &mut Terminal, why: &str| {
+        terminal.error(&format!("{name}: {why}"));
+        End::Failed
+    };
+    let mut reader = match Reader::open(&args.log) {
+        Ok(reader) => reader,
+        Err(why) => return fail(terminal, &why),
+    };
+    let head = reader.head.clone();
+    let needed = ["rig", "file", "source", "set"].map(|section| head.text(section));
+    let [Some(rig), Some(file), Some(source), Some(set)] = needed else {
+        return fail(terminal, "its head lacks the text of the rig");
+    };
+    let Some((bounds, settings)) = head.get("settings").and_then(trace::settings_from_bytes) else {
+        return fail(terminal, "its head lacks what the drives said of themselves");
+    };
+    let kept = Kept(&head);
+    let mut watch = Stopwatch::start("read");
+    let Some(mut loaded) = load_text(file, source, &kept, terminal, &mut watch) else { return End::Failed };
+    let changes = Changes { set: set.lines().map(str::to_string).collect(), ..Changes::default() };
+    let options = Options { changes, interpret: args.interpret };
+    let ready = match compile::rig(&mut loaded, &kept, rig, &options, &mut Vec::new()) {
+        Ok(ready) => ready,
+        Err(found) => {
+            terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+            return fail(terminal, "the rig in it does not compile");
+        }
+    };
+    let control = match Control::new(&ready.rig, ready.control, &bounds, settings) {
+        Ok(control) => control,
+        Err(why) => return fail(terminal, &why),
+    };
+    let mut exports = Exports::new(args, &ready.rig, &control);
+    let mut replay = Replay::new(&ready.rig, control);
+    let mut stopped = None;
+    loop {
+        let message = match reader.message() {
+            Ok(Some(message)) => message,
+            Ok(None) => break,
+            Err(error) => return fail(terminal, &error.to_string()),
+        };
+        exports.add(&message);
+        if stopped.is_none() {
+            stopped = replay.message(&message).err();
+        }
+    }
+    if let Err(why) = exports.write(args, terminal) {
+        return fail(terminal, &why);
+    }
+    let ends = match reader.end() {
+        Some(LogEnd::Cut { at }) => format!("it is cut off at byte {at}: the writer was killed"),
+        Some(LogEnd::Damaged { at }) => return fail(terminal, &format!("it is damaged at byte {at}")),
+        Some(LogEnd::Whole) | None => match reader.tail().and_then(|tail| tail.text("end")) {
+            Some(end) => format!("it ended {end}"),
+            None => "it was not ended: the writer was killed".into(),
+        },
+    };
+    let found = replay.found();
+    match stopped {
+        Some(Stopped::Unreadable { k }) => fail(terminal, &format!("what it holds of cycle {k} is not of this rig")),
+        Some(Stopped::Differs(difference)) => {
+            let what = differing(&ready.rig, difference.what);
+            let (recorded, computed) = (difference.recorded, difference.computed);
+            fail(
+                terminal,
+                &format!(
+                    "cycle {}: {what} was {recorded:?} and is {computed:?} now, {} cycles before agree",
+                    difference.k,
+                    value::count(found.cycles - 1)
+                ),
+            )
+        }
+        None if found.cycles == 0 => fail(terminal, "it holds no cycle that can be computed"),
+        None => {
+            terminal.line(&format!(
+                "{rig}: {} cycles and {} states agree to the bit; {ends}",
+                value::count(found.cycles),
+                value::count(found.states)
+            ));
+            if found.skipped + found.lost > 0 {
+                terminal.line(&format!(
+                    "  {} messages were lost when it was written; {} cycles could not be computed",
+                    value::count(found.lost),
+                    value::count(found.skipped)
+                ));
+            }
+            End::Fine
+        }
+    }
+}
+
+/// A number of a cycle in words.
+fn differing(rig: &Rig, what: What) -> String {
+    let output = |i: usize| words::signal(rig, rig.outputs[i].signal);
+    match what {
+        What::Request(i) => format!("the request for {}", output(i)),
+        What::Permitted(i) => format!("what was permitted of {}", output(i)),
+        What::Clamps(i) => format!("why {} was clamped", output(i)),
+        What::Order => "what the drives were told".into(),
+        What::Recorded(i) => format!("`{}`", rig.record[i].label),
+        What::State => "the state of model and safety".into(),
+    }
+}
+
+/// Tables made of a log.
+struct Exports {
+    rig: Rig,
+    signals: Vec<Signal>,
+    shape: Shape,
+    csv: Option<String>,
+    candump: Option<String>,
+}
+
+impl Exports {
+    fn new(args: &Args, rig: &Rig, control: &Control) -> Exports {
+        let signals: Vec<Signal> = control.signals().collect();
+        let shape = Shape::of(rig, control);
+        let csv = args.csv.as_ref().map(|_| {
+            let mut header = "k,t [s],late [s],ticks,order".to_string();
+            for signal in &signals {
+                let name = words::signal(rig, *signal);
+                let _ = write!(header, ",{name},{name} age");
+            }
+            for output in &rig.outputs {
+                let name = words::signal(rig, output.signal);
+                let _ = write!(header, ",{name} requested,{name} permitted,{name} clamped");
+            }
+            for series in &rig.record {
+                let unit = if series.unit.text.is_empty() { String::new() } else { format!(" [{}]", series.unit) };
+                let _ = write!(header, ",{}{unit}", series.label.replace(',', ";"));
+            }
+            header + "\n"
+        });
+        Exports { rig: rig.clone(), signals, shape, csv, candump: args.candump.as_ref().map(|_| String::new()) }
+    }
+
+    fn add(&mut self, message: &Message) {
+        if let (Some(csv), trace::CYCLE) = (&mut self.csv, message.kind)
+            && let Some(cycle) = Cycle::read(self.shape, &message.words)
+        {
+            let Cycle { k, due_ns, late_ns, ticks, order, .. } = cycle;
+            let _ = write!(csv, "{k},{:?},{:?},{ticks},{order:?}", due_ns as f64 * 1e-9, f64::from(late_ns) * 1e-9);
+            for reading in cycle.readings.iter().take(self.signals.len()) {
+                let _ = write!(csv, ",{:?},{}", reading.value, reading.age);
+            }
+            for i in 0..self.rig.outputs.len() {
+                let _ = write!(csv, ",{:?},{:?},{}", cycle.requests[i], cycle.permitted[i], cycle.clamps[i].0);
+            }
+            for (series, si) in self.rig.record.iter().zip(&cycle.recorded) {
+                let _ = write!(csv, ",{:?}", series.unit.from_si(*si));
+            }
+            csv.push('\n');
+        }
+        if let (Some(candump), trace::FRAMES) = (&mut self.candump, message.kind) {
+            for Passed { stamp_ns, bus, frame, .. } in Passed::read(&message.words).into_iter().flatten() {
+                let name = self.rig.buses.get(usize::from(bus)).map_or("can", |bus| &bus.name);
+                let (seconds, micros) = (stamp_ns / 1_000_000_000, stamp_ns % 1_000_000_000 / 1000);
+                let _ = writeln!(candump, "({seconds:010}.{micros:06}) {name} {frame}");
+            }
+        }
+    }
+
+    fn write(&self, args: &Args, terminal: &mut Terminal) -> Result<(), String> {
+        for (path, text) in [(&args.csv, &self.csv), (&args.candump, &self.candump)] {
+            let (Some(path), Some(text)) = (path, text) else { continue };
+            project::write(path, text.as_bytes())
+                .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+            terminal.line(&format!("wrote {}", path.display()));
+        }
+        Ok(())
+    }
+}

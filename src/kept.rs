@@ -1,0 +1,116 @@
+//! Texts as a log keeps them: what was asked for while a rig was compiled, and the same answers again.
+//!
+//! In: the [`Sources`] of a compilation. Out: sections of a log, and sources made of them, so that a replay compiles what
+//! ran, whatever has become of the files since.
+
+use crate::compile::Sources;
+use runtime::record::log::Sections;
+use std::cell::RefCell;
+
+/// Answers as another source gives them, kept.
+pub struct Keeping<'a> {
+    inner: &'a dyn Sources,
+    kept: RefCell<Sections>,
+}
+
+/// Between the parts of a section's name and of its text: stands in no text of the language.
+const GAP: char = '\0';
+
+impl<'a> Keeping<'a> {
+    /// Keeps what another source answers.
+    pub fn new(inner: &'a dyn Sources) -> Keeping<'a> {
+        Keeping { inner, kept: RefCell::default() }
+    }
+
+    /// What was kept, added to the head of a log.
+    pub fn into(self, mut head: Sections) -> Sections {
+        head.0.extend(self.kept.into_inner().0);
+        head
+    }
+
+    fn keep(&self, name: &str, text: &str) {
+        let mut kept = self.kept.borrow_mut();
+        if kept.get(name).is_none() {
+            kept.0.push((name.into(), text.into()));
+        }
+    }
+}
+
+impl Sources for Keeping<'_> {
+    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+        let found = self.inner.library(module)?;
+        let names: Vec<&str> = found.iter().map(|(name, _)| name.as_str()).collect();
+        self.keep(&format!("library{GAP}{module}"), &names.join("\n"));
+        found.iter().for_each(|(name, text)| self.keep(&format!("text{GAP}{name}"), text));
+        Some(found)
+    }
+
+    fn modules(&self) -> Vec<String> {
+        self.inner.modules()
+    }
+
+    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+        let (name, text) = self.inner.file(from, path)?;
+        self.keep(&format!("file{GAP}{from}{GAP}{path}"), &name);
+        self.keep(&format!("text{GAP}{name}"), &text);
+        Ok((name, text))
+    }
+}
+
+/// Answers from the head of a log.
+pub struct Kept<'a>(pub &'a Sections);
+
+impl Kept<'_> {
+    fn text(&self, name: &str) -> Option<(String, String)> {
+        Some((name.into(), self.0.text(&format!("text{GAP}{name}"))?.into()))
+    }
+}
+
+impl Sources for Kept<'_> {
+    fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+        let names = self.0.text(&format!("library{GAP}{module}"))?;
+        names.lines().map(|name| self.text(name)).collect()
+    }
+
+    fn modules(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+        let name = self.0.text(&format!("file{GAP}{from}{GAP}{path}"));
+        name.and_then(|name| self.text(name)).ok_or_else(|| "the log does not hold it".into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Some2;
+
+    impl Sources for Some2 {
+        fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
+            (module == "std.a")
+                .then(|| vec![("std.a.x.fric".into(), "one".into()), ("std.a.y.fric".into(), "two".into())])
+        }
+        fn modules(&self) -> Vec<String> {
+            vec!["std.a".into()]
+        }
+        fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
+            (path == "p.fric").then(|| (format!("{from}/p.fric"), "three".into())).ok_or("no".into())
+        }
+    }
+
+    #[test]
+    fn what_was_answered_is_answered_again() {
+        let keeping = Keeping::new(&Some2);
+        let library = keeping.library("std.a");
+        let file = keeping.file("f", "p.fric");
+        assert!(keeping.library("std.b").is_none() && keeping.file("f", "q").is_err());
+        let head = keeping.into(Sections::default().with("rig", "r"));
+        let kept = Kept(&head);
+        assert_eq!((kept.library("std.a"), kept.file("f", "p.fric")), (library, file));
+        assert!(kept.library("std.b").is_none() && kept.file("g", "p.fric").is_err());
+        assert_eq!(head.text("rig"), Some("r"));
+    }
+}
