@@ -2,7 +2,7 @@
 
 use abi::encode::Encode;
 use abi::image::Target;
-use abi::plan::Method;
+pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
 use compiler::backend::{blob, c};
 pub use compiler::explain::{Explanation, Listed};
@@ -12,8 +12,8 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, compile, dissipation, explain,
-    explain_in, explain_run, linear, load, quantities, rig, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile, dissipation,
+    explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;

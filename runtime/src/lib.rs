@@ -6,6 +6,7 @@
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
 pub mod show;
+pub mod queue;
 
 pub mod measure;
 pub mod record;

@@ -404,7 +404,7 @@ fn prompt(mut operator: runtime::hil::cycle::Operator, description: &Description
             },
         };
         match command {
-            Ok(command) if operator.push(command).is_err() => terminal.error("too much at once: say it again"),
+            Ok(command) if !operator.push(command) => terminal.error("too much at once: say it again"),
             Ok(_) => {}
             Err(why) => terminal.error(&why),
         }

@@ -224,6 +224,11 @@ impl Control {
         &self.requests
     }
 
+    /// What was measured of each drive, as far as it was believed.
+    pub fn seen(&self) -> &[Seen] {
+        &self.seen
+    }
+
     /// What watches over the outputs.
     pub fn supervisor(&self) -> &Supervisor {
         &self.supervisor

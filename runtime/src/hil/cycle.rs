@@ -15,11 +15,11 @@ use crate::can::{Bus, Event, Frame, Received};
 use crate::clock::Clock;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind};
 use crate::histogram::Histogram;
+use crate::queue::{Receiver, Sender, queue};
 use crate::record::log::{self, Log, Sections};
-use crate::safety::{Cause, Clamps, Order, Supervisor};
+use crate::safety::{Cause, Clamps, Order, Seen, Supervisor};
 use abi::rig::{Kind, Rig, Signal};
 use abi::{Instance, Slot};
-use rtrb::{Consumer, Producer, RingBuffer};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -33,10 +33,11 @@ const STATE_EVERY: u64 = 1000;
 /// Parameters that can be changed at once.
 pub const SET_MOST: usize = 16;
 /// Time in which drives must lose their torque once they are told to.
-const REST_NS: u64 = 2_000_000_000;
+const REST_NS: u64 = 1_000_000_000;
 
 /// What an operator may ask for while the rig is under way.
 #[derive(Clone, Copy, PartialEq, Debug)]
+#[allow(clippy::large_enum_variant, reason = "a box would be freed in a cycle")]
 pub enum Command {
     /// Power on, at zero command.
     Enable,
@@ -67,7 +68,7 @@ impl Set {
 }
 
 /// How a rig is run.
-#[derive(Clone, PartialEq, Debug)]
+#[derive(Clone, PartialEq, Debug, Default)]
 pub struct Options {
     /// What is not in its text.
     pub control: control::Options,
@@ -83,20 +84,6 @@ pub struct Options {
     pub collect_ns: Option<u64>,
     /// Time the model runs, ns; none: until somebody stops it.
     pub duration_ns: Option<u64>,
-}
-
-impl Default for Options {
-    fn default() -> Options {
-        Options {
-            control: control::Options::default(),
-            start: drive::Options::default(),
-            arms_itself: false,
-            checks_only: false,
-            only_simulated: None,
-            collect_ns: None,
-            duration_ns: None,
-        }
-    }
 }
 
 /// How it ended.
@@ -245,7 +232,7 @@ impl Wires {
 }
 
 /// Where the operator's commands go in.
-pub type Operator = Producer<Command>;
+pub type Operator = Sender<Command>;
 
 /// A rig under way.
 pub struct Hil {
@@ -259,7 +246,7 @@ pub struct Hil {
     log_wanted: Option<(log::Settings, Sections)>,
     log: Option<Log>,
     gauges: Arc<Gauges>,
-    commands: Consumer<Command>,
+    commands: Receiver<Command>,
     due_ns: u64,
     collect_ns: u64,
     k: u64,
@@ -295,7 +282,7 @@ impl Hil {
     ) -> Result<(Hil, Operator), String> {
         assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
         let fieldbus = Fieldbus::new(rig, options.start)?;
-        let (operator, commands) = RingBuffer::new(64);
+        let (operator, commands) = queue(64);
         let at_sync = |node: &abi::rig::Node| match &node.kind {
             Kind::Cia402(drive) => !node.moves || drive.at_sync,
             Kind::Frames(_) => true,
@@ -375,6 +362,16 @@ impl Hil {
     /// The nodes of the rig.
     pub fn fieldbus(&self) -> &Fieldbus {
         &self.fieldbus
+    }
+
+    /// What the drives were told in the last cycle.
+    pub fn order(&self) -> Order {
+        self.order
+    }
+
+    /// What was measured of each drive, as far as it was believed.
+    pub fn seen(&self) -> &[Seen] {
+        self.control.as_ref().map_or(&[], Control::seen)
     }
 
     /// What was counted until now.
@@ -463,7 +460,7 @@ impl Hil {
         if self.over || emergency::asked().is_some() {
             self.stop();
         }
-        while let Ok(command) = self.commands.pop() {
+        while let Some(command) = self.commands.pop() {
             match command {
                 Command::Enable => {
                     self.fieldbus.request(Request::Enable);
@@ -676,7 +673,8 @@ impl Hil {
     fn count(&mut self, ticks: u32) {
         let counts = &mut self.counts;
         counts.all += 1;
-        let runs = self.control.is_some() && self.cycle.source == Source::Model && self.order == Order::Follow;
+        let armed = self.control.as_ref().is_some_and(|control| control.supervisor().is_armed());
+        let runs = armed && self.cycle.source == Source::Model;
         if self.fieldbus.step() > Step::AwaitEnable && ticks > 1 {
             counts.overruns += 1;
             counts.missed += u64::from(ticks) - 1;

@@ -16,3 +16,6 @@ mod bench;
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod campaign;

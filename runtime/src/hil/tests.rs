@@ -1,7 +1,7 @@
 //! A whole rig in simulated time: start, run, stop, log and replay.
 
 use super::bench;
-use super::control::{self, Control};
+use super::control::Control;
 use super::cycle::{End, Hil, Options};
 use super::replay::{Replay, Stopped};
 use super::simulated::{Pace, World};
@@ -96,24 +96,4 @@ fn a_rig_whose_drives_are_not_there_is_refused() {
     let End::Refused(why) = hil.run() else { panic!("it started") };
     assert!(why.contains("servo") || why.contains("load"), "{why}");
     assert!(world.clock().now_ns() < 20 * SECOND_NS);
-    let _ = control::Options::default();
-}
-
-#[test]
-fn debug_start() {
-    let (rig, model, plant) = bench::pair();
-    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
-    let masters = world.masters();
-    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options(1.0), None).unwrap();
-    let mut last = None;
-    while hil.ended().is_none() {
-        hil.cycle();
-        if last != Some(hil.step()) {
-            last = Some(hil.step());
-            eprintln!("{:.4} {:?}", world.clock().now_ns() as f64 * 1e-9, hil.step());
-        }
-        if hil.step() == crate::drive::Step::Refused {
-            break;
-        }
-    }
 }

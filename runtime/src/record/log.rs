@@ -7,7 +7,7 @@
 //! files. A full queue drops the message and counts it, and the next one that fits says how many are missing.
 
 use super::blocks::{Block, BlockReader, BlockWriter, End};
-use rtrb::{Consumer, Producer, RingBuffer};
+use crate::queue::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, BufReader};
@@ -101,7 +101,7 @@ pub struct Settings {
 
 /// The end of the queue that the cycle holds.
 pub struct Log {
-    queue: Producer<u64>,
+    queue: Sender<u64>,
     shared: Arc<Shared>,
     patient: bool,
     /// Messages dropped since the last that fitted.
@@ -136,7 +136,7 @@ impl Log {
     /// # Errors
     /// Those of the file.
     pub fn begin(settings: Settings, head: &Sections) -> io::Result<Log> {
-        let (queue, end) = RingBuffer::new(QUEUE);
+        let (queue, end) = queue(QUEUE);
         let shared = Arc::new(Shared::default());
         let mut carrier = Carrier::new(settings.sink, settings.cycles_per_block, end, shared.clone())?;
         carrier.keep(HEAD, head.bytes())?;
@@ -151,15 +151,15 @@ impl Log {
     pub fn push(&mut self, kind: u32, words: &[u64]) {
         assert!(words.len() < LONGEST, "a message of {} words", words.len());
         let needed = words.len() + 1 + if self.lost > 0 { 2 } else { 0 };
-        while self.patient && self.queue.slots() < needed && !self.shared.broken.load(Ordering::Relaxed) {
+        while self.patient && self.queue.free() < needed && !self.shared.broken.load(Ordering::Relaxed) {
             std::thread::sleep(Duration::from_micros(100));
         }
-        if self.queue.slots() < needed {
+        if self.queue.free() < needed {
             self.lost += 1;
             self.dropped += 1;
             return;
         }
-        let mut put = |words: &[u64]| self.queue.push_entire_slice(words).expect("the slots were counted");
+        let mut put = |words: &[u64]| assert!(self.queue.push_all(words), "the places were counted");
         if self.lost > 0 {
             put(&[word(LOST, 1), self.lost]);
             self.lost = 0;
@@ -222,7 +222,7 @@ fn pack(bytes: &[u8]) -> Vec<u64> {
 
 /// The thread's side.
 struct Carrier {
-    queue: Consumer<u64>,
+    queue: Receiver<u64>,
     shared: Arc<Shared>,
     out: Out,
     cycles_per_block: u32,
@@ -237,7 +237,7 @@ enum Out {
 }
 
 impl Carrier {
-    fn new(sink: Sink, cycles_per_block: u32, queue: Consumer<u64>, shared: Arc<Shared>) -> io::Result<Carrier> {
+    fn new(sink: Sink, cycles_per_block: u32, queue: Receiver<u64>, shared: Arc<Shared>) -> io::Result<Carrier> {
         let out = match sink {
             Sink::File(path) => Out::File(BlockWriter::new(File::create(path)?)?),
             Sink::BlackBox(path, most) => Out::Ring { path, head: Vec::new(), blocks: VecDeque::new(), most },
@@ -251,14 +251,11 @@ impl Carrier {
         let mut words = Vec::new();
         loop {
             let over = self.shared.over.load(Ordering::Acquire);
-            while let Ok(&first) = self.queue.peek() {
-                let length = (first & 0xffff_ffff) as usize;
-                if self.queue.slots() < length + 1 {
+            while let Some(first) = self.queue.first() {
+                words.clear();
+                if !self.queue.take((first & 0xffff_ffff) as usize + 1, &mut words) {
                     break;
                 }
-                words.clear();
-                let chunk = self.queue.read_chunk(length + 1).expect("the slots were counted");
-                words.extend(chunk);
                 if let Err(error) = self.take(&words) {
                     self.shared.broken.store(true, Ordering::Relaxed);
                     return Err(error);
@@ -481,17 +478,19 @@ mod tests {
 
     #[test]
     fn a_full_queue_drops_counts_and_says_so() {
-        let (queue, mut end) = RingBuffer::new(16);
+        let (queue, mut end) = queue(16);
         let shared = Arc::new(Shared::default());
         let mut log = Log { queue, shared, patient: false, lost: 0, dropped: 0, thread: None };
         for k in 0..6 {
             log.push(CYCLE, &[k, k, k]);
         }
         assert_eq!(log.dropped(), 2);
-        let all: Vec<u64> = end.read_chunk(16).unwrap().into_iter().collect();
+        let mut all = Vec::new();
+        assert!(end.take(16, &mut all));
         assert_eq!(all[12..], [word(CYCLE, 3), 3, 3, 3]);
         log.push(CYCLE, &[6, 6, 6]);
-        let all: Vec<u64> = end.read_chunk(6).unwrap().into_iter().collect();
+        all.clear();
+        assert!(end.take(6, &mut all));
         assert_eq!(all, [word(LOST, 1), 2, word(CYCLE, 3), 6, 6, 6]);
     }
 

@@ -1,0 +1,688 @@
+//! The fault campaign: one test for each fault on the list, in simulated time, each with the time in which the rig must
+//! have reacted; then random rigs with random faults.
+//!
+//! In every test, in every cycle: no command beyond its limit, no torque on the shaft beyond that of its drive. At the end
+//! of every stop: no drive under torque.
+
+use super::bench;
+use super::control;
+use super::cycle::{Command, End, Hil, Operator, Options};
+use super::simulated::{BENCH, MASTER, Pace, World};
+use crate::can::sim::{Fault, Kind as FaultKind, Port};
+use crate::can::{Bus, Frame};
+use crate::drive::hooks::{self, Effect, Hook, Start};
+use crate::drive::sign::SignTest;
+use crate::drive::{self, Step};
+use crate::safety::{Cause, Order};
+use abi::rig::{Cia402, Kind, Overrun, Rig};
+use abi::{Instance, Slot};
+
+const MS: u64 = 1_000_000;
+/// Bound on everything that follows a trip: the slew, the quick stop, torque off.
+const STOP_NS: u64 = 2_100 * MS;
+
+/// A rig that is about to fail.
+struct Stand {
+    hil: Hil,
+    operator: Operator,
+    world: World,
+    rig: Rig,
+    /// The supervisor's cause, as it was first seen.
+    cause: Option<(Cause, u64)>,
+    /// What was permitted last.
+    last: [f64; 2],
+    /// Greatest power of each drive, W.
+    power: f64,
+}
+
+/// A quick start, for tests of what comes after it.
+fn quick() -> Options {
+    let start = drive::Options {
+        listen_ns: 5 * MS,
+        steady_ns: 20 * MS,
+        sign_test: SignTest::Skip,
+        timeout_test: false,
+        ..drive::Options::default()
+    };
+    let control = control::Options { ramp_ns: 10 * MS, clamped_ns: 150 * MS, ..control::Options::default() };
+    Options { control, start, arms_itself: true, ..Options::default() }
+}
+
+fn cia402(rig: &mut Rig, node: usize) -> &mut Cia402 {
+    match &mut rig.nodes[node].kind {
+        Kind::Cia402(drive) => drive,
+        Kind::Frames(_) => panic!("node {node} is a device"),
+    }
+}
+
+impl Stand {
+    fn new(options: Options, seed: u64, change: impl FnOnce(&mut Rig, &mut Instance)) -> Stand {
+        let (mut rig, mut model, plant) = bench::pair();
+        change(&mut rig, &mut model);
+        let mut world = World::new(&rig, Some(plant), Pace::Fast, seed).unwrap();
+        let masters = world.masters();
+        let (hil, operator) = Hil::new(&rig, model, world.clock(), masters, options, None).unwrap();
+        let power = cia402(&mut rig, 0).max_power.unwrap_or(f64::INFINITY);
+        Stand { hil, operator, world, rig, cause: None, last: [0.0; 2], power }
+    }
+
+    /// Armed and under way for 300 ms.
+    fn armed(change: impl FnOnce(&mut Rig, &mut Instance)) -> Stand {
+        let mut stand = Stand::new(quick(), 1, change);
+        stand.reach(Step::Armed);
+        let until = stand.now() + 300 * MS;
+        while stand.now() < until {
+            stand.cycle();
+        }
+        assert_eq!(stand.hil.ended(), None);
+        assert_eq!(stand.cause, None);
+        stand
+    }
+
+    fn now(&self) -> u64 {
+        self.world.clock().now_ns()
+    }
+
+    fn reach(&mut self, step: Step) {
+        while self.hil.step() != step {
+            self.cycle();
+            assert_eq!(self.hil.ended(), None, "before {step}");
+        }
+    }
+
+    /// One cycle, and what must hold in every one.
+    fn cycle(&mut self) {
+        self.hil.cycle();
+        let now = self.now();
+        if let Some(control) = self.hil.control() {
+            let supervisor = control.supervisor();
+            if self.cause.is_none() {
+                self.cause = supervisor.cause().map(|cause| (cause, now));
+            }
+            let follows = self.hil.order() == Order::Follow;
+            let speeds = self.hil.seen().iter().map(|seen| seen.speed.unwrap_or(0.0)).collect::<Vec<f64>>();
+            for (i, (limits, value)) in supervisor.outputs().iter().zip(supervisor.permitted()).enumerate() {
+                assert!(limits.low <= *value && *value <= limits.high, "{value} at {now} ns");
+                let most = limits.slew * self.rig.period_ns as f64 * 1e-9 * (1.0 + 1e-9);
+                let power = value * speeds[limits.drive.unwrap_or_default()];
+                assert!(!follows || (value - self.last[i]).abs() <= most, "from {} to {value}", self.last[i]);
+                assert!(!follows || self.cause.is_some() || power.abs() <= self.power * (1.0 + 1e-9), "{power} W");
+                self.last[i] = *value;
+            }
+        }
+        for (node, most) in [(0, 1.0), (1, 2.0)] {
+            let torque = self.world.bench().shaft(node).torque;
+            // One step of the drive's torque, and its lag, lie between a command and the shaft.
+            assert!(torque.abs() <= most * 1.01 + 0.01 || self.cause.is_some(), "{torque} N·m at {node}, {now} ns");
+        }
+    }
+
+    fn hook(&mut self, text: &str) -> u64 {
+        let now = self.now();
+        let hook = hooks::read(&format!("{text} at {} s", now as f64 * 1e-9), &self.rig).unwrap();
+        self.world.bench().hook(hook);
+        now
+    }
+
+    fn effect(&mut self, node: usize, effect: Effect, lasts_ns: Option<u64>) -> u64 {
+        let now = self.now();
+        self.world.bench().hook(Hook { node, effect, start: Start::At(now), lasts_ns });
+        now
+    }
+
+    /// Goes on until the rig has stopped by itself: the cause, and how long after `since` it was seen.
+    fn stops(&mut self, since: u64) -> (Cause, u64) {
+        let limit = since + 2 * STOP_NS;
+        while self.hil.ended().is_none() {
+            self.cycle();
+            assert!(self.now() < limit, "it goes on: {:?}, {:?}", self.cause, self.hil.step());
+        }
+        let (cause, at) = self.cause.expect("a stop has its cause");
+        assert!(matches!(self.hil.ended(), Some(End::Stopped(..))), "{:?}", self.hil.ended());
+        self.at_rest();
+        assert!(self.now() - at <= STOP_NS, "{} ns from the trip to the end", self.now() - at);
+        (cause, at - since)
+    }
+
+    /// Both drives are without torque, and stay so.
+    fn at_rest(&mut self) {
+        for node in 0..2 {
+            let mut bench = self.world.bench();
+            let state = bench.drive(node).unwrap().state();
+            assert!(!state.powered(), "drive {node} is {state}");
+        }
+    }
+
+    /// Goes on for a time, in which nothing may stop it.
+    fn goes_on(&mut self, ns: u64) {
+        let until = self.now() + ns;
+        while self.now() < until {
+            self.cycle();
+            assert_eq!((self.cause, self.hil.ended()), (None, None));
+        }
+    }
+}
+
+/// Parameters of the control program: amplitude, damping, time from which it gives no number.
+fn param(model: &mut Instance, i: usize, value: f64) {
+    let slot = model.description().layout.params.slot(i);
+    model.set(slot, value);
+}
+
+fn within(found: (Cause, u64), ns: u64) -> Cause {
+    assert!(found.1 <= ns, "{:?} after {} ns", found.0, found.1);
+    found.0
+}
+
+#[test]
+fn row_1_a_model_that_gives_no_number() {
+    let mut stand = Stand::armed(|_, model| param(model, 2, 0.4));
+    let since = stand.now() + 100 * MS;
+    assert_eq!(within(stand.stops(since - 100 * MS), 110 * MS), Cause::NotFinite(0));
+}
+
+#[test]
+fn row_2_a_tick_that_is_missed() {
+    let mut stand = Stand::armed(|rig, _| rig.overrun = Overrun::Stop);
+    let now = stand.now();
+    stand.world.simulation().run_to(now + 2 * MS);
+    assert!(matches!(within(stand.stops(now), 4 * MS), Cause::Overrun(1 | 2)));
+    let mut held = Stand::armed(|rig, _| rig.overrun = Overrun::Hold(2));
+    let now = held.now();
+    held.world.simulation().run_to(now + 2 * MS);
+    held.goes_on(100 * MS);
+    assert!(held.hil.counts().missed >= 1);
+    let now = held.now();
+    held.world.simulation().run_to(now + 4 * MS);
+    assert!(matches!(within(held.stops(now), 6 * MS), Cause::Overrun(3 | 4)));
+}
+
+#[test]
+fn row_3_a_torque_beyond_its_limit() {
+    let mut stand = Stand::new(quick(), 1, |_, model| param(model, 0, 9.0));
+    stand.reach(Step::Armed);
+    let since = stand.now();
+    // The sine passes 2 N·m after 36 ms and comes back after 464 ms.
+    assert_eq!(within(stand.stops(since), 200 * MS), Cause::Clamped(0));
+    let counts = stand.hil.counts();
+    assert!(counts.clamped[0] >= 150, "{:?}", counts.clamped);
+}
+
+#[test]
+fn row_3_a_change_beyond_its_slew_and_a_power_beyond_its_limit() {
+    let mut slow = Stand::armed(|rig, _| rig.outputs.iter_mut().for_each(|output| output.slew = 1.5));
+    slow.goes_on(1_000 * MS);
+    assert!(slow.hil.counts().clamped[1] > 100, "{:?}", slow.hil.counts().clamped);
+    let mut options = quick();
+    options.control.clamped_ns = 10_000 * MS;
+    let mut weak = Stand::new(options, 1, |rig, _| (0..2).for_each(|node| cia402(rig, node).max_power = Some(0.4)));
+    while weak.hil.ended().is_none() && weak.hil.counts().clamped[2] < 50 {
+        weak.cycle();
+    }
+    assert!(weak.hil.counts().clamped[2] >= 50);
+}
+
+#[test]
+fn row_3_outputs_come_up_from_their_safe_values() {
+    let mut options = quick();
+    options.control.ramp_ns = 400 * MS;
+    let mut stand = Stand::new(options, 1, |_, model| param(model, 0, 1.9));
+    stand.reach(Step::Armed);
+    for k in 1..400 {
+        stand.cycle();
+        let value = stand.last[0].abs();
+        assert!(value <= 1.9 * f64::from(k + 1) / 400.0, "{value} N·m in cycle {k}");
+    }
+}
+
+#[test]
+fn row_3_limits_are_never_widened() {
+    let mut stand = Stand::armed(|_, _| ());
+    let supervisor = stand.hil.supervisor_mut().unwrap();
+    assert!(supervisor.narrow(0, -3.0, 3.0, 1e9).is_err());
+    assert!(supervisor.narrow(0, -0.1, 0.1, 1e9).is_ok());
+    stand.goes_on(100 * MS);
+    assert!(stand.last[0].abs() <= 0.1);
+}
+
+#[test]
+fn row_4_too_fast_too_far() {
+    let fast = |rig: &mut Rig, model: &mut Instance| {
+        (0..2).for_each(|node| cia402(rig, node).max_speed = Some(8.0));
+        param(model, 1, 0.0);
+        param(model, 0, 1.0);
+    };
+    let mut stand = Stand::new(quick(), 1, fast);
+    stand.reach(Step::Armed);
+    let since = stand.now();
+    let (cause, _) = stand.stops(since);
+    assert!(matches!(cause, Cause::Speed(_, speed) if speed < 8.5), "{cause:?}");
+    let far = |rig: &mut Rig, model: &mut Instance| {
+        cia402(rig, 1).travel = Some((-0.5, 0.5));
+        param(model, 1, 0.0);
+    };
+    let mut stand = Stand::new(quick(), 1, far);
+    stand.reach(Step::Armed);
+    let since = stand.now();
+    let (cause, _) = stand.stops(since);
+    assert!(matches!(cause, Cause::Travel(1, position) if (0.5..0.52).contains(&position.abs())), "{cause:?}");
+}
+
+#[test]
+fn row_4_a_drive_whose_torque_goes_the_wrong_way() {
+    let mut stand = Stand::armed(|_, _| ());
+    let since = stand.effect(0, Effect::TorqueScale(-1.0), None);
+    // What brakes pushes from now on: the speed that 0.05 N·m·s/rad lets grow e-fold in 0.24 s gains 20 rad/s.
+    let cause = within(stand.stops(since), 3_000 * MS);
+    assert!(matches!(cause, Cause::RunAway(_) | Cause::Speed(..)), "{cause:?}");
+}
+
+#[test]
+fn row_5_answers_that_are_lost_late_or_doubled() {
+    for kind in [FaultKind::Drop, FaultKind::Duplicate, FaultKind::Delay(700_000), FaultKind::Reorder] {
+        let mut stand = Stand::armed(|_, _| ());
+        let before = stand.hil.counts().stale;
+        let now = stand.now();
+        stand.world.bus(0).plant(BENCH, Fault::new(kind).id(0x183).from(now).times(1));
+        stand.goes_on(50 * MS);
+        let held = stand.hil.counts().stale - before;
+        assert!(held <= 6, "{kind:?}: {held} readings held");
+        assert!(held > 0 || !matches!(kind, FaultKind::Drop | FaultKind::Delay(_)), "{kind:?}: {held}");
+    }
+}
+
+#[test]
+fn row_6_answers_that_stay_away() {
+    for id in [0x183, 0x283, 0x184] {
+        let mut stand = Stand::armed(|_, _| ());
+        let now = stand.now();
+        stand.world.bus(0).plant(BENCH, Fault::new(FaultKind::Drop).id(id).from(now));
+        assert!(matches!(within(stand.stops(now), 4 * MS), Cause::Lost(_)));
+    }
+}
+
+#[test]
+fn row_7_nobody_acknowledges_and_a_queue_that_is_full() {
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Full).from(now));
+    assert_eq!(within(stand.trips(now), 2 * MS), Cause::Bus(0));
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).unplug(BENCH, now, u64::MAX);
+    assert!(matches!(within(stand.trips(now), 4 * MS), Cause::Bus(0) | Cause::Lost(_)));
+}
+
+#[test]
+fn row_8_a_bus_that_goes_off_does_not_come_back_to_motion() {
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).short(now, now + 50 * MS);
+    let cause = within(stand.trips(now), 4 * MS);
+    assert!(matches!(cause, Cause::Bus(0) | Cause::Lost(_)), "{cause:?}");
+    stand.world.bus(0).restart(MASTER);
+    stand.world.bus(0).restart(BENCH);
+    while stand.hil.ended().is_none() {
+        stand.cycle();
+        let order = stand.order();
+        assert!(order != Order::Follow && order != Order::Wait, "motion came back");
+    }
+    stand.at_rest();
+}
+
+#[test]
+fn row_9_an_interface_that_goes_down() {
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).take_down(MASTER);
+    assert_eq!(within(stand.trips(now), 2 * MS), Cause::Bus(0));
+}
+
+#[test]
+fn row_10_a_node_that_babbles_and_frames_that_overrun() {
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).babble(BENCH, Frame::new(0x001, &[]), 0, now, u64::MAX);
+    let cause = within(stand.trips(now), 4 * MS);
+    assert!(matches!(cause, Cause::Lost(_) | Cause::Overload(_) | Cause::Bus(_)), "{cause:?}");
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Overrun).from(now).times(1));
+    stand.goes_on(50 * MS);
+    assert!(stand.hil.counts().lost_frames >= 1);
+    let now = stand.now();
+    stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Overrun).from(now));
+    let cause = within(stand.trips(now), 4 * MS);
+    assert!(matches!(cause, Cause::Overload(_) | Cause::Lost(_)), "{cause:?}");
+}
+
+#[test]
+fn row_11_a_drive_that_falls_silent_or_starts_anew() {
+    for (fault, limit) in [("load no heartbeat", 80 * MS), ("load reset", 100 * MS), ("servo pre-operational", 30 * MS)]
+    {
+        let mut stand = Stand::armed(|_, _| ());
+        let since = stand.hook(fault);
+        let cause = within(stand.stops(since), limit);
+        assert!(matches!(cause, Cause::Drive(_) | Cause::Lost(_)), "{fault}: {cause:?}");
+    }
+}
+
+#[test]
+fn row_12_a_drive_that_stops_by_itself() {
+    for fault in ["load emergency 0x2310", "servo fault 0x3210", "load safe torque off"] {
+        let mut stand = Stand::armed(|_, _| ());
+        let since = stand.hook(fault);
+        let cause = within(stand.stops(since), 3 * MS);
+        let node = usize::from(fault.starts_with("servo"));
+        assert_eq!(cause, Cause::Drive(node), "{fault}");
+    }
+}
+
+#[test]
+fn row_13_what_is_wrong_with_a_drive_is_found_before_arming() {
+    let slow = Options { start: drive::Options { sign_test: SignTest::Push, ..quick().start }, ..quick() };
+    let effects =
+        [Effect::TorqueScale(-1.0), Effect::EncoderScale(-1.0), Effect::EncoderScale(2.0), Effect::SpeedScale(0.1)];
+    for effect in effects {
+        let mut stand = Stand::new(slow.clone(), 1, |_, _| ());
+        stand.effect(0, effect, None);
+        let end = stand.hil.run();
+        assert!(matches!(end, End::Refused(_)), "{effect:?}: {end:?}");
+        stand.at_rest();
+    }
+    let mut wrong = Stand::new(slow, 1, |rig, _| cia402(rig, 0).rated_torque = 5.0);
+    // The bench was made of the same rig: it is the drive that has another rated torque.
+    wrong.world.bench().drive(0).unwrap().objects().set(crate::canopen::Object(0x6076, 0), 4000);
+    assert!(matches!(wrong.hil.run(), End::Refused(why) if why.contains("load")));
+}
+
+#[test]
+fn row_14_a_mode_that_is_not_the_one_asked_for() {
+    let mut stand = Stand::armed(|_, _| ());
+    let since = stand.hook("load mode 4");
+    let cause = within(stand.stops(since), 30 * MS);
+    assert!(matches!(cause, Cause::NotFollowing(0)), "{cause:?}");
+}
+
+#[test]
+fn row_15_encoders() {
+    // So many counts that the position passes the end of its 32 bits.
+    let mut wraps = Stand::new(quick(), 3, |_, model| param(model, 1, 0.0));
+    wraps.reach(Step::Armed);
+    wraps.goes_on(300 * MS);
+    // A glitch of a quarter turn in one answer is not believed.
+    let mut glitch = Stand::armed(|_, _| ());
+    glitch.effect(1, Effect::EncoderGlitch(65_536), Some(MS));
+    glitch.goes_on(50 * MS);
+    // One that stays is no glitch.
+    let mut jump = Stand::armed(|_, _| ());
+    let since = jump.effect(1, Effect::EncoderLost(65_536), None);
+    let cause = within(jump.stops(since), 5 * MS);
+    assert!(matches!(cause, Cause::Implausible(_)), "{cause:?}");
+}
+
+#[test]
+fn row_16_a_data_word_that_is_wrong() {
+    for id in [0x183, 0x184, 0x283, 0x284] {
+        let mut stand = Stand::armed(|_, _| ());
+        let now = stand.now();
+        stand.world.bus(0).plant(BENCH, Fault::new(FaultKind::Corrupt).id(id).from(now).times(1));
+        // One bit of one answer: held, clamped, or a stop by what it says; never a torque beyond its limit.
+        let until = now + 100 * MS;
+        while stand.now() < until && stand.hil.ended().is_none() {
+            stand.cycle();
+        }
+    }
+}
+
+#[test]
+fn row_17_and_18_a_process_that_is_frozen_or_gone() {
+    for node in 0..2 {
+        let stand = Stand::armed(|_, _| ());
+        let now = stand.now();
+        // No cycle any more: the drives must notice by themselves.
+        stand.world.simulation().run_to(now + 60 * MS);
+        let mut bench = stand.world.bench();
+        let state = bench.drive(node).unwrap().state();
+        assert!(state != crate::drive::state::State::Enabled, "drive {node} is {state}");
+    }
+}
+
+#[test]
+fn row_19_parameters_while_it_runs() {
+    let mut stand = Stand::armed(|_, _| ());
+    let slot = |i| stand.hil.control().unwrap().model().description().layout.params.slot(i);
+    let (amplitude, damping): (Slot, Slot) = (slot(0), slot(1));
+    for k in 0..200 {
+        let values = [(amplitude, 0.3 + 0.1 * f64::from(k % 2)), (damping, 0.05 + 0.01 * f64::from(k % 3))];
+        stand.operator.push(Command::Set(super::cycle::Set::new(&values).unwrap()));
+        stand.goes_on(MS);
+    }
+    stand.operator.push(Command::Set(super::cycle::Set::new(&[(amplitude, f64::NAN)]).unwrap()));
+    stand.goes_on(20 * MS);
+    assert_eq!(stand.hil.counts().refused_sets, 1);
+}
+
+#[test]
+fn row_20_a_second_master() {
+    let foreign = |stand: &Stand| -> Port { stand.world.bus(0).port("foreign") };
+    let mut early = Stand::new(quick(), 1, |_, _| ());
+    let mut port = foreign(&early);
+    early.cycle();
+    port.send(Frame::new(0x080, &[])).unwrap();
+    let end = early.hil.run();
+    assert!(matches!(&end, End::Refused(why) if why.contains("0x080")), "{end:?}");
+    for frame in
+        [Frame::new(0x080, &[]), Frame::new(0x000, &[1, 3]), Frame::new(0x603, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0])]
+    {
+        let mut late = Stand::armed(|_, _| ());
+        let mut port = foreign(&late);
+        let now = late.now();
+        port.send(frame).unwrap();
+        let cause = within(late.stops(now), 2 * MS);
+        assert_eq!(cause, Cause::Foreign(0, frame.id()));
+    }
+}
+
+#[test]
+fn row_22_an_emergency_stop_in_each_state() {
+    let steps = [Step::Configure, Step::Sync, Step::Enable, Step::Armed];
+    for step in steps {
+        let mut stand = Stand::new(quick(), 1, |_, _| ());
+        stand.reach(step);
+        let since = stand.effect(0, Effect::SafeTorqueOff, None);
+        stand.effect(1, Effect::SafeTorqueOff, None);
+        let limit = since + 12_000 * MS;
+        while stand.hil.ended().is_none() {
+            stand.cycle();
+            assert!(stand.now() < limit, "{step}: it goes on: {:?}", stand.hil.step());
+        }
+        assert!(!matches!(stand.hil.ended(), Some(End::Asked)), "{step}");
+        stand.at_rest();
+    }
+}
+
+#[test]
+fn nothing_moves_again_without_the_operator() {
+    let mut stand = Stand::armed(|_, _| ());
+    let since = stand.hook("load fault 0x2310");
+    stand.stops(since);
+    for _ in 0..500 {
+        stand.hil.cycle();
+        stand.at_rest();
+    }
+}
+
+impl Stand {
+    /// As [`Stand::stops`] where the drives cannot be told: the cause alone.
+    fn trips(&mut self, since: u64) -> (Cause, u64) {
+        while self.cause.is_none() {
+            self.cycle();
+            assert!(self.now() < since + STOP_NS, "it goes on");
+        }
+        let (cause, at) = self.cause.expect("it was just seen");
+        let until = self.now() + 100 * MS;
+        while self.now() < until {
+            self.cycle();
+        }
+        // By our frames or by their own time-out.
+        self.at_rest();
+        (cause, at - since)
+    }
+
+    fn order(&self) -> Order {
+        self.hil.order()
+    }
+}
+
+/// Each protection taken away makes the tests above fail: so they would notice if it were broken.
+#[cfg(feature = "mutants")]
+#[test]
+fn mutants_are_caught() {
+    let passes = |mutant: Option<&str>| {
+        let mut tests = std::process::Command::new(std::env::current_exe().unwrap());
+        tests.args(["hil::campaign::row", "hil::campaign::nothing"]).env_remove("FRIC_MUTANT");
+        mutant.map(|name| tests.env("FRIC_MUTANT", name));
+        tests.output().unwrap().status.success()
+    };
+    assert!(passes(None), "with every protection in place");
+    for (name, _) in crate::safety::Protection::ALL {
+        assert!(!passes(Some(name)), "nothing notices that `{name}` is missing");
+    }
+}
+
+/// A small generator: the same numbers from the same seed on every machine.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: u64) -> u64 {
+        self.next() % n
+    }
+
+    fn between(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * (self.next() >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+/// One random rig with one random fault: it must hold its limits and, if it stops, come to rest.
+fn random_run(seed: u64) {
+    let mut random = Random(seed);
+    let (amplitude, damping) = (random.between(0.0, 6.0), random.between(-0.02, 0.1));
+    let (speed, slew) = (random.between(5.0, 200.0), [f64::INFINITY, 50.0, 500.0][random.below(3) as usize]);
+    let hold = random.below(4) as u32;
+    let mut stand = Stand::new(quick(), seed, |rig, model| {
+        param(model, 0, amplitude);
+        param(model, 1, damping);
+        rig.overrun = if hold == 0 { Overrun::Stop } else { Overrun::Hold(hold) };
+        rig.outputs.iter_mut().for_each(|output| output.slew = slew);
+        (0..2).for_each(|node| cia402(rig, node).max_speed = Some(speed));
+    });
+    stand.reach(Step::Armed);
+    let quiet = stand.now() + random.below(40) * MS;
+    while stand.now() < quiet && stand.hil.ended().is_none() {
+        stand.cycle();
+    }
+    let (now, node) = (stand.now(), random.below(2) as usize);
+    let id = [0x183, 0x184, 0x283, 0x284, 0x203, 0x204, 0x080, 0x703][random.below(8) as usize];
+    let lasts = [None, Some(random.below(20) * MS + 1)][random.below(2) as usize];
+    let until = lasts.map_or(u64::MAX, |lasts| now + lasts);
+    let place = [MASTER, BENCH][random.below(2) as usize];
+    let chance = random.between(0.05, 1.0);
+    let plant = |kind| stand.world.bus(0).plant(place, Fault::new(kind).id(id).from(now).until(until).chance(chance));
+    let hooked = match random.below(24) {
+        0 => Some(Effect::Emergency(0x2310)),
+        1 => Some(Effect::Fault(0x3210)),
+        2 => Some(Effect::PreOperational),
+        3 => Some(Effect::Reset),
+        4 => Some(Effect::NoHeartbeat),
+        5 => Some(Effect::ModeShown(4)),
+        6 => Some(Effect::EncoderFrozen),
+        7 => Some(Effect::EncoderGlitch(random.below(1 << 20) as i64)),
+        8 => Some(Effect::EncoderLost(random.below(1 << 18) as i64)),
+        9 => Some(Effect::SpeedScale(random.between(-2.0, 2.0))),
+        10 => Some(Effect::AnswersLate(random.below(5_000_000))),
+        11 => Some(Effect::NoAnswers),
+        12 => Some(Effect::IgnoresCommands),
+        13 => Some(Effect::SafeTorqueOff),
+        14 => Some(Effect::Silent),
+        15 => {
+            plant(FaultKind::Drop);
+            None
+        }
+        16 => {
+            plant(FaultKind::Corrupt);
+            None
+        }
+        17 => {
+            plant(FaultKind::Disturb);
+            None
+        }
+        18 => {
+            plant(FaultKind::Delay(random.below(3_000_000)));
+            None
+        }
+        19 => {
+            plant(FaultKind::Duplicate);
+            None
+        }
+        20 => {
+            plant(FaultKind::Full);
+            None
+        }
+        21 => {
+            stand.world.bus(0).short(now, until.min(now + 200 * MS));
+            None
+        }
+        22 => {
+            stand.world.simulation().run_to(now + random.below(12 * MS));
+            None
+        }
+        _ => {
+            stand.world.bus(0).unplug(place, now, until);
+            None
+        }
+    };
+    if let Some(effect) = hooked {
+        stand.effect(node, effect, lasts);
+    }
+    let end = now + 120 * MS;
+    while stand.now() < end && stand.hil.ended().is_none() {
+        stand.cycle();
+    }
+    if stand.hil.ended().is_none() && stand.cause.is_none() {
+        assert!(stand.operator.push(Command::Stop));
+    }
+    let limit = stand.now() + 2 * STOP_NS;
+    while stand.hil.ended().is_none() {
+        stand.cycle();
+        assert!(stand.now() < limit, "it goes on: {:?}", stand.cause);
+    }
+    // A drive that hears nobody stops by its own time-out.
+    let calm = stand.now() + 50 * MS;
+    while stand.now() < calm {
+        stand.cycle();
+    }
+    stand.at_rest();
+}
+
+/// `FRIC_SEED` repeats one run, `FRIC_RUNS` says how many there are.
+#[test]
+fn random_rigs_with_random_faults_hold_their_limits_and_come_to_rest() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
+    let (first, runs) = match number("FRIC_SEED") {
+        Some(seed) => (seed, 1),
+        None => (0, number("FRIC_RUNS").unwrap_or(300)),
+    };
+    for seed in first..first + runs {
+        let run = std::panic::catch_unwind(|| random_run(seed));
+        assert!(run.is_ok(), "FRIC_SEED={seed} repeats it");
+    }
+}
