@@ -12,8 +12,8 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile, dissipation,
-    explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
+    dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
 use grammar::diagnostic::Diagnostic;
 use std::time::Instant;

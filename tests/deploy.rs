@@ -128,7 +128,11 @@ fn a_package_is_signed_and_its_signer_named() {
     fine(&folder, &["build", "rig.fric", "--sign", "keys/anna.key", "-o", "a.fricpkg"]);
     assert!(fine(&folder, &["inspect", "--trusted", "keys", "a.fricpkg"]).contains("signed by anna"));
     fine(&folder, &["build", "rig.fric", "-o", "a.fricpkg"]);
-    fails(&folder, &["inspect", "--trusted", "keys", "a.fricpkg"], "it is not signed, and this computer trusts anna only");
+    fails(
+        &folder,
+        &["inspect", "--trusted", "keys", "a.fricpkg"],
+        "it is not signed, and this computer trusts anna only",
+    );
 }
 
 #[test]

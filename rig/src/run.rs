@@ -292,7 +292,7 @@ fn answer(stream: UnixStream, operator: &Mutex<Operator>) {
         "reset" => Command::Reset,
         _ => return,
     };
-    let taken = operator.lock().map(|mut operator| operator.push(command).is_ok()).unwrap_or(false);
+    let taken = operator.lock().map(|mut operator| operator.push(command)).unwrap_or(false);
     let _ = (&stream).write_all(if taken { b"ok\n" } else { b"too much at once\n" });
 }
 

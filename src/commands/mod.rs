@@ -1,11 +1,14 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
 mod build;
+mod bench_rt;
+mod bus;
 mod characterise;
 mod check;
 mod cross;
 mod deploy;
 mod doc;
+mod doctor;
 mod explain;
 mod fmt;
 mod inspect;
@@ -69,6 +72,9 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Key { command: Key::New(args) } => key::new(args, terminal),
         Command::Deploy(args) => deploy::deploy(args, terminal),
         Command::FetchLog(args) => deploy::fetch_log(args, terminal),
+        Command::Bus(args) => bus::bus(args, terminal),
+        Command::Doctor(args) => doctor::doctor(args, terminal),
+        Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();
