@@ -1,7 +1,7 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
-mod build;
 mod bench_rt;
+mod build;
 mod bus;
 mod characterise;
 mod check;

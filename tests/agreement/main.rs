@@ -129,7 +129,7 @@ fn compiled_c(cases: &[Case]) -> Vec<Results> {
         let description = Description { name: format!("Case{k}"), ..case.description.clone() };
         let mut source = c::source(&case.functions, &description, &case.params);
         // Each is a file of its own: here they share one.
-        for name in ["table_", "bits_of", "real_of", "truncated", "as_real", "shifted", "is_less", "entry"] {
+        for name in ["table_", "bits_of", "real_of", "truncated", "as_real", "shifted", "is_less", "entry", "inside"] {
             source = source.replace(&format!("{name}("), &format!("{name}{k}("));
         }
         text += &source.replace("table_", &format!("table{k}_"));
@@ -323,6 +323,7 @@ fn kind(op: Op) -> &'static str {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) => "constant",
         Op::Load(_) => "load",
         Op::Pool { .. } => "table",
+        Op::Ring { .. } => "ring",
         Op::Add(..) | Op::Sub(..) => "sum",
         Op::Mul(..) => "product",
         Op::Div(..) => "quotient",

@@ -240,6 +240,7 @@ enum Helper {
     ShiftSigned,
     Less,
     Entry,
+    Inside,
 }
 
 impl Helper {
@@ -269,6 +270,10 @@ impl Helper {
                 "/* As signed integers. */\nstatic inline int is_less(uint64_t a, uint64_t b)\n{\n    const uint64_t \
                  sign = UINT64_C(1) << 63;\n    return (a ^ sign) < (b ^ sign);\n}"
             }
+            Helper::Inside => {
+                "/* What is beyond the last is the last. */\nstatic inline uint64_t inside(uint64_t last, uint64_t k)\n{\n    \
+                 return k < last ? k : last;\n}"
+            }
             Helper::Entry => {
                 "/* What is beyond the last entry is the last. */\n\
                  static inline double entry(const double *table, uint64_t last, uint64_t k)\n{\n    return table[k < \
@@ -286,6 +291,8 @@ struct Writer<'a> {
     uses: Vec<usize>,
     /// The names of what is stored.
     stored: HashMap<Value, String>,
+    /// What rings are written with: computed before anything is stored.
+    written: HashSet<Value>,
     /// How each value is written where it is used.
     text: Vec<String>,
     helpers: &'a mut BTreeSet<Helper>,
@@ -310,7 +317,8 @@ impl<'a> Writer<'a> {
         for (slot, value) in &func.stores {
             stored.entry(*value).or_insert_with(|| names.next(*slot));
         }
-        Writer { func, names, types, uses, stored, text: vec![String::new(); func.ops.len()], helpers, tables }
+        let written = func.writes.iter().flat_map(|write| [write.index, write.value]).collect();
+        Writer { func, names, types, uses, stored, written, text: vec![String::new(); func.ops.len()], helpers, tables }
     }
 
     fn function(&mut self, function: Function) -> String {
@@ -323,12 +331,13 @@ impl<'a> Writer<'a> {
             let written = self.expression(op);
             let constant = matches!(op, Op::Real(_) | Op::Int(_) | Op::Bool(_));
             let once = self.uses[i] == 1 || self.uses[i] == 0 && self.func.status == Some(value);
-            let short = once && written.len() <= LONGEST && !self.stored.contains_key(&value);
+            let named = self.stored.contains_key(&value) || self.written.contains(&value);
+            let short = once && written.len() <= LONGEST && !named;
             self.text[i] = if constant {
                 written
-            } else if short || matches!(op, Op::Load(_)) && !self.stored.contains_key(&value) {
+            } else if short || matches!(op, Op::Load(_)) && !named {
                 match op {
-                    Op::Load(_) | Op::Pool { .. } => written,
+                    Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => written,
                     _ if written.ends_with(')') && called(&written) => written,
                     _ => format!("({written})"),
                 }
@@ -352,9 +361,16 @@ impl<'a> Writer<'a> {
             let (slot, value) = (self.names.slot(*slot), &self.text[value.index()]);
             writeln!(body, "{indent}block[{slot}] = {value};").expect("writing to a string does not fail");
         }
+        for write in &self.func.writes {
+            self.helpers.insert(Helper::Inside);
+            let (base, last) = (self.names.slot(write.base), write.len - 1);
+            let [index, value] = [write.index, write.value].map(|value| &self.text[value.index()]);
+            writeln!(body, "{indent}block[{base} + inside({last}, {index})] = {value};")
+                .expect("writing to a string does not fail");
+        }
         let mut out =
             format!("\n/* {} */\nuint64_t {}\n{{\n", purpose(function), signature(&self.names.prefix, function));
-        if self.func.stores.is_empty() && self.func.loads().is_empty() {
+        if !body.contains("block") {
             out += "    (void)block;\n";
         }
         match (repeated, status.is_some()) {
@@ -386,6 +402,10 @@ impl<'a> Writer<'a> {
                 let (table, index) = (table(base, len), t(index));
                 self.tables.insert((base, len));
                 self.helped(Helper::Entry, format!("entry({table}, {}, {index})", len - 1))
+            }
+            Op::Ring { base, len, index } => {
+                let (base, index) = (self.names.slot(base), t(index));
+                self.helped(Helper::Entry, format!("entry(block + {base}, {}, {index})", len - 1))
             }
             Op::Add(a, b) | Op::IntAdd(a, b) => format!("{} + {}", t(a), t(b)),
             Op::Sub(a, b) | Op::IntSub(a, b) => format!("{} - {}", t(a), t(b)),

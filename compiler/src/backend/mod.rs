@@ -8,5 +8,6 @@ pub mod target;
 pub mod jit;
 pub mod blob;
 pub mod c;
+pub mod wide;
 #[cfg(test)]
 mod agree;
