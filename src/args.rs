@@ -3,8 +3,10 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
+use crate::compile::Emit;
 use crate::value;
 use crate::vary::{self, Vary};
+use abi::image::Target;
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
@@ -35,6 +37,8 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
+    /// Make C or machine code of a model, to take away
+    Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
     /// Compute a rig's log again and compare every output to the bit
@@ -72,8 +76,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
+            "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
+            "compare", "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -233,6 +237,35 @@ pub struct Linearise {
     /// Write A, B, C, D to a file: .npz, .mat or .json
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
     pub out: Option<PathBuf>,
+}
+
+/// `fric build`
+#[derive(clap::Args, Debug)]
+pub struct Build {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// A model, with its inputs free, or an experiment; the only one if none is named
+    #[arg(value_name = "MODEL|EXPERIMENT")]
+    pub name: Option<String>,
+    /// What to make
+    #[arg(long, value_name = "WHAT", value_enum)]
+    pub emit: Emit,
+    /// File to write [default: the standard output]
+    #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub out: Option<PathBuf>,
+    /// Processor: x86_64 or aarch64 [default: this one]
+    #[arg(long, value_name = "NAME", value_parser = target)]
+    pub target: Option<Target>,
+    /// How the step is made [default: of an experiment its own, else expo]
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step of an experiment, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
 }
 
 /// `fric hil`
@@ -527,6 +560,11 @@ fn setting(text: &str) -> Result<(String, String), String> {
 fn solver(text: &str) -> Result<Method, String> {
     let names = || Method::ALL.map(Method::name).join(", ");
     Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
+}
+
+fn target(text: &str) -> Result<Target, String> {
+    let names = || Target::ALL.map(Target::name).join(", ");
+    Target::named(text).ok_or_else(|| format!("code is made for {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {

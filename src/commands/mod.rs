@@ -1,6 +1,7 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
 mod bench_rt;
+mod build;
 mod bus;
 mod characterise;
 mod check;
@@ -52,6 +53,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Build(build) => build::build(build, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
         Command::Check(check) => check::check(check, terminal),
