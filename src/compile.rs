@@ -1,13 +1,17 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+use abi::Function;
 use abi::image::Target;
+use abi::lanes::Lanes;
 pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
-use compiler::backend::{blob, c};
+use compiler::backend::wide::{self, Width};
+use compiler::backend::{blob, c, jit};
 pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
+use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
@@ -66,6 +70,33 @@ pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<
         }
     };
     Ok(text.into_bytes())
+}
+
+/// The step of an experiment, for who wants to know what it costs.
+pub struct StepCode {
+    /// Operations of the straight line.
+    pub operations: usize,
+    /// Bytes of machine code.
+    pub bytes: usize,
+    /// Cycles of the longest chain from one step to the next, by latencies of current processors.
+    pub critical_path: u32,
+    /// The step for many instances at once, or why there is none.
+    pub lanes: Result<Lanes, String>,
+}
+
+/// What a fixed step is made of.
+pub fn step_code(built: &Built, method: Method) -> StepCode {
+    let description = &built.program.description;
+    let (layout, pool) = (&description.layout, description.pool.len());
+    let mut functions = compiler::functions(&built.program, method);
+    functions.retain(|(function, _)| *function == Function::Step);
+    let func = &functions[0].1;
+    let bytes = jit::compile(&functions, layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
+    let lanes = match Width::here() {
+        None => Err("this processor has neither AVX2 nor AVX-512".to_string()),
+        Some(width) => wide::compile(func, layout, pool, width, width.vectors()).map_err(|why| why.to_string()),
+    };
+    StepCode { operations: func.ops.len(), bytes, critical_path: regroup::critical_path(func), lanes }
 }
 
 /// How long each stage took, in the order in which they ran.
