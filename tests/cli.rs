@@ -106,7 +106,7 @@ fn exit_codes_tell_how_it_went() {
 #[test]
 fn wrong_usage_is_told_apart_from_wrong_input() {
     let folder = Folder::new("usage").with("pull.fric", PULL);
-    folder.check(&[], 2, "Usage: fric");
+    folder.check(&["--nothing"], 2, "unexpected argument '--nothing'");
     folder.check(&["rnu"], 2, "unrecognized subcommand 'rnu'");
     folder.check(&["run"], 2, "<FILE>");
     folder.check(&["run", "pull.fric", "--step", "10"], 2, "a time needs its unit, for example 10s");

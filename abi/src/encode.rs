@@ -106,7 +106,19 @@ macro_rules! numbers {
     )*};
 }
 
-numbers!(u8, u32, u64, i32, f64);
+numbers!(u8, u16, u32, u64, i32, f64);
+
+/// As 64 bits.
+impl Encode for usize {
+    fn encode(&self, out: &mut Vec<u8>) {
+        (*self as u64).encode(out);
+    }
+
+    fn decode(reader: &mut Reader) -> Result<usize, Malformed> {
+        let number = u64::decode(reader)?;
+        usize::try_from(number).or_else(|_| reader.wrong(format!("{number} is no index")))
+    }
+}
 
 /// How many entries a list can have at most: each takes a byte at least, so a wrong length is found at once.
 fn length(reader: &mut Reader) -> Result<usize, Malformed> {

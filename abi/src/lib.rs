@@ -14,6 +14,7 @@ pub mod lanes;
 pub mod rig;
 pub mod plan;
 pub mod encode;
+pub mod packing;
 pub mod image;
 
 pub use description::{Description, Layout, Slot};
