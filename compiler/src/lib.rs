@@ -9,7 +9,9 @@ pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod elimination;
 pub mod discretize;
+pub mod rosenbrock;
 pub mod backend;
 
 pub mod names;
@@ -109,6 +111,50 @@ pub fn varying(
         vary::Varying::new(variant, paths, &loaded.files, code, notes)
     };
     Ok(variants.into_iter().map(one).collect())
+}
+
+/// A model or an experiment as one program, for what is made of it beside a run.
+pub struct Built {
+    /// The program.
+    pub program: program::Program,
+    /// How an experiment is stepped; none for a model on its own.
+    pub solver: Option<abi::plan::Solver>,
+}
+
+/// Compiles a model on its own, its inputs open, or the first combination of an experiment's sweeps.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn build(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Built, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let model = ast.items.iter().find_map(|item| match item {
+        Item::Model(model) if model.name.text == name => Some(model),
+        _ => None,
+    });
+    let Some(model) = model else {
+        let variants = experiment::read(loaded, sources, name, changes, warnings, &mut |_| ())?;
+        let variant = variants.into_iter().next().expect("there is at least one combination");
+        return Ok(Built { program: variant.program, solver: Some(variant.experiment.solver) });
+    };
+    let given = experiment::overrides(loaded, changes, warnings);
+    let overrides = given.iter().map(|change| change.override_in(root)).collect();
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, root, overrides);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    diagnostics.extend(std::mem::take(warnings));
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
+    }
+    warnings.extend(diagnostics);
+    Ok(Built { program: lower::lower(&system, &types, &[]).program, solver: None })
 }
 
 /// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
@@ -300,12 +346,17 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
             if program.description.layout.jacobian.len > 0 {
                 out.push((Function::Jacobian, derive::jacobian(program)));
             }
+            out.extend(rosenbrock::rosenbrock(program).map(|step| (Function::Rosenbrock, step)));
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }
         method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
     }
-    out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
+    let expanded = |(function, func): (Function, ir::Func)| match function {
+        Function::Rosenbrock => (function, rosenbrock::pooled(&math::expand(&func))),
+        _ => (function, math::expand(&func)),
+    };
+    out.into_iter().map(expanded).collect()
 }
 
 /// Machine code of functions, or the interpreter where there can be none, which is noted.

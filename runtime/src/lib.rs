@@ -26,6 +26,7 @@ pub mod steady;
 pub mod sweep;
 
 pub mod blob;
+pub mod package;
 
 pub mod modes;
 
@@ -36,7 +37,11 @@ pub mod clock;
 pub mod histogram;
 pub mod realtime;
 
+pub mod host;
+
 pub mod can;
+
+pub mod bench_rt;
 
 pub mod canopen;
 
