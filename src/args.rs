@@ -3,11 +3,14 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
+use crate::compile::Emit;
 use crate::value;
 use crate::vary::{self, Vary};
+use abi::image::Target;
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
+use runtime::can::address::Address;
 use std::path::PathBuf;
 
 /// A small equation language for friction models, controllers and the rigs they run on.
@@ -34,6 +37,8 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
+    /// Make C or machine code of a model, to take away
+    Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
     /// Compute a rig's log again and compare every output to the bit
@@ -54,6 +59,12 @@ pub enum Command {
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
     Watch(Watch),
+    /// Join CAN buses, open doors to them, and print their traffic
+    Bus(Bus),
+    /// Say what this machine lacks for real time, with the line that mends each
+    Doctor(Doctor),
+    /// Run a loop as a rig does and say how late it wakes
+    BenchRt(BenchRt),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -65,8 +76,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "new", "completions",
+            "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
+            "compare", "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -226,6 +237,35 @@ pub struct Linearise {
     /// Write A, B, C, D to a file: .npz, .mat or .json
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
     pub out: Option<PathBuf>,
+}
+
+/// `fric build`
+#[derive(clap::Args, Debug)]
+pub struct Build {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// A model, with its inputs free, or an experiment; the only one if none is named
+    #[arg(value_name = "MODEL|EXPERIMENT")]
+    pub name: Option<String>,
+    /// What to make
+    #[arg(long, value_name = "WHAT", value_enum)]
+    pub emit: Emit,
+    /// File to write [default: the standard output]
+    #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub out: Option<PathBuf>,
+    /// Processor: x86_64 or aarch64 [default: this one]
+    #[arg(long, value_name = "NAME", value_parser = target)]
+    pub target: Option<Target>,
+    /// How the step is made [default: of an experiment its own, else expo]
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step of an experiment, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
 }
 
 /// `fric hil`
@@ -410,6 +450,74 @@ pub struct Repl {
     pub echo: bool,
 }
 
+/// `fric bus`
+#[derive(clap::Args, Debug)]
+#[command(after_help = BUS_ADDRESSES)]
+pub struct Bus {
+    /// Buses to join, such as can0, sim:bench, slcan:/dev/ttyACM0@1000000, socketcand:host/can0
+    #[arg(value_name = "ADDRESS", required_unless_present_any = ["pty", "tcp"], value_parser = address)]
+    pub addresses: Vec<Address>,
+    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
+    pub pty: Vec<PathBuf>,
+    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    #[arg(long, value_name = "PORT")]
+    pub tcp: Option<u16>,
+    /// Let other machines come to the TCP port too
+    #[arg(long, requires = "tcp")]
+    pub everywhere: bool,
+    /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
+    #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub bit_rate: Option<u32>,
+    /// Print traffic as `candump -L` does, for `replay:`
+    #[arg(long)]
+    pub log: bool,
+    /// Join without printing traffic
+    #[arg(long, short, conflicts_with = "log")]
+    pub quiet: bool,
+    /// End after this time, such as 10s [default: Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+}
+
+const BUS_ADDRESSES: &str = "Addresses:\n  \
+    can0, socketcan:can0         an interface of the kernel\n  \
+    sim:NAME                     a bus in this process\n  \
+    slcan:PATH@BITRATE           a serial adapter\n  \
+    socketcand:HOST:PORT/NAME    a TCP gateway\n  \
+    replay:FILE                  a log of candump -L";
+
+/// `fric doctor`
+#[derive(clap::Args, Debug)]
+pub struct Doctor {
+    /// Buses to look at too, such as can0
+    #[arg(value_name = "ADDRESS", value_parser = address)]
+    pub addresses: Vec<Address>,
+    /// Bits a second that they should have
+    #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub bit_rate: Option<u32>,
+    /// Priority of the loop that will run
+    #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
+    pub priority: i32,
+}
+
+/// `fric bench-rt`
+#[derive(clap::Args, Debug)]
+pub struct BenchRt {
+    /// Cycles a second, such as 1kHz
+    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency)]
+    pub rate: f64,
+    /// How long to run
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    pub seconds: u64,
+    /// Stay on this core [default: an isolated one, if there is any]
+    #[arg(long, value_name = "N")]
+    pub core: Option<usize>,
+    /// Priority under SCHED_FIFO
+    #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
+    pub priority: i32,
+}
+
 /// `fric watch`
 #[derive(clap::Args, Debug)]
 pub struct Watch {
@@ -445,6 +553,11 @@ fn solver(text: &str) -> Result<Method, String> {
     Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
 }
 
+fn target(text: &str) -> Result<Target, String> {
+    let names = || Target::ALL.map(Target::name).join(", ");
+    Target::named(text).ok_or_else(|| format!("code is made for {}", names()))
+}
+
 fn positive_time(text: &str) -> Result<f64, String> {
     let (value, unit) = value::parse(text)?;
     let second = Unit::parse("s").expect("the second is known").dimension;
@@ -454,6 +567,20 @@ fn positive_time(text: &str) -> Result<f64, String> {
         dimension => return Err(format!("a time is needed, not {}", dimension.describe())),
     }
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a time greater than 0 is needed".into()) }
+}
+
+fn address(text: &str) -> Result<Address, String> {
+    text.parse()
+}
+
+/// 1 Hz to 20 kHz.
+fn frequency(text: &str) -> Result<f64, String> {
+    let (value, unit) = value::parse(text)?;
+    let hertz = Unit::parse("1/s").expect("per second is known").dimension;
+    if unit.dimension != hertz {
+        return Err(format!("a frequency is needed, for example {text}Hz").replace("HzHz", "Hz"));
+    }
+    if (1.0..=20e3).contains(&value) { Ok(value) } else { Err("a frequency from 1 Hz to 20 kHz is needed".into()) }
 }
 
 fn tolerance(text: &str) -> Result<f64, String> {

@@ -1,9 +1,13 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod bench_rt;
+mod build;
+mod bus;
 mod characterise;
 mod check;
 mod cross;
 mod doc;
+mod doctor;
 mod explain;
 mod fmt;
 mod hil;
@@ -49,6 +53,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Build(build) => build::build(build, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
         Command::Check(check) => check::check(check, terminal),
@@ -59,6 +64,9 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Doc(args) => doc::doc(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
+        Command::Bus(args) => bus::bus(args, terminal),
+        Command::Doctor(args) => doctor::doctor(args, terminal),
+        Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();
