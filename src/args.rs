@@ -428,6 +428,9 @@ pub struct Compare {
 /// `fric doc`
 #[derive(clap::Args, Debug)]
 pub struct Doc {
+    /// Write the page only, and leave the plots as they are
+    #[arg(long, conflicts_with = "check")]
+    pub keep_plots: bool,
     /// The page; plots go into the folder of the same name
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "docs/models.md")]
     pub out: PathBuf,
