@@ -1,5 +1,7 @@
 //! Rigs under way: the example against simulated drives, its log, its replay, kills, and what a cycle must not do.
 
+#![allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions")]
+
 mod support;
 
 use abi::rig::{Kind, Rig, Signal, What};
@@ -43,13 +45,18 @@ fn asked() -> u64 {
 
 /// The example, changed by settings such as `fr = rotary Karnopp()`.
 fn ready(set: &[&str]) -> Ready {
+    rig_of("rtfs.fric", "rtfs", set)
+}
+
+/// A rig of a text beside the example.
+fn rig_of(file: &str, rig: &str, set: &[&str]) -> Ready {
     let folder = root().join("examples/rtfs");
     let read = |name: &str| fs::read_to_string(folder.join(name)).unwrap();
     let sources = Texts(vec![("shaft.dbc".into(), read("shaft.dbc"))]);
-    let mut loaded = compiler::load("rtfs.fric", &read("rtfs.fric"), &sources);
+    let mut loaded = compiler::load(file, &read(file), &sources);
     let changes = Changes { set: set.iter().map(|one| (*one).to_string()).collect(), ..Changes::default() };
     let options = Options { changes, ..Options::default() };
-    let made = compiler::rig(&mut loaded, &sources, "rtfs", &options, &mut Vec::new());
+    let made = compiler::rig(&mut loaded, &sources, rig, &options, &mut Vec::new());
     made.unwrap_or_else(|errors| panic!("{errors:?}"))
 }
 
@@ -98,6 +105,69 @@ fn another_model_is_put_on_the_shaft() {
         assert_eq!(end, End::Asked, "{model}");
         assert!(x.iter().any(|x| *x > 0.8), "{model}: it moved");
     }
+}
+
+/// One row a cycle of what a rig records, and of its readings, while the model runs.
+fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
+    let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
+    let mut options =
+        HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
+    options.start.sign_test = runtime::drive::sign::SignTest::Skip;
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&ready.rig, ready.control, world.clock(), masters, options, None).unwrap();
+    let mut rows = Vec::new();
+    loop {
+        hil.cycle();
+        if hil.counts().cycles as usize > rows.len() {
+            let model = hil.control().unwrap().model();
+            let series = ready.rig.record.iter().map(|series| model.get(series.slot)).collect();
+            let read = signals.iter().map(|signal| hil.fieldbus().reading(*signal).value).collect();
+            rows.push((series, read));
+        }
+        if let Some(end) = hil.ended() {
+            assert_eq!(*end, End::Asked);
+            return rows;
+        }
+    }
+}
+
+/// F(v) as the load drive gives it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow turning.
+#[test]
+fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
+    let torque = Signal { node: 0, what: What::Torque };
+    let speed = Signal { node: 0, what: What::Speed };
+    let rows = recorded(rig_of("characteristics.fric", "characteristic", &[]), 40.0, &[speed, torque]);
+    assert_eq!(rows.len(), 40_000);
+    let (mut worst, mut compared) = (0f64, 0);
+    for (_, read) in &rows[10_000..] {
+        let (v, friction) = (read[0], -read[1]);
+        // At the turning points the friction is on its way from one side to the other, and near rest speed is coarse.
+        if v.abs() < 0.03 {
+            continue;
+        }
+        let g = 0.28 + (0.42 - 0.28) * (-(v / 0.01f64).powi(2)).exp();
+        let own = g * v.signum() + 0.018 * v;
+        worst = worst.max((friction - own).abs() / own.abs());
+        compared += 1;
+    }
+    assert!(compared > 20_000, "{compared}");
+    assert!(worst < 0.02, "measured and own friction differ by up to {} %", 100.0 * worst);
+    // T_friction against T_ref: what the drive says it applies is what it was told, but for its step of 4 mN·m and its lag.
+    let apart = rows[10_000..].iter().map(|(series, read)| (series[1] + read[1]).powi(2)).sum::<f64>();
+    let rms = (apart / 30_000.0).sqrt();
+    assert!(rms < 0.02, "{rms} N·m between asked and applied");
+}
+
+#[test]
+fn an_observer_of_the_friction_makes_the_servo_follow() {
+    let rms = |share: &str| {
+        let rows = recorded(rig_of("characteristics.fric", "tracking", &[share]), 15.0, &[]);
+        let squares: f64 = rows[5_000..].iter().map(|(series, _)| series[0].powi(2)).sum();
+        (squares / 10_000.0).sqrt()
+    };
+    let (with, without) = (rms("share = 1"), rms("share = 0"));
+    assert!(without > 0.05, "{without} rad without it");
+    assert!(with < without / 50.0, "{with} rad with it, {without} without");
 }
 
 #[test]

@@ -8,11 +8,13 @@ use crate::terminal::{Style, Terminal};
 use crate::{project, report, value};
 use abi::Description;
 use abi::description::Kind;
+use abi::rig::{self, Mode, Node, Rig};
 use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
+use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::simulated::{MASTER, Pace, World};
 use runtime::hil::{cycle, emergency, words};
@@ -26,6 +28,8 @@ use std::time::Duration;
 
 /// Cycles whose loss a killed process may cost, as a time.
 const BLOCK_NS: u64 = 100_000_000;
+/// Without a cycle for so long even a run that only counts what it misses is over.
+const PATIENT_NS: u64 = 60_000_000_000;
 /// What a black box holds.
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
@@ -61,6 +65,10 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
     if let Err(why) = usage(args, &ready, simulated) {
         terminal.error(&why);
         return End::Misused;
+    }
+    if args.count_overruns {
+        // Neither the drives nor the watchdog stop what is only to be counted.
+        ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(PATIENT_NS);
     }
     let root = loaded.files.get(loaded.root());
     let head = Sections::default()
@@ -156,10 +164,31 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
     Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
 }
 
-fn hil_options(args: &Args, simulated: bool) -> HilOptions {
+/// Whether one drive holds speed or position while another gives torque.
+fn holds_and_pushes(rig: &Rig) -> bool {
+    let pushes = |node: &Node| match &node.kind {
+        rig::Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),
+        rig::Kind::Frames(_) => None,
+    };
+    let all = || rig.nodes.iter().filter_map(pushes);
+    all().any(|pushes| pushes) && all().any(|pushes| !pushes)
+}
+
+fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     let mut options = HilOptions::default();
     options.control.count_overruns = args.count_overruns;
     options.start.simulated = simulated;
+    // What is late between this process and itself says nothing of the drives.
+    options.start.missed = match (simulated, args.count_overruns) {
+        (_, true) => 1.0,
+        (true, false) => 0.05,
+        (false, false) => 0.0,
+    };
+    options.start.timeout_test = !args.count_overruns;
+    if simulated && holds_and_pushes(rig) {
+        // A drive that holds its speed would not let another one push the shaft.
+        options.start.sign_test = SignTest::Skip;
+    }
     options.arms_itself = args.sim || simulated || args.arm;
     options.checks_only = args.check;
     options.duration_ns = args.duration.map(|seconds| (seconds * 1e9).round() as u64);
@@ -233,7 +262,7 @@ fn run(
         Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
     });
     let fast = simulated && args.fast;
-    let mut options = hil_options(args, simulated);
+    let mut options = hil_options(args, &rig, simulated);
     let real_time = (!fast)
         .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
     let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
@@ -286,14 +315,7 @@ fn said(refusal: &realtime::Refusal) -> String {
     format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
 }
 
-fn begin(
-    rig: &abi::rig::Rig,
-    simulated: bool,
-    fast: bool,
-    refusals: &[String],
-    notes: &[String],
-    terminal: &mut Terminal,
-) {
+fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[String], terminal: &mut Terminal) {
     let rate = 1e9 / rig.period_ns as f64;
     let kind = match (simulated, fast) {
         (false, _) => "drives on their buses",
@@ -313,6 +335,7 @@ fn begin(
 /// Tells how it ended, after the log was closed.
 fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
     let counts = words::counts(hil.counts());
+    let missed = hil.counts().missed;
     let misuse = hil.is_misuse();
     let written = hil.finish();
     if !args.quiet {
@@ -328,6 +351,12 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
         }
         cycle::End::Stopped(_, why) => {
             terminal.error(&format!("stopped: {why}"));
+            if missed > 0 && !args.count_overruns {
+                terminal.report(&format!(
+                    "  {missed} ticks were missed: this host was too late, and a drive that hears nothing stops.\n  \
+                     With simulated drives: --fast, or --count-overruns; `fric doctor` says what would help\n"
+                ));
+            }
             End::Stopped
         }
     };
@@ -348,7 +377,7 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
 }
 
 /// Shows the gauges, some times a second, until it is over.
-fn view(gauges: &Gauges, rig: &abi::rig::Rig, over: &AtomicBool) {
+fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
     let mut terminal = Terminal::new();
     let names: Vec<String> = (rig.outputs.iter())
         .map(|output| words::signal(rig, output.signal))
