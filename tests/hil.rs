@@ -11,6 +11,7 @@ use runtime::hil::simulated::{Pace, World};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
@@ -252,6 +253,21 @@ fn what_stops_a_rig_is_told_and_is_exit_code_3() {
 }
 
 #[test]
+fn what_the_drives_are_like_is_measured() {
+    let folder = folder("hil-identify");
+    let said = run(&folder, &["hil", "--sim", "--fast", "--identify", &example()], 0);
+    let line = said.lines().find(|line| line.contains("drive load")).unwrap_or_else(|| panic!("{said}"));
+    let number = |after: &str| -> f64 {
+        let rest = &line[line.find(after).unwrap() + after.len()..];
+        rest.trim_start().split(' ').next().unwrap().parse().unwrap()
+    };
+    // 0.8 and 0.6 ms in the text of the rig; a command is some 0.1 ms on the bus.
+    assert!((0.6..1.1).contains(&number("delay =")), "{line}");
+    assert!((0.5..0.7).contains(&number("lag =")), "{line}");
+    assert!((0.011..0.013).contains(&number("inertia")), "{line}");
+}
+
+#[test]
 fn wrong_usage_is_told() {
     let folder = folder("hil-usage");
     let example = example();
@@ -269,22 +285,66 @@ fn wrong_usage_is_told() {
     assert!(said.contains("not a log of fric"), "{said}");
 }
 
+/// A run at the pace of the wall that counts what this machine misses, once its log is there.
+fn under_way(folder: &Path, log: &str) -> std::process::Child {
+    let example = example();
+    let args = ["hil", "--sim", "--count-overruns", "--log", log, &example];
+    let mut command = fric(folder, &args);
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    while !folder.join(log).exists() {
+        std::thread::sleep(Duration::from_millis(20));
+        assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
+    }
+    child
+}
+
+#[test]
+fn control_c_is_a_controlled_stop() {
+    let folder = folder("hil-interrupt");
+    for signal in ["-INT", "-TERM"] {
+        let mut child = under_way(&folder, "log");
+        std::thread::sleep(Duration::from_millis(1500));
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(0), "{signal}");
+        let said = run(&folder, &["replay", "log"], 0);
+        assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
+        fs::remove_file(folder.join("log")).unwrap();
+    }
+}
+
+#[test]
+fn parameters_change_while_it_runs_and_the_log_knows() {
+    let folder = folder("hil-set");
+    let mut child = under_way(&folder, "log");
+    let mut say = |line: &str| {
+        std::thread::sleep(Duration::from_millis(700));
+        writeln!(child.stdin.as_mut().unwrap(), "{line}").unwrap();
+    };
+    say("");
+    say("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
+    say("set fr.Fs = -1 N·m");
+    say("set fr.Fz = 1 N·m");
+    say("set fr.Fs = 1 s");
+    say("stop");
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    for words in ["must lie in", "no parameter `fr.Fz`; did you mean `fr.F", "`fr.Fs` is a"] {
+        assert!(said.contains(words), "no `{words}` in {said}");
+    }
+    let said = run(&folder, &["replay", "log"], 0);
+    assert!(said.contains("agree to the bit"), "{said}");
+}
+
 /// `FRIC_KILLS` says how often; 200 is the full measure.
 #[test]
 fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
     let folder = folder("hil-kill");
-    let example = example();
     let kills = std::env::var("FRIC_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(4);
     for kill in 0..kills {
         let log = format!("killed-{kill}");
-        let args = ["hil", "--sim", "--count-overruns", "--log", &log, &example];
-        let mut child = fric(&folder, &args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        // Into the run, at another time each time.
+        let mut child = under_way(&folder, &log);
         let path = folder.join(&log);
-        while !path.exists() {
-            std::thread::sleep(Duration::from_millis(20));
-            assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
-        }
         let before = std::time::Instant::now();
         std::thread::sleep(Duration::from_millis(1500 + 97 * kill % 1000));
         child.kill().unwrap();

@@ -16,6 +16,7 @@ use runtime::can::{self, Bus};
 use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
+use runtime::hil::identify::{self, Identification};
 use runtime::hil::simulated::{MASTER, Pace, World};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
@@ -88,8 +89,11 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
+    if args.identify {
+        return identified(args, ready, simulated, terminal);
+    }
     emergency::guard();
-    if simulated { in_process(args, ready, log, terminal) } else { on_buses(args, ready, log, terminal) }
+    if simulated { in_process(args, ready, log, None, terminal) } else { on_buses(args, ready, log, None, terminal) }
 }
 
 /// The rig to run: the one named, or the only one.
@@ -195,10 +199,46 @@ fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     options
 }
 
+/// Torque pulses in place of the model.
+fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Terminal) -> End {
+    let asked = match Identification::new(&ready.rig) {
+        Ok(asked) => asked,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    emergency::guard();
+    ready.rig = asked.rig.clone();
+    ready.control = asked.program.clone();
+    if simulated {
+        in_process(args, ready, None, Some(&asked), terminal)
+    } else {
+        on_buses(args, ready, None, Some(&asked), terminal)
+    }
+}
+
+/// Says what was measured, as text to paste.
+fn measured(asked: &Identification, rows: &[identify::Row], sends: f64, terminal: &mut Terminal) {
+    let milli = |seconds: f64| value::significant(seconds * 1e3, 3);
+    for found in asked.evaluate(rows, sends) {
+        let name = &asked.rig.nodes[found.node].name;
+        let inertia = found
+            .inertia
+            .map_or("it hardly moved".into(), |inertia| format!("inertia {} kg·m²", value::significant(inertia, 3)));
+        terminal.line(&format!(
+            "  drive {name}: delay = {} ms, lag = {} ms    ({inertia}; {} N·m rms unexplained)",
+            milli(found.delay),
+            milli(found.lag),
+            value::significant(found.residual, 2)
+        ));
+    }
+}
+
 type Log = Option<(Settings, Sections)>;
 
 /// Buses, drives and devices in this process.
-fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+fn in_process(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
     let pace = if args.fast { Pace::Fast } else { Pace::Wall };
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
@@ -218,11 +258,11 @@ fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> E
         }
     }
     let (clock, masters) = (world.clock(), world.masters());
-    run(args, ready, clock, masters, true, log, terminal)
+    run(args, ready, clock, masters, true, log, asked, terminal)
 }
 
 /// Buses of this machine.
-fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+fn on_buses(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
     for bus in &ready.rig.buses {
@@ -244,9 +284,10 @@ fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End
             }
         }
     }
-    run(args, ready, Box::new(world), buses, false, log, terminal)
+    run(args, ready, Box::new(world), buses, false, log, asked, terminal)
 }
 
+#[allow(clippy::too_many_arguments, reason = "what a rig consists of")]
 fn run(
     args: &Args,
     ready: Ready,
@@ -254,6 +295,7 @@ fn run(
     buses: Vec<Box<dyn Bus>>,
     simulated: bool,
     log: Log,
+    asked: Option<&Identification>,
     terminal: &mut Terminal,
 ) -> End {
     let Ready { rig, control, notes, .. } = ready;
@@ -263,6 +305,10 @@ fn run(
     });
     let fast = simulated && args.fast;
     let mut options = hil_options(args, &rig, simulated);
+    if let Some(asked) = asked {
+        options.duration_ns = Some(asked.duration_ns);
+        options.control.ramp_ns = 0;
+    }
     let real_time = (!fast)
         .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
     let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
@@ -301,7 +347,13 @@ fn run(
     if !fast {
         std::thread::spawn(move || prompt(operator, &description));
     }
-    let end = hil.run();
+    if let Some(asked) = asked {
+        let rows = identify::rows(&mut hil, asked);
+        if hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
+            measured(asked, &rows, hil.collect_ns() as f64 * 1e-9, terminal);
+        }
+    }
+    let end = hil.ended().cloned().unwrap_or_else(|| hil.run());
     over.store(true, Ordering::Relaxed);
     if let Some(view) = view {
         let _ = view.join();

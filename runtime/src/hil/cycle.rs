@@ -374,6 +374,11 @@ impl Hil {
         self.control.as_ref().map_or(&[], Control::seen)
     }
 
+    /// From SYNC to the computing, ns.
+    pub fn collect_ns(&self) -> u64 {
+        self.collect_ns
+    }
+
     /// What was counted until now.
     pub fn counts(&self) -> &Counts {
         &self.counts
