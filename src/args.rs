@@ -346,6 +346,9 @@ pub struct Explain {
     pub subject: String,
     /// Models of the file to explain; all if none is named
     pub models: Vec<String>,
+    /// How long a fixed step takes on this machine: the worst of a million calls
+    #[arg(long)]
+    pub step: bool,
     /// One JSON object per model
     #[arg(long)]
     pub json: bool,

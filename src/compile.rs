@@ -1,5 +1,6 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+pub use abi::plan::Method;
 pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
@@ -7,8 +8,8 @@ pub use compiler::names::nearest;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, compile, dissipation, explain, explain_in,
-    explain_run, linear, load, quantities, rig, varying,
+    Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, check_models, compile, dissipation, explain,
+    explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
 use std::time::Instant;
 

@@ -52,6 +52,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
             points: points(recording, series, plot.against.as_ref()),
             boolean: series.boolean && plot.against.is_none(),
             marks: false,
+            style: None,
         };
         // What no case changes, such as a reference, is drawn once.
         let (common, own): (Vec<&Series>, Vec<&Series>) =

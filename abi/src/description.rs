@@ -58,7 +58,7 @@ pub struct Layout {
     pub inputs: Segment,
     /// Continuous states x.
     pub states: Segment,
-    /// Sampled states, held outputs, tick counters, delay buffers, crossing memory.
+    /// Sampled states, held outputs, tick counters, what is delayed, crossing memory.
     pub memory: Segment,
     /// Active regime of each automaton: a whole number.
     pub regimes: Segment,
@@ -72,18 +72,25 @@ pub struct Layout {
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
+    /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
+    pub rings: Segment,
 }
 
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        let last = self.due;
+        let last = self.rings;
         (last.start + last.len).max(Slot::FIXED) as usize
     }
 
-    /// Lengths of the segments, in the order of the fields.
+    /// The same with so many slots for rings.
+    pub fn with_rings(self, len: u32) -> Layout {
+        Layout { rings: Segment { start: self.due.start + self.due.len, len }, ..self }
+    }
+
+    /// Lengths of the segments but the rings, in the order of the fields.
     pub fn lens(&self) -> [u32; 10] {
-        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due } = self;
+        let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, .. } = self;
         [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
     }
 
@@ -107,6 +114,7 @@ impl Layout {
             roots: take(roots),
             jacobian: take(jacobian),
             due: take(due),
+            rings: take(0),
         }
     }
 }
@@ -160,6 +168,28 @@ pub struct Tick {
     pub due: Slot,
 }
 
+/// `delay(x, T)`: x as it was T ago, on straight lines between samples. Functions of the model read it as
+/// `past + weight · (x − past)`; whoever runs them puts past and weight in place, a fixed step from its ring.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Delay {
+    /// Slot of T in s, in the segment `memory`, written by `Start`.
+    pub time: Slot,
+    /// Least and greatest T in s.
+    pub range: (f64, f64),
+    /// Slot of x, in the segment `outputs`.
+    pub source: Slot,
+    /// Slot of the value before, in the segment `memory`.
+    pub past: Slot,
+    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. None where
+    /// no step may be longer than the least T: then x at this instant is not needed.
+    pub weight: Option<Slot>,
+    /// Slot of the slope of the value before along time, per s: for ∂f/∂t.
+    pub slope: Slot,
+    /// First slot and number of slots of its ring, a power of two: sample k, at the end of step k, lies in slot
+    /// k mod number. Empty until the step is known.
+    pub ring: Segment,
+}
+
 /// One automaton: its regimes in the order of the text.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Automaton {
@@ -206,6 +236,8 @@ pub struct Description {
     pub ticks: Vec<Tick>,
     /// Automata.
     pub automata: Vec<Automaton>,
+    /// What is delayed.
+    pub delays: Vec<Delay>,
     /// Watched ranges; `status = k + 1` names guard k.
     pub guards: Vec<Guard>,
     /// Switching surfaces.
@@ -225,6 +257,15 @@ impl Description {
         let quantities = self.quantities.iter().map(|quantity| quantity.slot);
         let ticks = self.ticks.iter().flat_map(|tick| [tick.period, tick.due]);
         let automata = self.automata.iter().map(|automaton| automaton.slot);
-        quantities.chain(ticks).chain(automata).chain(self.guards.iter().map(|guard| guard.slot))
+        let delays = self.delays.iter().flat_map(|delay| {
+            // An empty ring lies nowhere.
+            let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
+            [Some(delay.time), Some(delay.source), Some(delay.past), Some(delay.slope), delay.weight, ring]
+        });
+        quantities
+            .chain(ticks)
+            .chain(automata)
+            .chain(delays.flatten())
+            .chain(self.guards.iter().map(|guard| guard.slot))
     }
 }

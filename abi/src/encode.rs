@@ -4,7 +4,7 @@
 //! Whole numbers and reals are little endian, a list is its length (32 bits) and its entries, a struct its fields in
 //! their order. Knows no versions: whoever writes a file says which it is.
 
-use crate::description::{Automaton, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
+use crate::description::{Automaton, Delay, Guard, Kind, Layout, Quantity, Root, Segment, Slot, Tick};
 use crate::unit::{Angle, Dimension, Ratio, Unit};
 use std::fmt;
 use std::sync::Arc;
@@ -249,7 +249,7 @@ impl Encode for Slot {
 /// As the lengths of its segments, which lie one behind the other.
 impl Encode for Layout {
     fn encode(&self, out: &mut Vec<u8>) {
-        self.lens().iter().for_each(|len| len.encode(out));
+        self.lens().iter().chain([&self.rings.len]).for_each(|len| len.encode(out));
     }
 
     fn decode(reader: &mut Reader) -> Result<Layout, Malformed> {
@@ -257,12 +257,13 @@ impl Encode for Layout {
         for len in &mut lens {
             *len = u32::decode(reader)?;
         }
-        let size = lens.iter().fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
+        let rings = u32::decode(reader)?;
+        let size = lens.iter().chain([&rings]).fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
         // Generated code addresses a block by 32-bit offsets in bytes.
         if size > i32::MAX as u64 / 8 {
             return reader.wrong(format!("a block of {size} slots is too large"));
         }
-        Ok(Layout::new(lens))
+        Ok(Layout::new(lens).with_rings(rings))
     }
 }
 
@@ -295,7 +296,9 @@ encode_structs! {
     Quantity { path, kind, unit, boolean, slot, range, doc }
     Tick { period, due }
     Automaton { path, regimes, slot }
+    Segment { start, len }
+    Delay { time, range, source, past, weight, slope, ring }
     Guard { path, slot, range, unit }
     Root { text, decides }
-    crate::description::Description { name, layout, quantities, ticks, automata, guards, roots, pool }
+    crate::description::Description { name, layout, quantities, ticks, automata, delays, guards, roots, pool }
 }

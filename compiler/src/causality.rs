@@ -3,6 +3,7 @@
 //! In: a flat [`System`]. Out: diagnostics only; `lower` follows the same graph on demand. The graph is over single
 //! quantities, one for each phase; states, held outputs and `next` break circles.
 
+use crate::delays;
 use crate::source::Files;
 use crate::system::*;
 use grammar::diagnostic::Diagnostic;
@@ -89,7 +90,11 @@ fn graph(system: &System, phase: Phase) -> Graph {
                 Node::Var(needed) => out.push((*needed, id)),
                 Node::Rate(needed) => out.push((rate_number(system, *needed), id)),
                 node => {
-                    let mut operands: Vec<ExprId> = node.operands().collect();
+                    let mut operands: Vec<ExprId> = match phase {
+                        // The value before is known.
+                        Phase::Now | Phase::Tick if delays::breaks(system, node) => Vec::new(),
+                        _ => node.operands().collect(),
+                    };
                     operands.extend(rate_of(system, node));
                     if let Node::Crossing(crossing) = node {
                         operands.push(system.crossings[*crossing as usize].difference);

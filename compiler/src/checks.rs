@@ -1,5 +1,6 @@
 //! Values known before anything runs: ranges and `require`, at the argument that breaks them.
 
+use crate::delays;
 use crate::lower::evaluate;
 use crate::source::Files;
 use crate::system::*;
@@ -14,6 +15,7 @@ pub fn values(system: &System, types: &Types, files: &Files, diagnostics: &mut V
     constants(system, diagnostics);
     ranges(system, types, files, diagnostics);
     periods(system, types, diagnostics);
+    delays::check(system, diagnostics);
     resets(system, diagnostics);
     requires(system, types, files, diagnostics);
 }
@@ -142,12 +144,14 @@ pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>
         }
         let second = Unit::parse("s").expect("the second is known");
         let (period, step) = (shown(value, &second), shown(step, &second));
-        let mut error =
-            Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"))
-                .label(system.span(*expr), format!("{} steps", three_digits(ratio)));
-        if let Some(at) = at {
-            error = error.label(at, "the step");
-        }
+        let error = Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"));
+        let ticks = (system.span(*expr), format!("{} steps", three_digits(ratio)));
+        // The first label is where the change is to be made: not in a library.
+        let labels = match at.map(|at| (at, "the step".to_string())) {
+            Some(step) if step.0.file != ticks.0.file => vec![step, ticks],
+            step => std::iter::once(ticks).chain(step).collect(),
+        };
+        let error = labels.into_iter().fold(error, |error, (span, text)| error.label(span, text));
         diagnostics.push(error.help("ticks fall on whole steps: change one of them so that it divides the other"));
     }
 }
@@ -160,7 +164,7 @@ fn resets(system: &System, diagnostics: &mut Vec<Diagnostic>) {
         let var = system.var(*var);
         if matches!(var.definition, Definition::Sampled { .. }) {
             let error = Diagnostic::error("E0307", format!("`{}` is a sampled state: it cannot be reset", var.name))
-                .label(system.span(*value), "`reset` sets a continuous state")
+                .label(system.reset_place(*value), "`reset` sets a continuous state")
                 .label(var.span, "changes at ticks only");
             diagnostics.push(error.help(format!("let `next({})` say so, with a condition", var.name)));
         }
@@ -171,7 +175,7 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
     let conditions: Vec<ExprId> = system.requires.iter().map(|require| require.condition).collect();
     let values = evaluate(system, types, &conditions);
     for (require, value) in system.requires.iter().zip(values) {
-        if value != 0.0 {
+        if value != 0.0 || moving(system, require.condition).is_some() {
             continue;
         }
         let info = system.instance(require.instance);

@@ -53,7 +53,9 @@ pub fn jacobian(program: &Program) -> Func {
     let layout = &program.description.layout;
     let n = layout.states.len as usize;
     assert_eq!(layout.jacobian.len as usize, n * n + n, "room for the Jacobian of {n} states");
-    let directions: Vec<Slot> = (0..n).map(|j| layout.states.slot(j)).chain([Slot::TIME]).collect();
+    let delays = &program.description.delays;
+    let states = (0..n).map(|j| layout.states.slot(j));
+    let directions: Vec<Slot> = states.chain([Slot::TIME]).chain(delays.iter().map(|delay| delay.past)).collect();
     let build = Shared::new(Build::new("jacobian"));
     let of_slots = inline(&build, &program.derivatives, &mut Env::new(), &directions);
     let mut build = build.into_inner();
@@ -61,7 +63,15 @@ pub fn jacobian(program: &Program) -> Func {
         let gradient = of_slots.get(&layout.derivatives.slot(i));
         for j in 0..=n {
             let entry = gradient.and_then(|gradient| entry(gradient, j as u32));
-            let entry = entry.unwrap_or_else(|| build.real(0.0));
+            let mut entry = entry.unwrap_or_else(|| build.real(0.0));
+            // What was before moves along time too.
+            for (k, delay) in delays.iter().enumerate().filter(|_| j == n) {
+                if let Some(d) = gradient.and_then(|gradient| self::entry(gradient, (n + 1 + k) as u32)) {
+                    let slope = build.load(delay.slope);
+                    let part = build.mul(d, slope);
+                    entry = build.add(entry, part);
+                }
+            }
             build.store(layout.jacobian.slot(if j < n { i * n + j } else { n * n + i }), entry);
         }
     }
@@ -85,7 +95,7 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
         merge(&a, &b, |a, b| Some(sum(build, a, b)))
     };
     match op {
-        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } => Gradient::new(),
+        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => Gradient::new(),
         Op::Add(..) => merge(of(0), of(1), |a, b| Some(sum(build, a, b))),
         Op::Sub(..) => merge(of(0), of(1), |a, b| {
             let a = a.map(at);

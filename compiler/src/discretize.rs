@@ -7,7 +7,7 @@
 use crate::derive::{self, Gradient};
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared, Truth};
-use crate::ir::{Func, Unary, Value};
+use crate::ir::{Func, Unary, Value, Write};
 use crate::program::Program;
 use abi::Slot;
 use abi::description::Guard;
@@ -39,6 +39,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let count = model.load(Slot::COUNT) + 1.0;
     env.insert(Slot::COUNT, count.value);
     env.insert(Slot::TIME, (count * model.h).value);
+    model.delays(1.0, &mut env);
     if let Some(tick) = &program.tick {
         for block in &program.description.ticks {
             // COUNT is a multiple of n exactly if the nearest quotient times n gives it back: both are whole.
@@ -53,6 +54,15 @@ pub fn step(program: &Program, method: Method) -> Func {
     }
     build.borrow_mut().inline(&program.outputs, &mut env);
     let status = watch(&build, &program.description.guards, &env);
+
+    for delay in &program.description.delays {
+        let mut build = build.borrow_mut();
+        let number = build.to_int(count.value);
+        let mask = build.int(i64::from(delay.ring.len) - 1);
+        let index = build.int_and(number, mask);
+        let value = build.read(delay.source, &env);
+        build.write(Write { base: Slot(delay.ring.start), len: delay.ring.len, index, value });
+    }
 
     let mut build = build.into_inner();
     let stored = [layout.states, layout.memory, layout.regimes, layout.outputs];
@@ -129,10 +139,43 @@ impl<'a> Model<'a> {
         Real::new(self.build, self.build.borrow_mut().load(slot))
     }
 
-    fn env(&self, t: Real<'a>, x: &[Real<'a>]) -> Env {
+    /// Slots at a part `c` of the step, where the states are x.
+    fn env(&self, c: f64, x: &[Real<'a>]) -> Env {
         let states = self.program.description.layout.states;
-        let states = x.iter().enumerate().map(|(k, x)| (states.slot(k), x.value));
-        states.chain([(Slot::TIME, t.value)]).collect()
+        let mut env: Env = x.iter().enumerate().map(|(k, x)| (states.slot(k), x.value)).collect();
+        let t = if c == 0.0 { self.t } else { self.t + c * self.h };
+        env.insert(Slot::TIME, t.value);
+        self.delays(c, &mut env);
+        env
+    }
+
+    /// Puts what is delayed in place at a part `c` of the step. Samples are those at the ends of the steps before.
+    fn delays(&self, c: f64, env: &mut Env) {
+        let count = self.load(Slot::COUNT);
+        for delay in &self.program.description.delays {
+            let (first, len) = (Slot(delay.ring.start), delay.ring.len);
+            assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
+            let sample = |number: Real<'a>| {
+                let mut build = self.build.borrow_mut();
+                let number = build.to_int(number.value);
+                let mask = build.int(i64::from(len) - 1);
+                let index = build.int_and(number, mask);
+                self.h.same(build.ring(first, len, index))
+            };
+            // In steps, back from the newest sample.
+            let back = self.load(delay.time) / self.h - c;
+            let ago = back.below(0.0).choose(0.0, back);
+            let whole = ago.floor();
+            let newer = count - whole;
+            let newer = newer.below(0.0).choose(0.0, newer);
+            let older = newer.is(0.0).choose(0.0, newer - 1.0);
+            let (newer, older) = (sample(newer), sample(older));
+            env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
+            if let Some(weight) = delay.weight {
+                let part = if c == 0.0 { self.h.constant(0.0) } else { back.below(0.0).choose(-back / c, 0.0) };
+                env.insert(weight, part.value);
+            }
+        }
     }
 
     fn rates(&self, env: &Env) -> Vec<Real<'a>> {
@@ -140,16 +183,16 @@ impl<'a> Model<'a> {
         (0..self.x.len()).map(|k| Real::new(self.build, self.build.borrow_mut().read(rates.slot(k), env))).collect()
     }
 
-    fn f(&self, t: Real<'a>, x: &[Real<'a>]) -> Vec<Real<'a>> {
-        let mut env = self.env(t, x);
+    fn f(&self, c: f64, x: &[Real<'a>]) -> Vec<Real<'a>> {
+        let mut env = self.env(c, x);
         self.build.borrow_mut().inline(&self.program.derivatives, &mut env);
         self.rates(&env)
     }
 
     /// f and the rows of ∂f/∂x.
-    fn f_and_gradient(&self, t: Real<'a>, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Gradient>) {
+    fn f_and_gradient(&self, c: f64, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Gradient>) {
         let layout = &self.program.description.layout;
-        let mut env = self.env(t, x);
+        let mut env = self.env(c, x);
         let states: Vec<Slot> = (0..x.len()).map(|k| layout.states.slot(k)).collect();
         let mut gradients = derive::inline(self.build, &self.program.derivatives, &mut env, &states);
         let rows = (0..x.len()).map(|k| gradients.remove(&layout.derivatives.slot(k)).unwrap_or_default());
@@ -162,16 +205,16 @@ impl<'a> Model<'a> {
     }
 
     fn euler(&self) -> Vec<Real<'a>> {
-        self.moved(self.h, &self.f(self.t, &self.x))
+        self.moved(self.h, &self.f(0.0, &self.x))
     }
 
     /// The classical method of order 4.
     fn rk4(&self) -> Vec<Real<'a>> {
         let (h, half) = (self.h, 0.5 * self.h);
-        let k1 = self.f(self.t, &self.x);
-        let k2 = self.f(self.t + half, &self.moved(half, &k1));
-        let k3 = self.f(self.t + half, &self.moved(half, &k2));
-        let k4 = self.f(self.t + h, &self.moved(h, &k3));
+        let k1 = self.f(0.0, &self.x);
+        let k2 = self.f(0.5, &self.moved(half, &k1));
+        let k3 = self.f(0.5, &self.moved(half, &k2));
+        let k4 = self.f(1.0, &self.moved(h, &k3));
         let mean = |k: usize| (k1[k] + 2.0 * (k2[k] + k3[k])) + k4[k];
         let means: Vec<Real> = (0..self.x.len()).map(mean).collect();
         self.moved(h / 6.0, &means)
@@ -184,7 +227,7 @@ impl<'a> Model<'a> {
     ///   three times: r = f + a (x − X), and r in place of f    f, a at (t + h/2, X)
     fn expo(&self) -> Vec<Real<'a>> {
         let h = self.h;
-        let (f, a) = self.relaxation(self.t, &self.x);
+        let (f, a) = self.relaxation(0.0, &self.x);
         let mean = |f: &[Real<'a>], a: &[Option<Real<'a>>]| -> Vec<Real<'a>> {
             let one = |(k, f): (usize, &Real<'a>)| self.x[k] + h * self.phi2(a[k]) * *f;
             f.iter().enumerate().map(one).collect()
@@ -192,7 +235,7 @@ impl<'a> Model<'a> {
         let mut middle = mean(&f, &a);
         let mut last = (f, a);
         for _ in 0..3 {
-            let (f, a) = self.relaxation(self.t + 0.5 * h, &middle);
+            let (f, a) = self.relaxation(0.5, &middle);
             let toward = |k: usize| a[k].map_or(f[k], |a| f[k] + a * (self.x[k] - middle[k]));
             let r: Vec<Real> = (0..self.x.len()).map(toward).collect();
             middle = mean(&r, &a);
@@ -203,8 +246,8 @@ impl<'a> Model<'a> {
     }
 
     /// f, and for each state min(∂f/∂x, 0) of itself alone; none where it does not depend on itself.
-    fn relaxation(&self, t: Real<'a>, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Option<Real<'a>>>) {
-        let (f, rows) = self.f_and_gradient(t, x);
+    fn relaxation(&self, c: f64, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Option<Real<'a>>>) {
+        let (f, rows) = self.f_and_gradient(c, x);
         let own = |(k, row): (usize, &Gradient)| {
             let a = Real::new(self.build, derive::entry(row, k as u32)?);
             Some(a.below(0.0).choose(a, 0.0))
@@ -243,11 +286,11 @@ impl<'a> Model<'a> {
     fn implicit(&self) -> Vec<Real<'a>> {
         let h = self.h;
         let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
-        let (f, rows) = self.f_and_gradient(self.t, &self.x);
+        let (f, rows) = self.f_and_gradient(0.0, &self.x);
         let matrix = Matrix::identity_less(gamma * h, &rows);
         let factors = matrix.factorise();
         let k1 = factors.solve(&f);
-        let f = self.f(self.t + h, &self.moved(h, &k1));
+        let f = self.f(1.0, &self.moved(h, &k1));
         let right: Vec<Real> = f.iter().zip(&k1).map(|(f, k)| *f - 2.0 * *k).collect();
         let k2 = factors.solve(&right);
         let half = 0.5 * h;

@@ -390,6 +390,7 @@ impl<'a> Prover<'a> {
             }
             Builtin::Cosh => Interval { low: 1.0, above_low: false, not_zero: true, ..Interval::ALL },
             Builtin::Hypot => Interval { low: 0.0, above_low: false, ..Interval::ALL },
+            Builtin::Delay => values[0],
             Builtin::Random => Interval { low: 0.0, high: 1.0, above_low: false, below_high: true, not_zero: false },
             Builtin::Step => values[1].hull(Interval::point(0.0)),
             Builtin::Pulse => values[2].hull(Interval::point(0.0)),
@@ -472,21 +473,20 @@ impl Visit {
                         }
                     }
                     _ if x.is_not_negative() => {}
-                    _ => {
-                        diagnostics.push(domain(prover, files, *a, "a power with a broken exponent", "negative", "abs"))
-                    }
+                    _ => diagnostics.push(domain(prover, files, *a, "a power", "negative", "0", "abs")),
                 }
             }
             Node::Call(Builtin::Sqrt, args) if !prover.interval(args[0]).is_not_negative() => {
-                diagnostics.push(domain(prover, files, args[0], "the root", "negative", "abs"));
+                diagnostics.push(domain(prover, files, args[0], "`sqrt`", "negative", ">= 0", "abs"));
             }
             Node::Call(Builtin::Log, args) if !prover.interval(args[0]).is_positive() => {
-                diagnostics.push(domain(prover, files, args[0], "the logarithm", "zero or negative", "max"));
+                diagnostics.push(domain(prover, files, args[0], "`log`", "zero or negative", "> 0", "max"));
             }
-            Node::Call(Builtin::Asin | Builtin::Acos, args) => {
+            Node::Call(arc @ (Builtin::Asin | Builtin::Acos), args) => {
                 let x = prover.interval(args[0]);
                 if x.low < -1.0 || x.high > 1.0 {
-                    diagnostics.push(domain(prover, files, args[0], "this arc", "beyond -1 .. 1", "clamp"));
+                    let arc = format!("`{}`", arc.name());
+                    diagnostics.push(domain(prover, files, args[0], &arc, "beyond -1 .. 1", "-1 .. 1", "clamp"));
                 }
             }
             _ => {}
@@ -494,16 +494,26 @@ impl Visit {
     }
 }
 
-fn domain(prover: &Prover, files: &Files, id: ExprId, what: &str, can_be: &str, guard: &str) -> Diagnostic {
+fn domain(
+    prover: &Prover,
+    files: &Files,
+    id: ExprId,
+    what: &str,
+    can_be: &str,
+    range: &str,
+    guard: &str,
+) -> Diagnostic {
     let text = files.slice(prover.system.span(id));
     let shown = match guard {
         "clamp" => format!("clamp({text}, -1, 1)"),
         "max" => format!("max({text}, …)"),
         other => format!("{other}({text})"),
     };
-    let error = Diagnostic::error("E0602", format!("`{text}` can be {can_be}, and {what} of that is not defined"))
-        .label(prover.system.span(id), format!("not proven within {what}'s domain"));
-    error.help(format!("declare a range (`in > 0`), or guard it: `{shown}`"))
+    // A power of a negative number is one only if its exponent is whole.
+    let (what, range) = if range == "0" { ("a power with this exponent", ">= 0") } else { (what, range) };
+    Diagnostic::error("E0602", format!("`{text}` can be {can_be}, where {what} is not defined"))
+        .label(prover.system.span(id), format!("not proven to be {}", range.replace("-1 .. 1", "within -1 .. 1")))
+        .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{shown}`"))
 }
 
 /// E0601: names the parameter whose range would mend it, if one does.

@@ -11,7 +11,7 @@ use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
-use crate::{causality, checks};
+use crate::{causality, checks, delays};
 use abi::plan::{self, Formula, MeasureKind, Method, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -568,6 +568,7 @@ fn variant(
     if solver.method != Method::Adaptive {
         let at = step.map(|at| system.span(nodes[at]));
         checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+        delays::fits(&system, solver.step, at, &mut reader.diagnostics);
         if duration / solver.step > MOST_STEPS {
             let steps = units::three_digits(duration / solver.step);
             let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
@@ -600,6 +601,9 @@ fn variant(
     warnings.extend(diagnostics);
     on_stage("lower");
     let Lowered { mut program, observed: slots } = lower(&system, &types, &wanted);
+    if solver.method != Method::Adaptive {
+        program.size_rings(solver.step);
+    }
     program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
     for root in &mut program.description.roots {
         root.text = surface_text(loaded, &root.text);

@@ -3,12 +3,14 @@
 //!
 //! In: a flat and typed system. Out: plain data for whoever shows it.
 
+use crate::backend::target::{Coder, here};
 use crate::causality::{Phase, rate_of, value_of};
 use crate::friction::{self, Verdict};
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
-use crate::ir::{Op, Value};
+use crate::ir::{Func, Op, Value};
 use crate::lower::{Lowered, lower};
+use crate::opt::regroup::regroup;
 use crate::program::Program;
 use crate::source::Files;
 use crate::system::*;
@@ -17,6 +19,7 @@ use crate::{derive, discretize};
 use abi::description::Slot;
 use abi::plan::Method;
 use grammar::ast::BinaryOp;
+use grammar::span::Span;
 
 /// Everything about a model.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -31,14 +34,31 @@ pub struct Explanation {
     pub needs: Vec<(String, Vec<String>)>,
     /// How each continuous state is stepped.
     pub states: Vec<Stepped>,
-    /// Operations of the fixed steps, before functions are expanded and after: method, count, count, divisions.
-    pub steps: Vec<(Method, usize, usize, usize)>,
+    /// What the fixed steps cost.
+    pub steps: Vec<StepCost>,
     /// Bytes of the block of one instance.
     pub bytes: usize,
+    /// What is stored, as written: for models that say it.
+    pub storage: Vec<String>,
     /// Whether the friction depends on the path only; none for other models.
     pub rate_independent: Option<bool>,
     /// Whether the friction dissipates; none for other models.
     pub dissipation: Option<Verdict>,
+}
+
+/// What one fixed step of a method costs, with its outputs.
+#[derive(Clone, PartialEq, Debug)]
+pub struct StepCost {
+    /// The method.
+    pub method: Method,
+    /// Operations before elementary functions are expanded.
+    pub plain: usize,
+    /// Operations of arithmetic.
+    pub operations: usize,
+    /// Divisions and roots among them.
+    pub divisions: usize,
+    /// Instructions of the machine code for this processor, and its bytes; none where there is none.
+    pub code: Option<(usize, usize)>,
 }
 
 /// One quantity.
@@ -80,14 +100,24 @@ pub enum Own {
     Sampled,
 }
 
+/// A step in s, where what is told depends on one: the room that delays take.
+const EXAMPLE_STEP: f64 = 1e-3;
+
 /// Explains a model on its own.
 pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
-    let Lowered { program, .. } = lower(system, types, &[]);
+    let Lowered { mut program, .. } = lower(system, types, &[]);
+    program.size_rings(EXAMPLE_STEP);
     let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
         let step = discretize::step(&program, method);
         let expanded = crate::math::expand(&step);
         let divisions = expanded.ops.iter().filter(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))).count();
-        (method, step.ops.len(), expanded.ops.len(), divisions)
+        StepCost {
+            method,
+            plain: step.ops.len(),
+            operations: expanded.ops.len(),
+            divisions,
+            code: code_size(&crate::math::expand(&regroup(&step))),
+        }
     });
     Explanation {
         model: system.instances.first().map_or(String::new(), |top| top.model.clone()),
@@ -97,6 +127,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
         states: states(system, &program),
         steps: steps.to_vec(),
         bytes: 8 * program.description.layout.size(),
+        storage: system.storages.iter().map(|(_, energy)| one_line(files, system.span(*energy))).collect(),
         rate_independent: rate_independent(system),
         dissipation: friction::dissipation(system, types),
     }
@@ -118,9 +149,21 @@ pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> 
     system.var_ids().map(listed).collect()
 }
 
+/// Instructions and bytes of the machine code of a function; none on a processor without.
+fn code_size(func: &Func) -> Option<(usize, usize)> {
+    let mut coder = Coder::new(here().ok()?);
+    // One instruction a line; labels stand at the margin.
+    let instructions = coder.assembly(func).ok()?.lines().filter(|line| line.starts_with(' ')).count();
+    Some((instructions, coder.function(func).ok()?.code.len()))
+}
+
+fn one_line(files: &Files, span: Span) -> String {
+    files.slice(span).split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// Equations in the order of need.
 fn equations(system: &System, files: &Files) -> Vec<(String, String)> {
-    let one_line = |id: ExprId| files.slice(system.span(id)).split_whitespace().collect::<Vec<_>>().join(" ");
+    let one_line = |id: ExprId| one_line(files, system.span(id));
     let mut done = vec![false; system.vars.len()];
     let mut order: Vec<VarId> = Vec::new();
     for start in system.var_ids() {

@@ -19,6 +19,7 @@ pub mod system;
 pub mod tables;
 pub mod flatten;
 pub mod units;
+pub mod delays;
 pub mod causality;
 pub mod lower;
 pub mod checks;
@@ -131,6 +132,9 @@ pub fn linear(
     let Some(model) = model else {
         let variants = experiment::read(loaded, sources, name, &options.changes, warnings, &mut |_| ())?;
         let variant = variants.into_iter().next().expect("there is at least one combination");
+        if let Some(error) = delays::linear(&variant.system) {
+            return Err(vec![error]);
+        }
         let mut functions = functions(&variant.program, variant.experiment.solver.method);
         if !functions.iter().any(|(function, _)| *function == Function::Derivatives) {
             functions.push((Function::Derivatives, math::expand(&variant.program.derivatives)));
@@ -148,6 +152,7 @@ pub fn linear(
         frame: None,
     };
     let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    diagnostics.extend(delays::linear(&system));
     let ports = options.changes.ports.clone().unwrap_or_default();
     let opened = linearise::open(&mut system, &ports, &mut diagnostics);
     let types = units::check(&system, &loaded.files, &mut diagnostics);
@@ -375,6 +380,35 @@ pub fn explain_in(
     }
 }
 
+/// A model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
+///
+/// # Errors
+/// Everything that is wrong with it, and why there is no machine code.
+pub fn stepping(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &str,
+    method: Method,
+    step: f64,
+) -> Result<Instance, Vec<Diagnostic>> {
+    let found = loaded.models().into_iter().find(|candidate| candidate.name.text == model);
+    let Some(model) = found else {
+        return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
+    };
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, loaded.root(), Vec::new());
+    delays::check(&system, &mut diagnostics);
+    delays::fits(&system, step, None, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
+    }
+    let lower::Lowered { mut program, .. } = lower::lower(&system, &types, &[]);
+    program.size_rings(step);
+    let (code, _) = code(&functions(&program, method), &program.description, false);
+    let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    instance.start(step);
+    Ok(instance)
+}
+
 /// Every quantity of what an experiment runs, with these changes.
 ///
 /// # Errors
@@ -443,23 +477,9 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let mut all = loaded.diagnostics.clone();
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
-    let unreadable = loaded.has_errors();
     for item in &ast.items {
         match item {
-            Item::Model(model) => {
-                let mut found = check_model(loaded, sources, model, root, !unreadable);
-                let misread = loaded.diagnostics.iter().any(|d| {
-                    let (span, place) = (d.span(), model.span);
-                    d.is_error() && span.file == root && place.start <= span.start && span.end <= place.end
-                });
-                if misread {
-                    // What could not be read is missing elsewhere: say the cause.
-                    found.retain(|d| {
-                        !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501")
-                    });
-                }
-                all.extend(found);
-            }
+            Item::Model(model) => all.extend(check_model(loaded, sources, model, true)),
             Item::Experiment(experiment) => {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();
@@ -495,14 +515,18 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     once(all)
 }
 
-/// `whole`: the text could be read in whole; else what is proven of it would rest on gaps.
-fn check_model(
-    loaded: &Loaded,
-    sources: &dyn Sources,
-    model: &grammar::ast::Model,
-    file: FileId,
-    whole: bool,
-) -> Vec<Diagnostic> {
+/// Checks the models of a loaded text, each on its own, but for the physics of friction: what a run should know, in no
+/// time.
+pub fn check_models(loaded: &Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
+    let models = loaded.models();
+    once(models.into_iter().flat_map(|model| check_model(loaded, sources, model, false)).collect())
+}
+
+/// Checks a model of the text on its own.
+fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model, physics: bool) -> Vec<Diagnostic> {
+    let file = loaded.root();
+    // What is proven of a text with gaps would rest on them.
+    let whole = !loaded.has_errors();
     let (system, types, mut diagnostics) = alone(loaded, sources, model, file, Vec::new());
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
@@ -511,7 +535,15 @@ fn check_model(
         }
     }
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
-        diagnostics.extend(lints::check(&system, &types, &loaded.files));
+        diagnostics.extend(lints::check(&system, &types, &loaded.files, physics));
+    }
+    let misread = loaded.diagnostics.iter().any(|d| {
+        let (span, place) = (d.span(), model.span);
+        d.is_error() && span.file == file && place.start <= span.start && span.end <= place.end
+    });
+    if misread {
+        // What could not be read is missing elsewhere: say the cause.
+        diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
     }
     lints::silence(&system, &mut diagnostics);
     diagnostics
@@ -521,16 +553,18 @@ fn check_model(
 pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     let errors = diagnostics.iter().any(Diagnostic::is_error);
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
-    diagnostics.sort_by_key(|diagnostic| diagnostic.span());
     let mut seen = std::collections::HashSet::new();
     let mut circles = std::collections::HashSet::new();
     diagnostics.retain(|diagnostic| {
-        // A circle is met from each of its members.
-        let circle = ["contains itself", "calls itself", "is defined by itself"]
-            .into_iter()
-            .find(|end| diagnostic.message.ends_with(end));
+        // A circle is met from each of its members; the first is where it was entered. What grows without end does so
+        // wherever it is used.
+        let circle =
+            ["contains itself", "calls itself", "is defined by itself", " operations", " quantities and parts"]
+                .into_iter()
+                .find(|end| diagnostic.message.ends_with(end));
         let again = circle.is_some_and(|circle| !circles.insert(circle));
         seen.insert((diagnostic.code, diagnostic.span())) && !again
     });
+    diagnostics.sort_by_key(|diagnostic| diagnostic.span());
     diagnostics
 }

@@ -9,12 +9,14 @@ use crate::units::Types;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 
-/// All warnings of a model on its own.
-pub fn check(system: &System, types: &Types, files: &Files) -> Vec<Diagnostic> {
+/// All warnings of a model on its own; `physics`: those of friction too, which take longer.
+pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     unused(system, &mut found);
     regimes(system, files, &mut found);
-    friction::check(system, types, &mut found);
+    if physics {
+        friction::check(system, types, &mut found);
+    }
     found
 }
 

@@ -4,12 +4,13 @@
 //! are no units, and names serve only printing.
 
 use crate::causality::{Phase, rate_of, value_of};
+use crate::delays;
 use crate::ir::build::{Build, Env};
 use crate::ir::{Binary, Func, Type, Unary, Value};
 use crate::program::Program;
 use crate::system::*;
 use crate::units::Types;
-use abi::description::{Automaton, Description, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
+use abi::description::{Automaton, Delay, Description, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
 use std::collections::{HashMap, HashSet};
@@ -191,6 +192,8 @@ struct Plan<'a> {
     periods: Vec<Slot>,
     crossings: Vec<Slot>,
     events: Vec<Slot>,
+    /// The number of each call of `delay`.
+    delayed: HashMap<ExprId, usize>,
     /// Quantity or expression of each output slot.
     outputs: Vec<Output>,
     observed: Vec<Slot>,
@@ -248,7 +251,16 @@ impl<'a> Plan<'a> {
                 }
             }
         }
+        let sources: Vec<usize> = system
+            .delays
+            .iter()
+            .map(|delay| {
+                outputs.push(Output::Expr(delays::of(system, *delay).0));
+                outputs.len() - 1
+            })
+            .collect();
         let memory = sampled.len() + held.len() + system.blocks.len() + system.crossings.len() + system.events.len();
+        let memory = memory + 4 * system.delays.len();
         let n = states.len();
         let jacobian = if n <= MOST_JACOBIAN { n * n + n } else { 0 };
         let layout = Layout::new(
@@ -286,6 +298,21 @@ impl<'a> Plan<'a> {
         let periods = take(system.blocks.len());
         let crossings = take(system.crossings.len());
         let events = take(system.events.len());
+        let delays = system.delays.iter().zip(sources).map(|(delay, source)| {
+            let (_, time) = delays::of(system, *delay);
+            let [at, past, weight, slope] = take(4).try_into().expect("four slots");
+            Delay {
+                time: at,
+                // Checked before; a text with mistakes is never run.
+                range: delays::range(system, time).unwrap_or((0.0, 0.0)),
+                source: layout.outputs.slot(source),
+                past,
+                weight: (!delays::breaks(system, system.node(*delay))).then_some(weight),
+                slope,
+                ring: abi::description::Segment::default(),
+            }
+        });
+        let delays: Vec<Delay> = delays.collect();
         let param_values = params
             .iter()
             .map(|id| match system.var(*id).definition {
@@ -307,7 +334,7 @@ impl<'a> Plan<'a> {
         let mut plan = Plan {
             system,
             types,
-            description: Description { layout, ..Description::default() },
+            description: Description { layout, delays, ..Description::default() },
             places,
             param_values,
             states,
@@ -316,6 +343,7 @@ impl<'a> Plan<'a> {
             periods,
             crossings,
             events,
+            delayed: system.delays.iter().enumerate().map(|(k, delay)| (*delay, k)).collect(),
             outputs,
             observed,
             tables,
@@ -463,6 +491,14 @@ impl<'a> Plan<'a> {
         for (block, slot) in self.system.blocks.iter().zip(&self.periods) {
             let value = emit.value(block.period);
             emit.build.store(*slot, value);
+        }
+        for (delay, described) in self.system.delays.iter().zip(&self.description.delays) {
+            let (value, time) = delays::of(self.system, *delay);
+            let (value, time, zero) = (emit.value(value), emit.value(time), emit.build.real(0.0));
+            emit.build.store(described.time, time);
+            emit.build.store(described.past, value);
+            emit.build.store(described.slope, zero);
+            emit.build.store(described.weight.unwrap_or(described.slope), zero);
         }
         for slot in &self.crossings {
             let unknown = emit.build.real(f64::NAN);
@@ -803,7 +839,7 @@ impl<'a> Emit<'a> {
             let waiting: Vec<ExprId> = behind
                 .into_iter()
                 .chain(crossing)
-                .chain(node.operands())
+                .chain(self.operands(node))
                 .filter(|operand| self.nodes[operand.0 as usize].is_none())
                 .collect();
             if waiting.is_empty() {
@@ -818,6 +854,12 @@ impl<'a> Emit<'a> {
             }
         }
         self.nodes[id.0 as usize].expect("just computed")
+    }
+
+    /// The operands that must be known: of a delay that breaks circles only the time, but at the start.
+    fn operands<'n>(&self, node: &'n Node) -> impl Iterator<Item = ExprId> + use<'n> {
+        let known = self.phase != Phase::Start && delays::breaks(self.plan.system, node);
+        node.operands().skip(usize::from(known))
     }
 
     fn got(&self, id: ExprId) -> Value {
@@ -996,11 +1038,30 @@ impl<'a> Emit<'a> {
                 };
                 self.binary(op, a, b, boolean, exponent)
             }
+            Node::Call(Builtin::Delay, _) => self.delay(id),
             Node::Call(builtin, args) => {
                 let args: Vec<Value> = args.iter().map(|arg| self.quantity(*arg)).collect();
                 self.call(builtin, &args)
             }
         }
+    }
+
+    /// What was before, or between that and what is now; at the start what is then.
+    fn delay(&mut self, id: ExprId) -> Value {
+        let (value, _) = delays::of(self.plan.system, id);
+        if self.inline_params {
+            return self.build.real(f64::NAN); // Not known before a run.
+        }
+        if self.phase == Phase::Start {
+            return self.quantity(value);
+        }
+        let delay = &self.plan.description.delays[self.plan.delayed[&id]];
+        let past = self.build.load(delay.past);
+        let Some(weight) = delay.weight else { return past };
+        let (weight, now) = (self.build.load(weight), self.quantity(value));
+        let way = self.build.sub(now, past);
+        let part = self.build.mul(weight, way);
+        self.build.add(past, part)
     }
 
     fn crossing(&mut self, k: usize) -> Value {
@@ -1158,6 +1219,7 @@ impl<'a> Emit<'a> {
                 let sine = self.build.unary(Unary::Sin, angle);
                 self.build.mul(args[0], sine)
             }
+            Builtin::Delay => unreachable!("it is no function of its arguments"),
             Builtin::Noise => {
                 let time = self.time();
                 let number = self.build.div(time, args[1]);

@@ -7,6 +7,7 @@ use crate::source::{Files, SourceFile, Sources};
 use grammar::ast::{self, Item, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
+use std::cell::RefCell;
 use std::collections::HashMap;
 use std::sync::Arc;
 
@@ -206,10 +207,11 @@ impl Loader<'_> {
     fn add(&mut self, name: String, text: &str, library: bool) -> FileId {
         let id = FileId(self.loaded.files.0.len() as u32);
         self.by_name.insert(name.clone(), id);
-        let parsed = grammar::parse::parse(id, text);
-        self.loaded.diagnostics.extend(parsed.diagnostics);
-        let ast = Arc::new(parsed.file);
-        self.loaded.files.0.push(SourceFile { name, text: text.into(), ast: ast.clone(), library });
+        let (text, ast) = match library {
+            true => library_tree(id, &name, text, &mut self.loaded.diagnostics),
+            false => tree(id, text, &mut self.loaded.diagnostics),
+        };
+        self.loaded.files.0.push(SourceFile { name, text, ast: ast.clone(), library });
         self.loaded.scopes.push(Scope::default());
         self.declare(id, &ast);
         self.open.push(id);
@@ -321,6 +323,42 @@ impl Loader<'_> {
             }
         }
     }
+}
+
+/// Trees of library texts that are kept for the next text that imports them.
+const MOST_KEPT: usize = 1000;
+
+type Tree = (Arc<str>, Arc<ast::File>);
+
+thread_local! {
+    /// By their place among the texts of a compilation, which the tree mentions, and their name.
+    static KEPT: RefCell<HashMap<(FileId, String), Tree>> = RefCell::default();
+}
+
+fn tree(id: FileId, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+    let parsed = grammar::parse::parse(id, text);
+    diagnostics.extend(parsed.diagnostics);
+    (text.into(), Arc::new(parsed.file))
+}
+
+/// As [`tree`], of a text that many others import: read once, as long as it is the same.
+fn library_tree(id: FileId, name: &str, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+    let key = (id, name.to_string());
+    let known = KEPT.with_borrow(|kept| kept.get(&key).filter(|(known, _)| **known == *text).cloned());
+    if let Some(known) = known {
+        return known;
+    }
+    let before = diagnostics.len();
+    let new = tree(id, text, diagnostics);
+    if diagnostics.len() == before {
+        KEPT.with_borrow_mut(|kept| {
+            if kept.len() >= MOST_KEPT {
+                kept.clear();
+            }
+            kept.insert(key, new.clone());
+        });
+    }
+    new
 }
 
 /// E0210

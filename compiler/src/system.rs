@@ -54,6 +54,10 @@ pub struct System {
     pub tables: Vec<Table>,
     /// Instants at which a signal has a corner.
     pub corners: Vec<ExprId>,
+    /// Calls of `delay`: each has memory of its own.
+    pub delays: Vec<ExprId>,
+    /// Where the state of a reset is named, by the value it is given.
+    pub reset_places: Vec<(ExprId, Span)>,
     /// Instances that cannot be made rotary: reported, and their units fit everything.
     pub strangers: Vec<InstanceId>,
 }
@@ -302,6 +306,7 @@ pub enum Builtin {
     Square,
     Chirp,
     Noise,
+    Delay,
 }
 
 /// Name, function, least and greatest number of arguments.
@@ -336,6 +341,7 @@ const BUILTINS: &[(&str, Builtin, usize)] = &[
     ("square", Builtin::Square, 2),
     ("chirp", Builtin::Chirp, 4),
     ("noise", Builtin::Noise, 3),
+    ("delay", Builtin::Delay, 2),
 ];
 
 impl Builtin {
@@ -530,6 +536,11 @@ impl System {
     /// Where it was written.
     pub fn span(&self, id: ExprId) -> Span {
         self.spans[id.0 as usize]
+    }
+
+    /// Where the state that a reset gives this value is named.
+    pub fn reset_place(&self, value: ExprId) -> Span {
+        self.reset_places.iter().find(|(of, _)| *of == value).map_or(self.span(value), |(_, place)| *place)
     }
 
     /// The quantity.

@@ -571,6 +571,10 @@ impl Checker<'_> {
                 }
                 Kind::Real(none)
             }
+            Builtin::Delay => {
+                need(self, 1, &time);
+                Kind::Real(terms[0].clone())
+            }
             Builtin::Step => {
                 need(self, 0, &time);
                 Kind::Real(terms[1].clone())

@@ -42,8 +42,11 @@ fn once(text: &str, width: usize) -> Result<String, Vec<Diagnostic>> {
     layout.lines();
     layout.heads();
     layout.fold(width);
-    layout.paragraphs();
+    let runs = layout.runs();
+    layout.names(&runs);
     layout.arguments();
+    layout.chosen();
+    layout.columns(&runs);
     Ok(layout.write())
 }
 
@@ -119,6 +122,9 @@ struct Layout<'s, 't> {
     /// Where the comment of a line stands.
     comments: HashMap<usize, usize>,
 }
+
+/// Words that begin a column.
+const COLUMN_WORDS: [&str; 7] = ["in", "limit", "slew", "at", "byte", "as", "scale"];
 
 impl<'s, 't> Layout<'s, 't> {
     fn new(source: &'s Source<'t>, strokes: HashSet<usize>) -> Layout<'s, 't> {
@@ -384,9 +390,8 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Aligns neighbouring statements: names, units and equals signs of the same kind; ranges and comments of all.
-    fn paragraphs(&mut self) {
-        // Lines that begin a statement, in runs without a gap or a comment between them.
+    /// Lines that begin a statement, in runs without a gap or a comment between them.
+    fn runs(&self) -> Vec<Vec<usize>> {
         let mut runs: Vec<Vec<usize>> = Vec::new();
         let mut block = None;
         for (index, line) in self.lines.iter().enumerate() {
@@ -405,7 +410,12 @@ impl<'s, 't> Layout<'s, 't> {
                 None => {}
             }
         }
-        for run in &runs {
+        runs
+    }
+
+    /// Aligns neighbouring statements of the same kind: names, units and equals signs.
+    fn names(&mut self, runs: &[Vec<usize>]) {
+        for run in runs {
             let groups: Vec<&[usize]> = run.chunk_by(|&a, &b| self.kind(a) == self.kind(b)).collect();
             for group in groups {
                 let name: Vec<(usize, usize)> = group.iter().filter_map(|&line| self.name_stop(line)).collect();
@@ -414,7 +424,13 @@ impl<'s, 't> Layout<'s, 't> {
                 let equals: Vec<(usize, usize)> = group.iter().filter_map(|&line| self.equals_stop(line)).collect();
                 self.align(&equals, false);
             }
-            for word in ["in", "limit", "slew", "at", "byte", "as", "scale"] {
+        }
+    }
+
+    /// Aligns ranges and comments of neighbouring statements, and what else stands in columns.
+    fn columns(&mut self, runs: &[Vec<usize>]) {
+        for run in runs {
+            for word in COLUMN_WORDS {
                 let stops: Vec<(usize, usize)> = run.iter().filter_map(|&line| self.word_stop(line, word)).collect();
                 let least = if word == "in" { RANGE_COLUMN } else { 0 };
                 self.keep_or_align(&stops, least);
@@ -565,6 +581,63 @@ impl<'s, 't> Layout<'s, 't> {
                 self.pads.insert(at, widest - self.width(at - 1));
             }
         }
+    }
+
+    /// Blanks by which something stands exactly under or above something of the neighbouring statement stay:
+    /// `F_ext >  Fs` over `F_ext < -Fs`.
+    fn chosen(&mut self) {
+        let mut kept: Vec<(usize, (usize, usize), (usize, usize))> = Vec::new();
+        let statement = |layout: &Self, line: usize| {
+            let piece = layout.lines[line].piece;
+            layout.starts.get(piece.start).copied().flatten().filter(|start| start.place.is_some()).map(|s| s.block)
+        };
+        for upper in 1..self.lines.len() {
+            let (upper, lower) = (upper - 1, upper);
+            let block = statement(self, upper);
+            if block.is_none() || block != statement(self, lower) || self.lines[lower].gap {
+                continue;
+            }
+            let (above, below) = (self.marks_of(upper), self.marks_of(lower));
+            for (line, marks, other, others) in [(upper, &above, lower, &below), (lower, &below, upper, &above)] {
+                for &(column, at, _) in marks.iter().filter(|(_, _, extra)| *extra) {
+                    // Columns ascend along a line.
+                    if let Ok(k) = others.binary_search_by_key(&column, |(column, ..)| *column)
+                        && !others[k].2
+                    {
+                        kept.push((column, (line, at), (other, others[k].1)));
+                    }
+                }
+            }
+        }
+        kept.sort_unstable();
+        for (_, (line, at), (other, mark)) in kept {
+            let (here, there) = (self.column(&self.lines[line], at), self.column(&self.lines[other], mark));
+            *self.pads.entry(at).or_insert(0) += there.saturating_sub(here);
+        }
+    }
+
+    /// The marks of a line but the first, if it was one before: the column each had, and whether it had more blanks
+    /// before it than it has now.
+    fn marks_of(&self, line: usize) -> Vec<(usize, usize, bool)> {
+        let Piece { start, end } = self.lines[line].piece;
+        let begins = |at: usize| self.source.marks[at].token.start;
+        if self.source.marks[start].line != self.source.marks[end - 1].line {
+            return Vec::new();
+        }
+        let mut column = self.old_column(begins(start));
+        let columns: Vec<usize> = COLUMN_WORDS.iter().filter_map(|word| Some(self.word_stop(line, word)?.1)).collect();
+        let mut out = Vec::new();
+        for at in start + 1..end {
+            let before = self.source.marks[at - 1].token;
+            column += before.text(self.source.text).chars().count();
+            let blanks = begins(at) - before.end;
+            column += blanks;
+            // What stands in a column of its own is brought there afterwards.
+            if !columns.contains(&at) {
+                out.push((column, at, blanks > self.space(at, start) + self.pad(at)));
+            }
+        }
+        out
     }
 
     // ---- the text

@@ -181,8 +181,9 @@ fn says(pair: &Pair<Rule>, word: Rule) -> bool {
 impl<'t> Reader<'t> {
     fn new(file: FileId, text: &'t str) -> Reader<'t> {
         let mut source = Source::new(file, text);
-        let diagnostics = std::mem::take(&mut source.complaints);
+        let mut diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
+        diagnostics.extend(slips::block_comment(&source));
         Reader {
             source,
             names: Names::default(),
@@ -197,6 +198,9 @@ impl<'t> Reader<'t> {
 
     fn finish(mut self) -> Vec<Diagnostic> {
         self.diagnostics.sort_by_key(|diagnostic| diagnostic.span().start);
+        // A name in foreign letters is read wherever it is used: said once.
+        let mut names = HashSet::new();
+        self.diagnostics.retain(|d| !d.message.ends_with(slips::NO_NAME) || names.insert(d.message.clone()));
         self.diagnostics.truncate(DIAGNOSTIC_LIMIT);
         self.diagnostics
     }
@@ -253,6 +257,11 @@ impl<'t> Reader<'t> {
         let (start, end) = (self.source.marks[piece.start].token.start, self.source.marks[piece.end - 1].token.end);
         (self.base, self.too_high) = (start, false);
         let text = &self.source.text[start..end];
+        let rule = match self.source.word(piece.start) {
+            "param" | "input" | "output" | "state" | "let" if rule == Rule::one_stmt => Rule::one_decl,
+            _ if rule == Rule::one_stmt && matches!(self.source.word(piece.start + 1), "=" | "/") => Rule::one_eq,
+            _ => rule,
+        };
         // The rules of pest need many calls for each bracket.
         match stacker::maybe_grow(STACK_PER_LEVEL * (depth + 4), STACK_PER_LEVEL * (depth + 4), || {
             Fric::parse(rule, text)
@@ -319,7 +328,8 @@ impl<'t> Reader<'t> {
         if self.braces && matches!(self.source.word(first), "{" | "}") {
             return;
         }
-        if let Some(brace) = (first..piece.end).find(|&at| self.source.is_symbol(at, "}")) {
+        let brace = (first..piece.end).find(|&at| matches!(self.source.word(at), "{" | "}"));
+        if let Some(brace) = brace.filter(|&at| self.source.is_symbol(at, "}")) {
             if self.braces {
                 return;
             }
@@ -1507,6 +1517,7 @@ fn words(rule: Rule) -> Option<String> {
         Rule::expr
         | Rule::atom
         | Rule::call
+        | Rule::called
         | Rule::quantity
         | Rule::path
         | Rule::hole
@@ -1549,6 +1560,27 @@ mod tests {
         *found.unwrap_or_else(|| panic!("no rule {name}"))
     }
 
+    /// The grammar writes its words by their first letters. None is taken that is not in the lists: those that share
+    /// all but their last letters with one, and every run of letters in the grammar.
+    #[test]
+    fn the_word_lists_agree_with_the_grammar() {
+        use crate::tokens::{CONTEXT_WORDS, KEYWORDS, is_context_word, is_keyword};
+        let pieces = include_str!("../fric.pest").split(|c: char| !c.is_ascii_lowercase());
+        let mut words: HashSet<String> = pieces.map(str::to_string).collect();
+        for word in KEYWORDS.iter().chain(&CONTEXT_WORDS) {
+            let letters = (b'a'..=b'z').map(char::from);
+            words.extend(
+                (1..word.len()).flat_map(|end| letters.clone().map(move |last| format!("{}{last}", &word[..end]))),
+            );
+            words.insert(format!("{word}x"));
+        }
+        for word in words.iter().filter(|word| !word.is_empty()) {
+            let taken = (takes(Rule::keyword, word), takes(Rule::context_kw, word), takes(Rule::ident, word));
+            assert_eq!(taken, (is_keyword(word), is_context_word(word), !is_keyword(word)), "{word}");
+            assert!(!is_context_word(word) || !takes(Rule::unit, word), "{word} as a unit");
+        }
+    }
+
     #[test]
     fn rules_take_their_ok_lines_and_refuse_their_no_lines() {
         let (mut cases, mut count) = (Vec::new(), 0);
@@ -1574,28 +1606,6 @@ mod tests {
         for rule in Rule::all_rules() {
             let name = format!("{rule:?}");
             assert_eq!(is_fixed(*rule), name.starts_with("kw_") || SIGNS.contains(&name.as_str()), "{name}");
-        }
-    }
-
-    #[test]
-    fn the_word_lists_agree_with_the_grammar() {
-        use crate::tokens::{CONTEXT_WORDS, KEYWORDS};
-        let grammar = include_str!("../fric.pest");
-        let listed = |name: &str| {
-            let start = grammar.find(&format!("\n{name} ")).unwrap();
-            let body = &grammar[start..start + grammar[start..].find('}').unwrap()];
-            let mut words: Vec<&str> = body.split('"').skip(1).step_by(2).collect();
-            words.sort_unstable();
-            words
-        };
-        assert_eq!(listed("keyword"), KEYWORDS);
-        assert_eq!(listed("context_kw"), CONTEXT_WORDS);
-        for word in KEYWORDS {
-            assert!(!takes(Rule::ident, word), "{word} as a name");
-            assert!(takes(Rule::ident, &format!("{word}x")), "{word}x as a name");
-        }
-        for word in CONTEXT_WORDS {
-            assert!(takes(Rule::ident, word) && !takes(Rule::unit, word), "{word}");
         }
     }
 

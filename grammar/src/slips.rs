@@ -17,7 +17,8 @@ pub(crate) struct Stop {
 
 /// What is wrong with `piece`.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
-    let finders = [character, head, operator, condition, branch, unit, bare_unit, reserved, neighbours, model_name];
+    let finders =
+        [character, head, operator, condition, branch, unit, bare_unit, reserved, deeper, neighbours, model_name];
     finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
 }
 
@@ -123,6 +124,9 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         );
     }
     let found = source.word(at).chars().next()?;
+    if found.is_alphabetic() {
+        return Some(foreign(source, piece, at));
+    }
     let instead = match found {
         '−' | '–' | '—' => "write `-`",
         '×' | '⋅' | '∙' | '•' => "write `*`; between units `·`",
@@ -140,7 +144,6 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         '“' | '”' | '„' => "text stands in plain double quotes, `\"`",
         '#' => "a comment begins with `//`",
         '\u{a0}' | '\u{2009}' | '\u{202f}' | '\u{200b}' => "write a plain space",
-        _ if found.is_alphabetic() => "names are made of the letters a to z, digits and `_`: `sigma0`, `omega`",
         _ => "remove it",
     };
     let hidden =
@@ -151,6 +154,118 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         format!("`{found}`")
     };
     Some(Diagnostic::error("E0001", format!("{shown} has no place here")).label(source.span(at), "").help(instead))
+}
+
+/// How the message about a name in foreign letters ends.
+pub(crate) const NO_NAME: &str = "is no name here";
+
+/// A name with letters that no name has: the whole of it, and how it can be written.
+fn foreign(source: &Source, piece: Piece, at: usize) -> Diagnostic {
+    let letters = |at: usize| {
+        let foreign = source.kind(at) == Some(TokenKind::Unknown)
+            && source.word(at).chars().all(|c| c.is_alphanumeric() || plain_letters(c).is_some());
+        foreign || matches!(source.kind(at), Some(TokenKind::Word | TokenKind::Number))
+    };
+    let (mut first, mut last) = (at, at);
+    while first > piece.start && source.glued(first) && letters(first - 1) {
+        first -= 1;
+    }
+    while last + 1 < piece.end && source.glued(last + 1) && letters(last + 1) {
+        last += 1;
+    }
+    let word = slice(source, first, last);
+    let plain: Option<String> = word
+        .chars()
+        .map(|c| if c.is_ascii() { Some(c.to_string()) } else { plain_letters(c).map(str::to_string) })
+        .collect();
+    let made_of = "names are made of the letters a to z, digits and `_`";
+    Diagnostic::error("E0001", format!("`{word}` {NO_NAME}")).label(source.span(first).to(source.span(last)), "").help(
+        match plain {
+            Some(plain) => format!("write `{plain}`: {made_of}"),
+            None => format!("{made_of}: `sigma0`, `omega`"),
+        },
+    )
+}
+
+/// A letter of another alphabet in plain ones, as it is written where there are no others.
+fn plain_letters(letter: char) -> Option<&'static str> {
+    const GREEK: [&str; 25] = [
+        "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
+        "xi", "omicron", "pi", "rho", "sigma", "sigma", "tau", "upsilon", "phi", "chi", "psi", "omega",
+    ];
+    Some(match letter {
+        'α'..='ω' => GREEK[letter as usize - 'α' as usize],
+        'µ' => "mu",
+        'Γ' => "Gamma",
+        'Δ' => "Delta",
+        'Θ' => "Theta",
+        'Λ' => "Lambda",
+        'Φ' => "Phi",
+        'Ψ' => "Psi",
+        'Σ' => "Sigma",
+        'Ω' => "Omega",
+        'ä' | 'æ' => "ae",
+        'ö' | 'ø' | 'œ' => "oe",
+        'ü' => "ue",
+        'ß' => "ss",
+        'Ä' => "Ae",
+        'Ö' | 'Ø' => "Oe",
+        'Ü' => "Ue",
+        'à'..='å' => "a",
+        'ç' => "c",
+        'è'..='ë' => "e",
+        'ì'..='ï' => "i",
+        'ñ' => "n",
+        'ò'..='õ' => "o",
+        'ù'..='û' => "u",
+        'ý' | 'ÿ' => "y",
+        'À'..='Å' => "A",
+        'Ç' => "C",
+        'È'..='Ë' => "E",
+        'Ñ' => "N",
+        'Ò'..='Õ' => "O",
+        'Ù'..='Û' => "U",
+        '₀' => "0",
+        '₁' => "1",
+        '₂' => "2",
+        '₃' => "3",
+        '₄' => "4",
+        _ => return None,
+    })
+}
+
+/// `/* … */`, which many languages have.
+pub(crate) fn block_comment(source: &Source) -> Option<Diagnostic> {
+    let span = *source.block_comments.first()?;
+    Some(
+        Diagnostic::error("E0001", "a comment goes from `//` to the end of its line")
+            .label(span, "no comment here")
+            .help("begin each of its lines with `//`"),
+    )
+}
+
+/// `run M(fr.Fs = 1 N)`: an argument of a part.
+fn deeper(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let at = stop.at;
+    let names = at > piece.start
+        && source.is_symbol(at, ".")
+        && source.kind(at - 1) == Some(TokenKind::Word)
+        && source.kind(at + 1) == Some(TokenKind::Word);
+    if !names || !stop.expected.iter().any(|expected| expected == "`=`") {
+        return None;
+    }
+    let mut last = at + 1;
+    while source.is_symbol(last + 1, ".") && source.kind(last + 2) == Some(TokenKind::Word) {
+        last += 2;
+    }
+    let (path, part, name) = (slice(source, at - 1, last), source.word(at - 1), source.word(last));
+    Some(
+        Diagnostic::error("E0001", "an argument is a name of the model itself, not of its parts")
+            .label(source.span(at - 1).to(source.span(last)), "")
+            .help(format!(
+                "in an experiment write `sweep {path} = ...`;\nwhere `{part}` is a slot, give it another model: `{part} = Model({name} = ...)`"
+            )),
+    )
 }
 
 /// The first words: a declaration in another language's words, an assignment, a derivative in another form.

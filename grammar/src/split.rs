@@ -38,6 +38,8 @@ pub(crate) struct Source<'t> {
     blocks: Vec<(usize, usize)>,
     /// What is wrong with the braces.
     pub complaints: Vec<Diagnostic>,
+    /// `/* … */`: left out.
+    pub block_comments: Vec<Span>,
 }
 
 /// A range of marks.
@@ -118,7 +120,7 @@ pub(crate) fn begins_item(word: &str) -> bool {
 
 impl<'t> Source<'t> {
     pub fn new(file: FileId, text: &'t str) -> Source<'t> {
-        let (mut marks, mut docs) = (Vec::new(), Vec::new());
+        let (mut marks, mut docs, mut block_comments) = (Vec::new(), Vec::new(), Vec::new());
         let (mut fresh, mut line) = (true, 0);
         for token in tokens(text) {
             match token.kind {
@@ -126,6 +128,10 @@ impl<'t> Source<'t> {
                 TokenKind::Blank | TokenKind::Comment => {}
                 TokenKind::Doc => {
                     docs.push(DocLine { after: marks.len(), own_line: fresh, line, start: token.start, end: token.end })
+                }
+                TokenKind::Unknown if token.text(text).starts_with("/*") => {
+                    block_comments.push(Span::new(file, token.start, token.end));
+                    line += token.text(text).matches('\n').count() as u32;
                 }
                 TokenKind::Word
                 | TokenKind::Number
@@ -140,7 +146,7 @@ impl<'t> Source<'t> {
             }
         }
         let blocks = vec![(0, 0); marks.len()];
-        let mut source = Source { file, text, marks, docs, blocks, complaints: Vec::new() };
+        let mut source = Source { file, text, marks, docs, blocks, complaints: Vec::new(), block_comments };
         source.match_braces();
         source
     }

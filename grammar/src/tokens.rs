@@ -85,7 +85,7 @@ pub enum TokenKind {
     OpenText,
     /// An operator or a bracket.
     Symbol,
-    /// A character that has no place in the language.
+    /// A character that has no place in the language, or `/* … */`.
     Unknown,
 }
 
@@ -136,6 +136,11 @@ pub fn tokens(text: &str) -> Vec<Token> {
                 let end = at + run(&bytes[at..], |b| b != b'\n');
                 let doc = bytes[at..].starts_with(b"///") && !bytes[at..].starts_with(b"////");
                 (if doc { TokenKind::Doc } else { TokenKind::Comment }, end)
+            }
+            // Not a comment here: what another language would have as one.
+            b'/' if bytes[at..].starts_with(b"/*") => {
+                let end = text[at + 2..].find("*/").map_or(text.len(), |close| at + 2 + close + 2);
+                (TokenKind::Unknown, end)
             }
             b'"' => {
                 let inside = at + 1 + run(&bytes[at + 1..], |b| b != b'"' && b != b'\n');

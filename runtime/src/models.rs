@@ -186,6 +186,7 @@ impl Model {
             quantities,
             ticks: ticks.collect(),
             automata: automata.collect(),
+            delays: Vec::new(),
             guards,
             roots: self.roots.iter().map(|text| Root { text: (*text).into(), decides: true }).collect(),
             pool: Arc::new([]),

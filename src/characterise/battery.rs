@@ -186,6 +186,11 @@ impl<'a> Layout<'a> {
         Layout { subject, units: Units::of(subject.rotary), scales }
     }
 
+    /// Regimes of the model's own.
+    pub fn own_regimes(&self) -> &[String] {
+        &self.subject.own_regimes
+    }
+
     /// What fills the slot of a bench that has no force of its own.
     fn moved(&self) -> String {
         match self.subject.external {
@@ -331,6 +336,12 @@ impl<'a> Layout<'a> {
             entry.plot(format!("F [{force}]")).plot(format!("x [{length}]")).plot(format!("v [{speed}]"))
         };
 
+        // Where a model has regimes, what is drawn over time is shaded by them.
+        let shaded = |entry: Entry, slot: &str| {
+            let regimes = self.subject.own_regimes.iter();
+            regimes.fold(entry, |entry, regime| entry.plot(format!("{slot}.{regime}")))
+        };
+
         for (i, r) in self.rates().into_iter().enumerate() {
             let u = format!("ramp(0 s, 0 {force}, {} {rate})", n(r));
             let duration = round(1.3 * f_b / r + 2.0 * root(2.0 * m * s.v_slip / r));
@@ -452,7 +463,7 @@ impl<'a> Layout<'a> {
         for (i, vp) in self.pull_speeds().into_iter().enumerate() {
             let loading = f_b / (k * vp);
             let duration = round(3.0 * loading + 40.0 / frequency);
-            entries.push(motion(Entry::new(
+            let pulled = motion(Entry::new(
                 format!("stick_slip_{}", i + 1),
                 format!("Pulled at {} {speed} through a spring of {} {stiffness}.", n(vp), n(k)),
                 format!(
@@ -464,20 +475,22 @@ impl<'a> Layout<'a> {
                     self.pushed()
                 ),
                 duration,
-            )));
+            ));
+            entries.push(shaded(pulled, "fr"));
         }
 
         let v0 = round(s.f_c.max(0.1 * f_b) / m);
-        entries.push(motion(Entry::new(
+        let thrown = motion(Entry::new(
             "coast_down",
             format!("Thrown at {} {speed}, left alone.", n(v0)),
             self.force_bench(&format!("0 {force}"), &format!(", v_start = {} {speed}", n(v0))),
             2.0,
-        )));
+        ));
+        entries.push(shaded(thrown, "fr"));
 
         // A load that the contact carries, if it can carry any.
         let load = if s.f_c > 0.01 * f_b { s.f_c } else { f_b };
-        entries.push(
+        entries.push(shaded(
             motion(Entry::new(
                 "drift",
                 "A constant load with a small oscillation, both below break-away.",
@@ -488,9 +501,10 @@ impl<'a> Layout<'a> {
                 20.0,
             ))
             .solver("adaptive tol 1e-8"),
-        );
+            "fr",
+        ));
         let half = round(0.5 * load);
-        entries.push(
+        entries.push(shaded(
             motion(Entry::new(
                 "hold",
                 "Half of what it slides with, applied gently and held for 100 s.",
@@ -502,7 +516,8 @@ impl<'a> Layout<'a> {
             ))
             .solver("adaptive tol 1e-9")
             .expect(format!("peak_to_peak(x) < 1e-9 {length} after 12 s")),
-        );
+            "bench.fr",
+        ));
 
         let vp = self.pull_speeds()[2];
         let pulled = format!(

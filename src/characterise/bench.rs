@@ -101,10 +101,23 @@ fn outcomes(cases: &[&compile::Case]) -> Vec<Result<Outcome, Failure>> {
     done.into_iter().map(|(_, result)| result).collect()
 }
 
-/// Whether the reason is that a model turns to and fro without end.
-pub fn chatters(results: &Result<Vec<Ran>, String>) -> bool {
-    let chatter = |ran: &Ran| matches!(&ran.result, Err(failure) if matches!(failure.cause, Cause::Chatter(_)));
-    results.as_ref().is_ok_and(|cases| cases.iter().any(chatter))
+/// Why an adaptive run came to no end that a run with fixed steps would come to.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Endless {
+    /// The model turns to and fro.
+    Chatters,
+    /// It takes more steps than are worth waiting for.
+    Slow,
+}
+
+/// Whether a case came to no such end, and why.
+pub fn endless(results: &Result<Vec<Ran>, String>) -> Option<Endless> {
+    let why = |ran: &Ran| match ran.result.as_ref().err()?.cause {
+        Cause::Chatter(_) => Some(Endless::Chatters),
+        Cause::TooManySteps { .. } | Cause::StepTooShort { .. } | Cause::Stopped => Some(Endless::Slow),
+        Cause::Guard { .. } | Cause::NotFinite { .. } | Cause::NoDerivatives => None,
+    };
+    results.as_ref().ok()?.iter().find_map(why)
 }
 
 type Compiled = (String, Result<Vec<compile::Case>, String>);

@@ -176,15 +176,16 @@ fn section(test: &Test, studies: &[&Study]) -> String {
         .iter()
         .filter_map(|study| Some((*study, study.tests.iter().find(|other| other.key == test.key)?)))
         .collect();
-    let mut graphs: Vec<Vec<(&str, &Graph)>> = Vec::new();
+    let mut graphs: Vec<Vec<(usize, &str, &Graph)>> = Vec::new();
     let mut reasons = String::new();
     for (study, test) in &found {
+        let number = studies.iter().position(|other| std::ptr::eq(*other, *study)).unwrap_or_default();
         match &test.result {
             Ok(own) => {
                 for graph in own {
-                    match graphs.iter_mut().find(|group| group[0].1.key == graph.key && group[0].1.x.1 == graph.x.1) {
-                        Some(group) => group.push((&study.label, graph)),
-                        None => graphs.push(vec![(&study.label, graph)]),
+                    match graphs.iter_mut().find(|group| group[0].2.key == graph.key && group[0].2.x.1 == graph.x.1) {
+                        Some(group) => group.push((number, &study.label, graph)),
+                        None => graphs.push(vec![(number, &study.label, graph)]),
                     }
                 }
             }
@@ -201,14 +202,8 @@ fn section(test: &Test, studies: &[&Study]) -> String {
     }
     out += "</header>\n";
     for group in &graphs {
-        let id = format!("{}-", group[0].1.key);
-        // A comparison of one that has it draws that one by its name.
-        let mut drawn = figure(group);
-        if studies.len() > 1 && group.len() == 1 {
-            for curve in &mut drawn.panels[0].curves {
-                curve.name = format!("{}{}{}", group[0].0, if curve.name.is_empty() { "" } else { ", " }, curve.name);
-            }
-        }
+        let id = format!("{}-", group[0].2.key);
+        let drawn = figure(group, studies.len());
         let _ = writeln!(out, "<figure style=\"margin:0\">{}</figure>", plot::inline(&drawn, WIDE, &id));
     }
     out += &reasons;

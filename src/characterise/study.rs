@@ -4,11 +4,11 @@
 //! travel, then the steady curve; the rest is laid out with them.
 
 use super::battery::{self, Entry, Layout, Scales, Units, n};
-use super::bench::{self, Ran, Results};
+use super::bench::{self, Endless, Ran, Results};
 use super::phenomena::{self, Finding};
 use super::subject::{External, Subject};
 use crate::compile::{self, Sources, Verdict};
-use crate::plot::{Axis, Curve, Figure, Panel};
+use crate::plot::{Axis, Band, Curve, Figure, Panel};
 use crate::value::{show, significant};
 use abi::unit::Unit;
 
@@ -98,6 +98,8 @@ pub struct Graph {
     pub logarithmic: (bool, bool),
     /// The curves.
     pub lines: Vec<Line>,
+    /// In which regime the model is, over time.
+    pub bands: Vec<Band>,
 }
 
 /// One curve of a graph.
@@ -144,28 +146,37 @@ pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
     }
 }
 
-/// A graph as a figure: the curves of several models, or all curves of one.
-pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
-    let Some((_, first)) = graphs.first() else { return Figure::default() };
+/// A graph as a figure: the curves of several models, each by its number, or all curves of one. A model has the same
+/// colour in every figure.
+pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
+    let Some((_, _, first)) = graphs.first() else { return Figure::default() };
     let alone = graphs.len() == 1;
     let shown = |line: &&Line| alone || line.main;
-    let lines =
-        || graphs.iter().flat_map(|(name, graph)| graph.lines.iter().filter(shown).map(move |line| (*name, line)));
+    let lines = || {
+        graphs.iter().flat_map(|(number, name, graph)| {
+            let shown = graph.lines.iter().filter(shown).enumerate();
+            shown.map(move |(k, line)| (*name, (*number, k), line))
+        })
+    };
     let size = |of: fn(&(f64, f64)) -> f64| {
-        let values = lines().flat_map(|(_, line)| line.points.iter().map(of));
+        let values = lines().flat_map(|(_, _, line)| line.points.iter().map(of));
         values.filter(|value| value.is_finite()).fold(0.0, |size: f64, value| size.max(value.abs()))
     };
     let (x_unit, x_scale) = prefixed(&first.x.1, size(|point| point.0));
     let (y_unit, y_scale) = prefixed(&first.y.1, size(|point| point.1));
-    let curves = lines().map(|(model, line)| Curve {
-        name: match (alone, graphs.iter().map(|(_, graph)| graph.lines.iter().filter(shown).count()).max() > Some(1)) {
-            (true, _) => line.name.clone(),
+    let curves = lines().map(|(model, style, line)| Curve {
+        name: match (alone, graphs.iter().map(|(_, _, graph)| graph.lines.iter().filter(shown).count()).max() > Some(1))
+        {
+            (true, _) if among == 1 => line.name.clone(),
+            // A comparison of one that has it draws that one by its name.
+            (true, _) => format!("{model}{}{}", if line.name.is_empty() { "" } else { ", " }, line.name),
             (false, true) => format!("{model}, {}", line.name),
             (false, false) => model.into(),
         },
         points: line.points.iter().map(|(x, y)| (x / x_scale, y / y_scale)).collect(),
         boolean: false,
         marks: line.marks,
+        style: (among > 1).then_some(style),
     });
     let axis = |(name, _): &(String, String), unit: Unit, logarithmic| Axis {
         name: name.clone(),
@@ -176,7 +187,8 @@ pub fn figure(graphs: &[(&str, &Graph)]) -> Figure {
         x: axis(&first.x, x_unit, first.logarithmic.0),
         y: axis(&first.y, y_unit, first.logarithmic.1),
         curves: curves.collect(),
-        bands: Vec::new(),
+        // Several models would shade over each other.
+        bands: if alone { first.bands.clone() } else { Vec::new() },
     };
     Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
 }
@@ -187,7 +199,7 @@ pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
     let graph = graphs.into_iter().find(|graph| graph.key == key)?;
     // What did not move is no curve.
     let moved = graph.lines.iter().any(|line| line.points.iter().any(|point| point.0.abs() > 1e-12));
-    moved.then(|| figure(&[(&study.label, graph)]))
+    moved.then(|| figure(&[(0, &study.label, graph)], 1))
 }
 
 /// Puts a model through the battery.
@@ -196,8 +208,15 @@ pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
 /// Why nothing at all can be said, as a message or a report.
 pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), extent: Extent) -> Result<Study, String> {
     let rotary = subject.rotary;
-    let mut runner =
-        Runner { subject: &subject, name, sources, entries: Vec::new(), results: Results::new(), chatter: None };
+    let mut runner = Runner {
+        subject: &subject,
+        name,
+        sources,
+        entries: Vec::new(),
+        results: Results::new(),
+        chatter: None,
+        slow: false,
+    };
     // Twins of straight models keep their numbers; what is written for shafts turns faster.
     let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
     let mut scales =
@@ -238,11 +257,17 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
     let layout = Layout::new(&subject, scales.clone());
     let text = battery::text(&subject.imports, &layout.head(), &runner.entries);
     let dissipation = runner.dissipation(&text);
-    let chatter = runner.chatter.clone();
+    let (chatter, slow) = (runner.chatter.clone(), runner.slow);
     let reader = Reader { results: &runner.results, layout: &layout, units, scales: &scales, steady: &steady };
     let tests = reader.tests(dissipation);
     let findings = phenomena::findings(&subject, &scales, &tests, chatter.as_deref());
     let mut notes = Vec::new();
+    if slow {
+        notes.push(
+            "Some adaptive runs took too many steps, and were run with a fixed step: what happens within one is not seen."
+                .to_string(),
+        );
+    }
     if let Some(chatter) = chatter {
         notes.push(format!(
             "At rest it {chatter}. What comes to rest was therefore run with a fixed step; there the force jumps to and \
@@ -265,6 +290,8 @@ struct Runner<'a> {
     entries: Vec<Entry>,
     results: Results,
     chatter: Option<String>,
+    /// Whether some adaptive runs took too many steps.
+    slow: bool,
 }
 
 impl Runner<'_> {
@@ -277,11 +304,17 @@ impl Runner<'_> {
             let text = battery::text(&self.subject.imports, &layout.head(), &self.entries);
             let loaded = bench::load(self.name, &text, self.sources)?;
             let results = bench::run(&loaded, &names, self.sources);
-            names =
-                results.iter().filter(|(_, result)| bench::chatters(result)).map(|(name, _)| name.clone()).collect();
+            names = results
+                .iter()
+                .filter(|(_, result)| bench::endless(result).is_some())
+                .map(|(name, _)| name.clone())
+                .collect();
             self.results.extend(results);
             for entry in self.entries.iter_mut().filter(|entry| names.contains(&entry.name) && entry.adaptive()) {
-                if let (None, Some(Ok(cases))) = (&self.chatter, self.results.get(&entry.name)) {
+                let result = &self.results[&entry.name];
+                if bench::endless(result) == Some(Endless::Slow) {
+                    self.slow = true;
+                } else if let (None, Ok(cases)) = (&self.chatter, result) {
                     let why = cases.iter().find_map(|ran| ran.result.as_ref().err());
                     self.chatter = why.map(|why| why.to_string().split(';').next().unwrap_or_default().to_string());
                 }
@@ -509,6 +542,15 @@ impl Reader<'_> {
         one(self.results, name)?.rows()
     }
 
+    /// When the model is in which regime; rows hold t, F, x, v, and then its regimes.
+    fn regimes(&self, rows: &[Vec<f64>]) -> Vec<Band> {
+        let band = |(k, name): (usize, &String)| {
+            let course: Vec<(f64, f64)> = rows.iter().map(|row| (row[0], row[4 + k])).collect();
+            Band::of(name, &course)
+        };
+        self.layout.own_regimes().iter().enumerate().map(band).collect()
+    }
+
     fn axis(&self, name: &str, unit: &str) -> (String, String) {
         (name.into(), unit.into())
     }
@@ -518,6 +560,7 @@ impl Reader<'_> {
         let mirrored = steady.backward.iter().map(|(v, f)| (-v, -f)).collect();
         let graph = Graph {
             key: "steady",
+            bands: Vec::new(),
             x: self.axis("|v|", self.units.speed),
             y: self.axis("|F|", self.units.force),
             logarithmic: (true, false),
@@ -566,6 +609,7 @@ impl Reader<'_> {
         let graphs = vec![
             Graph {
                 key: "break_away",
+                bands: Vec::new(),
                 x: self.axis("force rate", self.units.rate),
                 y: self.axis("break-away force", self.units.force),
                 logarithmic: (true, false),
@@ -573,6 +617,7 @@ impl Reader<'_> {
             },
             Graph {
                 key: "break_away_travel",
+                bands: Vec::new(),
                 x: self.axis("x", self.units.length),
                 y: self.axis("F", self.units.force),
                 logarithmic: (false, false),
@@ -602,6 +647,7 @@ impl Reader<'_> {
         let course = |rows: &[Vec<f64>]| rows.iter().map(|row| (row[2], row[1])).collect::<Vec<_>>();
         let graph = Graph {
             key: "presliding",
+            bands: Vec::new(),
             x: self.axis("x", self.units.length),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
@@ -666,6 +712,7 @@ impl Reader<'_> {
         }
         let graph = Graph {
             key: "lag",
+            bands: Vec::new(),
             x: self.axis("v", self.units.speed),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
@@ -695,6 +742,7 @@ impl Reader<'_> {
         let (forth, back) = (cut(forth), cut(back));
         let graph = Graph {
             key: "reversal",
+            bands: Vec::new(),
             x: self.axis("path", self.units.length),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
@@ -714,6 +762,7 @@ impl Reader<'_> {
 
     fn read_stick_slip(&self) -> Read {
         let (mut lines, mut numbers, mut periods) = (Vec::new(), Vec::new(), Vec::new());
+        let mut bands = Vec::new();
         let mut failed = Vec::new();
         let speeds = self.layout.pull_speeds();
         let (mut sticks_last, mut smooth_first) = (None, None);
@@ -741,6 +790,7 @@ impl Reader<'_> {
             }
             if i == 2 {
                 lines.push(Line::course("x", rows.iter().map(|row| (row[0], row[2])).collect()));
+                bands = self.regimes(&rows);
                 let end = rows.last().map_or(0.0, |row| row[0]);
                 lines.push(Line::course("far end of the spring", vec![(0.0, 0.0), (end, vp * end)]).aside());
             }
@@ -750,6 +800,7 @@ impl Reader<'_> {
         }
         let mut graphs = vec![Graph {
             key: "stick_slip",
+            bands,
             x: self.axis("t", "s"),
             y: self.axis("x", self.units.length),
             logarithmic: (false, false),
@@ -758,6 +809,7 @@ impl Reader<'_> {
         if periods.len() > 1 {
             graphs.push(Graph {
                 key: "stick_slip_period",
+                bands: Vec::new(),
                 x: self.axis("pull speed", self.units.speed),
                 y: self.axis("period", "s"),
                 logarithmic: (true, true),
@@ -779,6 +831,7 @@ impl Reader<'_> {
         let stop = rows.iter().find(|row| row[3].abs() < 1e-4 * v0).map(|row| row[0]);
         let graph = Graph {
             key: "coast_down",
+            bands: self.regimes(&rows),
             x: self.axis("t", "s"),
             y: self.axis("v", self.units.speed),
             logarithmic: (false, false),
@@ -798,6 +851,7 @@ impl Reader<'_> {
         let end = rows.last().map_or(0.0, |row| row[0]);
         let graph = Graph {
             key: "hold",
+            bands: self.regimes(&rows),
             x: self.axis("t", "s"),
             y: self.axis("x", self.units.length),
             logarithmic: (false, false),
@@ -821,6 +875,7 @@ impl Reader<'_> {
         let drift = (value_at(&rows, 20.0, 2) - value_at(&rows, 10.0, 2)) / 10.0;
         let graph = Graph {
             key: "drift",
+            bands: self.regimes(&rows),
             x: self.axis("t", "s"),
             y: self.axis("x", self.units.length),
             logarithmic: (false, false),
@@ -852,6 +907,7 @@ impl Reader<'_> {
         let graphs = vec![
             Graph {
                 key: "energy",
+                bands: Vec::new(),
                 x: self.axis("amplitude", self.units.length),
                 y: self.axis("loss per cycle", "J"),
                 logarithmic: (true, true),
@@ -859,6 +915,7 @@ impl Reader<'_> {
             },
             Graph {
                 key: "energy_cycle",
+                bands: Vec::new(),
                 x: self.axis("x", self.units.length),
                 y: self.axis("F", self.units.force),
                 logarithmic: (false, false),
@@ -900,6 +957,7 @@ impl Reader<'_> {
         }
         let graph = Graph {
             key: "rate",
+            bands: Vec::new(),
             x: self.axis("place on the path", ""),
             y: self.axis("F", self.units.force),
             logarithmic: (false, false),
@@ -928,6 +986,7 @@ impl Reader<'_> {
         }
         let graph = Graph {
             key: "dissipation",
+            bands: Vec::new(),
             x: self.axis("t", "s"),
             y: self.axis("F v", "W"),
             logarithmic: (false, false),
@@ -974,6 +1033,7 @@ impl Reader<'_> {
         }
         let graph = Graph {
             key: "steps",
+            bands: Vec::new(),
             x: self.axis("step", "s"),
             y: self.axis("error of x, relative", ""),
             logarithmic: (true, true),

@@ -43,6 +43,8 @@ pub struct Subject {
     /// Continuous states, and whether it has regimes or sampled code.
     pub states: usize,
     pub regimes: Vec<String>,
+    /// Regimes of its own, not of its parts.
+    pub own_regimes: Vec<String>,
 }
 
 /// The port `F_ext`.

@@ -194,6 +194,12 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
         params: subject::params(model, instance),
         states: crate::results::states(description),
         regimes: description.automata.iter().flat_map(|automaton| automaton.regimes.clone()).collect(),
+        own_regimes: description
+            .automata
+            .iter()
+            .filter(|automaton| automaton.path.is_empty())
+            .flat_map(|automaton| automaton.regimes.clone())
+            .collect(),
         instance: written,
     })
 }

@@ -2,11 +2,12 @@
 
 use super::End;
 use crate::args::Explain;
-use crate::compile::{self, Explanation, Stopwatch, Verdict};
+use crate::compile::{self, Explanation, Method, Stopwatch, Verdict};
 use crate::terminal::{Style, Terminal};
 use crate::{project, report};
 use serde_json::json;
 use std::path::Path;
+use std::time::Instant;
 
 /// Every code has a section: `## E0101 units differ`.
 const PAGES: &str = include_str!("../../docs/errors.md");
@@ -50,8 +51,13 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
             continue;
         }
         match compile::explain(&loaded, &project::Disk, name) {
-            Ok(explanation) if args.json => terminal.line(&as_json(&explanation).to_string()),
-            Ok(explanation) => tell(&explanation, terminal),
+            Ok(explanation) => {
+                let bounds = if args.step { bounds(&loaded, &explanation) } else { Vec::new() };
+                match args.json {
+                    true => terminal.line(&as_json(&explanation, &bounds).to_string()),
+                    false => tell(&explanation, &bounds, terminal),
+                }
+            }
             Err(diagnostics) => {
                 terminal.report(&report::full(&loaded.files.0, &diagnostics, terminal.error_colour()));
                 end = End::Failed;
@@ -61,8 +67,8 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     end
 }
 
-/// Everything about a model.
-pub(super) fn tell(explanation: &Explanation, terminal: &mut Terminal) {
+/// Everything about a model, and how long its steps take where that was asked for.
+pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &explanation.model));
     let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
     let names = width(&mut explanation.quantities.iter().map(|q| q.path.chars().count()));
@@ -85,11 +91,33 @@ pub(super) fn tell(explanation: &Explanation, terminal: &mut Terminal) {
         terminal.line(&format!("    {}: {}", state.path, state.words()));
     }
     terminal.line(&format!("\n  an instance takes {} bytes; one fixed step, with its outputs:", explanation.bytes));
-    for (method, plain, expanded, divisions) in &explanation.steps {
+    for step in &explanation.steps {
+        let code = step.code.map_or("no machine code here".into(), |(instructions, bytes)| {
+            format!("{instructions} instructions in {bytes} bytes")
+        });
         terminal.line(&format!(
-            "    {:<8} {expanded} operations ({plain} before functions are expanded), {divisions} divisions and roots",
-            method.name()
+            "    {:<8} {code}; {} operations ({} before functions are expanded), {} divisions and roots",
+            step.method.name(),
+            step.operations,
+            step.plain,
+            step.divisions
         ));
+    }
+    if !bounds.is_empty() {
+        terminal.line(&format!("\n  a step on this machine, each of {CALLS} calls timed, with its inputs at 0:"));
+        for bound in bounds {
+            terminal.line(&format!(
+                "    {:<8} {} in the middle, worst {}; with a margin of {MARGIN}: {}, so cycles of {} or more",
+                bound.method.name(),
+                nanoseconds(bound.median),
+                nanoseconds(bound.worst),
+                nanoseconds(MARGIN * bound.worst),
+                nanoseconds(2.0 * MARGIN * bound.worst),
+            ));
+        }
+    }
+    for storage in &explanation.storage {
+        terminal.line(&format!("\n  stores {storage}"));
     }
     if let Some(independent) = explanation.rate_independent {
         terminal.line(match independent {
@@ -115,7 +143,7 @@ fn dissipation(verdict: &Verdict) -> String {
     }
 }
 
-fn as_json(explanation: &Explanation) -> serde_json::Value {
+fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
     json!({
         "model": explanation.model,
         "quantities": explanation.quantities.iter().map(|q| json!({
@@ -126,12 +154,60 @@ fn as_json(explanation: &Explanation) -> serde_json::Value {
             "name": state.path, "how": state.words(), "fastest": state.fastest.map(|(rate, _)| rate),
         })).collect::<Vec<_>>(),
         "bytes": explanation.bytes,
-        "steps": explanation.steps.iter().map(|(method, plain, expanded, divisions)| json!({
-            "method": method.name(), "operations": expanded, "before_expansion": plain, "divisions": divisions,
+        "steps": explanation.steps.iter().map(|step| json!({
+            "method": step.method.name(), "operations": step.operations, "before_expansion": step.plain,
+            "divisions": step.divisions, "instructions": step.code.map(|(instructions, _)| instructions),
+            "code_bytes": step.code.map(|(_, bytes)| bytes),
         })).collect::<Vec<_>>(),
+        "bounds": bounds.iter().map(|bound| json!({
+            "method": bound.method.name(), "calls": CALLS, "median_ns": bound.median, "worst_ns": bound.worst,
+            "margin": MARGIN,
+        })).collect::<Vec<_>>(),
+        "storage": explanation.storage,
         "rate_independent": explanation.rate_independent,
         "dissipation": explanation.dissipation.as_ref().map(dissipation),
     })
+}
+
+/// Calls that are timed.
+const CALLS: usize = 1_000_000;
+/// What another million may bring: other programs, other states, a colder cache.
+const MARGIN: f64 = 2.0;
+/// The step that is timed, in s. Its length changes no instruction.
+const STEP: f64 = 1e-3;
+
+/// How long one call took, in ns.
+pub(super) struct Bound {
+    method: Method,
+    median: f64,
+    worst: f64,
+}
+
+/// Times the fixed steps of a model; of methods without machine code nothing.
+fn bounds(loaded: &compile::Loaded, explanation: &Explanation) -> Vec<Bound> {
+    let timed = explanation.steps.iter().filter(|step| step.code.is_some());
+    let bound = |method: Method| {
+        let mut instance = compile::stepping(loaded, &project::Disk, &explanation.model, method, STEP).ok()?;
+        let mut calls: Vec<f64> = (0..CALLS)
+            .map(|_| {
+                let begin = Instant::now();
+                instance.advance(1);
+                begin.elapsed().as_nanos() as f64
+            })
+            .collect();
+        calls.sort_by(f64::total_cmp);
+        Some(Bound { method, median: calls[CALLS / 2], worst: calls[CALLS - 1] })
+    };
+    timed.filter_map(|step| bound(step.method)).collect()
+}
+
+/// A short time in words.
+fn nanoseconds(ns: f64) -> String {
+    match ns {
+        ns if ns < 1e3 => format!("{ns:.0} ns"),
+        ns if ns < 1e6 => format!("{:.3} us", ns / 1e3),
+        ns => format!("{:.3} ms", ns / 1e6),
+    }
 }
 
 /// The page of a code: from its heading to the next.

@@ -117,6 +117,25 @@ fn load_text(
     Some(loaded)
 }
 
+/// Refuses what `fric check` refuses in the models of a text, and reports it; counts its warnings in one line.
+fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
+    watch.stage("models");
+    let found = compile::check_models(loaded, &project::Disk);
+    if found.iter().any(Diagnostic::is_error) {
+        reported(loaded, &found, terminal);
+        return Err(found);
+    }
+    if !found.is_empty() && !quiet {
+        let (n, s, them) = match found.len() {
+            1 => (1, "", "it"),
+            n => (n, "s", "them"),
+        };
+        let name = &loaded.files.get(loaded.root()).name;
+        terminal.report(&format!("{n} warning{s}: `fric check {name}` shows {them}\n"));
+    }
+    Ok(())
+}
+
 /// An experiment, compiled and run.
 struct Done {
     cases: Vec<Case>,

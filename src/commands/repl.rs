@@ -356,7 +356,7 @@ impl Prompt<'_> {
         let (explanation, path) = self.session.explained(rest)?;
         match path {
             Some(path) if !path.is_empty() => self.quantity(&explanation, &path),
-            _ => super::explain::tell(&explanation, self.terminal),
+            _ => super::explain::tell(&explanation, &[], self.terminal),
         }
         Ok(())
     }

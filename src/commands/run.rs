@@ -1,13 +1,14 @@
 //! `fric run`: compiles experiments, runs them, shows and writes what they did.
 
 use super::cross::{Crossed, cross};
-use super::{Done, End, compiled, done, load};
+use super::{Done, End, compiled, done, load, sound};
 use crate::args::Run;
 use crate::compile::{self, Changes, Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
 use crate::{figure, project, report};
+use grammar::diagnostic::Diagnostic;
 use runtime::record::csv;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -15,7 +16,6 @@ use std::path::{Path, PathBuf};
 pub fn run(args: &Run, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
-    let stages = watch.stop();
     let names = match chosen(args, &loaded) {
         Ok(names) => names,
         Err(message) => {
@@ -30,6 +30,13 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         ));
         return End::Misused;
     }
+    if let Err(diagnostics) = sound(&loaded, args.json || args.quiet, terminal, &mut watch) {
+        if args.json {
+            names.iter().for_each(|name| refused(args, &loaded, name, &diagnostics, terminal));
+        }
+        return End::Failed;
+    }
+    let stages = watch.stop();
     let changes = Changes {
         set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
         method: args.solver,
@@ -46,6 +53,12 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         }
     }
     end
+}
+
+/// What `--json` says of an experiment that does not run.
+fn refused(args: &Run, loaded: &Loaded, name: &str, diagnostics: &[Diagnostic], terminal: &mut Terminal) {
+    let (file, found) = (args.file.display().to_string(), report::json(&loaded.files.0, diagnostics));
+    terminal.line(&json!({ "file": file, "experiment": name, "passed": false, "diagnostics": found }).to_string());
 }
 
 /// The experiments to run: those named, else all.
@@ -81,10 +94,7 @@ fn experiment(
         Ok(compiled) => compiled,
         Err(diagnostics) => {
             if args.json {
-                let found = report::json(&loaded.files.0, &diagnostics);
-                terminal.line(
-                    &json!({ "file": file, "experiment": name, "passed": false, "diagnostics": found }).to_string(),
-                );
+                refused(args, loaded, name, &diagnostics, terminal);
             }
             return End::Failed;
         }

@@ -460,7 +460,7 @@ impl Table {
             Panel {
                 x: self.columns[x].axis.clone(),
                 y: self.columns[y].axis.clone(),
-                curves: vec![Curve { name: String::new(), points, boolean: false, marks: true }],
+                curves: vec![Curve { points, marks: true, ..Curve::default() }],
                 bands: Vec::new(),
             }
         };

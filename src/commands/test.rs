@@ -32,6 +32,10 @@ pub fn test(args: &Test, terminal: &mut Terminal) -> End {
             tally.failed += 1;
             continue;
         };
+        if super::sound(&loaded, args.quiet, terminal, &mut watch).is_err() {
+            tally.failed += 1;
+            continue;
+        }
         let stages = watch.stop();
         let names: Vec<String> =
             loaded.experiments().into_iter().filter(|info| info.has_expect).map(|info| info.name).collect();

@@ -61,6 +61,8 @@ pub struct Curve {
     pub boolean: bool,
     /// Each point is a measured one and gets a mark.
     pub marks: bool,
+    /// Numbers of its colour and of its dashes; by its place among the curves if there are none.
+    pub style: Option<(usize, usize)>,
 }
 
 /// Where something is true.

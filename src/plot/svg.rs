@@ -148,13 +148,13 @@ fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height
     );
     for (i, curve) in panel.curves.iter().enumerate() {
         for &(x, y) in curve.points.iter().filter(|(x, y)| curve.marks && x.is_finite() && y.is_finite()) {
-            let colour = PALETTE[i % PALETTE.len()];
+            let colour = PALETTE[style(panel, i).0 % PALETTE.len()];
             let _ =
                 writeln!(out, "<circle cx=\"{}\" cy=\"{}\" r=\"3\" fill=\"{colour}\"/>", tenth(px(x)), tenth(py(y)));
         }
         let path = path(curve, px, py, width, height);
         if !path.is_empty() {
-            let _ = writeln!(out, "<path d=\"{path}\" {}/>", stroke(i));
+            let _ = writeln!(out, "<path d=\"{path}\" {}/>", stroke(panel, i));
         }
     }
     out.push_str("</g>\n");
@@ -210,7 +210,11 @@ fn legend(out: &mut String, panel: &Panel, top: f64, wide: f64) -> f64 {
         let middle = y - 4.5;
         let _ = match curve {
             Some(i) => {
-                writeln!(out, "<path d=\"M{x:.1} {middle:.1}h22\" fill=\"none\" stroke-width=\"2.4\" {}/>", stroke(i))
+                writeln!(
+                    out,
+                    "<path d=\"M{x:.1} {middle:.1}h22\" fill=\"none\" stroke-width=\"2.4\" {}/>",
+                    stroke(panel, i)
+                )
             }
             None => writeln!(
                 out,
@@ -226,10 +230,17 @@ fn legend(out: &mut String, panel: &Panel, top: f64, wide: f64) -> f64 {
     y + 4.0
 }
 
+/// Numbers of colour and dashes of the `i`-th curve: more colours than there are come again with other dashes.
+fn style(panel: &Panel, i: usize) -> (usize, usize) {
+    let (colour, dashes) = panel.curves[i].style.unwrap_or((i, 0));
+    (colour, dashes + colour / PALETTE.len())
+}
+
 /// Colour and dashes of the `i`-th curve.
-fn stroke(i: usize) -> String {
-    let colour = PALETTE[i % PALETTE.len()];
-    match DASHES[i / PALETTE.len() % DASHES.len()] {
+fn stroke(panel: &Panel, i: usize) -> String {
+    let (colour, dashes) = style(panel, i);
+    let colour = PALETTE[colour % PALETTE.len()];
+    match DASHES[dashes % DASHES.len()] {
         "" => format!("stroke=\"{colour}\""),
         dashes => format!("stroke=\"{colour}\" stroke-dasharray=\"{dashes}\""),
     }

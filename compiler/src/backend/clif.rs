@@ -48,7 +48,7 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     let carried: Vec<(Value, Value)> = emitter.carried();
     let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, &mut b))).collect();
     // Nothing changes from one iteration to the next: one is enough.
-    let count = if carried.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
+    let count = if carried.is_empty() && func.writes.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
     let first: Vec<BlockArg> = first.into_iter().chain([BlockArg::Value(count)]).collect();
     b.ins().jump(body, &first);
 
@@ -61,6 +61,11 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
         if !matches!(func.op(value), Op::Load(_)) {
             emitter.operation(value, &mut b);
         }
+    }
+    for write in &func.writes {
+        let (address, offset) = emitter.entry(block, write.base.0, write.len, write.index, &mut b);
+        let value = emitter.get(write.value, &mut b);
+        b.ins().store(MemFlagsData::trusted(), value, address, offset);
     }
     let left = b.ins().iadd_imm_s(left, -1);
     match watch {
@@ -133,15 +138,16 @@ impl Watch {
         };
         let mut needed = vec![false; func.ops.len()];
         needed[when.index()] = true;
-        for (_, value) in &func.stores {
+        for value in func.results().filter(|value| Some(*value) != func.status) {
             needed[value.index()] = true;
         }
         for i in (0..func.ops.len()).rev() {
             if needed[i] {
                 func.ops[i].each_operand(|operand| needed[operand.index()] = true);
             }
-            let load = matches!(func.ops[i], Op::Load(_));
-            late[i] = !needed[i] && !load;
+            // What the block holds is read before the iteration writes to it.
+            let read = matches!(func.ops[i], Op::Load(_) | Op::Ring { .. });
+            late[i] = !needed[i] && !read;
         }
         (Watch::Failed { when, detail }, late)
     }
@@ -170,14 +176,18 @@ impl Emitter<'_> {
         let mut varies = vec![false; func.ops.len()];
         let mut as_real = vec![false; func.ops.len()];
         for (i, op) in func.ops.iter().enumerate() {
-            let mut changes = matches!(op, Op::Load(slot) if stored.contains_key(slot));
+            let mut changes = match op {
+                Op::Load(slot) => stored.contains_key(slot),
+                Op::Ring { .. } => !func.writes.is_empty(),
+                _ => false,
+            };
             op.each_operand(|operand| {
                 changes |= varies[operand.index()];
                 as_real[operand.index()] |= !matches!(op, Op::ToBits(_));
             });
             varies[i] = changes;
         }
-        for (_, value) in &func.stores {
+        for value in func.results() {
             as_real[value.index()] = true;
         }
         let types = verify::types(func).expect("the function is sound");
@@ -212,15 +222,20 @@ impl Emitter<'_> {
         // Of a table only the bits may be needed: then the number is never loaded.
         if let Op::Pool { base, len, index } = op {
             if self.as_real[value.index()] {
-                let (address, offset) = self.entry(base, len, index, b);
+                let (address, offset) = self.entry(self.pool, base, len, index, b);
                 self.values[value.index()] = Some(b.ins().load(types::F64, flags, address, offset));
             }
+            return;
+        }
+        if let Op::Ring { base, len, index } = op {
+            let (address, offset) = self.entry(self.block, base.0, len, index, b);
+            self.values[value.index()] = Some(b.ins().load(types::F64, flags, address, offset));
             return;
         }
         if let Op::ToBits(table) = op
             && let Op::Pool { base, len, index } = self.func.op(table)
         {
-            let (address, offset) = self.entry(base, len, index, b);
+            let (address, offset) = self.entry(self.pool, base, len, index, b);
             self.values[value.index()] = Some(b.ins().load(types::I64, flags, address, offset));
             return;
         }
@@ -231,7 +246,7 @@ impl Emitter<'_> {
         let x = |i: usize| operands[i].expect("an operand");
         let result = match op {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) => return,
-            Op::Pool { .. } => unreachable!("done above"),
+            Op::Pool { .. } | Op::Ring { .. } => unreachable!("done above"),
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Load(slot) => b.ins().load(types::F64, flags, self.block, offset(slot.0)),
             Op::Add(..) => b.ins().fadd(x(0), x(1)),
@@ -277,8 +292,16 @@ impl Emitter<'_> {
         self.values[value.index()] = Some(result);
     }
 
-    /// Address and offset of an entry of a table, the index held inside unless it cannot leave.
-    fn entry(&self, base: u32, len: u32, index: Value, b: &mut FunctionBuilder) -> (clif::Value, i32) {
+    /// Address and offset of an entry of a table in the pool or a ring in the block (`whole`), the index held inside
+    /// unless it cannot leave.
+    fn entry(
+        &self,
+        whole: clif::Value,
+        base: u32,
+        len: u32,
+        index: Value,
+        b: &mut FunctionBuilder,
+    ) -> (clif::Value, i32) {
         let masked = |value: Value| match self.func.op(value) {
             Op::Int(mask) => (0..i64::from(len)).contains(&mask),
             _ => false,
@@ -293,6 +316,6 @@ impl Emitter<'_> {
             place = b.ins().umin(place, last);
         }
         let bytes = b.ins().ishl_imm_u(place, 3);
-        (b.ins().iadd(self.pool, bytes), offset(base))
+        (b.ins().iadd(whole, bytes), offset(base))
     }
 }

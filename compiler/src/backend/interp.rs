@@ -65,11 +65,19 @@ fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 
                 let index = values[index.index()].min(u64::from(len) - 1);
                 pool[base as usize + index as usize].to_bits()
             }
+            Op::Ring { base, len, index } => {
+                let index = values[index.index()].min(u64::from(len) - 1);
+                block[base.index() + index as usize].to_bits()
+            }
             op => evaluate(op, |operand| values[operand.index()]).expect("elementary functions are expanded"),
         };
     }
     for (slot, value) in &func.stores {
         block[slot.index()] = f64::from_bits(values[value.index()]);
+    }
+    for write in &func.writes {
+        let index = values[write.index.index()].min(u64::from(write.len) - 1);
+        block[write.base.index() + index as usize] = f64::from_bits(values[write.value.index()]);
     }
     func.status.map_or(0, |status| values[status.index()])
 }

@@ -364,11 +364,6 @@ impl<'a> Flattener<'a> {
                 self.wrong_count(function, wanted, args.len());
                 self.error(span)
             }
-            None if function.text == "delay" => {
-                let error = Diagnostic::error("E0905", "`delay` is not available yet").label(function.span, "reserved");
-                self.report(error.help("a first-order lag comes close: `dy/dt = (x - y) / T`"));
-                self.error(span)
-            }
             None if MeasureName::named(&function.text).is_some() => {
                 let error =
                     Diagnostic::error("E0901", format!("`{}` is a measure: it belongs in `expect`", function.text))
@@ -393,7 +388,11 @@ impl<'a> Flattener<'a> {
             }
             _ => {}
         }
-        self.system.push(Node::Call(builtin, values.into()), span)
+        let call = self.system.push(Node::Call(builtin, values.into()), span);
+        if builtin == Builtin::Delay {
+            self.system.delays.push(call);
+        }
+        call
     }
 
     pub(super) fn wrong_count(&mut self, function: &Name, wanted: usize, got: usize) {
@@ -524,6 +523,9 @@ impl<'a> Flattener<'a> {
                     .help("write some of them out"),
             };
             self.report(error);
+            return self.error(span);
+        }
+        if self.full(span) {
             return self.error(span);
         }
         self.functions.push(item);

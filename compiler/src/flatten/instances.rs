@@ -390,13 +390,6 @@ impl<'a> Flattener<'a> {
                 Some(part) => made.push(part),
                 None => return,
             }
-            if self.system.vars.len() > MOST_VARS {
-                let error = Diagnostic::error("E0502", format!("more than {MOST_VARS} quantities"))
-                    .label(repeat.span, "made here")
-                    .help("a program of this size is refused; use fewer elements");
-                self.report(error);
-                return;
-            }
         }
         self.bind(id, &part.name.text, Binding::Parts(Rc::new(made), first));
     }
@@ -455,6 +448,9 @@ impl<'a> Flattener<'a> {
                 .label(instance.model.span, "a straight model")
                 .help(format!("write `rotary {}(…)`", model.name.text));
             self.report(error);
+        }
+        if self.full(part.repeat.as_ref().map_or(instance.model.span, |repeat| repeat.span)) {
+            return None;
         }
         let mut args = args_of(&instance.args, &instance_env);
         if let Some(slot) = &part.slot {

@@ -23,6 +23,10 @@ pub use frame::{Frame, Framed, Node as BusNode, Scope};
 
 /// Most quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;
+/// Most operations of one instance with all its parts.
+pub const MOST_NODES: usize = 2_000_000;
+/// Most operations of a function on its own.
+const MOST_NODES_OF_ITEM: usize = 100_000;
 /// For so many unknown names a suggestion is looked for; the rest is hardly read.
 const MOST_SUGGESTIONS: usize = 50;
 /// Deepest nesting of parts in parts, and of functions in functions.
@@ -143,12 +147,16 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         }
         None => Vec::new(),
     };
+    if f.too_large {
+        // Nobody looks at what is refused.
+        f.system = System::default();
+    }
     Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
 }
 
 /// Reads a function, constant or table on its own: a function's arguments come from outside.
 pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
-    let mut f = Flattener::new(loaded, sources);
+    let mut f = Flattener { most_nodes: MOST_NODES_OF_ITEM, ..Flattener::new(loaded, sources) };
     let env = Env::file(file);
     let observed = match item {
         Item::Function(function) => {
@@ -185,6 +193,9 @@ pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: 
         }
         _ => Vec::new(),
     };
+    if f.too_large {
+        f.system = System::default();
+    }
     Flat { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
 }
 
@@ -209,6 +220,9 @@ struct Flattener<'a> {
     unknowns: usize,
     /// Wiring of slots that the present model has no port for: another model may read it.
     dropped: Vec<Arg<'a>>,
+    /// Most operations, and whether it has been reported that there are more.
+    most_nodes: usize,
+    too_large: bool,
     /// Parts whose name is taken, and reported.
     refused_parts: Vec<Span>,
     /// Quantities whose definition was refused, and reported.
@@ -322,6 +336,8 @@ impl<'a> Flattener<'a> {
             models: Vec::new(),
             refused: Vec::new(),
             unknowns: 0,
+            most_nodes: MOST_NODES,
+            too_large: false,
             refused_parts: Vec::new(),
             dropped: Vec::new(),
             data: HashMap::new(),
@@ -330,6 +346,23 @@ impl<'a> Flattener<'a> {
 
     fn report(&mut self, diagnostic: Diagnostic) {
         self.diagnostics.push(diagnostic);
+    }
+
+    /// Whether the program has grown too large to go on: reported once, at a place where it grows.
+    fn full(&mut self, span: Span) -> bool {
+        let made = self.system.vars.len() + self.system.instances.len();
+        let (most, what) = match () {
+            () if made > MOST_VARS => (MOST_VARS, "quantities and parts"),
+            () if self.system.nodes.len() > self.most_nodes => (self.most_nodes, "operations"),
+            () => return false,
+        };
+        if !std::mem::replace(&mut self.too_large, true) {
+            let error = Diagnostic::error("E0502", format!("more than {most} {what}"))
+                .label(span, "it is still growing here")
+                .help("a program of this size is refused: use fewer parts, or let each do more");
+            self.report(error);
+        }
+        true
     }
 }
 

@@ -5,7 +5,7 @@
 
 use super::eval::evaluate;
 use super::verify::result;
-use super::{Binary, Func, Op, Type, Unary, Value};
+use super::{Binary, Func, Op, Type, Unary, Value, Write};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{BuildHasherDefault, Hasher};
@@ -22,6 +22,7 @@ pub struct Build {
     types: Vec<Type>,
     known: HashMap<Op, Value, BuildHasherDefault<Mix>>,
     stores: BTreeMap<Slot, Value>,
+    writes: Vec<Write>,
     status: Option<Value>,
     pool: Arc<[f64]>,
 }
@@ -270,7 +271,7 @@ impl Build {
                     None
                 }
             }
-            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } => None,
+            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => None,
             Op::Sqrt(_) | Op::Unary(..) | Op::Binary(..) => None,
             Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => None,
             Op::IntAdd(..) | Op::IntSub(..) | Op::IntMul(..) | Op::IntAnd(..) | Op::IntOr(..) => None,
@@ -283,6 +284,13 @@ impl Build {
     pub fn store(&mut self, slot: Slot, value: Value) {
         assert_eq!(self.type_of(value), Type::Real, "slot {} of {} holds a real", slot.0, self.name);
         self.stores.insert(slot, value);
+    }
+
+    /// Writes to a ring when the function ends.
+    pub fn write(&mut self, write: Write) {
+        assert_eq!(self.type_of(write.index), Type::Int, "{} writes at an integer", self.name);
+        assert_eq!(self.type_of(write.value), Type::Real, "a ring of {} holds reals", self.name);
+        self.writes.push(write);
     }
 
     /// Stores every slot of `env` that `keep` accepts.
@@ -326,7 +334,7 @@ impl Build {
     pub fn finish(self) -> Func {
         let kept = |(slot, value): &(Slot, Value)| self.ops[value.index()] != Op::Load(*slot);
         let stores = self.stores.into_iter().filter(kept).collect();
-        let func = Func { name: self.name, ops: self.ops, stores, status: self.status };
+        let func = Func { name: self.name, ops: self.ops, stores, writes: self.writes, status: self.status };
         prune(&func)
     }
 }
@@ -344,6 +352,7 @@ pub fn prune(func: &Func) -> Func {
         name: func.name.clone(),
         ops,
         stores: func.stores.iter().map(|(slot, value)| (*slot, moved[value.index()])).collect(),
+        writes: func.writes.iter().map(|write| write.map(|value| moved[value.index()])).collect(),
         status: func.status.map(|status| moved[status.index()]),
     }
 }
@@ -448,6 +457,11 @@ impl Build {
     /// Entry `index` of the table at `base` of the pool; the index is held inside.
     pub fn pool(&mut self, base: u32, len: u32, index: Value) -> Value {
         self.op(Op::Pool { base, len, index })
+    }
+
+    /// What slot `index` of a ring holds when the function begins; the index is held inside.
+    pub fn ring(&mut self, base: Slot, len: u32, index: Value) -> Value {
+        self.op(Op::Ring { base, len, index })
     }
 
     /// An elementary function.

@@ -11,7 +11,7 @@ pub fn evaluate(op: Op, bits: impl Fn(Value) -> u64) -> Option<u64> {
     let int = |value| bits(value) as i64;
     let truth = |value| bits(value) != 0;
     Some(match op {
-        Op::Load(_) | Op::Pool { .. } | Op::Unary(..) | Op::Binary(..) => return None,
+        Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } | Op::Unary(..) | Op::Binary(..) => return None,
         Op::Real(constant) => constant,
         Op::Int(constant) => constant as u64,
         Op::Bool(constant) => constant.into(),

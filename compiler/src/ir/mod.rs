@@ -85,6 +85,16 @@ pub enum Op {
         /// Which.
         index: Value,
     },
+    /// The slot `base + min(index as unsigned, len − 1)` when the function begins: a ring of samples. `index` is an
+    /// integer. No load and no store of the function touches the slots of a ring, only [`Write`]s do.
+    Ring {
+        /// First slot.
+        base: Slot,
+        /// Number of slots, at least 1.
+        len: u32,
+        /// Which.
+        index: Value,
+    },
 
     /// a + b, rounded once.
     Add(Value, Value),
@@ -160,6 +170,19 @@ pub enum Op {
     ToReal(Value),
 }
 
+/// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Write {
+    /// First slot of the ring.
+    pub base: Slot,
+    /// Number of its slots, at least 1.
+    pub len: u32,
+    /// An integer: which slot.
+    pub index: Value,
+    /// The real it takes.
+    pub value: Value,
+}
+
 /// A straight-line function over a block of slots: first all loads, then the operations, then all stores.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Func {
@@ -169,8 +192,17 @@ pub struct Func {
     pub ops: Vec<Op>,
     /// What is written, each slot at most once, all at the end.
     pub stores: Vec<(Slot, Value)>,
+    /// What is written to rings, each at most once, after the stores.
+    pub writes: Vec<Write>,
     /// An integer: 0, or the number of the guard that failed. None: always 0.
     pub status: Option<Value>,
+}
+
+impl Write {
+    /// The same write of the values that `f` gives for its own.
+    pub fn map(self, f: impl Fn(Value) -> Value) -> Write {
+        Write { index: f(self.index), value: f(self.value), ..self }
+    }
 }
 
 impl Op {
@@ -179,6 +211,7 @@ impl Op {
         match self {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => self,
             Op::Pool { base, len, index } => Op::Pool { base, len, index: f(index) },
+            Op::Ring { base, len, index } => Op::Ring { base, len, index: f(index) },
             Op::Add(a, b) => Op::Add(f(a), f(b)),
             Op::Sub(a, b) => Op::Sub(f(a), f(b)),
             Op::Mul(a, b) => Op::Mul(f(a), f(b)),
@@ -231,10 +264,16 @@ impl Func {
         self.ops[value.index()]
     }
 
-    /// For each operation, whether a store or the status needs it.
+    /// The values that leave the function: stored, written, or its status.
+    pub fn results(&self) -> impl Iterator<Item = Value> + '_ {
+        let written = self.writes.iter().flat_map(|write| [write.index, write.value]);
+        self.stores.iter().map(|(_, value)| *value).chain(written).chain(self.status)
+    }
+
+    /// For each operation, whether a store, a write or the status needs it.
     pub fn live(&self) -> Vec<bool> {
         let mut live = vec![false; self.ops.len()];
-        for value in self.stores.iter().map(|(_, value)| *value).chain(self.status) {
+        for value in self.results() {
             live[value.index()] = true;
         }
         for i in (0..self.ops.len()).rev() {

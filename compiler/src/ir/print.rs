@@ -8,7 +8,7 @@
 //!   store 4 = v2
 //! ```
 
-use super::{Binary, Func, Op, Unary, Value};
+use super::{Binary, Func, Op, Unary, Value, Write};
 use std::fmt;
 
 impl fmt::Display for Value {
@@ -25,6 +25,7 @@ impl fmt::Display for Op {
             Op::Bool(b) => write!(f, "{b}"),
             Op::Load(slot) => write!(f, "load {}", slot.0),
             Op::Pool { base, len, index } => write!(f, "pool {base}[{index} < {len}]"),
+            Op::Ring { base, len, index } => write!(f, "ring {}[{index} < {len}]", base.0),
             Op::Add(a, b) => write!(f, "add {a} {b}"),
             Op::Sub(a, b) => write!(f, "sub {a} {b}"),
             Op::Mul(a, b) => write!(f, "mul {a} {b}"),
@@ -71,6 +72,9 @@ impl fmt::Display for Func {
         }
         for (slot, value) in &self.stores {
             writeln!(f, "  store {} = {value}", slot.0)?;
+        }
+        for Write { base, len, index, value } in &self.writes {
+            writeln!(f, "  write {}[{index} < {len}] = {value}", base.0)?;
         }
         match self.status {
             Some(status) => writeln!(f, "  status {status}"),
@@ -148,6 +152,7 @@ mod tests {
                 Op::Int(0),
                 Op::Pool { base: 8, len: 3, index: Value(4) },
             ],
+            writes: Vec::new(),
             stores: vec![(Slot(4), Value(3)), (Slot(5), Value(5))],
             status: Some(Value(4)),
         };

@@ -1,7 +1,7 @@
 //! Sound functions by chance, from a seed: for tests that hold two ways of running against each other.
 
 use super::verify::result;
-use super::{Func, Op, Type, Value};
+use super::{Func, Op, Type, Value, Write};
 use abi::{Layout, Slot};
 
 /// SplitMix64.
@@ -89,7 +89,7 @@ pub const INTS: &[i64] =
 
 /// Layout of the functions made here: some of every segment that a function may read or write.
 pub fn layout() -> Layout {
-    Layout::new([4, 2, 4, 2, 1, 3, 0, 0, 0, 1])
+    Layout::new([4, 2, 4, 2, 1, 3, 0, 0, 0, 1]).with_rings(8)
 }
 
 /// Length of the pool of the functions made here.
@@ -100,7 +100,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
     let layout = layout();
     let mut made = Made::default();
     for _ in 0..8 {
-        let op = Op::Load(Slot(random.below(layout.size()) as u32));
+        let op = Op::Load(Slot(random.below(layout.rings.start as usize) as u32));
         made.push(op);
     }
     made.push(Op::Int(random.int()));
@@ -117,7 +117,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
         let (i, j) = (any(Type::Int, &made), any(Type::Int, &made));
         let (p, q) = (any(Type::Bool, &made), any(Type::Bool, &made));
         let n = random.below(64) as u8;
-        match random.below(40) {
+        match random.below(41) {
             0 => made.push(Op::Real(random.real().to_bits())),
             1 => made.push(Op::Int(random.int())),
             2 | 3 => made.push(Op::Add(x, y)),
@@ -161,6 +161,10 @@ pub fn func(random: &mut Random, len: usize) -> Func {
             36 => made.push(Op::FromBits(i)),
             37 => made.push(Op::ToInt(x)),
             38 => made.push(Op::ToReal(i)),
+            39 => {
+                let (base, len) = ring(random, &layout);
+                made.push(Op::Ring { base, len, index: i });
+            }
             _ => {
                 let base = random.below(POOL_LEN) as u32;
                 let len = 1 + random.below(POOL_LEN - base as usize) as u32;
@@ -184,6 +188,13 @@ pub fn func(random: &mut Random, len: usize) -> Func {
             }
         }
     }
+    let mut writes = Vec::new();
+    for _ in 0..random.below(3) {
+        let (base, len) = ring(random, &layout);
+        let (reals, ints) = (made.of(Type::Real), made.of(Type::Int));
+        let (value, index) = (reals[random.below(reals.len())], ints[random.below(ints.len())]);
+        writes.push(Write { base, len, index, value });
+    }
     let status = (random.below(2) == 0).then(|| {
         let fit = made.of(Type::Bool);
         let failed = fit[random.below(fit.len())];
@@ -202,7 +213,13 @@ pub fn func(random: &mut Random, len: usize) -> Func {
         made.push(Op::Select(failed, made.last(0), zero));
         made.last(0)
     });
-    Func { name: "random".into(), ops: made.ops, stores, status }
+    Func { name: "random".into(), ops: made.ops, stores, writes, status }
+}
+
+/// Some of the slots for rings.
+fn ring(random: &mut Random, layout: &Layout) -> (Slot, u32) {
+    let from = random.below(layout.rings.len as usize);
+    (layout.rings.slot(from), 1 + random.below(layout.rings.len as usize - from) as u32)
 }
 
 #[derive(Default)]

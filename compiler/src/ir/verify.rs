@@ -21,6 +21,18 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
         Ok(types) => types,
         Err(what) => return fault(what),
     };
+    let touched: std::collections::HashSet<Slot> =
+        func.loads().into_iter().chain(func.stores.iter().map(|(slot, _)| *slot)).collect();
+    let ring = |base: Slot, len: u32| {
+        let (start, end) = (base.0, base.0 as u64 + u64::from(len));
+        if len == 0 || start < layout.rings.start || end > u64::from(layout.rings.start + layout.rings.len) {
+            return Err(format!("uses {len} slots from {start} on as a ring, which lie outside the rings"));
+        }
+        match touched.iter().find(|slot| (start..start + len).contains(&slot.0)) {
+            Some(slot) => Err(format!("uses a ring of which slot {} is loaded or stored", slot.0)),
+            None => Ok(()),
+        }
+    };
     for (i, op) in func.ops.iter().enumerate() {
         let value = Value(i as u32);
         match *op {
@@ -30,6 +42,11 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
             Op::Pool { len: 0, .. } => return fault(format!("{value} reads a table without entries")),
             Op::Pool { base, len, .. } if base as usize + len as usize > pool_len => {
                 return fault(format!("{value} reads entries {base}..{base} + {len} of a pool of {pool_len}"));
+            }
+            Op::Ring { base, len, .. } => {
+                if let Err(what) = ring(base, len) {
+                    return fault(format!("{value} {what}"));
+                }
             }
             Op::ShiftLeft(_, n) | Op::ShiftRight(_, n) | Op::ShiftRightSigned(_, n) if n > 63 => {
                 return fault(format!("{value} shifts by {n}"));
@@ -52,6 +69,15 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
             Some(Type::Real) => {}
             Some(other) => return fault(format!("slot {} holds reals, {value} is {other:?}", slot.0)),
             None => return fault(format!("slot {} is given {value}, which does not exist", slot.0)),
+        }
+    }
+    for write in &func.writes {
+        if let Err(what) = ring(write.base, write.len) {
+            return fault(format!("a write {what}"));
+        }
+        let of = |value: Value| types.get(value.index()).copied();
+        if of(write.index) != Some(Type::Int) || of(write.value) != Some(Type::Real) {
+            return fault(format!("a write of {} at {}: a real at an integer is needed", write.value, write.index));
         }
     }
     match func.status {
@@ -95,7 +121,7 @@ pub fn result(op: Op, of: impl Fn(Value) -> Type) -> Result<Type, String> {
         Op::Real(_) | Op::Load(_) => (&[], Real),
         Op::Int(_) => (&[], Int),
         Op::Bool(_) => (&[], Bool),
-        Op::Pool { .. } => (&[Int], Real),
+        Op::Pool { .. } | Op::Ring { .. } => (&[Int], Real),
         Op::Add(..) | Op::Sub(..) | Op::Mul(..) | Op::Div(..) | Op::Binary(..) => (&[Real, Real], Real),
         Op::Neg(_) | Op::Abs(_) | Op::Sqrt(_) | Op::Floor(_) | Op::Nearest(_) | Op::Unary(..) => (&[Real], Real),
         Op::Fma(..) => (&[Real, Real, Real], Real),
@@ -141,6 +167,7 @@ mod tests {
             name: "f".into(),
             ops: ops.to_vec(),
             stores: stores.iter().map(|&(slot, value)| (Slot(slot), Value(value))).collect(),
+            writes: Vec::new(),
             status: status.map(Value),
         };
         let found = verify(&func, &layout(), 8, Stage::Expanded).err().unwrap_or_default();

@@ -47,6 +47,9 @@ pub fn expand(func: &Func) -> Func {
     for (slot, value) in &func.stores {
         build.store(*slot, values[value.index()]);
     }
+    for write in &func.writes {
+        build.write(write.map(|value| values[value.index()]));
+    }
     if let Some(status) = func.status {
         build.status(values[status.index()]);
     }

@@ -48,6 +48,9 @@ fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: 
             longest = longest.max(pass.ready[value.index()].unwrap_or(0));
         }
     }
+    for write in &func.writes {
+        build.write(write.map(|value| values[value.index()]));
+    }
     if let Some(status) = func.status {
         build.status(values[status.index()]);
     }
@@ -87,7 +90,7 @@ fn latency(op: Op) -> u32 {
         Op::ShiftLeft(..) | Op::ShiftRight(..) | Op::ShiftRightSigned(..) => 1,
         Op::IntMul(..) | Op::IntLess(..) | Op::IntEqual(..) => 3,
         Op::ToBits(_) | Op::FromBits(_) => 3,
-        Op::Pool { .. } | Op::ToInt(_) | Op::ToReal(_) => 7,
+        Op::Pool { .. } | Op::Ring { .. } | Op::ToInt(_) | Op::ToReal(_) => 7,
         Op::Unary(Unary::Exp, _) => 36,
         Op::Unary(Unary::Log | Unary::Expm1 | Unary::Log1p | Unary::Sin | Unary::Cos, _) => 45,
         Op::Unary(
@@ -125,6 +128,7 @@ impl Pass<'_> {
             let op = self.build.get(Value(self.ready.len() as u32));
             let mut last = match op {
                 Op::Load(slot) if self.carried.contains(&slot) => Some(0),
+                Op::Ring { .. } => Some(0),
                 _ => None,
             };
             op.each_operand(|operand| last = last.max(self.ready[operand.index()]));

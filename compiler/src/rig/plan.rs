@@ -536,7 +536,10 @@ impl Cut {
         let control = lower(&self.control, &self.control_types, &self.wanted());
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
         let rig = self.finish(&control, &plant);
-        let (control, plant) = (control.program, plant.program);
+        let (mut control, mut plant) = (control.program, plant.program);
+        let step = rig.period_ns as f64 * 1e-9 / f64::from(rig.steps);
+        control.size_rings(step);
+        plant.size_rings(step);
         warnings.extend(self.advice(&rig, &control, &plant));
         super::Lowered { rig, control, plant }
     }

@@ -57,7 +57,8 @@ pub(crate) fn run(
 struct Adaptive<'a> {
     system: System<'a>,
     duration: f64,
-    corners: &'a [f64],
+    /// Instants that are met exactly, ascending.
+    corners: Vec<f64>,
     tol: f64,
     /// Scale of each state, SI.
     scales: Vec<f64>,
@@ -100,6 +101,8 @@ struct Adaptive<'a> {
     /// For each sampled block its period in s and the number of its next tick.
     ticks: Vec<(f64, u64)>,
     points: Points<'a>,
+    /// θ of the step up to which the past is kept.
+    kept: f64,
     work: Work,
 }
 
@@ -128,12 +131,13 @@ impl<'a> Adaptive<'a> {
         let n = system.n;
         Adaptive {
             duration: experiment.duration,
-            corners: &experiment.corners,
+            corners: experiment.corners.clone(),
             tol,
             t: 0.0,
             x: system.instance.block()[system.states.clone()].to_vec(),
             h: 0.0,
-            longest: experiment.duration / 50.0,
+            longest: (experiment.duration / 50.0).min(system.history.longest()),
+            kept: 0.0,
             step: Step::new(n),
             slope_known: false,
             end_slope: vec![0.0; n],
@@ -374,6 +378,7 @@ impl<'a> Adaptive<'a> {
     /// Follows an accepted step up to its end at time `reached`, or to its first event.
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
+        self.kept = 0.0;
         self.surfaces.begin(&mut self.system, &self.step, self.fresh);
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
@@ -395,6 +400,7 @@ impl<'a> Adaptive<'a> {
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
         self.points.until(&mut self.system, &self.step, 1.0, reached)?;
+        self.keep(1.0, reached)?;
         self.t = reached;
         self.x.copy_from_slice(&self.step.x1);
         self.step.f0.copy_from_slice(&self.end_slope);
@@ -459,6 +465,7 @@ impl<'a> Adaptive<'a> {
     fn acts(&mut self, crossing: Crossing, jumps: bool) -> Result<bool, Stop> {
         let time = self.step.time(crossing.far);
         self.points.until(&mut self.system, &self.step, crossing.near, time)?;
+        self.keep(crossing.near, time)?;
         self.step.at(crossing.far, &mut self.x);
         self.system.place(time, &self.x);
         if !self.settle()? && !jumps {
@@ -479,10 +486,53 @@ impl<'a> Adaptive<'a> {
                 return Err(self.chatter(time - first));
             }
         }
+        self.keep_here()?;
         self.points.here(&mut self.system, self.t, &self.x)?;
         self.restart();
         self.h = self.h.min(self.first_step());
         Ok(true)
+    }
+
+    /// Keeps what is delayed along the step, from where it was kept last to θ, whose point is said to be at `time`.
+    fn keep(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
+        if self.system.history.is_empty() || theta <= self.kept {
+            return Ok(());
+        }
+        let from = std::mem::replace(&mut self.kept, theta);
+        let at = |run: &mut Self, theta: f64| {
+            run.step.at(theta, &mut run.beside);
+            // What jumps at the end has not jumped before it.
+            run.system.place(run.step.time(theta).min(run.step.end), &run.beside);
+            let status = run.system.instance.call(Function::Outputs);
+            check_status(run.system.instance, status)
+        };
+        at(self, 0.5 * (from + theta))?;
+        let middle = self.system.history.present(self.system.instance);
+        at(self, theta)?;
+        let pieces = self.system.history.pieces(&middle, self.system.instance, self.tol);
+        for piece in 1..=pieces {
+            let theta = from + (theta - from) * f64::from(piece) / f64::from(pieces);
+            at(self, theta)?;
+            let t = if piece == pieces { time } else { self.step.time(theta) };
+            self.system.history.push(t, self.system.instance);
+        }
+        Ok(())
+    }
+
+    /// Keeps what is delayed as it is behind an event or tick; what jumps is met again when it is seen again.
+    fn keep_here(&mut self) -> Result<(), Stop> {
+        if self.system.history.is_empty() {
+            return Ok(());
+        }
+        self.system.place(self.t, &self.x);
+        let status = self.system.instance.call(Function::Outputs);
+        check_status(self.system.instance, status)?;
+        for echo in self.system.history.push(self.t, self.system.instance) {
+            if let Err(at) = self.corners.binary_search_by(|corner| corner.total_cmp(&echo)) {
+                self.corners.insert(at, echo);
+            }
+        }
+        Ok(())
     }
 
     /// Lets transitions happen until none does, at most as often as there are regimes. Returns whether any did.
@@ -576,6 +626,7 @@ impl<'a> Adaptive<'a> {
         }
         self.settle()?;
         self.x.copy_from_slice(&self.system.instance.block()[self.system.states.clone()]);
+        self.keep_here()?;
         self.points.here(&mut self.system, self.t, &self.x)?;
         self.restart();
         Ok(())

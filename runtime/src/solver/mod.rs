@@ -2,10 +2,11 @@
 //!
 //! In: a model that offers derivatives, and if it can its Jacobian, switching surfaces, transitions and sampled
 //! blocks. Out: its points, shown to an observer. [`linear`] solves the small systems, [`rosenbrock`] and
-//! [`explicit`] make one [`Step`](step::Step) each, [`surfaces`] finds where one crosses a switching surface,
+//! [`explicit`] make one [`Step`](step::Step) each, [`history`] keeps what is delayed, [`surfaces`] finds where one crosses a switching surface,
 //! [`points`] shows it, and [`adaptive`] chooses and joins steps.
 
 pub(crate) mod linear;
+pub(crate) mod history;
 pub(crate) mod step;
 
 pub(crate) mod explicit;

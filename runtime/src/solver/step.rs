@@ -1,5 +1,6 @@
 //! The model as a solver sees it, and one step of it as a polynomial.
 
+use super::history::History;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
@@ -15,6 +16,8 @@ pub(crate) struct System<'a> {
     roots: Range<usize>,
     /// Evaluations of the derivatives.
     pub(crate) evaluations: u64,
+    /// What is delayed.
+    pub(crate) history: History,
 }
 
 impl<'a> System<'a> {
@@ -27,6 +30,7 @@ impl<'a> System<'a> {
             derivatives: layout.derivatives.range(),
             jacobian: layout.jacobian.range(),
             roots,
+            history: History::new(instance),
             instance,
             evaluations: 0,
         }
@@ -43,6 +47,7 @@ impl<'a> System<'a> {
         let block = self.instance.block_mut();
         block[Slot::TIME.index()] = t;
         block[states].copy_from_slice(x);
+        self.history.place(t, block);
     }
 
     /// dx/dt at (t, x), in SI per second.
@@ -58,6 +63,7 @@ impl<'a> System<'a> {
         let block = self.instance.block_mut();
         block[Slot::TIME.index()] = t;
         block[states..states + n].copy_from_slice(&x[..n]);
+        self.history.place(t, block);
         if n > 0 {
             self.instance.call(Function::Derivatives);
         }
