@@ -8,6 +8,7 @@ use crate::vary::{self, Vary};
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
+use runtime::can::address::Address;
 use std::path::PathBuf;
 
 /// A small equation language for friction models, controllers and the rigs they run on.
@@ -54,6 +55,12 @@ pub enum Command {
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
     Watch(Watch),
+    /// Join CAN buses, open doors to them, and print their traffic
+    Bus(Bus),
+    /// Say what this machine lacks for real time, with the line that mends each
+    Doctor(Doctor),
+    /// Run a loop as a rig does and say how late it wakes
+    BenchRt(BenchRt),
     /// Make a folder with a first model and its experiment
     New(New),
     /// Print completions for a shell
@@ -66,7 +73,7 @@ pub enum Command {
         /// Such as run
         #[arg(value_parser = [
             "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "new", "completions",
+            "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -413,6 +420,74 @@ pub struct Repl {
     pub echo: bool,
 }
 
+/// `fric bus`
+#[derive(clap::Args, Debug)]
+#[command(after_help = BUS_ADDRESSES)]
+pub struct Bus {
+    /// Buses to join, such as can0, sim:bench, slcan:/dev/ttyACM0@1000000, socketcand:host/can0
+    #[arg(value_name = "ADDRESS", required_unless_present_any = ["pty", "tcp"], value_parser = address)]
+    pub addresses: Vec<Address>,
+    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
+    pub pty: Vec<PathBuf>,
+    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    #[arg(long, value_name = "PORT")]
+    pub tcp: Option<u16>,
+    /// Let other machines come to the TCP port too
+    #[arg(long, requires = "tcp")]
+    pub everywhere: bool,
+    /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
+    #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub bit_rate: Option<u32>,
+    /// Print traffic as `candump -L` does, for `replay:`
+    #[arg(long)]
+    pub log: bool,
+    /// Join without printing traffic
+    #[arg(long, short, conflicts_with = "log")]
+    pub quiet: bool,
+    /// End after this time, such as 10s [default: Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+}
+
+const BUS_ADDRESSES: &str = "Addresses:\n  \
+    can0, socketcan:can0         an interface of the kernel\n  \
+    sim:NAME                     a bus in this process\n  \
+    slcan:PATH@BITRATE           a serial adapter\n  \
+    socketcand:HOST:PORT/NAME    a TCP gateway\n  \
+    replay:FILE                  a log of candump -L";
+
+/// `fric doctor`
+#[derive(clap::Args, Debug)]
+pub struct Doctor {
+    /// Buses to look at too, such as can0
+    #[arg(value_name = "ADDRESS", value_parser = address)]
+    pub addresses: Vec<Address>,
+    /// Bits a second that they should have
+    #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub bit_rate: Option<u32>,
+    /// Priority of the loop that will run
+    #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
+    pub priority: i32,
+}
+
+/// `fric bench-rt`
+#[derive(clap::Args, Debug)]
+pub struct BenchRt {
+    /// Cycles a second, such as 1kHz
+    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency)]
+    pub rate: f64,
+    /// How long to run
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86_400))]
+    pub seconds: u64,
+    /// Stay on this core [default: an isolated one, if there is any]
+    #[arg(long, value_name = "N")]
+    pub core: Option<usize>,
+    /// Priority under SCHED_FIFO
+    #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
+    pub priority: i32,
+}
+
 /// `fric watch`
 #[derive(clap::Args, Debug)]
 pub struct Watch {
@@ -457,6 +532,20 @@ fn positive_time(text: &str) -> Result<f64, String> {
         dimension => return Err(format!("a time is needed, not {}", dimension.describe())),
     }
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a time greater than 0 is needed".into()) }
+}
+
+fn address(text: &str) -> Result<Address, String> {
+    text.parse()
+}
+
+/// 1 Hz to 20 kHz.
+fn frequency(text: &str) -> Result<f64, String> {
+    let (value, unit) = value::parse(text)?;
+    let hertz = Unit::parse("1/s").expect("per second is known").dimension;
+    if unit.dimension != hertz {
+        return Err(format!("a frequency is needed, for example {text}Hz").replace("HzHz", "Hz"));
+    }
+    if (1.0..=20e3).contains(&value) { Ok(value) } else { Err("a frequency from 1 Hz to 20 kHz is needed".into()) }
 }
 
 fn tolerance(text: &str) -> Result<f64, String> {

@@ -104,6 +104,7 @@ fn outside_crates_have_one_home() {
         ("cranelift_jit", "compiler/src/backend/"),
         ("sha2", "abi/src/image.rs"),
         ("memmap2", "runtime/src/blob.rs"),
+        ("::socketcan", "runtime/src/can/socketcan.rs"),
         ("miette", "src/report.rs"),
         ("resvg", "src/plot/png.rs"),
         ("rustyline", "src/repl/line.rs"),
@@ -122,7 +123,8 @@ fn outside_crates_have_one_home() {
         }
     }
     for path in sources {
-        let text = code(&path);
+        // Its home bears the name of the crate.
+        let text = code(&path).replace("can::socketcan", "");
         let name = path.strip_prefix(root()).expect("a source of this project").display().to_string();
         for (outside, home) in homes {
             let used = text.contains(&format!("use {outside}")) || text.contains(&format!("{outside}::"));

@@ -29,7 +29,11 @@ pub mod clock;
 pub mod histogram;
 pub mod realtime;
 
+pub mod host;
+
 pub mod can;
+
+pub mod bench_rt;
 
 pub mod canopen;
 

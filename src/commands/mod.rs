@@ -1,9 +1,12 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod bench_rt;
+mod bus;
 mod characterise;
 mod check;
 mod cross;
 mod doc;
+mod doctor;
 mod explain;
 mod fmt;
 mod hil;
@@ -59,6 +62,9 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Doc(args) => doc::doc(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
+        Command::Bus(args) => bus::bus(args, terminal),
+        Command::Doctor(args) => doctor::doctor(args, terminal),
+        Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),
         Command::New(new) => new::new(new, terminal),
         Command::Completions { shell } => {
             let mut out = Vec::new();

@@ -2,6 +2,7 @@
 //!
 //! In: addresses and frames. Out: frames, stamps and events of the bus. Knows no drive and no model.
 
+pub mod names;
 pub mod wire;
 
 pub mod sim;

@@ -6,7 +6,7 @@
 use super::descriptor;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
 use crate::clock::{Clock, Monotonic};
-use socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl};
+use ::socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl};
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};
 
@@ -22,6 +22,7 @@ pub struct SocketCan {
     dropped: u32,
     /// Came behind a loss that is told first.
     held: Option<Received>,
+    listen_only: bool,
     /// Whether it was told already that the interface is down.
     down_told: bool,
 }
@@ -76,7 +77,7 @@ pub fn make_virtual(name: &str) -> Result<(), String> {
 
 /// Sets the bit rate of an interface and takes it up: needs CAP_NET_ADMIN.
 pub fn take_up(name: &str, bit_rate: Option<u32>) -> Result<(), String> {
-    let set = || -> Result<(), socketcan::Error> {
+    let set = || -> Result<(), ::socketcan::Error> {
         let interface = CanInterface::open(name)?;
         if let Some(bit_rate) = bit_rate {
             interface.set_bitrate(bit_rate, None)?;
@@ -141,7 +142,16 @@ impl SocketCan {
         if socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUFFORCE, BUFFER).is_err() {
             socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUF, BUFFER)?;
         }
-        Ok(SocketCan { socket, clock, health: Health::default(), dropped: 0, held: None, down_told: false })
+        let listen_only = options.listen_only;
+        Ok(SocketCan {
+            socket,
+            clock,
+            health: Health::default(),
+            dropped: 0,
+            held: None,
+            listen_only,
+            down_told: false,
+        })
     }
 
     /// One message from the kernel: a frame, when it came, and how many were dropped until then.
@@ -193,6 +203,28 @@ impl SocketCan {
         now_ns.saturating_sub(age_ns)
     }
 
+    /// What the socket dropped since the last frame: notes travel with frames, and the tail of a burst has none behind it.
+    fn dropped_behind(&mut self) -> Option<Received> {
+        let mut memory = [0u32; MEMINFO];
+        let mut length = size_of_val(&memory) as libc::socklen_t;
+        // SAFETY: the array is written up to its length, and both outlive the call.
+        let told = unsafe {
+            let (level, name) = (libc::SOL_SOCKET, libc::SO_MEMINFO);
+            libc::getsockopt(self.socket.as_raw_fd(), level, name, memory.as_mut_ptr().cast(), &mut length)
+        };
+        let dropped = if told == 0 { memory[MEMINFO - 1] } else { self.dropped };
+        let lost = self.lost(dropped);
+        (lost > 0).then(|| Received::Event(Event::Lost(lost), self.clock.now_ns()))
+    }
+
+    /// How many more the kernel has dropped than it had; they are counted.
+    fn lost(&mut self, dropped: u32) -> u32 {
+        let lost = dropped.wrapping_sub(self.dropped);
+        self.dropped = dropped;
+        self.health.lost += u64::from(lost);
+        lost
+    }
+
     fn down(&mut self) -> Option<Received> {
         self.health.state = State::Down;
         let told = std::mem::replace(&mut self.down_told, true);
@@ -240,26 +272,33 @@ impl SocketCan {
     }
 }
 
+/// Values that SO_MEMINFO tells; the last one is of drops.
+const MEMINFO: usize = libc::SK_MEMINFO_DROPS as usize + 1;
+
 /// Error counters are in the last two bytes. Newer than the crate libc.
 const CAN_ERR_CNT: u32 = 0x200;
 
 impl Bus for SocketCan {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
+        if self.listen_only {
+            return Err(Refused::Unable);
+        }
         let bytes = encode(&frame);
+        let fd = self.socket.as_raw_fd();
         // SAFETY: the bytes are valid for their length and outlive the call.
-        let written = unsafe { libc::write(self.socket.as_raw_fd(), bytes.as_ptr().cast(), bytes.len()) };
-        if written == bytes.len() as isize {
+        let write = || unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) } == bytes.len() as isize;
+        let full = |error: &io::Error| matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR));
+        // A socket keeps the news that its interface was down, and a write gets it even when that is over.
+        if write() || !full(&io::Error::last_os_error()) && write() {
             return Ok(());
         }
         self.health.refused += 1;
-        match io::Error::last_os_error().raw_os_error() {
-            // The queue towards the interface, or the socket's own.
-            Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR) => Err(Refused::Full),
-            _ => {
-                self.health.state = State::Down;
-                Err(Refused::Down)
-            }
+        // The queue towards the interface, or the socket's own.
+        if full(&io::Error::last_os_error()) {
+            return Err(Refused::Full);
         }
+        self.health.state = State::Down;
+        Err(Refused::Down)
     }
 
     fn receive(&mut self) -> Option<Received> {
@@ -270,7 +309,7 @@ impl Bus for SocketCan {
             let (frame, stamp_ns, dropped) = match self.message() {
                 Ok(message) => message,
                 Err(error) => match error.raw_os_error() {
-                    Some(libc::EAGAIN | libc::EINTR) => return None,
+                    Some(libc::EAGAIN | libc::EINTR) => return self.dropped_behind(),
                     _ => return self.down(),
                 },
             };
@@ -283,10 +322,8 @@ impl Bus for SocketCan {
                 }
                 Some(Received::Frame(decode(&frame), stamp_ns))
             };
-            let lost = dropped.wrapping_sub(self.dropped);
-            self.dropped = dropped;
+            let lost = self.lost(dropped);
             if lost > 0 {
-                self.health.lost += u64::from(lost);
                 self.held = received;
                 return Some(Received::Event(Event::Lost(lost), stamp_ns));
             }

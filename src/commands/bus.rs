@@ -1,0 +1,130 @@
+//! `fric bus`: joins buses of any kind, opens doors to them, and prints what goes over them.
+
+use super::End;
+use crate::args::Bus as Args;
+use crate::terminal::Terminal;
+use runtime::can::hub::Hub;
+use runtime::can::log::Entry;
+use runtime::can::sim::Simulation;
+use runtime::can::slcan::Slcan;
+use runtime::can::socketcand::Server;
+use runtime::can::{self, CannotOpen, Event, Options, Received, names};
+use runtime::clock::Clock;
+use std::fmt::Write;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Ctrl-C.
+static STOP: AtomicBool = AtomicBool::new(false);
+
+/// How soon Ctrl-C is heard on a silent bus.
+const LOOK_NS: u64 = 50_000_000;
+
+pub fn bus(args: &Args, terminal: &mut Terminal) -> End {
+    let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
+    match run(args, terminal) {
+        Ok(()) => End::Fine,
+        Err(cannot) => {
+            terminal.error(&cannot.to_string());
+            End::Failed
+        }
+    }
+}
+
+fn run(args: &Args, terminal: &mut Terminal) -> Result<(), CannotOpen> {
+    let world = Simulation::real_time();
+    let clock = world.monotonic().expect("this world's time is real");
+    let options = Options { bit_rate: args.bit_rate, ..Options::default() };
+    let mut hub = Hub::new();
+    for address in &args.addresses {
+        let name = address.to_string();
+        let name = name.strip_prefix("socketcan:").unwrap_or(&name);
+        hub.join(name, can::open(address, &options, &world, name)?);
+    }
+    for path in &args.pty {
+        let door = Slcan::door(Some(path), clock)?;
+        hub.join(&path.display().to_string(), Box::new(door));
+    }
+    let mut server = args.tcp.map(|port| Server::listen(port, args.everywhere, clock)).transpose()?;
+    let mut joined: Vec<String> = hub.members().iter().map(|member| member.name.clone()).collect();
+    joined.extend(server.as_ref().map(|server| format!("TCP port {}", server.port())));
+    terminal.report(&format!("joined: {}\n", joined.join(", ")));
+
+    // Logs count from 1970, pages for people from the start.
+    let day_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |day| day.as_nanos() as u64);
+    let origin_ns = day_ns.saturating_sub(clock.now_ns());
+    let until_ns = args.duration.map_or(u64::MAX, |seconds| clock.now_ns().saturating_add((seconds * 1e9) as u64));
+    let also: Vec<i32> = server.iter().map(Server::descriptor).collect();
+    let (mut frames, mut clients) = (0u64, 0);
+    let mut page = String::new();
+    while !STOP.load(Ordering::Relaxed) && clock.now_ns() < until_ns {
+        while let Some(connection) = server.as_mut().and_then(Server::accept) {
+            clients += 1;
+            hub.admit(&format!("tcp{clients}"), Box::new(connection));
+        }
+        page.clear();
+        let passed = hub.pass_on(|from, received| {
+            frames += u64::from(matches!(received, Received::Frame(..)));
+            if args.log {
+                log_line(&mut page, from, received, origin_ns);
+            } else if !args.quiet {
+                traffic_line(&mut page, from, received);
+            }
+        });
+        if !page.is_empty() {
+            terminal.print(&page);
+        }
+        if !passed {
+            hub.wait(&world, &also, until_ns.min(clock.now_ns() + LOOK_NS));
+        }
+    }
+    let lost: Vec<String> = hub
+        .members()
+        .iter()
+        .filter(|member| member.lost > 0)
+        .map(|member| format!(", {} did not take {}", member.name, member.lost))
+        .collect();
+    terminal.report(&format!("{frames} frames{}\n", lost.concat()));
+    Ok(())
+}
+
+/// As candump prints it, and what CANopen calls it.
+fn traffic_line(page: &mut String, from: &str, received: &Received) {
+    let seconds = |ns: u64| format!("({:03}.{:06})", ns / 1_000_000_000, ns / 1000 % 1_000_000);
+    match received {
+        Received::Frame(frame, at_ns) => {
+            let id = if frame.is_extended() { format!("{:08X}", frame.id()) } else { format!("{:03X}", frame.id()) };
+            let data: String = match frame.is_remote() {
+                true => "remote request".into(),
+                false => frame.data().iter().map(|byte| format!("{byte:02X} ")).collect(),
+            };
+            let name = names::canopen(frame).unwrap_or_default();
+            let line = format!("{}  {from}  {id:>8}  [{}]  {data:<24} {name}", seconds(*at_ns), frame.length());
+            let _ = writeln!(page, "{}", line.trim_end());
+        }
+        Received::Event(event, at_ns) => {
+            let _ = writeln!(page, "{}  {from}  {}", seconds(*at_ns), describe(*event));
+        }
+    }
+}
+
+fn log_line(page: &mut String, from: &str, received: &Received, origin_ns: u64) {
+    if let Received::Frame(frame, at_ns) = received {
+        // A reader of logs takes white space for the end of a name.
+        let interface = from.replace(char::is_whitespace, "_");
+        let _ = writeln!(page, "{}", Entry { time_ns: origin_ns + at_ns, interface, frame: *frame });
+    }
+}
+
+fn describe(event: Event) -> String {
+    match event {
+        Event::Warning => "warning: more than 96 errors".into(),
+        Event::Passive => "error passive: more than 127 errors".into(),
+        Event::BusOff => "bus-off: it takes no part any more".into(),
+        Event::Restarted => "restarted".into(),
+        Event::NotAcknowledged => "nobody acknowledges: is anybody there, at this bit rate?".into(),
+        Event::Lost(count) => format!("{count} frames lost"),
+        Event::Error => "error on the bus".into(),
+        Event::Down => "down: its other end is gone".into(),
+    }
+}

@@ -1,0 +1,197 @@
+//! Interfaces of a real kernel: the contract of buses, states, errors, and what is said of an interface. Needs a kernel
+//! with CAN and the right to make interfaces: `runner` sees to both.
+
+mod contract;
+
+use contract::Pair;
+use runtime::can::socketcan::{self, SocketCan};
+use runtime::can::{Bus, Event, Frame, Options, Received, Refused, State};
+use runtime::clock::{Clock, Monotonic};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+const RATE: u32 = 1_000_000;
+
+/// The cards are two, and tests are many.
+static CARDS: Mutex<()> = Mutex::new(());
+
+/// A virtual interface of its own for each pair.
+fn fresh() -> String {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let name = format!("vcan{}", NEXT.fetch_add(1, Ordering::Relaxed));
+    socketcan::make_virtual(&name).expect("the kernel has vcan");
+    name
+}
+
+fn open(name: &str) -> SocketCan {
+    SocketCan::open(name, &Options::default(), Monotonic::new()).expect("it is up")
+}
+
+/// Whether this is the guest of `tests/can`, with its cards. Elsewhere only what virtual interfaces show can be seen.
+fn guest() -> bool {
+    let guest = std::env::var("GUEST").is_ok();
+    if !guest {
+        eprintln!("no cards here; `tests/can/guest --cards` has them");
+    }
+    guest
+}
+
+#[test]
+fn a_virtual_interface_keeps_the_contract() {
+    contract::check("vcan", &|options| {
+        let (name, clock) = (fresh(), Monotonic::new());
+        let near = SocketCan::open(&name, options, clock).expect("it is up");
+        let far = SocketCan::open(&name, &Options::default(), clock).expect("it is up");
+        let part = move |_| socketcan::take_down(&name).expect("we may");
+        Pair {
+            near: Box::new(near),
+            far: Box::new(far),
+            now_ns: Box::new(move || clock.now_ns()),
+            part: Box::new(part),
+        }
+    });
+}
+
+#[test]
+fn two_cards_keep_the_contract() {
+    if !guest() {
+        return;
+    }
+    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    contract::check("SJA1000", &|options| {
+        for name in ["can0", "can1"] {
+            // Down first: a bit rate is set before an interface is taken up.
+            socketcan::take_down(name).expect("we may");
+            socketcan::take_up(name, Some(RATE)).expect("the driver is loaded");
+        }
+        let clock = Monotonic::new();
+        let near = SocketCan::open("can0", options, clock).expect("it is up");
+        let far = SocketCan::open("can1", &Options::default(), clock).expect("it is up");
+        let part = |_| socketcan::take_down("can0").expect("we may");
+        Pair {
+            near: Box::new(near),
+            far: Box::new(far),
+            now_ns: Box::new(move || clock.now_ns()),
+            part: Box::new(part),
+        }
+    });
+}
+
+#[test]
+fn an_interface_is_compared_and_never_set() {
+    let clock = Monotonic::new();
+    let refused = |name: &str, rate| {
+        let options = Options { bit_rate: Some(rate), ..Options::default() };
+        SocketCan::open(name, &options, clock).err().expect("refused").to_string()
+    };
+    assert!(refused("can77", RATE).contains("socketcan:can77: there is no interface can77"));
+    assert!(refused("can77", RATE).contains("mend: "));
+    let name = fresh();
+    assert_eq!(socketcan::inspect(&name).map(|interface| (interface.up, interface.bit_rate)), Ok((true, None)));
+    socketcan::take_down(&name).expect("we may");
+    assert!(refused(&name, RATE).contains(&format!("it is down\n  mend: ip link set {name} up")));
+
+    if !guest() {
+        return;
+    }
+    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    socketcan::take_down("can0").expect("we may");
+    socketcan::take_up("can0", Some(500_000)).expect("the driver is loaded");
+    let said = refused("can0", RATE);
+    assert!(said.contains("it runs at 500000 bit/s, and 1000000 bit/s are asked for"), "{said}");
+    assert!(said.contains("mend: ip link set can0 down && ip link set can0 up type can bitrate 1000000"), "{said}");
+    let interface = socketcan::inspect("can0").expect("it is there");
+    assert_eq!(interface.bit_rate, Some(500_000), "looked at, not set");
+    assert_eq!((interface.state, interface.restart_ms, interface.queue), (Some(State::Active), Some(0), Some(10)));
+}
+
+/// Puts an error frame on a virtual bus, as a driver would.
+fn inject(name: &str, class: u32, data: [u8; 8]) {
+    let index = {
+        let name = std::ffi::CString::new(name).expect("no zero in it");
+        // SAFETY: the name ends in zero and outlives the call.
+        unsafe { libc::if_nametoindex(name.as_ptr()) }
+    };
+    // SAFETY: takes no pointers.
+    let fd = unsafe { libc::socket(libc::PF_CAN, libc::SOCK_RAW, libc::CAN_RAW) };
+    // SAFETY: all bytes 0 is a valid address; its family and interface are set below.
+    let mut address: libc::sockaddr_can = unsafe { std::mem::zeroed() };
+    address.can_family = libc::AF_CAN as u16;
+    address.can_ifindex = index as i32;
+    let mut bytes = [0u8; 16];
+    bytes[..4].copy_from_slice(&(class | libc::CAN_ERR_FLAG).to_ne_bytes());
+    bytes[4] = 8;
+    bytes[8..].copy_from_slice(&data);
+    // SAFETY: address and bytes are valid for their lengths and outlive the calls; the descriptor is closed once.
+    let written = unsafe {
+        let length = size_of_val(&address) as libc::socklen_t;
+        assert_eq!(libc::bind(fd, (&raw const address).cast(), length), 0);
+        let written = libc::write(fd, bytes.as_ptr().cast(), bytes.len());
+        libc::close(fd);
+        written
+    };
+    assert_eq!(written, 16);
+}
+
+#[test]
+fn error_frames_are_events_and_never_frames() {
+    let name = fresh();
+    let mut bus = open(&name);
+    let mut say = |class: u32, data: [u8; 8]| {
+        inject(&name, class, data);
+        let got = bus.receive();
+        let Some(Received::Event(event, _)) = got else { panic!("{class:#x} {data:?} gives {got:?}") };
+        (event, bus.health())
+    };
+    let controller = |flags: u8| [0, flags, 0, 0, 0, 0, 0, 0];
+    assert_eq!(say(libc::CAN_ERR_CRTL, controller(0x0C)).0, Event::Warning);
+    let (event, health) = say(libc::CAN_ERR_CRTL | 0x200, [0, 0x30, 0, 0, 0, 0, 130, 140]);
+    assert_eq!((event, health.state), (Event::Passive, State::Passive));
+    assert_eq!((health.transmit_errors, health.receive_errors), (130, 140));
+    assert_eq!(say(libc::CAN_ERR_ACK, [0; 8]).0, Event::NotAcknowledged);
+    assert_eq!(say(libc::CAN_ERR_PROT, [0; 8]).0, Event::Error);
+    let (event, health) = say(libc::CAN_ERR_CRTL, controller(0x01));
+    assert_eq!((event, health.lost), (Event::Lost(1), 1));
+    let (event, health) = say(libc::CAN_ERR_BUSOFF, [0; 8]);
+    assert_eq!((event, health.state), (Event::BusOff, State::BusOff));
+    let (event, health) = say(libc::CAN_ERR_RESTARTED, [0; 8]);
+    assert_eq!((event, health.state, health.lost), (Event::Restarted, State::Active, 1));
+}
+
+#[test]
+fn an_interface_that_comes_back_works_again() {
+    let name = fresh();
+    let (mut near, mut far) = (open(&name), open(&name));
+    socketcan::take_down(&name).expect("we may");
+    assert!(matches!(near.receive(), Some(Received::Event(Event::Down, _))));
+    assert_eq!(near.receive(), None, "told once");
+    assert_eq!(near.send(Frame::new(1, &[])), Err(Refused::Down));
+    socketcan::take_up(&name, None).expect("we may");
+    far.send(Frame::new(1, &[])).expect("it is up");
+    assert!(matches!(near.receive(), Some(Received::Frame(..))));
+    assert_eq!(near.health().state, State::Active);
+}
+
+/// A stamp is the kernel's: the age of a frame when it is read, not when it is looked at.
+#[test]
+fn frames_are_stamped_when_they_come() {
+    let (name, clock) = (fresh(), Monotonic::new());
+    let mut near = SocketCan::open(&name, &Options::default(), clock).expect("it is up");
+    let mut far = open(&name);
+    let before_ns = clock.now_ns();
+    far.send(Frame::new(1, &[])).expect("it is up");
+    let after_ns = clock.now_ns();
+    clock.sleep_until(after_ns + 50_000_000);
+    let Some(Received::Frame(_, stamp_ns)) = near.receive() else { panic!("no frame came") };
+    assert!((before_ns..=after_ns + 1_000_000).contains(&stamp_ns), "{before_ns} {stamp_ns} {after_ns}");
+}
+
+#[test]
+fn prepared_frames_arrive() {
+    let name = fresh();
+    let (near, mut far) = (open(&name), open(&name));
+    let stop = Frame::new(0x201, &[2, 0, 0, 0]);
+    let prepared = near.prepare(stop).expect("an interface can");
+    assert!(std::thread::spawn(move || prepared.send()).join().expect("it ends"));
+    assert!(matches!(far.receive(), Some(Received::Frame(frame, _)) if frame == stop));
+}
