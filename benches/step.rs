@@ -2,11 +2,13 @@
 //! hand with `gcc -O3 -march=native`, side by side in one run. Ratios are medians over interleaved rounds.
 
 use abi::description::Guard;
+use abi::lanes::Batch;
 use abi::plan::Method;
 use abi::unit::Unit;
 use abi::{Code, Description, Function, Layout, Slot};
 use compiler::backend::interp::Interpreter;
 use compiler::backend::jit::compile;
+use compiler::backend::wide::{self, Width};
 use compiler::discretize::step;
 use compiler::ir::Unary;
 use compiler::ir::build::Build;
@@ -115,7 +117,65 @@ fn main() {
         println!("  {name}: interpreter with guards       {interpreted:7.1} ns, ratio {:.1}", interpreted / gcc);
         let x = blocks[0][layout.states.slot(0).index()];
         println!("  {name}: position at the end {x:.12} m, of gcc {:.12} m", state[0]);
+        lanes(method, name, *hand);
     }
+}
+
+/// Many instances, each with its own parameters, on one core: the code for lanes against C that runs one after the other.
+fn lanes(method: Method, name: &str, hand: Hand) {
+    println!("{name}, many instances with their own parameters, on one core:");
+    let program = servo(true);
+    let layout = &program.description.layout;
+    let func = expand(&regroup(&step(&program, method)));
+    let mut codes = Vec::new();
+    for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
+        for vectors in [1, 2, 3, 4, 5, 6, 8] {
+            let begun = Instant::now();
+            let lanes = wide::compile(&func, layout, POOL.len(), width, vectors).expect("this processor can");
+            codes.push((format!("{} compiled in {:.2} ms", lanes.name(), ms(begun)), lanes));
+        }
+    }
+    let count = 2_000 / if method == Method::Rk4 { 4 } else { 1 };
+    // Parameters within 10 % of their own; the same for every code.
+    let varied = |instance: usize| {
+        let mut params = PARAMS;
+        for (k, param) in params.iter_mut().enumerate() {
+            *param *= 0.9 + 0.2 * ((instance * 31 + k * 17) % 101) as f64 / 100.0;
+        }
+        params
+    };
+    let mut batches: Vec<Batch> = codes.iter().map(|(_, lanes)| Batch::new(lanes.clone())).collect();
+    for batch in &mut batches {
+        for lane in 0..batch.width() {
+            let mut block = vec![0.0; layout.size()];
+            block[Slot::STEP.index()] = H;
+            block[layout.params.range()].copy_from_slice(&varied(lane));
+            batch.load(lane, &block);
+        }
+    }
+    let mut states = [[0.0; 5]; 16];
+    let params: Vec<[f64; 14]> = (0..16).map(varied).collect();
+    let mut times = vec![Vec::new(); 1 + batches.len()];
+    for _ in 0..101 {
+        let begun = Instant::now();
+        for (state, params) in states.iter_mut().zip(&params) {
+            // SAFETY: five states and fourteen parameters, as the source declares.
+            unsafe { hand(state.as_mut_ptr(), params.as_ptr(), H, count) };
+        }
+        times[0].push(begun.elapsed().as_secs_f64() * 1e9 / (16 * count) as f64);
+        for (batch, times) in batches.iter_mut().zip(&mut times[1..]) {
+            let begun = Instant::now();
+            assert_eq!(batch.advance(&POOL, count), count);
+            times.push(begun.elapsed().as_secs_f64() * 1e9 / (batch.width() as u64 * count) as f64);
+        }
+    }
+    let medians: Vec<f64> = times.into_iter().map(median).collect();
+    println!("  gcc, one after the other   {:7.2} ns a step and instance", medians[0]);
+    for ((name, _), ns) in codes.iter().zip(&medians[1..]) {
+        println!("  {name:<36} {ns:7.2} ns, ratio {:.4}", ns / medians[0]);
+    }
+    let x = (batches[0].get(layout.states.slot(0), 1), states[1][0]);
+    println!("  position of the second instance {:.12} m, of gcc {:.12} m", x.0, x.1);
 }
 
 fn build_c() -> libloading::Library {

@@ -3,8 +3,10 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
+use crate::compile::Emit;
 use crate::value;
 use crate::vary::{self, Vary};
+use abi::image::Target;
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
@@ -35,6 +37,10 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
+    /// Time the step of an experiment: alone, in lanes, on all cores
+    Bench(Bench),
+    /// Make C or machine code of a model, to take away
+    Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
     Hil(Hil),
     /// Compute a rig's log again and compare every output to the bit
@@ -51,6 +57,8 @@ pub enum Command {
     Compare(Compare),
     /// Write the page of all models of the library, from its own text
     Doc(Doc),
+    /// Simulate the drives and devices of a rig on a bus that other programs can reach
+    Drives(Drives),
     /// Explore at a prompt; also what `fric` alone does
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
@@ -72,8 +80,8 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "hil", "replay", "check", "fmt", "explain", "characterise", "compare",
-            "doc", "repl", "watch", "bus", "doctor", "bench-rt", "new", "completions",
+            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
+            "characterise", "compare", "doc", "repl", "watch", "drives", "bus", "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -233,6 +241,57 @@ pub struct Linearise {
     /// Write A, B, C, D to a file: .npz, .mat or .json
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
     pub out: Option<PathBuf>,
+}
+
+/// `fric bench`
+#[derive(clap::Args, Debug)]
+pub struct Bench {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The experiment in it to time
+    pub experiment: String,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Print a JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// `fric build`
+#[derive(clap::Args, Debug)]
+pub struct Build {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// A model, with its inputs free, or an experiment; the only one if none is named
+    #[arg(value_name = "MODEL|EXPERIMENT")]
+    pub name: Option<String>,
+    /// What to make
+    #[arg(long, value_name = "WHAT", value_enum)]
+    pub emit: Emit,
+    /// File to write [default: the standard output]
+    #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub out: Option<PathBuf>,
+    /// Processor: x86_64 or aarch64 [default: this one]
+    #[arg(long, value_name = "NAME", value_parser = target)]
+    pub target: Option<Target>,
+    /// How the step is made [default: of an experiment its own, else expo]
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step of an experiment, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
 }
 
 /// `fric hil`
@@ -406,6 +465,40 @@ pub struct Doc {
     pub check: bool,
 }
 
+/// `fric drives`
+#[derive(clap::Args, Debug)]
+pub struct Drives {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in it; the only one if none is named
+    pub rig: Option<String>,
+    /// Serve them on another bus: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
+    #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
+    pub bus: Vec<(String, String)>,
+    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
+    pub pty: Vec<PathBuf>,
+    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    #[arg(long, value_name = "PORT")]
+    pub tcp: Option<u16>,
+    /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
+    #[arg(long, value_name = "FAULT")]
+    pub inject: Vec<String>,
+    /// Change a parameter: `m=0.02kg.m^2`, `load.delay=2ms`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// From which all that is random follows
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// End after this time, such as 10s [default: Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+    /// Don't tell how their states change
+    #[arg(long, short)]
+    pub quiet: bool,
+}
+
 /// `fric repl`
 #[derive(clap::Args, Debug, Default)]
 pub struct Repl {
@@ -521,6 +614,11 @@ fn setting(text: &str) -> Result<(String, String), String> {
 fn solver(text: &str) -> Result<Method, String> {
     let names = || Method::ALL.map(Method::name).join(", ");
     Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
+}
+
+fn target(text: &str) -> Result<Target, String> {
+    let names = || Target::ALL.map(Target::name).join(", ");
+    Target::named(text).ok_or_else(|| format!("code is made for {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {

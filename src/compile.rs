@@ -1,17 +1,103 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+use abi::Function;
+use abi::image::Target;
+use abi::lanes::Lanes;
 pub use abi::plan::Method;
+use compiler::backend::target::{self, Coder};
+use compiler::backend::wide::{self, Width};
+use compiler::backend::{blob, c, jit};
 pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
+use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
-    Case, Changes, Loaded, Options, Ready, SourceFile, Sources, check, check_models, compile, dissipation, explain,
-    explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
+    Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
+    dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
 use std::time::Instant;
+
+/// What `fric build` makes of a model.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, clap::ValueEnum)]
+pub enum Emit {
+    /// Readable C11, with the bits of the simulation
+    C,
+    /// The straight-line program
+    Ir,
+    /// The same as Cranelift has it
+    Clif,
+    /// Assembly
+    Asm,
+    /// A position-independent image of machine code, for `fric-rig` and other loaders
+    Blob,
+}
+
+/// Makes it. A model on its own is stepped by `solver`, else by `expo`; an experiment by its own; `target`: for which
+/// processor, else for this one.
+///
+/// # Errors
+/// Why it cannot be made, in words.
+pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<Target>) -> Result<Vec<u8>, String> {
+    let method = built.solver.map(|solver| solver.method).or(solver).unwrap_or(Method::Expo);
+    let functions = compiler::functions(&built.program, method);
+    let description = &built.program.description;
+    let told = |error: target::Unsupported| error.to_string();
+    let text = match emit {
+        Emit::C => c::source(&functions, description, &built.program.params),
+        Emit::Ir => functions.iter().map(|(_, func)| func.to_string()).collect::<Vec<_>>().join("\n"),
+        Emit::Clif | Emit::Asm => {
+            let isa = match made_for {
+                Some(made_for) => target::of(made_for),
+                None => target::here().map_err(told)?,
+            };
+            let mut coder = Coder::new(isa);
+            let mut listings = Vec::new();
+            for (function, func) in &functions {
+                let listing = if emit == Emit::Clif { coder.clif(func) } else { coder.assembly(func).map_err(told)? };
+                listings.push(format!("; {}\n{listing}", function.name()));
+            }
+            listings.join("\n")
+        }
+        Emit::Blob => {
+            let Some(made_for) = made_for.or(Target::here()) else {
+                return Err(format!("no code is made for {}: choose a --target", std::env::consts::ARCH));
+            };
+            let image = blob::image(&functions, description, &built.program.params, made_for).map_err(told)?;
+            return Ok(image.to_bytes());
+        }
+    };
+    Ok(text.into_bytes())
+}
+
+/// The step of an experiment, for who wants to know what it costs.
+pub struct StepCode {
+    /// Operations of the straight line.
+    pub operations: usize,
+    /// Bytes of machine code.
+    pub bytes: usize,
+    /// Cycles of the longest chain from one step to the next, by latencies of current processors.
+    pub critical_path: u32,
+    /// The step for many instances at once, or why there is none.
+    pub lanes: Result<Lanes, String>,
+}
+
+/// What a fixed step is made of.
+pub fn step_code(built: &Built, method: Method) -> StepCode {
+    let description = &built.program.description;
+    let (layout, pool) = (&description.layout, description.pool.len());
+    let mut functions = compiler::functions(&built.program, method);
+    functions.retain(|(function, _)| *function == Function::Step);
+    let func = &functions[0].1;
+    let bytes = jit::compile(&functions, layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
+    let lanes = match Width::here() {
+        None => Err("this processor has neither AVX2 nor AVX-512".to_string()),
+        Some(width) => wide::compile(func, layout, pool, width, width.vectors()).map_err(|why| why.to_string()),
+    };
+    StepCode { operations: func.ops.len(), bytes, critical_path: regroup::critical_path(func), lanes }
+}
 
 /// How long each stage took, in the order in which they ran.
 #[derive(Clone, Debug, Default)]

@@ -8,6 +8,7 @@ pub mod description;
 pub mod table;
 pub mod series;
 pub mod instance;
+pub mod lanes;
 pub mod rig;
 pub mod plan;
 pub mod encode;

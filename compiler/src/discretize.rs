@@ -84,8 +84,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     for (k, guard) in guards.iter().enumerate().rev() {
         let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
         // Of something infinite or NaN this is NaN, and so is the sum.
-        let zero = 0.0 * x;
-        fine = Some(fine.map_or(zero, |sum| sum + zero));
+        fine = Some(fine.map_or_else(|| 0.0 * x, |sum| x.fma(0.0, sum)));
         let (low, high) = widened(guard.range);
         let mut bad = !x.finite();
         for (bounded, beyond) in [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))] {

@@ -111,6 +111,50 @@ pub fn varying(
     Ok(variants.into_iter().map(one).collect())
 }
 
+/// A model or an experiment as one program, for what is made of it beside a run.
+pub struct Built {
+    /// The program.
+    pub program: program::Program,
+    /// How an experiment is stepped; none for a model on its own.
+    pub solver: Option<abi::plan::Solver>,
+}
+
+/// Compiles a model on its own, its inputs open, or the first combination of an experiment's sweeps.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn build(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
+) -> Result<Built, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let model = ast.items.iter().find_map(|item| match item {
+        Item::Model(model) if model.name.text == name => Some(model),
+        _ => None,
+    });
+    let Some(model) = model else {
+        let variants = experiment::read(loaded, sources, name, changes, warnings, &mut |_| ())?;
+        let variant = variants.into_iter().next().expect("there is at least one combination");
+        return Ok(Built { program: variant.program, solver: Some(variant.experiment.solver) });
+    };
+    let given = experiment::overrides(loaded, changes, warnings);
+    let overrides = given.iter().map(|change| change.override_in(root)).collect();
+    let (system, types, mut diagnostics) = alone(loaded, sources, model, root, overrides);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    diagnostics.extend(std::mem::take(warnings));
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
+    }
+    warnings.extend(diagnostics);
+    Ok(Built { program: lower::lower(&system, &types, &[]).program, solver: None })
+}
+
 /// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
 /// experiment's sweeps counts.
 ///

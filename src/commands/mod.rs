@@ -1,11 +1,14 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod bench;
 mod bench_rt;
+mod build;
 mod bus;
 mod characterise;
 mod check;
 mod cross;
 mod doc;
+mod drives;
 mod doctor;
 mod explain;
 mod fmt;
@@ -52,6 +55,8 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Bench(args) => bench::bench(args, terminal),
+        Command::Build(build) => build::build(build, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
         Command::Check(check) => check::check(check, terminal),
@@ -60,6 +65,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Characterise(args) => characterise::characterise(args, terminal),
         Command::Compare(args) => characterise::compare(args, terminal),
         Command::Doc(args) => doc::doc(args, terminal),
+        Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
         Command::Bus(args) => bus::bus(args, terminal),

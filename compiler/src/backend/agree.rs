@@ -2,9 +2,11 @@
 
 use super::interp::Interpreter;
 use super::jit::compile;
+use super::wide::{self, Width};
 use crate::ir::build::Build;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
 use crate::ir::{Func, Op, Value};
+use abi::lanes::Batch;
 use abi::{Code, Function, Layout, Slot};
 use std::sync::Arc;
 
@@ -122,5 +124,78 @@ fn iterations_in_one_call_equal_single_calls() {
         let mut untouched = start.clone();
         assert_eq!(code.call(Function::Step, &mut untouched, &pool, 0), 0);
         assert!(same(&untouched, &start), "seed {seed}: no iteration changes nothing");
+    }
+}
+
+/// Every lane ends with the bits and the status of an instance alone, up to the step at which the first of them stops.
+#[test]
+fn lanes_agree_with_instances_alone() {
+    let widths: Vec<Width> = [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()).collect();
+    let (mut compared, mut refused, mut stopped) = (0, 0, 0);
+    for seed in 0..6000 {
+        let mut random = Random(seed);
+        let len = 20 + random.below(120);
+        let func = random::func(&mut random, len);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let layout = random::layout();
+        let code = Interpreter::new(&[(Function::Step, func.clone())], &layout, POOL_LEN);
+        for width in &widths {
+            let vectors = 1 + random.below(6);
+            let Ok(lanes) = wide::compile(&func, &layout, POOL_LEN, *width, vectors) else {
+                refused += 1;
+                continue;
+            };
+            let mut batch = Batch::new(lanes);
+            let starts: Vec<Vec<f64>> =
+                (0..batch.width()).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
+            starts.iter().enumerate().for_each(|(lane, start)| batch.load(lane, start));
+            let count = random.below(5) as u64;
+            let done = batch.advance(&pool, count);
+            assert!(done <= count);
+            for (lane, start) in starts.iter().enumerate() {
+                let (mut expected, mut found) = (start.clone(), start.clone());
+                let status = abi::table::Interpret::call(&code, Function::Step, &mut expected, &pool, done);
+                batch.save(lane, &mut found);
+                assert!(
+                    same(&found, &expected) && batch.status(lane) == status,
+                    "seed {seed}, {width:?} × {vectors}, lane {lane}, {done} of {count} steps\n{func}\nfrom {start:?}\n\
+                     lane:  {found:?} status {}\nalone: {expected:?} status {status}",
+                    batch.status(lane)
+                );
+                stopped += usize::from(status != 0);
+                compared += 1;
+            }
+            let any = (0..batch.width()).any(|lane| batch.status(lane) != 0);
+            assert!(done == count || any, "seed {seed}: {done} of {count} steps and no status");
+        }
+    }
+    println!("{compared} lanes agree, {stopped} of them with a status; {refused} programs refused");
+    assert!(widths.is_empty() || compared > 20_000 && stopped > 500);
+}
+
+/// More states than registers can hold travel through the block.
+#[test]
+fn many_states_agree() {
+    let layout = Layout::new([0, 0, 60, 0, 0, 2, 0, 0, 0, 0]);
+    let mut build = Build::new("many");
+    let states: Vec<Value> = (0..60).map(|k| build.load(layout.states.slot(k))).collect();
+    let half = build.real(0.5);
+    for k in 0..60 {
+        let mixed = build.fma(states[(k + 7) % 60], half, states[k]);
+        // Some change places only.
+        build.store(layout.states.slot(k), if k % 9 == 0 { states[(k + 1) % 60] } else { mixed });
+    }
+    build.store(layout.outputs.slot(0), states[3]);
+    let limit = build.real(1e3);
+    let over = build.less(limit, states[11]);
+    let (zero, code) = (build.int(0), build.int(4));
+    let status = build.select(over, code, zero);
+    build.status(status);
+    let mut random = Random(7);
+    let blocks: Vec<Vec<f64>> =
+        (0..20).map(|_| (0..layout.size()).map(|_| random.within(-9.0, 9.0)).collect()).collect();
+    let func = build.finish();
+    for count in [1, 2, 3, 40] {
+        check(&func, &layout, &blocks, &[], count, "many states");
     }
 }

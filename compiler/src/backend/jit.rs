@@ -68,6 +68,32 @@ fn generate(
     Ok((entries, memory, stats))
 }
 
+/// Code that was made elsewhere, where it can be executed; given back with its last owner.
+pub struct Executable {
+    _memory: Memory,
+    address: usize,
+}
+
+impl Executable {
+    /// The code, beginning at a multiple of `alignment` bytes.
+    pub fn new(code: &[u8], alignment: u64) -> Result<Executable, Unsupported> {
+        let isa = here()?;
+        let mut memory = Memory::new(isa);
+        let module = memory.module();
+        let failed = |error: cranelift_module::ModuleError| Unsupported(format!("no memory for code: {error}"));
+        let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
+        module.define_function_bytes(id, alignment, code, &[]).map_err(failed)?;
+        module.finalize_definitions().map_err(failed)?;
+        let address = module.get_finalized_function(id) as usize;
+        Ok(Executable { _memory: memory, address })
+    }
+
+    /// Where it begins.
+    pub fn address(&self) -> *const u8 {
+        self.address as *const u8
+    }
+}
+
 /// The memory of the code.
 struct Memory(Mutex<Option<JITModule>>);
 

@@ -7,5 +7,7 @@ mod clif;
 pub mod target;
 pub mod jit;
 pub mod blob;
+pub mod c;
+pub mod wide;
 #[cfg(test)]
 mod agree;

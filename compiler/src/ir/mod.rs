@@ -8,7 +8,6 @@ pub mod verify;
 pub mod eval;
 pub mod build;
 pub mod expr;
-#[cfg(test)]
 pub mod random;
 
 use abi::Slot;

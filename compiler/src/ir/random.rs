@@ -1,4 +1,4 @@
-//! Sound functions by chance, from a seed: for tests that hold two ways of running against each other.
+//! Sound functions by chance, from a seed: what back ends are held against each other with, here and in tests/.
 
 use super::verify::result;
 use super::{Func, Op, Type, Value, Write};

@@ -74,6 +74,20 @@ fn after(func: &Func, carried: &HashSet<Slot>) -> Vec<Option<u32>> {
     after
 }
 
+/// Cycles of the longest chain from what an iteration takes over to what it hands on.
+pub fn critical_path(func: &Func) -> u32 {
+    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let mut ready: Vec<Ready> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let mut last = matches!(op, Op::Load(slot) if stored.contains(slot)).then_some(0);
+        op.each_operand(|operand| last = last.max(ready[operand.index()]));
+        ready.push(last.map(|last| last + latency(*op)));
+    }
+    let loaded: HashSet<Slot> = func.loads().into_iter().collect();
+    let handed = func.stores.iter().filter(|(slot, _)| loaded.contains(slot));
+    handed.filter_map(|(_, value)| ready[value.index()]).max().unwrap_or(0)
+}
+
 /// Latency in cycles, rounded from current processors; only its order of size matters.
 fn latency(op: Op) -> u32 {
     match op {

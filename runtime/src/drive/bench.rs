@@ -3,7 +3,6 @@
 //! In: received frames, the time. Out: frames, and the truth about the shaft. The shaft is the crossed-out part of the
 //! system, compiled from the same text: torques go in, angles and speeds come out, at fine steps between the frames.
 
-use super::Send;
 use super::frames;
 use super::hooks::{Effect, Hook, Start};
 use super::profiles;
@@ -11,6 +10,9 @@ use super::simulated::{Behaviour, SimulatedDrive};
 use crate::can::Frame;
 use abi::Instance;
 use abi::rig::{Kind, Message, Rig, Signal, What};
+
+/// Takes what nodes send: the node (an index into the rig's nodes) and the frame.
+pub type Speak<'a> = &'a mut dyn FnMut(usize, Frame);
 
 /// Steps of the shaft in a period of the rig.
 const STEPS: u64 = 50;
@@ -70,7 +72,10 @@ pub struct Bench {
     shafts: Vec<Shaft>,
     plant: Option<Instance>,
     applied: Vec<Link>,
-    seen: Vec<Link>,
+    /// For each node: where the plant gives its position and its speed.
+    seen: Vec<(Option<abi::Slot>, Option<abi::Slot>)>,
+    /// Signals of devices that the plant gives.
+    felt: Vec<Link>,
     /// Angular acceleration of a drive without a plant, rad/s² per N·m.
     compliance: Vec<f64>,
     step_ns: u64,
@@ -131,12 +136,23 @@ impl Bench {
             });
         }
         let link = |(signal, slot): &(Signal, abi::Slot)| Link { signal: *signal, slot: *slot };
+        let seen = |node, what| {
+            let signal = Signal { node, what };
+            rig.plant.seen.iter().find(|(seen, _)| *seen == signal).map(|(_, slot)| *slot)
+        };
         let mut bench = Bench {
             buses: rig.nodes.iter().map(|node| node.bus).collect(),
             shafts: vec![Shaft::default(); bodies.len()],
             bodies,
             applied: rig.plant.applied.iter().map(link).collect(),
-            seen: rig.plant.seen.iter().map(link).collect(),
+            seen: (0..rig.nodes.len()).map(|node| (seen(node, What::Position), seen(node, What::Speed))).collect(),
+            felt: rig
+                .plant
+                .seen
+                .iter()
+                .filter(|(signal, _)| matches!(signal.what, What::Field(..)))
+                .map(link)
+                .collect(),
             plant,
             compliance,
             step_ns,
@@ -195,34 +211,52 @@ impl Bench {
         bodies.chain(hooks).min().unwrap_or(u64::MAX)
     }
 
-    /// Takes a frame of a bus.
-    pub fn receive(&mut self, bus: usize, frame: &Frame, now_ns: u64, send: Send) {
-        self.advance(now_ns, send);
-        for (node, body) in self.bodies.iter_mut().enumerate().filter(|(node, _)| self.buses[*node] == bus) {
-            match body {
-                Body::Drive(drive) => drive.receive(frame, now_ns, &mut |frame| send(self.buses[node], frame)),
-                Body::Device(device) => device.receive(frame),
-            }
+    /// The bus of a node.
+    pub fn bus(&self, node: usize) -> usize {
+        self.buses[node]
+    }
+
+    /// Takes a frame of a bus to all nodes on it. `send` gets the bus and the frame of an answer.
+    pub fn receive(&mut self, bus: usize, frame: &Frame, now_ns: u64, send: super::Send) {
+        let buses = std::mem::take(&mut self.buses);
+        for node in (0..buses.len()).filter(|node| buses[*node] == bus) {
+            self.hear(node, frame, now_ns, &mut |node, frame| send(buses[node], frame));
+        }
+        self.buses = buses;
+    }
+
+    /// Goes on to a time. `send` gets the bus and the frame of what is due.
+    pub fn advance(&mut self, now_ns: u64, send: super::Send) {
+        let buses = std::mem::take(&mut self.buses);
+        self.go_on(now_ns, &mut |node, frame| send(buses[node], frame));
+        self.buses = buses;
+    }
+
+    /// Takes a frame to one node. `send` gets the node and the frame of an answer.
+    pub fn hear(&mut self, node: usize, frame: &Frame, now_ns: u64, send: Speak) {
+        self.go_on(now_ns, send);
+        match &mut self.bodies[node] {
+            Body::Drive(drive) => drive.receive(frame, now_ns, &mut |frame| send(node, frame)),
+            Body::Device(device) => device.receive(frame),
         }
     }
 
-    /// Goes on to a time: the shaft turns, and what is due is sent.
-    pub fn advance(&mut self, now_ns: u64, send: Send) {
+    /// Goes on to a time: the shaft turns, and what is due is sent. `send` gets the node and the frame.
+    pub fn go_on(&mut self, now_ns: u64, send: Speak) {
         while (self.count + 1) * self.step_ns <= now_ns {
             self.turn();
         }
         self.pull(now_ns, send);
         for (node, body) in self.bodies.iter_mut().enumerate() {
-            let bus = self.buses[node];
             match body {
-                Body::Drive(drive) => drive.poll(now_ns, &mut |frame| send(bus, frame)),
-                Body::Device(device) => device.poll(now_ns, &mut |frame| send(bus, frame)),
+                Body::Drive(drive) => drive.poll(now_ns, &mut |frame| send(node, frame)),
+                Body::Device(device) => device.poll(now_ns, &mut |frame| send(node, frame)),
             }
         }
     }
 
     /// Hooks whose time has come, or has gone.
-    fn pull(&mut self, now_ns: u64, send: Send) {
+    fn pull(&mut self, now_ns: u64, send: Speak) {
         for at in 0..self.hooks.len() {
             let Armed { hook, since_ns, until_ns, over } = &self.hooks[at];
             let (hook, begun) = (*hook, since_ns.is_some());
@@ -253,9 +287,9 @@ impl Bench {
             } else {
                 continue;
             }
-            let bus = self.buses[hook.node];
+            let node = hook.node;
             match &mut self.bodies[hook.node] {
-                Body::Drive(drive) => drive.afflict(hook.effect, begins, now_ns, &mut |frame| send(bus, frame)),
+                Body::Drive(drive) => drive.afflict(hook.effect, begins, now_ns, &mut |frame| send(node, frame)),
                 Body::Device(device) => device.afflict(hook.effect, begins, now_ns),
             }
         }
@@ -304,13 +338,9 @@ impl Bench {
     /// What the plant shows at the nodes. `h`: since the last look, s.
     fn look(&mut self, h: f64) {
         let Some(plant) = &self.plant else { return };
-        for (node, shaft) in self.shafts.iter_mut().enumerate() {
-            let of = |what| {
-                let link = self.seen.iter().find(|link| link.signal == Signal { node, what });
-                link.map(|link| plant.get(link.slot))
-            };
+        for (shaft, (position, speed)) in self.shafts.iter_mut().zip(&self.seen) {
             let last = *shaft;
-            match (of(What::Position), of(What::Speed)) {
+            match (position.map(|slot| plant.get(slot)), speed.map(|slot| plant.get(slot))) {
                 (Some(position), Some(speed)) => (shaft.position, shaft.speed) = (position, speed),
                 (Some(position), None) => {
                     shaft.position = position;
@@ -322,14 +352,12 @@ impl Bench {
                 }
                 (None, None) => {}
             }
-            if let Body::Device(device) = &mut self.bodies[node] {
-                for (message, values) in device.values.iter_mut().enumerate() {
-                    for (field, value) in values.iter_mut().enumerate() {
-                        if let Some(seen) = of(What::Field(message, field)) {
-                            *value = seen;
-                        }
-                    }
-                }
+        }
+        for link in &self.felt {
+            if let (Body::Device(device), What::Field(message, field)) =
+                (&mut self.bodies[link.signal.node], link.signal.what)
+            {
+                device.values[message][field] = plant.get(link.slot);
             }
         }
     }

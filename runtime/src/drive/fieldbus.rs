@@ -6,6 +6,7 @@
 
 use super::Send;
 use super::device::Device;
+use super::identify::{self, Identified, Steps};
 use super::master::{Drive, Limits, Setting, Status};
 use super::profiles::{self, Transport};
 use super::script::Watching;
@@ -33,6 +34,8 @@ pub struct Options {
     pub timeout_test: bool,
     /// The drives are simulated, whatever their transport.
     pub simulated: bool,
+    /// After the first motion, torque drives are measured.
+    pub identify: bool,
 }
 
 impl Default for Options {
@@ -44,6 +47,7 @@ impl Default for Options {
             sign_test: SignTest::Push,
             timeout_test: true,
             simulated: false,
+            identify: false,
         }
     }
 }
@@ -75,6 +79,8 @@ pub enum Step {
     Reenable,
     /// The first motion.
     SignTest,
+    /// Delay, lag and inertia are measured.
+    Identify,
     /// Waits for the operator's [`Request::Arm`].
     AwaitArm,
     /// Commands act.
@@ -100,6 +106,7 @@ impl fmt::Display for Step {
             Step::TimeoutTest => "testing the time-outs",
             Step::Reenable => "enabling again",
             Step::SignTest => "testing signs and scales",
+            Step::Identify => "measuring the drives",
             Step::AwaitArm => "waiting to be armed",
             Step::Armed => "armed",
             Step::Stopped => "stopped",
@@ -139,6 +146,8 @@ const CONFIGURE_NS: u64 = 20_000_000_000;
 const START_NS: u64 = 1_000_000_000;
 const MODE_NS: u64 = 1_000_000_000;
 const ENABLE_NS: u64 = 5_000_000_000;
+/// Angle by which a shaft is turned from outside, rad.
+const BY_HAND: f64 = 0.2;
 /// How long our life sign goes on at rest before it stops.
 const CALM_NS: u64 = 50_000_000;
 
@@ -171,7 +180,13 @@ pub struct Fieldbus {
     done: Vec<bool>,
     missed: Vec<u32>,
     answers: u32,
-    push: Option<(usize, Push)>,
+    /// The drive under test; the drive that turns it where it can't turn by itself.
+    push: Option<(usize, Push, Option<usize>)>,
+    steps: Option<(usize, Steps)>,
+    identified: Vec<Option<Identified>>,
+    /// When SYNC and commands went out last.
+    began_ns: u64,
+    sent_ns: u64,
     wanted: Vec<f64>,
     troubles: [Option<Trouble>; TROUBLES],
     lost_troubles: u64,
@@ -201,6 +216,7 @@ impl Fieldbus {
                         watchdog_ns: rig.watchdog_ns,
                         slew: outputs().map(|output| output.slew).fold(f64::INFINITY, f64::min),
                         safe: outputs().next().map_or(0.0, |output| output.safe),
+                        most: outputs().map(|output| output.high.min(-output.low)).fold(f64::INFINITY, f64::min),
                     };
                     Drive::new(config, profile, setting).map(|drive| Node::Drive(Box::new(drive)))
                 }
@@ -243,6 +259,10 @@ impl Fieldbus {
             refusal: None,
             answers: 0,
             push: None,
+            steps: None,
+            identified: vec![None; rig.nodes.len()],
+            began_ns: 0,
+            sent_ns: 0,
             troubles: [None; TROUBLES],
             lost_troubles: 0,
         };
@@ -461,7 +481,7 @@ impl Fieldbus {
         (self.step, self.since_ns, self.silent_since_ns) = (step, None, None);
         self.done.fill(false);
         self.wanted.fill(0.0);
-        self.push = None;
+        (self.push, self.steps) = (None, None);
     }
 
     fn aim(&mut self, goal: Goal, resets: bool) {
@@ -506,7 +526,8 @@ impl Fieldbus {
     }
 
     /// A tick begins: SYNC goes out, and everything known is a tick older.
-    pub fn begin(&mut self, _now_ns: u64, send: Send) {
+    pub fn begin(&mut self, now_ns: u64, send: Send) {
+        self.began_ns = now_ns;
         for node in &mut self.nodes {
             match node {
                 Node::Drive(drive) => drive.begin(),
@@ -544,6 +565,7 @@ impl Fieldbus {
                 Node::Device(device) => device.send_commands(now_ns, &mut send),
             }
         }
+        self.sent_ns = now_ns;
         self.live(now_ns, send);
         self.start(now_ns, send);
     }
@@ -665,7 +687,8 @@ impl Fieldbus {
             Step::AwaitEnable | Step::AwaitArm | Step::Armed | Step::Stopped | Step::Refused => {}
             Step::Enable | Step::Reenable => self.enable(lasted_ns, send),
             Step::TimeoutTest => self.test_timeouts(now_ns, lasted_ns, send),
-            Step::SignTest => self.test_signs(send),
+            Step::SignTest => self.test_signs(),
+            Step::Identify => self.identify(),
         }
     }
 
@@ -702,6 +725,7 @@ impl Fieldbus {
             }
             return self.go(match (again, self.options.timeout_test) {
                 (false, true) => Step::TimeoutTest,
+                _ if self.options.sign_test == SignTest::Skip && self.options.identify => Step::Identify,
                 _ if self.options.sign_test == SignTest::Skip => Step::AwaitArm,
                 _ => Step::SignTest,
             });
@@ -751,15 +775,12 @@ impl Fieldbus {
     }
 
     /// One drive after the other.
-    fn test_signs(&mut self, _send: Send) {
+    fn test_signs(&mut self) {
         let by_hand = self.options.sign_test == SignTest::ByHand;
         if self.push.is_none() {
             let next = (0..self.nodes.len()).find(|at| drive_of(&self.nodes[*at]).is_some() && !self.done[*at]);
             let Some(at) = next else {
-                for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
-                    drive.rest();
-                }
-                return self.go(Step::AwaitArm);
+                return self.moved();
             };
             let drive = drive_of(&self.nodes[at]).expect("found as one");
             if drive.reading(What::Position).is_none() {
@@ -767,33 +788,89 @@ impl Fieldbus {
                 self.done[at] = true;
                 return;
             }
-            self.push = Some((at, Push::new(bounds(drive), by_hand)));
+            // A torque can't turn a shaft whose speed or position another drive holds: that one turns it.
+            let holds =
+                |at: &usize| drive_of(&self.nodes[*at]).is_some_and(|drive| drive.config().mode != Mode::Torque);
+            let holder = (0..self.nodes.len()).find(holds).filter(|_| drive.config().mode == Mode::Torque && !by_hand);
+            let (mut bounds, turned) = (bounds(drive), by_hand || holder.is_some());
+            if turned {
+                bounds.angle = BY_HAND.max(bounds.angle);
+            }
+            self.push = Some((at, Push::new(bounds, turned), holder));
         }
-        let Some((at, push)) = &mut self.push else { return };
-        let at = *at;
-        let drive = drive_of(&self.nodes[at]).expect("found as one");
-        let value = |what| drive.reading(what).map(|reading| reading.value);
-        let sample = Sample {
-            position: value(What::Position).unwrap_or(0.0),
-            speed: value(What::Speed),
-            torque: value(What::Torque),
+        let turning = |drive: &Drive| match drive.config().mode {
+            Mode::Position => 1.5 * BY_HAND,
+            Mode::Torque | Mode::Speed => bounds(drive).command,
         };
-        match push.tick(sample, self.period_ns as f64 * 1e-9) {
-            Verdict::Wants(command) => self.wanted[at] = command,
+        let Some((at, push, holder)) = &mut self.push else { return };
+        let (at, holder) = (*at, *holder);
+        let drive = drive_of(&self.nodes[at]).expect("found as one");
+        match push.tick(sample(drive), self.period_ns as f64 * 1e-9) {
+            Verdict::Wants(command) => {
+                self.wanted[at] = command;
+                if let Some(holder) = holder {
+                    self.wanted[holder] = drive_of(&self.nodes[holder]).map_or(0.0, turning);
+                }
+            }
             Verdict::Right => {
+                if let Some(holder) = holder {
+                    self.wanted[holder] = 0.0;
+                }
                 (self.done[at], self.wanted[at], self.push) = (true, 0.0, None);
             }
             Verdict::Wrong(why) => self.refuse(Some(at), why),
         }
     }
+
+    /// The motions of the start-up are over: angles count from here.
+    fn moved(&mut self) {
+        for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
+            drive.rest();
+        }
+        let measured = self.step == Step::Identify || !self.options.identify;
+        self.go(if measured { Step::AwaitArm } else { Step::Identify });
+    }
+
+    /// One torque drive after the other.
+    fn identify(&mut self) {
+        let torque = |node: &Node| drive_of(node).is_some_and(|drive| drive.config().mode == Mode::Torque);
+        if self.steps.is_none() {
+            let next = (0..self.nodes.len()).find(|at| torque(&self.nodes[*at]) && !self.done[*at]);
+            let Some(at) = next else { return self.moved() };
+            let drive = drive_of(&self.nodes[at]).expect("found as one");
+            let (limits, most) = (drive.limits(), drive.most());
+            self.steps = Some((at, Steps::new(0.3 * most, 2.0, 0.3 * limits.speed)));
+        }
+        let Some((at, steps)) = &mut self.steps else { return };
+        let at = *at;
+        let drive = drive_of(&self.nodes[at]).expect("found as one");
+        match steps.tick(sample(drive), self.began_ns, self.sent_ns, self.period_ns as f64 * 1e-9) {
+            identify::Progress::Wants(command) => self.wanted[at] = command,
+            identify::Progress::Done(found) => {
+                (self.identified[at], self.done[at], self.wanted[at], self.steps) = (Some(found), true, 0.0, None);
+            }
+            identify::Progress::Wrong(why) => self.refuse(Some(at), why),
+        }
+    }
+
+    /// What was measured of a drive, if [`Options::identify`] asked for it.
+    pub fn identified(&self, node: usize) -> Option<Identified> {
+        self.identified[node]
+    }
+}
+
+/// What a drive says.
+fn sample(drive: &Drive) -> Sample {
+    let value = |what| drive.reading(what).map(|reading| reading.value);
+    Sample { position: value(What::Position).unwrap_or(0.0), speed: value(What::Speed), torque: value(What::Torque) }
 }
 
 /// What the first motion of a drive may use.
 fn bounds(drive: &Drive) -> Bounds {
     let (config, limits) = (drive.config(), drive.limits());
     let command = match config.mode {
-        Mode::Torque => 0.3 * limits.torque,
-        Mode::Speed => (0.01 * limits.speed).max(4.0 * config.speed_unit),
+        Mode::Torque => 0.3 * drive.most(),
+        Mode::Speed => (0.01 * drive.most()).max(4.0 * config.speed_unit),
         Mode::Position => 0.0,
     };
     Bounds {

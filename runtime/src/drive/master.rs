@@ -43,6 +43,8 @@ pub struct Setting {
     pub slew: f64,
     /// Value of its command on any stop, SI.
     pub safe: f64,
+    /// Greatest command either way, SI; inf where the rig names none.
+    pub most: f64,
 }
 
 /// Limits of a drive: the rig's, or its own where the rig names none. SI.
@@ -723,6 +725,16 @@ impl Drive {
     /// How it watches us, once configured.
     pub(super) fn watching(&self) -> Option<Watching> {
         self.watching
+    }
+
+    /// Greatest command that the rig lets through, SI.
+    pub(super) fn most(&self) -> f64 {
+        let own = match self.config.mode {
+            Mode::Torque => self.limits.torque,
+            Mode::Speed => self.limits.speed,
+            Mode::Position => f64::INFINITY,
+        };
+        own.min(self.setting.most)
     }
 
     /// Its arguments in the rig.

@@ -11,16 +11,20 @@ pub mod frames;
 pub mod trouble;
 pub mod script;
 pub mod sign;
+pub mod identify;
 pub mod master;
 pub mod device;
 pub mod fieldbus;
 pub mod hooks;
 pub mod simulated;
 pub mod bench;
+pub mod attend;
 
+pub use attend::attend;
 pub use bench::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 pub use hooks::{Effect, Hook, Start};
+pub use identify::Identified;
 pub use master::{Limits, Status};
 pub use trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 

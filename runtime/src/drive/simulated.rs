@@ -136,6 +136,8 @@ pub struct SimulatedDrive {
     shares: (f64, f64, f64),
     refreshed_ns: u64,
     held: [(u64, Option<Frame>); HELD],
+    /// Whether anything is held back.
+    holding: bool,
     wrong: Wrong,
 }
 
@@ -156,6 +158,11 @@ fn approach(x: f64) -> f64 {
         power *= power;
     }
     1.0 - power
+}
+
+/// `x`, or where it tends to once it is as good as there: what is left must not linger as ever smaller numbers.
+fn near(x: f64, end: f64) -> f64 {
+    if (x - end).abs() < 1e-12 { end } else { x }
 }
 
 /// A wave between −1 and 1 with period 1.
@@ -204,6 +211,7 @@ impl SimulatedDrive {
             shares: (0.0, 1.0, 1.0),
             refreshed_ns: 0,
             held: [(0, None); HELD],
+            holding: false,
             wrong: Wrong::default(),
         };
         let objects = drive.dictionary();
@@ -314,8 +322,12 @@ impl SimulatedDrive {
 
     /// The next moment at which [`poll`](SimulatedDrive::poll) has something to do.
     pub fn due_ns(&self) -> u64 {
+        let due = self.node.due_ns().min(self.machine.due_ns());
+        if !self.holding {
+            return due;
+        }
         let held = self.held.iter().filter(|(_, frame)| frame.is_some()).map(|(due, _)| *due).min();
-        self.node.due_ns().min(self.machine.due_ns()).min(held.unwrap_or(u64::MAX))
+        due.min(held.unwrap_or(u64::MAX))
     }
 
     /// Makes it fail, or ends that. `random` gives numbers from 0 to 1.
@@ -373,6 +385,7 @@ impl SimulatedDrive {
     /// Lets the node send through what is wrong with the drive.
     fn with_node<T>(&mut self, now_ns: u64, send: Send, work: impl FnOnce(&mut Node, Send) -> T) -> T {
         let (wrong, held, answer_ns) = (self.wrong, &mut self.held, self.behaviour.answer_ns);
+        let holding = &mut self.holding;
         work(&mut self.node, &mut |frame| {
             let heartbeat = frame.id() & 0x780 == 0x700;
             let answer = (0x180..0x580).contains(&frame.id());
@@ -384,7 +397,7 @@ impl SimulatedDrive {
                 return send(frame);
             }
             if let Some(place) = held.iter_mut().find(|(_, frame)| frame.is_none()) {
-                *place = (now_ns + late_ns, Some(frame));
+                (*place, *holding) = ((now_ns + late_ns, Some(frame)), true);
             }
         })
     }
@@ -420,12 +433,15 @@ impl SimulatedDrive {
 
     /// Does all that is due.
     pub fn poll(&mut self, now_ns: u64, send: Send) {
-        for (due_ns, frame) in &mut self.held {
-            if *due_ns <= now_ns
-                && let Some(frame) = frame.take()
-            {
-                send(frame);
+        if self.holding {
+            for (due_ns, frame) in &mut self.held {
+                if *due_ns <= now_ns
+                    && let Some(frame) = frame.take()
+                {
+                    send(frame);
+                }
             }
+            self.holding = self.held.iter().any(|(_, frame)| frame.is_some());
         }
         if self.machine.advance(now_ns) {
             self.tell(now_ns);
@@ -597,7 +613,7 @@ impl SimulatedDrive {
             self.shares = (h, lag, approach(h / self.profile.speed_lag));
         }
         let (_, lag, filter) = self.shares;
-        self.speed_filtered += (shaft.1 - self.speed_filtered) * filter;
+        self.speed_filtered = near(self.speed_filtered + (shaft.1 - self.speed_filtered) * filter, shaft.1);
         let refresh = self.profile.refresh_ns;
         if refresh == 0 || t_ns % refresh < (h * 1e9) as u64 {
             while self.waiting > 0 && self.queue[self.first].0 <= t_ns {
@@ -615,8 +631,8 @@ impl SimulatedDrive {
         };
         let permitted = wanted.clamp(self.parameters.low, self.parameters.high);
         self.limited = permitted != wanted;
-        self.torque += (permitted - self.torque) * lag;
-        if self.wrong.torque_off || !self.machine.state().powered() && permitted == 0.0 && self.torque.abs() < 1e-9 {
+        self.torque = near(self.torque + (permitted - self.torque) * lag, permitted);
+        if self.wrong.torque_off {
             self.torque = 0.0;
         }
     }

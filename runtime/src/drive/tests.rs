@@ -537,3 +537,99 @@ fn hooks_are_read_or_refused_in_words() {
         assert!(error.contains(word), "{text}: {error}");
     }
 }
+
+/// The start-up over a bus with its bit times: what the table does at once takes its time here.
+#[test]
+fn two_drives_start_up_over_a_bus() {
+    use crate::can::sim::Simulation;
+    use crate::can::{Bus, Received};
+    use crate::clock::Clock;
+    let rig = rig(Mode::Torque);
+    let simulation = Simulation::new();
+    let bus = simulation.bus("can0", 1_000_000);
+    let mut master = bus.port("fric");
+    let bench = Bench::new(&rig, Some(shaft(0.012, 0.001)), 7).unwrap();
+    let bench = attend(&simulation, &[bus], &rig, bench);
+    let mut fieldbus = Fieldbus::new(&rig, Options::default()).unwrap();
+    let (mut tick, mut late) = (0, 0);
+    while fieldbus.step() != Step::Armed {
+        tick += 1;
+        assert!(tick < 20_000, "stays at {:?}", fieldbus.step());
+        let start_ns = tick * rig.period_ns;
+        simulation.sleep_until(start_ns);
+        fieldbus.begin(start_ns, &mut |_, frame| master.send(frame).unwrap());
+        for share in [60, 95] {
+            simulation.sleep_until(start_ns + rig.period_ns * share / 100);
+            while let Some(received) = master.receive() {
+                let Received::Frame(frame, stamp_ns) = received else { panic!("{received:?}") };
+                late +=
+                    u64::from(share == 95 && fieldbus.step() == Step::AwaitArm && (0x180..0x300).contains(&frame.id()));
+                fieldbus.receive(0, &frame, stamp_ns, &mut |_, frame| master.send(frame).unwrap());
+            }
+            if share == 60 {
+                for output in &rig.outputs {
+                    fieldbus.command(output.signal, fieldbus.wanted(output.signal));
+                }
+                fieldbus.end(simulation.now_ns(), &mut |_, frame| master.send(frame).unwrap());
+            }
+        }
+        match fieldbus.step() {
+            Step::AwaitEnable => _ = fieldbus.request(Request::Enable),
+            Step::AwaitArm => _ = fieldbus.request(Request::Arm),
+            Step::Refused => panic!("{}", fieldbus.explain(fieldbus.refusal().unwrap())),
+            _ => {}
+        }
+    }
+    assert_eq!(late, 0, "all answers come in the first 0.6 of the period");
+    assert_eq!(bench.borrow().shaft(LOAD).torque, 0.0);
+    assert_eq!(master.health().lost, 0);
+}
+
+#[test]
+fn delay_lag_and_inertia_are_measured() {
+    for (delay, lag, inertia) in [(0.8e-3, 0.6e-3, 0.012), (2.3e-3, 1.5e-3, 0.03), (0.2e-3, 0.4e-3, 0.006)] {
+        let mut rig = rig(Mode::Torque);
+        for node in [LOAD, SERVO] {
+            (rig.nodes[node].delay, rig.nodes[node].lag) = (delay, lag);
+        }
+        let options = Options { identify: true, ..Options::default() };
+        let mut table = Table::new(&rig, Some(shaft(inertia, 0.001)), options);
+        table.arm();
+        for node in [LOAD, SERVO] {
+            let found = table.fieldbus.identified(node).expect("measured");
+            assert!((found.delay - delay).abs() < 0.05e-3, "{found:?} for {delay}");
+            assert!((found.lag.expect("seen") / lag - 1.0).abs() < 0.1, "{found:?} for {lag}");
+            assert!((found.inertia.expect("turned") / inertia - 1.0).abs() < 0.02, "{found:?} for {inertia}");
+        }
+        let shaft = table.bench.shaft(LOAD);
+        assert!(shaft.speed.abs() < 0.5, "{shaft:?}");
+    }
+}
+
+#[test]
+fn a_drive_that_holds_speed_turns_the_other_for_its_test() {
+    let mut rig = rig(Mode::Torque);
+    config(&mut rig, SERVO).mode = Mode::Speed;
+    rig.outputs[SERVO].signal.what = What::Speed;
+    (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-1.0, 1.0);
+    table(&rig).arm();
+    let mut table = table(&rig);
+    table.bench.hook(hooks::read("load speed scale -1 at 0 s", &rig).unwrap());
+    let refusal = table.refused();
+    assert!(refusal.starts_with("load (node 3): by its position it turned by"), "{refusal}");
+}
+
+#[test]
+fn the_first_motion_keeps_to_the_rigs_limit() {
+    let mut rig = rig(Mode::Torque);
+    (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-0.1, 0.5);
+    let mut table = table(&rig);
+    table.until(Step::AwaitEnable);
+    table.fieldbus.request(Request::Enable);
+    let mut most = 0.0f64;
+    while table.fieldbus.step() != Step::AwaitArm {
+        table.tick();
+        most = most.max(table.fieldbus.wanted(rig.outputs[LOAD].signal).abs());
+    }
+    assert!((0.005..=0.03).contains(&most), "{most} N·m");
+}

@@ -562,7 +562,7 @@ impl Hil {
             self.wires.causes.retain(|cause| *cause == Cause::Asked);
         }
         let source = match step {
-            Step::SignTest | Step::AwaitArm => Source::StartUp,
+            Step::SignTest | Step::Identify | Step::AwaitArm => Source::StartUp,
             Step::Armed => Source::Model,
             Step::Stopped => cycle.source,
             _ => Source::Nobody,

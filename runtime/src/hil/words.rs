@@ -72,7 +72,7 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
     }
 }
 
-const STEPS: [Step; 16] = [
+const STEPS: [Step; 17] = [
     Step::Listen,
     Step::Reset,
     Step::Identity,
@@ -85,6 +85,7 @@ const STEPS: [Step; 16] = [
     Step::TimeoutTest,
     Step::Reenable,
     Step::SignTest,
+    Step::Identify,
     Step::AwaitArm,
     Step::Armed,
     Step::Stopped,

@@ -1,0 +1,483 @@
+//! A model as readable C11, with the bits of every other back end.
+//!
+//! In: expanded functions and what the model says of itself. Out: one file that needs the standard headers only and
+//! compiles without warnings under `gcc -std=c11 -Wall -Wextra -pedantic`. It must be compiled without fusing products
+//! and sums (`-ffp-contract=off`, which `-std=c11` implies with gcc): where the model fuses, `fma` is written out.
+//! What is used once stands where it is used; what is used again, or stored, has a name.
+
+use crate::ir::{Func, Op, Type, Value, verify};
+use abi::description::Kind;
+use abi::unit::Unit;
+use abi::{Description, Function, Slot};
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::fmt::Write;
+
+/// Longest expression that is written inside another.
+const LONGEST: usize = 72;
+
+/// The file: `functions` are expanded, `params` are the defaults of the parameters in SI.
+///
+/// # Panics
+/// If a function is not sound or not expanded: a mistake of the passes before.
+pub fn source(functions: &[(Function, Func)], description: &Description, params: &[f64]) -> String {
+    let names = Names::new(description);
+    let mut helpers = BTreeSet::new();
+    let mut tables = BTreeSet::new();
+    let mut bodies = String::new();
+    for (function, func) in functions {
+        let mut writer = Writer::new(func, &names, &mut helpers, &mut tables);
+        bodies += &writer.function(*function);
+    }
+    let mut out = heading(description, &names);
+    for helper in &helpers {
+        out += &format!("\n{}\n", helper.source());
+    }
+    for (base, len) in &tables {
+        let entries = &description.pool[*base as usize..(base + len) as usize];
+        out += &format!("\nstatic const double {}[{len}] = {{\n", table(*base, *len));
+        for row in entries.chunks(4) {
+            let row: Vec<String> = row.iter().map(|entry| real(*entry)).collect();
+            out += &format!("    {},\n", row.join(", "));
+        }
+        out += "};\n";
+    }
+    let prefix = &names.prefix;
+    for (function, _) in functions {
+        out += &format!("\nuint64_t {};", signature(prefix, *function));
+    }
+    out += &format!("\nvoid {prefix}_defaults(double *block);\n");
+    out += &format!("\n/* Zeros, and the defaults of the parameters. */\nvoid {prefix}_defaults(double *block)\n{{\n");
+    out += &format!("    for (int k = 0; k < {}; k++) block[k] = 0.0;\n", names.count());
+    for (k, value) in params.iter().enumerate() {
+        out += &format!("    block[{}] = {};\n", names.slot(description.layout.params.slot(k)), real(*value));
+    }
+    out + "}\n" + &bodies
+}
+
+/// What a function is for, in the file's comments.
+fn purpose(function: Function) -> &'static str {
+    match function {
+        Function::Start => "Parameters and inputs -> states, memory and regimes at t = 0.",
+        Function::Outputs => "-> outputs.",
+        Function::Derivatives => "-> derivatives.",
+        Function::Jacobian => "-> derivatives of the derivatives by the states, row by row, then by time.",
+        Function::Roots => "-> switching surfaces.",
+        Function::Tick => "Runs the sampled blocks that are due.",
+        Function::Transitions => "One transition of each automaton, events and resets.",
+        Function::Step => {
+            "Up to count fixed steps, with their ticks, transitions, outputs and guards.\n   \
+             Returns 0, or the number of the guard that stopped it."
+        }
+    }
+}
+
+fn signature(prefix: &str, function: Function) -> String {
+    match function {
+        Function::Step => format!("{prefix}_step(double *block, uint64_t count)"),
+        other => format!("{prefix}_{}(double *block)", other.name()),
+    }
+}
+
+/// What stands before the code: how to use it, and where the numbers lie.
+fn heading(description: &Description, names: &Names) -> String {
+    let prefix = &names.prefix;
+    let mut out = format!(
+        "/* {}\n\n   The numbers of an instance lie in a block of {} doubles, SI units, at the places named below.\n   \
+         To begin: {prefix}_defaults(block), set what differs, block[{}] = step in s, {prefix}_start(block).\n   \
+         Compile with -std=c11 or -ffp-contract=off, and without -ffast-math: then every bit is that of the\n   \
+         simulation. Link with -lm. */\n",
+        comment(&description.name),
+        description.layout.size(),
+        names.slot(Slot::STEP),
+    );
+    out += "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n\n";
+    out += "#ifdef __FAST_MATH__\n#error \"-ffast-math would change the results\"\n#endif\n";
+    out += "#if FLT_EVAL_METHOD != 0\n#error \"doubles must be computed as doubles\"\n#endif\n";
+    out += "\n/* Places of the block. */\nenum {\n";
+    let mut told: HashMap<Slot, String> = HashMap::new();
+    for quantity in &description.quantities {
+        let doc = quantity.doc.as_ref().and_then(|doc| doc.lines().next()).unwrap_or_default();
+        let unit = if quantity.boolean { "true 1, false 0".into() } else { Unit::si(quantity.unit.dimension).text };
+        let what = [kind(quantity.kind), &unit, doc].map(str::trim).into_iter().filter(|part| !part.is_empty());
+        told.entry(quantity.slot).or_insert_with(|| comment(&what.collect::<Vec<_>>().join(", ")));
+    }
+    let width = names.slots.iter().map(String::len).max().unwrap_or(0);
+    for (at, name) in names.slots.iter().enumerate() {
+        let told = match Slot(at as u32) {
+            Slot::TIME => Some("time, s".to_string()),
+            Slot::STEP => Some("fixed step, s".into()),
+            Slot::COUNT => Some("steps since the start".into()),
+            slot => told.get(&slot).cloned(),
+        };
+        match told {
+            Some(told) => writeln!(out, "    {name:<width$} = {at},  /* {told} */"),
+            None => writeln!(out, "    {name:<width$} = {at},"),
+        }
+        .expect("writing to a string does not fail");
+    }
+    out += &format!("    {:<width$} = {}\n}};\n", names.count(), names.slots.len());
+    out
+}
+
+fn kind(kind: Kind) -> &'static str {
+    match kind {
+        Kind::Param => "parameter",
+        Kind::Input => "input",
+        Kind::State => "state",
+        Kind::SampledState => "sampled state",
+        Kind::Output => "output",
+        Kind::Let | Kind::Observed => "",
+        Kind::Regime => "regime",
+    }
+}
+
+/// A text that does not end the comment it stands in.
+fn comment(text: &str) -> String {
+    text.replace("*/", "* /").replace("/*", "/ *").replace(['\n', '\r'], " ")
+}
+
+/// Names of the places of a block, and of the functions.
+struct Names {
+    prefix: String,
+    slots: Vec<String>,
+}
+
+impl Names {
+    fn new(description: &Description) -> Names {
+        let model: String = description.name.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect();
+        let prefix = match identifier(&model).to_lowercase() {
+            name if name.starts_with(|c: char| c.is_ascii_alphabetic()) => name,
+            name => format!("model_{name}"),
+        };
+        let layout = &description.layout;
+        let mut wanted: Vec<Option<String>> = vec![None; layout.size()];
+        for (slot, name) in [(Slot::TIME, "t"), (Slot::STEP, "h"), (Slot::COUNT, "steps")] {
+            wanted[slot.index()] = Some(name.into());
+        }
+        for quantity in &description.quantities {
+            wanted[quantity.slot.index()].get_or_insert_with(|| identifier(&quantity.path));
+        }
+        for (k, state) in layout.states.range().enumerate() {
+            let rate = (k < layout.derivatives.len as usize).then(|| layout.derivatives.slot(k));
+            if let Some((rate, name)) = rate.zip(wanted[state].clone()) {
+                wanted[rate.index()] = Some(format!("d_{name}"));
+            }
+        }
+        // Names that differ in the text may not differ here.
+        let mut taken = HashSet::from(["slots".to_string()]);
+        let name = |(at, wanted): (usize, Option<String>)| {
+            let wanted = wanted.unwrap_or_else(|| format!("slot_{at}"));
+            let name = if taken.contains(&wanted) { format!("{wanted}_{at}") } else { wanted };
+            taken.insert(name.clone());
+            format!("{}_{name}", prefix.to_uppercase())
+        };
+        let slots = wanted.into_iter().enumerate().map(name).collect();
+        Names { prefix, slots }
+    }
+
+    fn slot(&self, slot: Slot) -> &str {
+        &self.slots[slot.index()]
+    }
+
+    fn count(&self) -> String {
+        format!("{}_slots", self.prefix.to_uppercase())
+    }
+
+    /// The name of what a slot gets.
+    fn next(&self, slot: Slot) -> String {
+        self.slots[slot.index()].replacen(&self.prefix.to_uppercase(), "new", 1)
+    }
+}
+
+/// Letters and digits of ASCII stay; Greek letters are spelled; everything else is an underscore.
+fn identifier(path: &str) -> String {
+    const GREEK: [(char, &str); 12] = [
+        ('α', "alpha"),
+        ('β', "beta"),
+        ('γ', "gamma"),
+        ('δ', "delta"),
+        ('θ', "theta"),
+        ('λ', "lambda"),
+        ('μ', "mu"),
+        ('µ', "mu"),
+        ('σ', "sigma"),
+        ('τ', "tau"),
+        ('φ', "phi"),
+        ('ω', "omega"),
+    ];
+    let spelled = path.chars().map(|c| match GREEK.iter().find(|(letter, _)| *letter == c) {
+        Some((_, name)) => (*name).to_string(),
+        None if c.is_ascii_alphanumeric() => c.to_string(),
+        None => "_".into(),
+    });
+    let joined: String = spelled.collect();
+    let name = joined.split('_').filter(|part| !part.is_empty()).collect::<Vec<_>>().join("_");
+    if name.is_empty() { "x".into() } else { name }
+}
+
+/// A real constant.
+fn real(x: f64) -> String {
+    match x {
+        x if x.is_nan() => "(double)NAN".into(),
+        f64::INFINITY => "(double)INFINITY".into(),
+        f64::NEG_INFINITY => "(-(double)INFINITY)".into(),
+        x if x.is_sign_negative() => format!("({x:?})"),
+        x => format!("{x:?}"),
+    }
+}
+
+fn table(base: u32, len: u32) -> String {
+    format!("table_{base}_{len}")
+}
+
+/// Functions that stand before the code if it needs them.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Helper {
+    ToBits,
+    FromBits,
+    ToInt,
+    ToReal,
+    ShiftSigned,
+    Less,
+    Entry,
+    Inside,
+}
+
+impl Helper {
+    fn source(self) -> &'static str {
+        match self {
+            Helper::ToBits => {
+                "static inline uint64_t bits_of(double x)\n{\n    uint64_t n;\n    memcpy(&n, &x, sizeof n);\n    return n;\n}"
+            }
+            Helper::FromBits => {
+                "static inline double real_of(uint64_t n)\n{\n    double x;\n    memcpy(&x, &n, sizeof x);\n    return x;\n}"
+            }
+            Helper::ToInt => {
+                "/* Towards zero; what is too large the nearest integer, NaN 0. */\n\
+                 static inline uint64_t truncated(double x)\n{\n    if (!(x < 9223372036854775808.0)) return x > 0.0 ? \
+                 UINT64_C(0x7fffffffffffffff) : 0;\n    if (x < -9223372036854775808.0) return \
+                 UINT64_C(0x8000000000000000);\n    return (uint64_t)(int64_t)x;\n}"
+            }
+            Helper::ToReal => {
+                "static inline double as_real(uint64_t n)\n{\n    int64_t s;\n    memcpy(&s, &n, sizeof s);\n    return \
+                 (double)s;\n}"
+            }
+            Helper::ShiftSigned => {
+                "/* To the right, the sign comes in; 0 <= by <= 63. */\n\
+                 static inline uint64_t shifted(uint64_t n, int by)\n{\n    return n >> 63 ? ~(~n >> by) : n >> by;\n}"
+            }
+            Helper::Less => {
+                "/* As signed integers. */\nstatic inline int is_less(uint64_t a, uint64_t b)\n{\n    const uint64_t \
+                 sign = UINT64_C(1) << 63;\n    return (a ^ sign) < (b ^ sign);\n}"
+            }
+            Helper::Inside => {
+                "/* What is beyond the last is the last. */\nstatic inline uint64_t inside(uint64_t last, uint64_t k)\n{\n    \
+                 return k < last ? k : last;\n}"
+            }
+            Helper::Entry => {
+                "/* What is beyond the last entry is the last. */\n\
+                 static inline double entry(const double *table, uint64_t last, uint64_t k)\n{\n    return table[k < \
+                 last ? k : last];\n}"
+            }
+        }
+    }
+}
+
+/// Writes one function.
+struct Writer<'a> {
+    func: &'a Func,
+    names: &'a Names,
+    types: Vec<Type>,
+    uses: Vec<usize>,
+    /// The names of what is stored.
+    stored: HashMap<Value, String>,
+    /// What rings are written with: computed before anything is stored.
+    written: HashSet<Value>,
+    /// How each value is written where it is used.
+    text: Vec<String>,
+    helpers: &'a mut BTreeSet<Helper>,
+    tables: &'a mut BTreeSet<(u32, u32)>,
+}
+
+impl<'a> Writer<'a> {
+    fn new(
+        func: &'a Func,
+        names: &'a Names,
+        helpers: &'a mut BTreeSet<Helper>,
+        tables: &'a mut BTreeSet<(u32, u32)>,
+    ) -> Writer<'a> {
+        let types = verify::types(func).expect("the function is sound");
+        let mut uses = vec![0; func.ops.len()];
+        for (op, live) in func.ops.iter().zip(func.live()) {
+            if live {
+                op.each_operand(|operand| uses[operand.index()] += 1);
+            }
+        }
+        let mut stored = HashMap::new();
+        for (slot, value) in &func.stores {
+            stored.entry(*value).or_insert_with(|| names.next(*slot));
+        }
+        let written = func.writes.iter().flat_map(|write| [write.index, write.value]).collect();
+        Writer { func, names, types, uses, stored, written, text: vec![String::new(); func.ops.len()], helpers, tables }
+    }
+
+    fn function(&mut self, function: Function) -> String {
+        let repeated = function == Function::Step;
+        let indent = if repeated { "        " } else { "    " };
+        let mut body = String::new();
+        let live = self.func.live();
+        for i in (0..self.func.ops.len()).filter(|i| live[*i]) {
+            let (value, op) = (Value(i as u32), self.func.ops[i]);
+            let written = self.expression(op);
+            let constant = matches!(op, Op::Real(_) | Op::Int(_) | Op::Bool(_));
+            let once = self.uses[i] == 1 || self.uses[i] == 0 && self.func.status == Some(value);
+            let named = self.stored.contains_key(&value) || self.written.contains(&value);
+            let short = once && written.len() <= LONGEST && !named;
+            self.text[i] = if constant {
+                written
+            } else if short || matches!(op, Op::Load(_)) && !named {
+                match op {
+                    Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => written,
+                    _ if written.ends_with(')') && called(&written) => written,
+                    _ => format!("({written})"),
+                }
+            } else {
+                let of = match self.types[i] {
+                    Type::Real => "double",
+                    Type::Int => "uint64_t",
+                    Type::Bool => "int",
+                };
+                let name = self.stored.get(&value).cloned().unwrap_or_else(|| format!("v{i}"));
+                writeln!(body, "{indent}const {of} {name} = {written};").expect("writing to a string does not fail");
+                name
+            };
+        }
+        let status = self.func.status.map(|status| self.text[status.index()].clone());
+        if let Some(status) = &status {
+            // Before the stores: what it reads is what was there.
+            writeln!(body, "{indent}const uint64_t status = {status};").expect("writing to a string does not fail");
+        }
+        for (slot, value) in &self.func.stores {
+            let (slot, value) = (self.names.slot(*slot), &self.text[value.index()]);
+            writeln!(body, "{indent}block[{slot}] = {value};").expect("writing to a string does not fail");
+        }
+        for write in &self.func.writes {
+            self.helpers.insert(Helper::Inside);
+            let (base, last) = (self.names.slot(write.base), write.len - 1);
+            let [index, value] = [write.index, write.value].map(|value| &self.text[value.index()]);
+            writeln!(body, "{indent}block[{base} + inside({last}, {index})] = {value};")
+                .expect("writing to a string does not fail");
+        }
+        let mut out =
+            format!("\n/* {} */\nuint64_t {}\n{{\n", purpose(function), signature(&self.names.prefix, function));
+        if !body.contains("block") {
+            out += "    (void)block;\n";
+        }
+        match (repeated, status.is_some()) {
+            (true, true) => {
+                out += &format!(
+                    "    for (; count; count--) {{\n{body}{indent}if (status) return status;\n    }}\n    return 0;\n"
+                )
+            }
+            (true, false) => out += &format!("    for (; count; count--) {{\n{body}    }}\n    return 0;\n"),
+            (false, true) => out += &format!("{body}    return status;\n"),
+            (false, false) => out += &format!("{body}    return 0;\n"),
+        }
+        out + "}\n"
+    }
+
+    fn helped(&mut self, helper: Helper, call: String) -> String {
+        self.helpers.insert(helper);
+        call
+    }
+
+    fn expression(&mut self, op: Op) -> String {
+        let t = |value: Value| self.text[value.index()].clone();
+        match op {
+            Op::Real(bits) => real(f64::from_bits(bits)),
+            Op::Int(n) => format!("UINT64_C({})", n as u64),
+            Op::Bool(truth) => u8::from(truth).to_string(),
+            Op::Load(slot) => format!("block[{}]", self.names.slot(slot)),
+            Op::Pool { base, len, index } => {
+                let (table, index) = (table(base, len), t(index));
+                self.tables.insert((base, len));
+                self.helped(Helper::Entry, format!("entry({table}, {}, {index})", len - 1))
+            }
+            Op::Ring { base, len, index } => {
+                let (base, index) = (self.names.slot(base), t(index));
+                self.helped(Helper::Entry, format!("entry(block + {base}, {}, {index})", len - 1))
+            }
+            Op::Add(a, b) | Op::IntAdd(a, b) => format!("{} + {}", t(a), t(b)),
+            Op::Sub(a, b) | Op::IntSub(a, b) => format!("{} - {}", t(a), t(b)),
+            Op::Mul(a, b) | Op::IntMul(a, b) => format!("{} * {}", t(a), t(b)),
+            Op::Div(a, b) => format!("{} / {}", t(a), t(b)),
+            Op::Neg(a) => format!("-{}", t(a)),
+            Op::Abs(a) => format!("fabs({})", bare(&t(a))),
+            Op::Sqrt(a) => format!("sqrt({})", bare(&t(a))),
+            Op::Fma(a, b, c) => format!("fma({}, {}, {})", bare(&t(a)), bare(&t(b)), bare(&t(c))),
+            Op::Floor(a) => format!("floor({})", bare(&t(a))),
+            Op::Nearest(a) => format!("nearbyint({})", bare(&t(a))),
+            Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
+            Op::Less(a, b) => format!("{} < {}", t(a), t(b)),
+            Op::LessEqual(a, b) => format!("{} <= {}", t(a), t(b)),
+            Op::Equal(a, b) | Op::IntEqual(a, b) => format!("{} == {}", t(a), t(b)),
+            Op::And(a, b) | Op::IntAnd(a, b) => format!("{} & {}", t(a), t(b)),
+            Op::Or(a, b) | Op::IntOr(a, b) => format!("{} | {}", t(a), t(b)),
+            Op::IntXor(a, b) => format!("{} ^ {}", t(a), t(b)),
+            Op::Not(a) => format!("!{}", t(a)),
+            Op::Select(a, b, c) => format!("{} ? {} : {}", t(a), t(b), t(c)),
+            Op::ShiftLeft(a, n) => format!("{} << {n}", t(a)),
+            Op::ShiftRight(a, n) => format!("{} >> {n}", t(a)),
+            Op::ShiftRightSigned(a, n) => {
+                let call = format!("shifted({}, {n})", bare(&t(a)));
+                self.helped(Helper::ShiftSigned, call)
+            }
+            Op::IntLess(a, b) => {
+                let call = format!("is_less({}, {})", bare(&t(a)), bare(&t(b)));
+                self.helped(Helper::Less, call)
+            }
+            Op::ToBits(a) => {
+                let call = format!("bits_of({})", bare(&t(a)));
+                self.helped(Helper::ToBits, call)
+            }
+            Op::FromBits(a) => {
+                let call = format!("real_of({})", bare(&t(a)));
+                self.helped(Helper::FromBits, call)
+            }
+            Op::ToInt(a) => {
+                let call = format!("truncated({})", bare(&t(a)));
+                self.helped(Helper::ToInt, call)
+            }
+            Op::ToReal(a) => {
+                let call = format!("as_real({})", bare(&t(a)));
+                self.helped(Helper::ToReal, call)
+            }
+        }
+    }
+}
+
+/// Whether an expression is one call as a whole.
+fn called(text: &str) -> bool {
+    let Some(open) = text.find('(') else { return false };
+    open > 0
+        && text[..open].chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+        && closes(text, open) == Some(text.len() - 1)
+}
+
+/// Without the parentheses around the whole: an argument needs none.
+fn bare(text: &str) -> &str {
+    if text.starts_with('(') && closes(text, 0) == Some(text.len() - 1) { &text[1..text.len() - 1] } else { text }
+}
+
+/// Where the parenthesis at `open` is closed.
+fn closes(text: &str, open: usize) -> Option<usize> {
+    let mut depth = 0;
+    text.bytes().enumerate().skip(open).find_map(|(at, byte)| {
+        depth += match byte {
+            b'(' => 1,
+            b')' => -1,
+            _ => 0,
+        };
+        (depth == 0).then_some(at)
+    })
+}

@@ -1,0 +1,497 @@
+//! Nodes as instructions, several vectors side by side, with registers given out on the way.
+//!
+//! The line is straight, so it is known when each value is read next: where registers run out, the one that is read last
+//! gives way (Belady). Loads, constants and what was computed before the loop lie in memory and cost no register; most
+//! instructions read one operand from there.
+
+use super::encode::{Assembler, Base, Instruction, Place, Width, instructions as i};
+use super::select::{Direction, Node, Nodes, What};
+use std::collections::HashMap;
+
+/// Where a node's vectors lie in memory: the `index`-th group of vectors behind `begin` bytes.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Home {
+    pub base: Base,
+    pub begin: usize,
+    pub index: usize,
+}
+
+/// One vector of a node.
+type Copy = usize;
+
+/// A straight line being written.
+pub struct Body<'a> {
+    code: &'a mut Assembler,
+    nodes: &'a Nodes,
+    order: &'a [Node],
+    homes: &'a HashMap<Node, Home>,
+    width: Width,
+    vectors: usize,
+    /// For each node the places of the order where it is read, ascending.
+    uses: HashMap<Node, Vec<usize>>,
+    /// Register of each copy.
+    register: HashMap<Copy, u8>,
+    /// Numbers of the places in memory of those that had to give way.
+    spills: HashMap<Copy, usize>,
+    free_spills: Vec<usize>,
+    left_spills: Vec<usize>,
+    spilled: usize,
+    spills_at: usize,
+    vector_of: Vec<Option<Copy>>,
+    mask_of: Vec<Option<Copy>>,
+    /// Registers that the instruction being written needs.
+    locked: Vec<(bool, u8)>,
+    /// The place in the order, and the vector.
+    now: (usize, usize),
+}
+
+impl<'a> Body<'a> {
+    /// An empty one; registers that give way are stored behind `spills_at` bytes of the block.
+    pub fn new(
+        code: &'a mut Assembler,
+        nodes: &'a Nodes,
+        order: &'a [Node],
+        homes: &'a HashMap<Node, Home>,
+        width: Width,
+        vectors: usize,
+        spills_at: usize,
+    ) -> Body<'a> {
+        let mut uses: HashMap<Node, Vec<usize>> = HashMap::new();
+        for (at, node) in order.iter().enumerate() {
+            for operand in nodes.nodes[node.index()].operands() {
+                uses.entry(operand).or_default().push(at);
+            }
+        }
+        Body {
+            code,
+            nodes,
+            order,
+            homes,
+            width,
+            vectors,
+            uses,
+            register: HashMap::new(),
+            spills: HashMap::new(),
+            free_spills: Vec::new(),
+            left_spills: Vec::new(),
+            spilled: 0,
+            spills_at,
+            vector_of: vec![None; width.registers() as usize],
+            mask_of: vec![None; 8],
+            locked: Vec::new(),
+            now: (0, 0),
+        }
+    }
+
+    /// Keeps a node to the end.
+    pub fn keep(&mut self, node: Node) {
+        self.uses.entry(node).or_default().push(self.order.len() + 1);
+    }
+
+    /// Most vectors that lay in memory at a time.
+    pub fn spilled(&self) -> usize {
+        self.spilled
+    }
+
+    /// Writes all nodes of the order; `stores` says where a node goes as soon as it is there. Nodes of `rest` that are not
+    /// in the order go there at the end.
+    pub fn write(&mut self, stores: &dyn Fn(Node) -> Vec<Home>, rest: &[Node]) {
+        let order = self.order;
+        for (at, node) in order.iter().enumerate() {
+            let homes = stores(*node);
+            for k in 0..self.vectors {
+                self.now = (at, k);
+                self.node(*node);
+                for home in &homes {
+                    let register = self.in_register(*node);
+                    self.store(*node, register, self.at_home(*home, k));
+                }
+                self.done(*node);
+            }
+        }
+        let mut seen: Vec<Node> = order.to_vec();
+        for node in rest {
+            if seen.contains(node) {
+                continue;
+            }
+            seen.push(*node);
+            for k in 0..self.vectors {
+                self.now = (order.len(), k);
+                let register = self.in_register(*node);
+                for home in stores(*node) {
+                    self.store(*node, register, self.at_home(home, k));
+                }
+                self.done(*node);
+            }
+        }
+    }
+
+    /// Jumps that are taken if a mask has a lane; their targets are open.
+    pub fn test(&mut self, mask: Node) -> Vec<usize> {
+        let mut jumps = Vec::new();
+        for k in 0..self.vectors {
+            self.now = (self.order.len() + 1, k);
+            let register = self.in_register(mask);
+            match self.width {
+                Width::Avx512 => self.code.mask(i::MASK_TEST, register, 0, Place::Register(register)),
+                Width::Avx2 => {
+                    // To r10.
+                    self.code.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 5, 0x7d, 0x50, 0xd0 | register & 7]);
+                    self.code.plain(&[0x45, 0x85, 0xd2]);
+                }
+            }
+            jumps.push(self.code.jump(&[0x0f, 0x85]));
+            self.done(mask);
+        }
+        jumps
+    }
+
+    fn copy(&self, node: Node) -> Copy {
+        node.index() * self.vectors + self.now.1
+    }
+
+    fn what(&self, node: Node) -> What {
+        self.nodes.nodes[node.index()]
+    }
+
+    fn is_mask(&self, node: Node) -> bool {
+        self.what(node).is_mask(self.width)
+    }
+
+    /// When a copy is read next, after now; later is larger.
+    fn next_use(&self, copy: Copy) -> Option<usize> {
+        let (node, k) = (Node((copy / self.vectors) as u32), copy % self.vectors);
+        let (at, now) = self.now;
+        let uses = self.uses.get(&node)?;
+        let first = uses.partition_point(|place| *place < at || *place == at && k <= now);
+        uses.get(first).map(|place| place * self.vectors + k)
+    }
+
+    fn at_home(&self, home: Home, k: usize) -> Place {
+        super::place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
+    }
+
+    fn spill_place(&self, number: usize) -> Place {
+        Place::Memory(Base::Block, (self.spills_at + number * self.width.bytes() as usize) as i32)
+    }
+
+    /// Where a node can be read: its register, or memory.
+    fn place(&mut self, node: Node) -> Place {
+        let copy = self.copy(node);
+        if let Some(register) = self.register.get(&copy) {
+            let register = *register;
+            self.locked.push((self.is_mask(node), register));
+            return Place::Register(register);
+        }
+        match self.what(node) {
+            What::Constant(bits) => Place::Constant(bits),
+            _ => self.memory(node),
+        }
+    }
+
+    fn memory(&self, node: Node) -> Place {
+        if let Some(number) = self.spills.get(&self.copy(node)) {
+            return self.spill_place(*number);
+        }
+        let home = self.homes.get(&node).unwrap_or_else(|| panic!("{:?} lies nowhere", self.what(node)));
+        self.at_home(*home, self.now.1)
+    }
+
+    /// The node's register, loaded if it lies in memory.
+    fn in_register(&mut self, node: Node) -> u8 {
+        match self.place(node) {
+            Place::Register(register) => register,
+            place => {
+                let register = self.take(self.is_mask(node));
+                self.load(node, register, place);
+                let copy = self.copy(node);
+                self.own(copy, self.is_mask(node), register);
+                register
+            }
+        }
+    }
+
+    fn load(&mut self, node: Node, register: u8, place: Place) {
+        match place {
+            _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
+            Place::Constant(_) if self.width == Width::Avx512 => {
+                self.code.vector(i::BROADCAST, register, 0, place, None);
+            }
+            place => self.code.vector(i::LOAD, register, 0, place, None),
+        }
+    }
+
+    fn store(&mut self, node: Node, register: u8, place: Place) {
+        if self.is_mask(node) {
+            self.code.mask(i::MASK_STORE, register, 0, place);
+        } else {
+            self.code.vector(i::STORE, register, 0, place, None);
+        }
+    }
+
+    fn own(&mut self, copy: Copy, mask: bool, register: u8) {
+        self.register.insert(copy, register);
+        let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
+        table[register as usize] = Some(copy);
+    }
+
+    /// A register that nobody owns; locked until the instruction is done.
+    fn take(&mut self, mask: bool) -> u8 {
+        let table = if mask { &self.mask_of } else { &self.vector_of };
+        // Mask register 0 means no mask.
+        let first = usize::from(mask);
+        let locked = |register: usize| self.locked.contains(&(mask, register as u8));
+        let free = (first..table.len()).find(|register| table[*register].is_none() && !locked(*register));
+        let register = free.unwrap_or_else(|| {
+            let candidates = (first..table.len()).filter(|register| !locked(*register));
+            let last = candidates.max_by_key(|register| {
+                let copy = table[*register].expect("none is free");
+                self.next_use(copy).map_or(usize::MAX, |place| place)
+            });
+            last.expect("an instruction locks fewer registers than there are")
+        });
+        if free.is_none() {
+            self.give_way(mask, register as u8);
+        }
+        self.locked.push((mask, register as u8));
+        register as u8
+    }
+
+    /// Frees a register; what is read later and lies nowhere else is stored.
+    fn give_way(&mut self, mask: bool, register: u8) {
+        let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
+        let copy = table[register as usize].take().expect("somebody owns it");
+        self.register.remove(&copy);
+        let node = Node((copy / self.vectors) as u32);
+        let known = self.homes.contains_key(&node) || self.spills.contains_key(&copy);
+        let constant = matches!(self.what(node), What::Constant(_));
+        if self.next_use(copy).is_some() && !known && !constant {
+            let number = self.free_spills.pop().unwrap_or_else(|| {
+                self.spilled += 1;
+                self.spilled - 1
+            });
+            self.spills.insert(copy, number);
+            self.store(node, register, self.spill_place(number));
+        }
+    }
+
+    /// Frees the register and the memory of a copy that is not read any more.
+    fn release(&mut self, node: Node) {
+        let copy = self.copy(node);
+        if self.next_use(copy).is_some() {
+            return;
+        }
+        if let Some(register) = self.register.remove(&copy) {
+            let mask = self.is_mask(node);
+            let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
+            table[register as usize] = None;
+            self.locked.retain(|locked| *locked != (mask, register));
+        }
+        if let Some(number) = self.spills.remove(&copy) {
+            // The instruction may read it from there yet.
+            self.left_spills.push(number);
+        }
+    }
+
+    /// The instruction for this copy is written.
+    fn done(&mut self, node: Node) {
+        self.locked.clear();
+        self.release(node);
+        self.free_spills.append(&mut self.left_spills);
+    }
+
+    /// Registers for a result, those of operands that are not read any more among them.
+    fn result(&mut self, node: Node) -> u8 {
+        self.what(node).operands().for_each(|operand| self.release(operand));
+        self.apart(node)
+    }
+
+    /// A register for a result, none of the operands' own.
+    fn apart(&mut self, node: Node) -> u8 {
+        let mask = self.is_mask(node);
+        let register = self.take(mask);
+        let copy = self.copy(node);
+        self.own(copy, mask, register);
+        register
+    }
+
+    fn node(&mut self, node: Node) {
+        let what = self.what(node);
+        // What this instruction reads does not give way to what it loads.
+        for operand in what.operands() {
+            if let Some(register) = self.register.get(&self.copy(operand)) {
+                self.locked.push((self.is_mask(operand), *register));
+            }
+        }
+        match what {
+            What::Load(_) | What::Constant(_) => unreachable!("they lie in memory"),
+            What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
+            What::One(instruction, immediate, a) => {
+                let last = self.place(a);
+                let to = self.result(node);
+                self.code.vector(instruction, to, 0, last, immediate);
+            }
+            What::Fma { negated, a, b, c } => self.fma(node, negated, a, b, c),
+            What::Shift(direction, a, n) => {
+                let from = self.in_register(a);
+                let to = self.result(node);
+                let (instruction, digit) = match direction {
+                    Direction::Left => (i::SHIFT, 6),
+                    Direction::Right => (i::SHIFT, 2),
+                    Direction::RightSigned => (i::SHIFT_SIGNED, 4),
+                };
+                self.code.vector(instruction, digit, to, Place::Register(from), Some(n));
+            }
+            What::Compare(predicate, a, b) => {
+                // The other way round: LT is GT, LE is GE.
+                let turned = [(0x11, 0x1e), (0x12, 0x1d), (0, 0)].into_iter().find(|(known, _)| *known == predicate);
+                let turned = turned.expect("a known predicate").1;
+                let (first, last, predicate) = match (self.place(a), self.place(b)) {
+                    (Place::Register(a), last) => (a, last, predicate),
+                    (last, Place::Register(b)) => (b, last, turned),
+                    (_, last) => (self.in_register(a), last, predicate),
+                };
+                let to = self.result(node);
+                self.code.vector(i::COMPARE, to, first, last, Some(predicate));
+            }
+            What::CompareInt(predicate, a, b) if self.width == Width::Avx512 => {
+                let first = self.in_register(a);
+                let last = self.place(b);
+                let to = self.result(node);
+                self.code.vector(i::INT_COMPARE, to, first, last, Some(predicate));
+            }
+            What::CompareInt(predicate, a, b) => {
+                // a < b is b > a.
+                let first = self.in_register(b);
+                let last = self.place(a);
+                let to = self.result(node);
+                let instruction = if predicate == 0 { i::INT_EQUAL } else { i::INT_GREATER };
+                self.code.vector(instruction, to, first, last, None);
+            }
+            What::Mask(truth) => {
+                let to = self.result(node);
+                let instruction = if truth { i::MASK_NOT_XOR } else { i::MASK_XOR };
+                self.code.mask(instruction, to, to, Place::Register(to));
+            }
+            What::MaskAnd(a, b) | What::MaskOr(a, b) => {
+                let (a, b) = (self.in_register(a), self.in_register(b));
+                let to = self.result(node);
+                let instruction = if matches!(what, What::MaskAnd(..)) { i::MASK_AND } else { i::MASK_OR };
+                self.code.mask(instruction, to, a, Place::Register(b));
+            }
+            What::MaskNot(a) => {
+                let from = self.in_register(a);
+                let to = self.result(node);
+                self.code.mask(i::MASK_NOT, to, 0, Place::Register(from));
+            }
+            What::MaskSelect(when, a, b) => {
+                let [when, a, b] = [when, a, b].map(|operand| self.in_register(operand));
+                let other = self.take(true);
+                let to = self.apart(node);
+                self.code.mask(i::MASK_AND_NOT, other, when, Place::Register(b));
+                self.code.mask(i::MASK_AND, to, when, Place::Register(a));
+                self.code.mask(i::MASK_OR, to, to, Place::Register(other));
+                what.operands().for_each(|operand| self.release(operand));
+            }
+            What::Select(when, a, b) => {
+                let mask = self.in_register(when);
+                let other = self.in_register(b);
+                let chosen = self.place(a);
+                let to = self.result(node);
+                match self.width {
+                    Width::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
+                    Width::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
+                }
+            }
+            What::Gather { base, index } => {
+                let from = self.in_register(index);
+                let mask = self.take(self.width == Width::Avx512);
+                let to = self.apart(node);
+                match self.width {
+                    Width::Avx512 => self.code.mask(i::MASK_NOT_XOR, mask, mask, Place::Register(mask)),
+                    Width::Avx2 => self.code.vector(i::INT_EQUAL_32, mask, mask, Place::Register(mask), None),
+                }
+                // It keeps lanes that the mask leaves out, so it would wait for whatever was there.
+                self.code.vector(i::XOR, to, to, Place::Register(to), None);
+                self.code.gather(to, from, mask, 8 * base as i32);
+                self.release(index);
+            }
+        }
+    }
+
+    fn two(&mut self, node: Node, instruction: Instruction, exchange: bool, a: Node, b: Node) {
+        let (first, last) = match (self.place(a), self.place(b)) {
+            (Place::Register(a), last) => (a, last),
+            (last, Place::Register(b)) if exchange => (b, last),
+            (_, last) => (self.in_register(a), last),
+        };
+        let to = self.result(node);
+        self.code.vector(instruction, to, first, last, None);
+    }
+
+    /// One of three operands is overwritten, one may lie in memory.
+    fn fma(&mut self, node: Node, negated: bool, a: Node, b: Node, c: Node) {
+        let all = [a, b, c];
+        let places = all.map(|operand| self.place(operand));
+        let held = |k: usize| matches!(places[k], Place::Register(_));
+        let dies = |body: &Self, k: usize| held(k) && body.next_use(body.copy(all[k])).is_none();
+        // What is not read any more is overwritten; else what has to be loaded; else a copy.
+        let over = [2, 0, 1]
+            .into_iter()
+            .find(|k| dies(self, *k))
+            .or_else(|| [2, 0, 1].into_iter().find(|k| !held(*k)))
+            .unwrap_or(2);
+        let others: [usize; 2] = [[1, 2], [0, 2], [0, 1]][over];
+        // Of the others one may stay in memory.
+        let mut read = others.map(|k| places[k]);
+        if !held(others[0]) && !held(others[1]) {
+            read[0] = Place::Register(self.in_register(all[others[0]]));
+            if all[others[0]] == all[others[1]] {
+                read[1] = read[0];
+            }
+        }
+        let (to, owned) = match places[over] {
+            Place::Register(register) if dies(self, over) => (register, true),
+            place => {
+                let to = self.take(false);
+                match place {
+                    Place::Register(_) => self.code.vector(i::LOAD, to, 0, place, None),
+                    place => self.load(all[over], to, place),
+                }
+                (to, false)
+            }
+        };
+        let [Place::Register(_), _] = read else {
+            let read = [read[1], read[0]];
+            return self.fused(node, negated, over, [others[1], others[0]], read, to, owned);
+        };
+        self.fused(node, negated, over, others, read, to, owned);
+    }
+
+    /// The first of `read` is a register.
+    #[allow(clippy::too_many_arguments)]
+    fn fused(
+        &mut self,
+        node: Node,
+        negated: bool,
+        over: usize,
+        others: [usize; 2],
+        read: [Place; 2],
+        to: u8,
+        owned: bool,
+    ) {
+        let Place::Register(second) = read[0] else { unreachable!("one of two is a register") };
+        let form = match (over, others[0]) {
+            (2, _) => i::FMA_231,
+            // The register is c.
+            (_, 2) => i::FMA_132,
+            (_, _) => i::FMA_213,
+        };
+        let form = if negated { Instruction(form.0, form.1, form.2, form.3 + 4) } else { form };
+        self.code.vector(form, to, second, read[1], None);
+        self.what(node).operands().for_each(|operand| self.release(operand));
+        let copy = self.copy(node);
+        debug_assert!(!owned || self.vector_of[to as usize].is_none(), "the operand has been released");
+        self.own(copy, false, to);
+    }
+}

@@ -1,0 +1,346 @@
+//! Vector instructions of x86-64 as bytes: VEX with 256 bits, EVEX with 512 bits.
+//!
+//! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
+//! is reached relative to the instruction. Knows nothing of programs.
+//! Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, sections 2.3 and 2.7.
+
+use std::collections::HashMap;
+
+/// Which vectors.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Width {
+    /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
+    Avx2,
+    /// Eight lanes of 64 bits in 32 registers, and masks: AVX-512 F and DQ.
+    Avx512,
+}
+
+impl Width {
+    /// Lanes of a vector.
+    pub fn lanes(self) -> usize {
+        match self {
+            Width::Avx2 => 4,
+            Width::Avx512 => 8,
+        }
+    }
+
+    /// Bytes of a vector.
+    pub fn bytes(self) -> i32 {
+        8 * self.lanes() as i32
+    }
+
+    /// Vector registers.
+    pub fn registers(self) -> u8 {
+        match self {
+            Width::Avx2 => 16,
+            Width::Avx512 => 32,
+        }
+    }
+}
+
+/// A general register that holds an address.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Base {
+    /// rdi: the block.
+    Block = 7,
+    /// rsi: the pool.
+    Pool = 6,
+    /// rcx: the statuses.
+    Statuses = 1,
+    /// r8: what an iteration begins with.
+    Before = 8,
+    /// r9: what it ends with.
+    After = 9,
+}
+
+/// The last operand of an instruction.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Place {
+    /// A vector or mask register.
+    Register(u8),
+    /// A vector in memory.
+    Memory(Base, i32),
+    /// A constant in every lane, by its bits.
+    Constant(u64),
+}
+
+/// Instruction: mandatory prefix (0: none, 1: 66, 2: F3, 3: F2), map (1: 0F, 2: 0F 38, 3: 0F 3A), W of the EVEX form and
+/// of the VEX form, opcode.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
+
+#[rustfmt::skip]
+#[allow(missing_docs)]
+pub mod instructions {
+    use super::Instruction;
+    pub const ADD: Instruction = Instruction(1, 1, [1, 0], 0x58);
+    pub const MUL: Instruction = Instruction(1, 1, [1, 0], 0x59);
+    pub const SUB: Instruction = Instruction(1, 1, [1, 0], 0x5c);
+    pub const MIN: Instruction = Instruction(1, 1, [1, 0], 0x5d);
+    pub const DIV: Instruction = Instruction(1, 1, [1, 0], 0x5e);
+    pub const MAX: Instruction = Instruction(1, 1, [1, 0], 0x5f);
+    pub const SQRT: Instruction = Instruction(1, 1, [1, 0], 0x51);
+    pub const AND: Instruction = Instruction(1, 1, [1, 0], 0x54);
+    pub const OR: Instruction = Instruction(1, 1, [1, 0], 0x56);
+    pub const XOR: Instruction = Instruction(1, 1, [1, 0], 0x57);
+    pub const COMPARE: Instruction = Instruction(1, 1, [1, 0], 0xc2);
+    pub const LOAD: Instruction = Instruction(1, 1, [1, 0], 0x28);
+    pub const STORE: Instruction = Instruction(1, 1, [1, 0], 0x29);
+    pub const BROADCAST: Instruction = Instruction(1, 2, [1, 0], 0x19);
+    /// VRNDSCALEPD as EVEX, VROUNDPD as VEX.
+    pub const ROUND: Instruction = Instruction(1, 3, [1, 0], 0x09);
+    /// d = d · rm + v
+    pub const FMA_132: Instruction = Instruction(1, 2, [1, 1], 0x98);
+    /// d = v · d + rm
+    pub const FMA_213: Instruction = Instruction(1, 2, [1, 1], 0xa8);
+    /// d = v · rm + d
+    pub const FMA_231: Instruction = Instruction(1, 2, [1, 1], 0xb8);
+    pub const GATHER: Instruction = Instruction(1, 2, [1, 1], 0x93);
+    pub const INT_ADD: Instruction = Instruction(1, 1, [1, 0], 0xd4);
+    pub const INT_SUB: Instruction = Instruction(1, 1, [1, 0], 0xfb);
+    /// By a constant: /2 right, /4 right with the sign (as opcode 72), /6 left.
+    pub const SHIFT: Instruction = Instruction(1, 1, [1, 0], 0x73);
+    pub const SHIFT_SIGNED: Instruction = Instruction(1, 1, [1, 0], 0x72);
+    pub const INT_EQUAL_32: Instruction = Instruction(1, 1, [0, 0], 0x76);
+    /// VEX only.
+    pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
+    pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
+    pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
+    /// EVEX only.
+    pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
+    pub const INT_MUL: Instruction = Instruction(1, 2, [1, 0], 0x40);
+    pub const INT_MIN_UNSIGNED: Instruction = Instruction(1, 2, [1, 0], 0x3b);
+    pub const INT_COMPARE: Instruction = Instruction(1, 3, [1, 0], 0x1f);
+    pub const TO_INT: Instruction = Instruction(1, 1, [1, 0], 0x7a);
+    pub const TO_REAL: Instruction = Instruction(2, 1, [1, 0], 0xe6);
+    /// Of masks, as VEX; the number is L.
+    pub const MASK_AND: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x41), 1);
+    pub const MASK_AND_NOT: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x42), 1);
+    pub const MASK_NOT: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x44), 0);
+    pub const MASK_OR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x45), 1);
+    pub const MASK_NOT_XOR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x46), 1);
+    pub const MASK_XOR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x47), 1);
+    pub const MASK_TEST: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x98), 0);
+    pub const MASK_LOAD: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x90), 0);
+    pub const MASK_STORE: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x91), 0);
+}
+
+/// Code under way.
+pub struct Assembler {
+    width: Width,
+    bytes: Vec<u8>,
+    /// Constants in the order of their first use, and where each is wanted: the place of a distance, and the end of its
+    /// instruction.
+    constants: Vec<u64>,
+    numbers: HashMap<u64, usize>,
+    wanted: Vec<(usize, usize, usize)>,
+}
+
+impl Assembler {
+    pub fn new(width: Width) -> Assembler {
+        Assembler { width, bytes: Vec::new(), constants: Vec::new(), numbers: HashMap::new(), wanted: Vec::new() }
+    }
+
+    /// An instruction without a mask: `reg` and `second` as their operands stand in the manual.
+    pub fn vector(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>) {
+        self.masked(what, reg, second, last, immediate, 0);
+    }
+
+    /// An instruction with a mask register; 0: none. VEX has no masks.
+    pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
+        match self.width {
+            Width::Avx512 => self.evex(what, reg, second, last, mask),
+            Width::Avx2 => {
+                assert_eq!(mask, 0, "VEX has no masks");
+                self.vex(what, reg, second, last, 1);
+            }
+        }
+        self.operand(reg, last, immediate);
+    }
+
+    /// An instruction on mask registers.
+    pub fn mask(&mut self, (what, l): (Instruction, u8), reg: u8, second: u8, last: Place) {
+        self.vex(what, reg, second, last, l);
+        self.operand(reg, last, None);
+    }
+
+    /// Entries of the table at `offset` bytes of the pool, at the indices in a vector; `mask`: a mask register, or a vector
+    /// whose signs are the mask. The mask is used up.
+    pub fn gather(&mut self, to: u8, index: u8, mask: u8, offset: i32) {
+        let Instruction(pp, map, w, opcode) = instructions::GATHER;
+        let base = Base::Pool as u8;
+        match self.width {
+            Width::Avx512 => {
+                let bit = |register: u8, n: u8| (!register >> n) & 1;
+                let p0 = bit(to, 3) << 7 | bit(index, 3) << 6 | 1 << 5 | bit(to, 4) << 4 | map;
+                let p1 = w[0] << 7 | 0xf << 3 | 1 << 2 | pp;
+                let p2 = 2 << 5 | bit(index, 4) << 3 | mask;
+                self.bytes.extend([0x62, p0, p1, p2]);
+            }
+            Width::Avx2 => {
+                let p0 = (!to >> 3 & 1) << 7 | (!index >> 3 & 1) << 6 | 1 << 5 | map;
+                let p1 = w[1] << 7 | (!mask & 15) << 3 | 1 << 2 | pp;
+                self.bytes.extend([0xc4, p0, p1]);
+            }
+        }
+        // Base and index scaled by 8, with a distance of 32 bits.
+        self.bytes.extend([opcode, 0x84 | (to & 7) << 3, 0xc0 | (index & 7) << 3 | base]);
+        self.bytes.extend(offset.to_le_bytes());
+    }
+
+    fn evex(&mut self, Instruction(pp, map, w, opcode): Instruction, reg: u8, second: u8, last: Place, mask: u8) {
+        let bit = |register: u8, n: u8| (!register >> n) & 1;
+        let (x, b, broadcast) = match last {
+            Place::Register(register) => (bit(register, 4), bit(register, 3), 0),
+            Place::Memory(base, _) => (1, bit(base as u8, 3), 0),
+            Place::Constant(_) => (1, 1, u8::from(opcode != instructions::BROADCAST.3)),
+        };
+        let p0 = bit(reg, 3) << 7 | x << 6 | b << 5 | bit(reg, 4) << 4 | map;
+        let p1 = w[0] << 7 | (!second & 15) << 3 | 1 << 2 | pp;
+        let p2 = 2 << 5 | broadcast << 4 | bit(second, 4) << 3 | mask;
+        self.bytes.extend([0x62, p0, p1, p2, opcode]);
+    }
+
+    fn vex(&mut self, Instruction(pp, map, w, opcode): Instruction, reg: u8, second: u8, last: Place, l: u8) {
+        let b = match last {
+            Place::Register(register) => !register >> 3 & 1,
+            Place::Memory(base, _) => !(base as u8) >> 3 & 1,
+            Place::Constant(_) => 1,
+        };
+        let p0 = (!reg >> 3 & 1) << 7 | 1 << 6 | b << 5 | map;
+        let p1 = w[1] << 7 | (!second & 15) << 3 | l << 2 | pp;
+        self.bytes.extend([0xc4, p0, p1, opcode]);
+    }
+
+    fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>) {
+        let reg = (reg & 7) << 3;
+        match last {
+            Place::Register(register) => self.bytes.push(0xc0 | reg | register & 7),
+            Place::Memory(base, offset) => {
+                self.bytes.push(0x80 | reg | base as u8 & 7);
+                self.bytes.extend(offset.to_le_bytes());
+            }
+            Place::Constant(bits) => {
+                self.bytes.push(0x05 | reg);
+                let next = self.constants.len();
+                let number = *self.numbers.entry(bits).or_insert(next);
+                if number == next {
+                    self.constants.push(bits);
+                }
+                let at = self.bytes.len();
+                self.bytes.extend([0; 4]);
+                self.wanted.push((at, at + 4 + usize::from(immediate.is_some()), number));
+            }
+        }
+        self.bytes.extend(immediate);
+    }
+
+    /// Instructions without vectors, as bytes.
+    pub fn plain(&mut self, bytes: &[u8]) {
+        self.bytes.extend(bytes);
+    }
+
+    /// Where the next instruction begins.
+    pub fn here(&self) -> usize {
+        self.bytes.len()
+    }
+
+    /// A jump whose target is not yet known; `opcode` takes a distance of 32 bits.
+    pub fn jump(&mut self, opcode: &[u8]) -> usize {
+        self.bytes.extend(opcode);
+        self.bytes.extend([0; 4]);
+        self.bytes.len() - 4
+    }
+
+    /// Lets a jump lead to a place.
+    pub fn lead(&mut self, jump: usize, to: usize) {
+        let distance = i32::try_from(to as i64 - (jump as i64 + 4)).expect("code is shorter than 2 GiB");
+        self.bytes[jump..jump + 4].copy_from_slice(&distance.to_le_bytes());
+    }
+
+    /// The code and, behind it, its constants: to lie at a multiple of 64.
+    pub fn finish(mut self) -> Vec<u8> {
+        // EVEX spreads one number over the lanes as it reads it.
+        let copies = if self.width == Width::Avx512 { 1 } else { self.width.lanes() };
+        self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
+        let begin = self.bytes.len();
+        for (at, end, number) in std::mem::take(&mut self.wanted) {
+            let distance = i32::try_from(begin + 8 * copies * number - end).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        }
+        for bits in &self.constants {
+            for _ in 0..copies {
+                self.bytes.extend(bits.to_le_bytes());
+            }
+        }
+        self.bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::instructions::*;
+    use super::*;
+
+    #[track_caller]
+    fn check(width: Width, write: impl Fn(&mut Assembler), expected: &[u8]) {
+        let mut code = Assembler::new(width);
+        write(&mut code);
+        assert_eq!(code.bytes, expected, "{:02x?}", code.bytes);
+    }
+
+    /// Against the GNU assembler's bytes.
+    #[test]
+    fn instructions_have_the_bytes_of_the_manual() {
+        // vaddpd zmm17, zmm2, zmm30
+        check(
+            Width::Avx512,
+            |c| c.vector(ADD, 17, 2, Place::Register(30), None),
+            &[0x62, 0x81, 0xed, 0x48, 0x58, 0xce],
+        );
+        // vfmadd231pd ymm9, ymm1, [r8+0x100]
+        check(
+            Width::Avx2,
+            |c| c.vector(FMA_231, 9, 1, Place::Memory(Base::Before, 0x100), None),
+            &[0xc4, 0x42, 0xf5, 0xb8, 0x88, 0, 1, 0, 0],
+        );
+        // vblendmpd zmm1{k3}, zmm2, zmm4
+        check(
+            Width::Avx512,
+            |c| c.masked(BLEND, 1, 2, Place::Register(4), None, 3),
+            &[0x62, 0xf2, 0xed, 0x4b, 0x65, 0xcc],
+        );
+        // vgatherqpd ymm1, [rsi+ymm10*8+0x40], ymm3
+        check(Width::Avx2, |c| c.gather(1, 10, 3, 0x40), &[0xc4, 0xa2, 0xe5, 0x93, 0x8c, 0xd6, 0x40, 0, 0, 0]);
+        // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
+        check(Width::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
+        // vrndscalepd zmm3, zmm20, 9
+        check(
+            Width::Avx512,
+            |c| c.vector(ROUND, 3, 0, Place::Register(20), Some(9)),
+            &[0x62, 0xb3, 0xfd, 0x48, 0x09, 0xdc, 0x09],
+        );
+        // vpsraq zmm18, zmm5, 7: the register it goes to stands where the second operand does.
+        check(
+            Width::Avx512,
+            |c| c.vector(SHIFT_SIGNED, 4, 18, Place::Register(5), Some(7)),
+            &[0x62, 0xf1, 0xed, 0x40, 0x72, 0xe5, 0x07],
+        );
+        // vblendvpd ymm1, ymm2, ymm3, ymm4
+        check(
+            Width::Avx2,
+            |c| c.vector(BLEND_BY_SIGN, 1, 2, Place::Register(3), Some(4 << 4)),
+            &[0xc4, 0xe3, 0x6d, 0x4b, 0xcb, 0x40],
+        );
+        // kandnb k1, k2, k3
+        check(Width::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x42, 0xcb]);
+        // vcvtqq2pd zmm1, zmm2
+        check(
+            Width::Avx512,
+            |c| c.vector(TO_REAL, 1, 0, Place::Register(2), None),
+            &[0x62, 0xf1, 0xfe, 0x48, 0xe6, 0xca],
+        );
+        // korb k1, k2, k3
+        check(Width::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x45, 0xcb]);
+    }
+}

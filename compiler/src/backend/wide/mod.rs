@@ -1,0 +1,263 @@
+//! The same program for many instances at once, in the widest vectors of x86-64: a straight line with a loop around it,
+//! and the bits of a single instance in every lane.
+//!
+//! In: an expanded step. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
+//! for itself. What no step changes is computed before the loop; what only the last step leaves behind (outputs) is
+//! computed in the last step. Two areas hold what one step hands to the next, in turn, so that a step at which a lane
+//! fails can be done again in full, with its status.
+//!
+//! ```text
+//! entry:  compute what no step changes; copy the carried slots to the first area
+//! loop:   if this is the last step: final
+//!         carried slots, from one area to the other; if a lane fails: final
+//!         exchange the areas; loop
+//! final:  everything, from the area to the block, with statuses; return the number of steps done
+//! ```
+
+mod body;
+mod encode;
+mod select;
+
+use super::jit::Executable;
+use super::target::Unsupported;
+use crate::ir::Func;
+use crate::ir::verify::{Stage, verify};
+use abi::lanes::{Lanes, LanesEntry};
+use abi::{Layout, Slot};
+use body::{Body, Home};
+pub use encode::Width;
+use encode::{Assembler, Base};
+use encode::{Place, instructions};
+use select::{Node, Nodes, What, select};
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+
+impl Width {
+    /// The widest of this processor.
+    pub fn here() -> Option<Width> {
+        [Width::Avx512, Width::Avx2].into_iter().find(|width| width.is_here())
+    }
+
+    /// Whether this processor has it, with the calling convention that the code is made for.
+    #[cfg(all(target_arch = "x86_64", unix))]
+    pub fn is_here(self) -> bool {
+        match self {
+            Width::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
+            Width::Avx512 => {
+                std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")
+            }
+        }
+    }
+
+    /// Whether this processor has it, with the calling convention that the code is made for.
+    #[cfg(not(all(target_arch = "x86_64", unix)))]
+    pub fn is_here(self) -> bool {
+        false
+    }
+
+    /// Vectors side by side that pay on current processors.
+    pub fn vectors(self) -> usize {
+        match self {
+            Width::Avx2 => 3,
+            Width::Avx512 => 4,
+        }
+    }
+
+    /// As its maker calls it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Width::Avx2 => "AVX2",
+            Width::Avx512 => "AVX-512",
+        }
+    }
+}
+
+/// Machine code of a step for as many instances as `vectors` vectors have lanes.
+///
+/// # Errors
+/// If this processor does not have the width, or the width no instruction for an operation.
+///
+/// # Panics
+/// If the function is not sound or not expanded: a mistake of the passes before.
+pub fn compile(
+    func: &Func,
+    layout: &Layout,
+    pool_len: usize,
+    width: Width,
+    vectors: usize,
+) -> Result<Lanes, Unsupported> {
+    verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+    if !width.is_here() {
+        return Err(Unsupported(format!("this processor lacks {}", width.name())));
+    }
+    let (code, scratch) = generate(func, layout, width, vectors)?;
+    let executable = Executable::new(&code, 64)?;
+    // SAFETY: `address` is the beginning of code with the signature of `LanesEntry`.
+    let entry = unsafe { std::mem::transmute::<*const u8, LanesEntry>(executable.address()) };
+    let lanes = vectors * width.lanes();
+    let name = format!("{} × {vectors}", width.name());
+    // SAFETY: the entry lives as long as the memory; `verify` has checked that every slot lies in the layout and every
+    // table in the pool, indices are held inside, and what the code needs beyond the block is `scratch`.
+    Ok(unsafe { Lanes::new(entry, lanes, layout.size(), scratch, pool_len, name, Arc::new(executable)) })
+}
+
+/// What the vectors of one node have in memory.
+fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Width) -> Place {
+    Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
+}
+
+/// The code, and the numbers it needs behind the block.
+fn generate(func: &Func, layout: &Layout, width: Width, vectors: usize) -> Result<(Vec<u8>, usize), Unsupported> {
+    let nodes = select(func, width)?;
+    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let loaded: HashSet<Slot> = func.loads().into_iter().collect();
+    let carried: Vec<(Slot, Node)> = nodes.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
+    let varies = varying(&nodes, &stored);
+
+    // Behind the block: two areas of what is carried, what is computed once, what registers have no room for.
+    let vector = width.bytes() as usize;
+    let areas = [0, 1].map(|area| (layout.size() + area * carried.len()) * vectors * vector);
+    let mut roots: Vec<Node> = carried.iter().map(|(_, node)| *node).chain(nodes.failed).collect();
+    let fast = order(&nodes, &roots, &varies);
+    roots = nodes.stores.iter().map(|(_, node)| *node).chain(nodes.status).collect();
+    let full = order(&nodes, &roots, &varies);
+    let once = needed_once(&nodes, &[&fast, &full], nodes.failed, &varies);
+    let once_at = areas[1] + carried.len() * vectors * vector;
+    let before = order(&nodes, &once, &varies.iter().map(|varies| !varies).collect::<Vec<_>>());
+    let spills_at = once_at + once.len() * vectors * vector;
+
+    let mut homes: HashMap<Node, Home> = HashMap::new();
+    for (index, node) in nodes.nodes.iter().enumerate() {
+        if let What::Load(slot) = node {
+            let home = match carried.iter().position(|(known, _)| known == slot) {
+                Some(index) => Home { base: Base::Before, begin: 0, index },
+                None => Home { base: Base::Block, begin: 0, index: slot.index() },
+            };
+            homes.insert(Node(index as u32), home);
+        }
+    }
+    let mut code = Assembler::new(width);
+    let none = {
+        code.plain(&[0x48, 0x85, 0xd2]); // test rdx, rdx
+        code.jump(&[0x0f, 0x84]) // jz
+    };
+    let mut most = 0;
+    let store_once = |node: Node| {
+        once.iter().position(|known| *known == node).map(|index| Home { base: Base::Block, begin: once_at, index })
+    };
+    let mut body = Body::new(&mut code, &nodes, &before, &homes, width, vectors, spills_at);
+    body.write(&|node| store_once(node).into_iter().collect(), &[]);
+    most = most.max(body.spilled());
+    for (index, node) in once.iter().enumerate() {
+        homes.insert(*node, Home { base: Base::Block, begin: once_at, index });
+    }
+    for (index, (slot, _)) in carried.iter().enumerate() {
+        for k in 0..vectors {
+            code.vector(instructions::LOAD, 0, 0, place_in(Base::Block, 0, slot.index(), vectors, k, width), None);
+            code.vector(instructions::STORE, 0, 0, place_in(Base::Block, areas[0], index, vectors, k, width), None);
+        }
+    }
+    for (area, opcode) in areas.into_iter().zip([0x87, 0x8f]) {
+        code.plain(&[0x4c, 0x8d, opcode]); // lea r8 or r9, [rdi + area]
+        code.plain(&(area as i32).to_le_bytes());
+    }
+    code.plain(&[0x31, 0xc0]); // xor eax, eax
+    code.plain(&[0x48, 0xff, 0xca]); // dec rdx
+    let top = code.here();
+    code.plain(&[0x48, 0x39, 0xd0]); // cmp rax, rdx
+    let mut to_final = vec![code.jump(&[0x0f, 0x83])]; // jae
+    if !carried.is_empty() {
+        let to_area = |node: Node| {
+            let of = carried.iter().enumerate().filter(|(_, (_, next))| *next == node);
+            of.map(|(index, _)| Home { base: Base::After, begin: 0, index }).collect()
+        };
+        let rest: Vec<Node> = carried.iter().map(|(_, node)| *node).collect();
+        let mut body = Body::new(&mut code, &nodes, &fast, &homes, width, vectors, spills_at);
+        if let Some(failed) = nodes.failed {
+            body.keep(failed);
+        }
+        body.write(&to_area, &rest);
+        if let Some(failed) = nodes.failed {
+            to_final.extend(body.test(failed));
+        }
+        most = most.max(body.spilled());
+        code.plain(&[0x48, 0xff, 0xc0]); // inc rax
+        code.plain(&[0x4d, 0x87, 0xc8]); // xchg r8, r9
+        let again = code.jump(&[0xe9]);
+        code.lead(again, top);
+    }
+    let last = code.here();
+    to_final.into_iter().for_each(|jump| code.lead(jump, last));
+    let to_block = |node: Node| {
+        let stores = nodes.stores.iter().filter(|(_, value)| *value == node);
+        let mut homes: Vec<Home> =
+            stores.map(|(slot, _)| Home { base: Base::Block, begin: 0, index: slot.index() }).collect();
+        homes.extend((nodes.status == Some(node)).then_some(Home { base: Base::Statuses, begin: 0, index: 0 }));
+        homes
+    };
+    let mut body = Body::new(&mut code, &nodes, &full, &homes, width, vectors, spills_at);
+    body.write(&to_block, &roots);
+    most = most.max(body.spilled());
+    if carried.is_empty() {
+        code.plain(&[0x48, 0x89, 0xd0]); // mov rax, rdx
+    }
+    code.plain(&[0x48, 0xff, 0xc0, 0xc5, 0xf8, 0x77, 0xc3]); // inc rax; vzeroupper; ret
+    let end = code.here();
+    code.lead(none, end);
+    code.plain(&[0x31, 0xc0, 0xc5, 0xf8, 0x77, 0xc3]); // xor eax, eax; vzeroupper; ret
+    let scratch = (spills_at + most * vector) / 8 - layout.size() * vectors * width.lanes();
+    let addressed = (spills_at + most * vector) as u64;
+    if addressed > i32::MAX as u64 {
+        return Err(Unsupported(format!("`{}` is too large for lanes: {} operations", func.name, func.ops.len())));
+    }
+    Ok((code.finish(), scratch))
+}
+
+/// For each node, whether a step can change it.
+fn varying(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
+    let mut varies: Vec<bool> = Vec::with_capacity(nodes.nodes.len());
+    for node in &nodes.nodes {
+        let own = matches!(node, What::Load(slot) if stored.contains(slot));
+        varies.push(own || node.operands().any(|operand| varies[operand.index()]));
+    }
+    varies
+}
+
+/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first,
+/// so that what is computed is soon used.
+fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+    let mut done = vec![false; nodes.nodes.len()];
+    let mut out = Vec::new();
+    for root in roots {
+        let mut open = vec![(*root, false)];
+        while let Some((node, ready)) = open.pop() {
+            let what = nodes.nodes[node.index()];
+            if done[node.index()] || !wanted[node.index()] || matches!(what, What::Load(_) | What::Constant(_)) {
+                continue;
+            }
+            if ready {
+                done[node.index()] = true;
+                out.push(node);
+                continue;
+            }
+            open.push((node, true));
+            // The last pushed is done first.
+            let operands: Vec<Node> = what.operands().collect();
+            open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
+        }
+    }
+    out
+}
+
+/// What no step changes and some step reads, loads and constants apart.
+fn needed_once(nodes: &Nodes, orders: &[&[Node]], failed: Option<Node>, varies: &[bool]) -> Vec<Node> {
+    let of_order = |node: &Node| nodes.nodes[node.index()].operands().collect::<Vec<_>>();
+    let read = orders.iter().flat_map(|order| order.iter().flat_map(of_order));
+    let stored = nodes.stores.iter().map(|(_, node)| *node).chain(nodes.status).chain(failed);
+    let mut seen = HashSet::new();
+    read.chain(stored)
+        .filter(|node| !varies[node.index()])
+        .filter(|node| !matches!(nodes.nodes[node.index()], What::Load(_) | What::Constant(_)))
+        .filter(|node| seen.insert(*node))
+        .collect()
+}

@@ -1,0 +1,76 @@
+//! `fric build`: a model as something to take away: C, a machine-code image, or what the compiler makes on the way.
+
+use super::{End, load, reported};
+use crate::args::Build;
+use crate::compile::{self, Changes, Emit, Stopwatch};
+use crate::project;
+use crate::terminal::Terminal;
+use grammar::diagnostic::Diagnostic;
+
+pub fn build(args: &Build, terminal: &mut Terminal) -> End {
+    let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
+    let models: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
+    let experiments: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
+    let all = || models.iter().chain(&experiments).map(String::as_str);
+    let file = args.file.display();
+    let name = match (&args.name, &models[..], &experiments[..]) {
+        (Some(name), ..) if all().any(|known| known == name) => name.clone(),
+        (Some(name), ..) => {
+            let help = match compile::nearest(name, all()) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => format!("it has {}", all().collect::<Vec<_>>().join(", ")),
+            };
+            terminal.error(&format!("{file} has no model or experiment `{name}`; {help}"));
+            return End::Failed;
+        }
+        (None, [only], _) | (None, [], [only]) => only.clone(),
+        (None, [], []) => {
+            terminal.error(&format!("{file} has no model and no experiment"));
+            return End::Failed;
+        }
+        (None, ..) => {
+            let all: Vec<&str> = all().collect();
+            terminal.error(&format!("which of {file}? Name one of {}", all.join(", ")));
+            return End::Misused;
+        }
+    };
+    if args.emit == Emit::Blob && args.out.is_none() {
+        terminal.error("an image is no text for a terminal: give it a file with --out");
+        return End::Misused;
+    }
+    let changes = Changes {
+        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
+        method: args.solver,
+        step: args.step,
+        ..Changes::default()
+    };
+    let mut found = Vec::new();
+    let built = match compile::build(&mut loaded, &project::Disk, &name, &changes, &mut found) {
+        Ok(built) => built,
+        Err(diagnostics) => {
+            reported(&loaded, &diagnostics, terminal);
+            return End::Failed;
+        }
+    };
+    found.retain(|diagnostic| !Diagnostic::is_error(diagnostic));
+    if !found.is_empty() {
+        reported(&loaded, &found, terminal);
+    }
+    let bytes = match compile::emit(&built, args.emit, args.solver, args.target) {
+        Ok(bytes) => bytes,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let Some(out) = &args.out else {
+        terminal.print(&String::from_utf8(bytes).expect("all but images are texts"));
+        return End::Fine;
+    };
+    if let Err(error) = project::write(out, &bytes) {
+        terminal.error(&format!("cannot write {}: {error}", out.display()));
+        return End::Failed;
+    }
+    terminal.report(&format!("wrote {}, {} bytes\n", out.display(), crate::value::count(bytes.len() as u64)));
+    End::Fine
+}

@@ -1,0 +1,113 @@
+//! 64-bit Arm on another processor: a static C harness, compiled across, under user-mode emulation.
+//!
+//! Compiler and emulator are taken from the system, else from Debian's packages, which are unpacked below `target/` and
+//! installed nowhere. Where neither is to be had, the test fails and says what to install.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+/// What is unpacked where it is not installed. The compiler's own libraries are those of the system's compiler.
+const PACKAGES: [&str; 9] = [
+    "qemu-user-static",
+    "binutils-aarch64-linux-gnu",
+    "gcc-12-aarch64-linux-gnu",
+    "cpp-12-aarch64-linux-gnu",
+    "libc6-arm64-cross",
+    "libc6-dev-arm64-cross",
+    "linux-libc-dev-arm64-cross",
+    "libgcc-12-dev-arm64-cross",
+    "libgcc-s1-arm64-cross",
+];
+
+/// Runs the harness on a file of cases, which gives the file of results.
+pub fn run(cases: &Path, results: &Path) {
+    static HARNESS: OnceLock<(Option<PathBuf>, PathBuf)> = OnceLock::new();
+    let (emulator, harness) = HARNESS.get_or_init(harness);
+    let mut command = match emulator {
+        Some(emulator) => {
+            let mut command = Command::new(emulator);
+            command.arg(harness);
+            command
+        }
+        None => Command::new(harness),
+    };
+    done(command.arg(cases).arg(results), "the harness");
+}
+
+/// The emulator, where one is needed, and the harness.
+fn harness() -> (Option<PathBuf>, PathBuf) {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/agreement/harness.c");
+    let harness = Path::new(env!("CARGO_TARGET_TMPDIR")).join("harness-aarch64");
+    let flags = ["-std=gnu11", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1", "-static", "-o"];
+    if cfg!(target_arch = "aarch64") {
+        done(Command::new("gcc").args(flags).arg(&harness).arg(&source), "gcc");
+        return (None, harness);
+    }
+    let emulator = ["qemu-aarch64-static", "qemu-aarch64"].into_iter().find_map(on_path);
+    let compiler = on_path("aarch64-linux-gnu-gcc");
+    if let (Some(emulator), Some(compiler)) = (emulator, compiler) {
+        done(Command::new(compiler).args(flags).arg(&harness).arg(&source), "aarch64-linux-gnu-gcc");
+        return (Some(emulator), harness);
+    }
+    let usr = unpacked().join("usr");
+    let (bin, target) = (usr.join("bin"), usr.join("aarch64-linux-gnu"));
+    let mut across = Command::new(bin.join("aarch64-linux-gnu-gcc-12"));
+    across.env("LD_LIBRARY_PATH", usr.join("lib/x86_64-linux-gnu"));
+    across.args(flags).arg(&harness).arg(&source);
+    across.arg(format!("-B{}/aarch64-linux-gnu-", bin.display()));
+    across.arg(format!("-B{}/lib", target.display())).arg(format!("-L{}/lib", target.display()));
+    across.arg("-isystem").arg(target.join("include"));
+    done(&mut across, "the cross compiler");
+    (Some(bin.join("qemu-aarch64-static")), harness)
+}
+
+/// The packages below `target/`, from an earlier run or fetched now.
+fn unpacked() -> PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("aarch64-tools");
+    if folder.is_dir() {
+        return folder;
+    }
+    // Under another name until it is whole.
+    let begun = folder.with_extension(format!("begun-{}", std::process::id()));
+    let archives = begun.join("archives");
+    fs::create_dir_all(archives.join("partial")).expect("target/ can be written");
+    let fetch = |own_lists: bool, what: &[&str]| {
+        let mut command = Command::new("apt-get");
+        command.current_dir(&archives).args(["-q", "-o", "APT::Sandbox::User=root"]);
+        if own_lists {
+            command.arg("-o").arg(format!("Dir::State::Lists={}", begun.join("lists").display()));
+            command.arg("-o").arg(format!("Dir::Cache={}", begun.join("cache").display()));
+        }
+        command.args(what).output().is_ok_and(|output| output.status.success())
+    };
+    let download: Vec<&str> = ["download"].into_iter().chain(PACKAGES).collect();
+    let fetched = fetch(false, &download) || fetch(true, &["update"]) && fetch(true, &download);
+    assert!(
+        fetched,
+        "code for 64-bit Arm cannot be tried: there is no qemu-aarch64 with aarch64-linux-gnu-gcc, and apt-get cannot \
+         download them.\nOn Debian: apt-get install qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross"
+    );
+    for archive in fs::read_dir(&archives).expect("it was just made").flatten() {
+        if archive.path().extension().is_some_and(|extension| extension == "deb") {
+            done(Command::new("dpkg-deb").arg("-x").arg(archive.path()).arg(&begun), "dpkg-deb");
+        }
+    }
+    fs::remove_dir_all(&archives).expect("target/ can be written");
+    // Another test may have been faster: what it unpacked is the same.
+    if fs::rename(&begun, &folder).is_err() {
+        fs::remove_dir_all(&begun).expect("target/ can be written");
+    }
+    folder
+}
+
+fn on_path(name: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    std::env::split_paths(&path).map(|folder| folder.join(name)).find(|file| file.is_file())
+}
+
+fn done(command: &mut Command, what: &str) {
+    let output = command.output().unwrap_or_else(|error| panic!("{what} does not start: {error}"));
+    assert!(output.status.success(), "{what}: {}", String::from_utf8_lossy(&output.stderr));
+}
