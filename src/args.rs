@@ -553,15 +553,24 @@ const BUS_ADDRESSES: &str = "Addresses:\n  \
 /// `fric doctor`
 #[derive(clap::Args, Debug)]
 pub struct Doctor {
-    /// Buses to look at too, such as can0
-    #[arg(value_name = "ADDRESS", value_parser = address)]
-    pub addresses: Vec<Address>,
-    /// Bits a second that they should have
+    /// Rigs whose buses to look at too, and buses such as can0
+    #[arg(value_name = "RIG.fric|ADDRESS", value_hint = ValueHint::FilePath, value_parser = looked_at)]
+    pub targets: Vec<LookedAt>,
+    /// Bits a second that the buses named here should have
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
     /// Priority of the loop that will run
     #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
     pub priority: i32,
+}
+
+/// What `fric doctor` looks at besides the machine.
+#[derive(Clone, Debug)]
+pub enum LookedAt {
+    /// The buses of the rigs in a text.
+    Rigs(PathBuf),
+    /// A bus.
+    Bus(Address),
 }
 
 /// `fric bench-rt`
@@ -634,6 +643,10 @@ fn positive_time(text: &str) -> Result<f64, String> {
 
 fn address(text: &str) -> Result<Address, String> {
     text.parse()
+}
+
+fn looked_at(text: &str) -> Result<LookedAt, String> {
+    if text.ends_with(".fric") { Ok(LookedAt::Rigs(text.into())) } else { address(text).map(LookedAt::Bus) }
 }
 
 /// 1 Hz to 20 kHz.
