@@ -1,0 +1,394 @@
+//! Rigs under way: the example against simulated drives, its log, its replay, kills, and what a cycle must not do.
+
+#![allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions")]
+
+mod support;
+
+use abi::rig::{Kind, Rig, Signal, What};
+use compiler::{Changes, Options, Ready};
+use runtime::hil::cycle::{End, Hil, Options as HilOptions};
+use runtime::hil::simulated::{Pace, World};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
+use support::{Texts, root};
+
+/// Counts what a thread asks of the heap.
+struct Counting;
+
+thread_local! {
+    static ASKED: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes to the system's allocator as it came.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        let _ = ASKED.try_with(|asked| asked.set(asked.get() + 1));
+        // SAFETY: as the caller promised.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promised.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static HEAP: Counting = Counting;
+
+fn asked() -> u64 {
+    ASKED.with(Cell::get)
+}
+
+/// The example, changed by settings such as `fr = rotary Karnopp()`.
+fn ready(set: &[&str]) -> Ready {
+    rig_of("rtfs.fric", "rtfs", set)
+}
+
+/// A rig of a text beside the example.
+fn rig_of(file: &str, rig: &str, set: &[&str]) -> Ready {
+    let folder = root().join("examples/rtfs");
+    let read = |name: &str| fs::read_to_string(folder.join(name)).unwrap();
+    let sources = Texts(vec![("shaft.dbc".into(), read("shaft.dbc"))]);
+    let mut loaded = compiler::load(file, &read(file), &sources);
+    let changes = Changes { set: set.iter().map(|one| (*one).to_string()).collect(), ..Changes::default() };
+    let options = Options { changes, ..Options::default() };
+    let made = compiler::rig(&mut loaded, &sources, rig, &options, &mut Vec::new());
+    made.unwrap_or_else(|errors| panic!("{errors:?}"))
+}
+
+fn started(ready: Ready, seconds: f64) -> (Hil, World, Rig) {
+    let Ready { rig, control, plant, .. } = ready;
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+    let options = HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
+    let masters = world.masters();
+    let (hil, _) = Hil::new(&rig, control, world.clock(), masters, options, None).unwrap();
+    (hil, world, rig)
+}
+
+/// True positions of the servo, one a cycle, while the model runs.
+fn course(mut hil: Hil, world: &World) -> (Vec<f64>, End) {
+    let mut all = Vec::new();
+    loop {
+        hil.cycle();
+        if hil.counts().cycles as usize > all.len() {
+            all.push(world.bench().shaft(1).position);
+        }
+        if let Some(end) = hil.ended() {
+            return (all, end.clone());
+        }
+    }
+}
+
+#[test]
+fn the_example_hunts_on_simulated_drives_as_it_does_without_them() {
+    let (hil, world, _) = started(ready(&[]), 60.0);
+    let (x, end) = course(hil, &world);
+    assert_eq!(end, End::Asked);
+    assert_eq!(x.len(), 60_000);
+    let late = &x[40_000..];
+    let (least, greatest) = late.iter().fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(*x), b.max(*x)));
+    // The dry run of the example expects more than 50 mrad after 40 s.
+    assert!(greatest - least > 0.05, "peak to peak {} rad", greatest - least);
+    assert!((least + greatest - 2.0).abs() < 0.1, "around 1 rad: {least} .. {greatest}");
+}
+
+#[test]
+fn another_model_is_put_on_the_shaft() {
+    for model in ["fr = rotary Karnopp(Fc = 0.28 N·m, Fs = 0.42 N·m)", "fr = rotary KFM(Fc = 0.28 N·m, Fs = 0.42 N·m)"]
+    {
+        let (hil, world, _) = started(ready(&[model]), 10.0);
+        let (x, end) = course(hil, &world);
+        assert_eq!(end, End::Asked, "{model}");
+        assert!(x.iter().any(|x| *x > 0.8), "{model}: it moved");
+    }
+}
+
+/// One row a cycle of what a rig records, and of its readings, while the model runs.
+fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
+    let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
+    let mut options =
+        HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
+    options.start.sign_test = runtime::drive::sign::SignTest::Skip;
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&ready.rig, ready.control, world.clock(), masters, options, None).unwrap();
+    let mut rows = Vec::new();
+    loop {
+        hil.cycle();
+        if hil.counts().cycles as usize > rows.len() {
+            let model = hil.control().unwrap().model();
+            let series = ready.rig.record.iter().map(|series| model.get(series.slot)).collect();
+            let read = signals.iter().map(|signal| hil.fieldbus().reading(*signal).value).collect();
+            rows.push((series, read));
+        }
+        if let Some(end) = hil.ended() {
+            assert_eq!(*end, End::Asked);
+            return rows;
+        }
+    }
+}
+
+/// F(v) as the load drive gives it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow turning.
+#[test]
+fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
+    let torque = Signal { node: 0, what: What::Torque };
+    let speed = Signal { node: 0, what: What::Speed };
+    let rows = recorded(rig_of("characteristics.fric", "characteristic", &[]), 40.0, &[speed, torque]);
+    assert_eq!(rows.len(), 40_000);
+    let (mut worst, mut compared) = (0f64, 0);
+    for (_, read) in &rows[10_000..] {
+        let (v, friction) = (read[0], -read[1]);
+        // Behind a turning point the bristles go from one side to the other within 2 z = 3 mrad: at 0.157 rad/s² that is
+        // over, several times, when 0.05 rad/s is reached.
+        if v.abs() < 0.05 {
+            continue;
+        }
+        let g = 0.28 + (0.42 - 0.28) * (-(v / 0.01f64).powi(2)).exp();
+        let own = g * v.signum() + 0.018 * v;
+        worst = worst.max((friction - own).abs() / own.abs());
+        compared += 1;
+    }
+    assert!(compared > 20_000, "{compared}");
+    assert!(worst < 0.02, "measured and own friction differ by up to {} %", 100.0 * worst);
+    // T_friction against T_ref: what the drive says it applies is what it was told, but for its step of 4 mN·m and its lag.
+    let apart = rows[10_000..].iter().map(|(series, read)| (series[1] + read[1]).powi(2)).sum::<f64>();
+    let rms = (apart / 30_000.0).sqrt();
+    assert!(rms < 0.02, "{rms} N·m between asked and applied");
+}
+
+#[test]
+fn an_observer_of_the_friction_makes_the_servo_follow() {
+    let rms = |share: &str| {
+        let rows = recorded(rig_of("characteristics.fric", "tracking", &[share]), 15.0, &[]);
+        let squares: f64 = rows[5_000..].iter().map(|(series, _)| series[0].powi(2)).sum();
+        (squares / 10_000.0).sqrt()
+    };
+    let (with, without) = (rms("share = 1"), rms("share = 0"));
+    assert!(without > 0.05, "{without} rad without it");
+    assert!(with < without / 50.0, "{with} rad with it, {without} without");
+}
+
+#[test]
+fn a_cycle_asks_nothing_of_the_heap() {
+    let (mut hil, _world, _) = started(ready(&[]), 10.0);
+    while hil.counts().cycles < 100 {
+        hil.cycle();
+        assert_eq!(hil.ended(), None);
+    }
+    let before = asked();
+    for _ in 0..2000 {
+        hil.cycle();
+    }
+    assert_eq!(asked() - before, 0, "heap calls in 2,000 cycles, simulated drives included");
+}
+
+fn folder(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = fs::remove_dir_all(&path);
+    fs::create_dir_all(&path).unwrap();
+    path
+}
+
+fn fric(folder: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
+    command.current_dir(folder).args(args).stdin(Stdio::null());
+    command
+}
+
+#[track_caller]
+fn run(folder: &Path, args: &[&str], code: i32) -> String {
+    let Output { status, stdout, stderr } = fric(folder, args).output().unwrap();
+    let said = format!("{}{}", String::from_utf8_lossy(&stdout), String::from_utf8_lossy(&stderr));
+    assert_eq!(status.code(), Some(code), "{args:?}\n{said}");
+    said
+}
+
+fn example() -> String {
+    root().join("examples/rtfs/rtfs.fric").display().to_string()
+}
+
+#[test]
+fn a_run_leaves_a_log_that_replays_and_two_equal_runs_leave_equal_logs() {
+    let folder = folder("hil-replay");
+    let example = example();
+    for log in ["a", "b"] {
+        run(&folder, &["hil", "--sim", "--fast", "--for", "5s", "--log", log, &example], 0);
+    }
+    let [a, b] = ["a", "b"].map(|log| fs::read(folder.join(log)).unwrap());
+    assert!(a == b, "two equal runs, two logs");
+    let said = run(&folder, &["replay", "a", "--csv", "a.csv", "--candump", "a.log"], 0);
+    assert!(said.contains("agree to the bit") && said.contains("ended as asked"), "{said}");
+    assert!(run(&folder, &["replay", "a", "--interpret"], 0).contains("agree to the bit"), "the other back end");
+    let csv = fs::read_to_string(folder.join("a.csv")).unwrap();
+    assert!(csv.lines().next().unwrap().contains("load.torque permitted"), "{:?}", csv.lines().next());
+    assert!(csv.lines().count() > 5000);
+    let frames = fs::read_to_string(folder.join("a.log")).unwrap();
+    assert!(frames.lines().any(|line| line.ends_with(" can0 080#")), "SYNC");
+    // A flipped bit and a cut are noticed.
+    let mut flipped = a.clone();
+    let middle = flipped.len() / 2;
+    flipped[middle] ^= 4;
+    fs::write(folder.join("flipped"), &flipped).unwrap();
+    assert!(run(&folder, &["replay", "flipped"], 1).contains("damaged at byte"));
+    fs::write(folder.join("cut"), &a[..middle]).unwrap();
+    assert!(run(&folder, &["replay", "cut"], 0).contains("cut off at byte"));
+}
+
+#[test]
+fn what_stops_a_rig_is_told_and_is_exit_code_3() {
+    let folder = folder("hil-stops");
+    let example = example();
+    let stops = |fault: &str| run(&folder, &["hil", "--sim", "--fast", "--for", "20s", "--inject", fault, &example], 3);
+    assert!(stops("panel.enable = 0 at 8 s").contains("enabling switch released"));
+    assert!(stops("load fault 0x2310 at 8 s").contains("load (node 3)"));
+    let said = run(&folder, &["replay", "out/rtfs.friclog"], 0);
+    assert!(said.contains("agree to the bit") && said.contains("stopped: load (node 3)"), "{said}");
+    let no_log = ["hil", "--sim", "--fast", "--for", "20s", "--no-log", "--inject", "servo silent at 14 s", &example];
+    run(&folder, &no_log, 3);
+    let said = run(&folder, &["replay", "out/rtfs.blackbox.friclog"], 0);
+    assert!(said.contains("agree to the bit"), "{said}");
+}
+
+#[test]
+fn what_the_drives_are_like_is_measured() {
+    let folder = folder("hil-identify");
+    let said = run(&folder, &["hil", "--sim", "--fast", "--identify", &example()], 0);
+    let line = said.lines().find(|line| line.contains("drive load")).unwrap_or_else(|| panic!("{said}"));
+    let number = |after: &str| -> f64 {
+        let rest = &line[line.find(after).unwrap() + after.len()..];
+        rest.trim_start().split(' ').next().unwrap().parse().unwrap()
+    };
+    // 0.8 and 0.6 ms in the text of the rig; a command is some 0.1 ms on the bus.
+    assert!((0.6..1.1).contains(&number("delay =")), "{line}");
+    assert!((0.5..0.7).contains(&number("lag =")), "{line}");
+    assert!((0.011..0.013).contains(&number("inertia")), "{line}");
+}
+
+#[test]
+fn wrong_usage_is_told() {
+    let folder = folder("hil-usage");
+    let example = example();
+    let said = run(&folder, &["hil", &example], 1);
+    assert!(said.contains("can0") && said.contains("--sim"), "{said}");
+    let said = run(&folder, &["hil", "--fast", &example], 2);
+    assert!(said.contains("--fast needs --sim"), "{said}");
+    let said = run(&folder, &["hil", "--sim", "--bus", "can1=sim:x", &example], 2);
+    assert!(said.contains("no bus `can1`; it has can0"), "{said}");
+    let said = run(&folder, &["hil", "--sim", "--inject", "load explodes at 3 s", &example], 2);
+    assert!(said.contains("load explodes"), "{said}");
+    let said = run(&folder, &["hil", "--sim", &example, "rtsf"], 1);
+    assert!(said.contains("did you mean `rtfs`?"), "{said}");
+    let said = run(&folder, &["replay", &example], 1);
+    assert!(said.contains("not a log of fric"), "{said}");
+}
+
+/// A run at the pace of the wall that counts what this machine misses, once its log is there.
+fn under_way(folder: &Path, log: &str) -> std::process::Child {
+    let example = example();
+    let args = ["hil", "--sim", "--count-overruns", "--log", log, &example];
+    let mut command = fric(folder, &args);
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    while !folder.join(log).exists() {
+        std::thread::sleep(Duration::from_millis(20));
+        assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
+    }
+    child
+}
+
+#[test]
+fn control_c_is_a_controlled_stop() {
+    let folder = folder("hil-interrupt");
+    for signal in ["-INT", "-TERM"] {
+        let mut child = under_way(&folder, "log");
+        std::thread::sleep(Duration::from_millis(1500));
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(0), "{signal}");
+        let said = run(&folder, &["replay", "log"], 0);
+        assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
+        fs::remove_file(folder.join("log")).unwrap();
+    }
+}
+
+#[test]
+fn parameters_change_while_it_runs_and_the_log_knows() {
+    let folder = folder("hil-set");
+    let mut child = under_way(&folder, "log");
+    let mut say = |line: &str| {
+        std::thread::sleep(Duration::from_millis(700));
+        writeln!(child.stdin.as_mut().unwrap(), "{line}").unwrap();
+    };
+    say("");
+    say("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
+    say("set fr.Fs = -1 N·m");
+    say("set fr.Fz = 1 N·m");
+    say("set fr.Fs = 1 s");
+    say("stop");
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    for words in ["must lie in", "no parameter `fr.Fz`; did you mean `fr.F", "`fr.Fs` is a"] {
+        assert!(said.contains(words), "no `{words}` in {said}");
+    }
+    let said = run(&folder, &["replay", "log"], 0);
+    assert!(said.contains("agree to the bit"), "{said}");
+}
+
+/// `FRIC_KILLS` says how often; 200 is the full measure.
+#[test]
+fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
+    let folder = folder("hil-kill");
+    let kills = std::env::var("FRIC_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(4);
+    for kill in 0..kills {
+        let log = format!("killed-{kill}");
+        let mut child = under_way(&folder, &log);
+        let path = folder.join(&log);
+        let before = std::time::Instant::now();
+        std::thread::sleep(Duration::from_millis(1500 + 97 * kill % 1000));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        let lived = before.elapsed().as_secs_f64();
+        let said = run(&folder, &["replay", &log], 0);
+        let cycles: f64 = said.split(' ').nth(1).unwrap().replace(',', "").parse().unwrap();
+        // A cycle a millisecond, but for those that a busy machine missed.
+        assert!(said.contains("agree to the bit"), "{said}");
+        assert!(cycles * 1e-3 > lived - 1.0 || cycles > 100.0, "{cycles} cycles in {lived} s");
+        fs::remove_file(path).unwrap();
+    }
+}
+
+/// `FRIC_SOAK` says how many cycles; 3,600,000 is the full measure.
+#[test]
+fn a_long_run_misses_nothing_and_its_memory_stays_as_it_is() {
+    let cycles = std::env::var("FRIC_SOAK").ok().and_then(|text| text.parse().ok()).unwrap_or(60_000u64);
+    let (mut hil, _world, _) = started(ready(&[]), cycles as f64 * 1e-3);
+    let resident = || {
+        let status = fs::read_to_string("/proc/self/statm").unwrap();
+        status.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
+    };
+    let mut early = 0;
+    let mut calls = 0;
+    while hil.ended().is_none() {
+        hil.cycle();
+        if hil.counts().cycles == cycles / 10 && early == 0 {
+            (early, calls) = (resident(), asked());
+        }
+    }
+    assert_eq!(hil.ended(), Some(&End::Asked));
+    assert_eq!((hil.counts().cycles, hil.counts().missed), (cycles, 0));
+    assert_eq!(asked() - calls, 0, "heap calls");
+    let grown = resident().saturating_sub(early);
+    assert!(grown < 8 << 20, "{grown} bytes more");
+}
+
+#[test]
+fn signals_of_the_example_are_named_as_in_its_text() {
+    let Ready { rig, .. } = ready(&[]);
+    let named = |node, what| runtime::hil::words::signal(&rig, Signal { node, what });
+    assert_eq!(named(0, What::Speed), "load.speed");
+    assert!(matches!(rig.nodes[2].kind, Kind::Frames(_)));
+    assert_eq!(named(3, What::Field(0, 0)), "panel.enable");
+}
