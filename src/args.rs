@@ -63,6 +63,18 @@ pub enum Command {
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
     Watch(Watch),
+    /// Show everything in a package, and verify it
+    Inspect(Inspect),
+    /// Make keys to sign packages with
+    Key {
+        /// What to do
+        #[command(subcommand)]
+        command: Key,
+    },
+    /// Put a rig onto the computer that runs it: build, copy, check there, swap at once
+    Deploy(Deploy),
+    /// Bring recordings back from the computer that runs a rig
+    FetchLog(FetchLog),
     /// Join CAN buses, open doors to them, and print their traffic
     Bus(Bus),
     /// Say what this machine lacks for real time, with the line that mends each
@@ -81,7 +93,8 @@ pub enum Command {
         /// Such as run
         #[arg(value_parser = [
             "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
-            "characterise", "compare", "doc", "repl", "watch", "drives", "bus", "doctor", "bench-rt", "new", "completions",
+            "characterise", "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "drives", "bus",
+            "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -271,16 +284,19 @@ pub struct Build {
     /// The text
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
-    /// A model, with its inputs free, or an experiment; the only one if none is named
-    #[arg(value_name = "MODEL|EXPERIMENT")]
+    /// A model, with its inputs free, an experiment, or a rig; the only one if none is named
+    #[arg(value_name = "MODEL|EXPERIMENT|RIG")]
     pub name: Option<String>,
-    /// What to make
+    /// What to make of a model or an experiment; a rig becomes a package
     #[arg(long, value_name = "WHAT", value_enum)]
-    pub emit: Emit,
+    pub emit: Option<Emit>,
     /// File to write [default: the standard output]
     #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub out: Option<PathBuf>,
-    /// Processor: x86_64 or aarch64 [default: this one]
+    /// Sign a package with a secret key, into a file beside it
+    #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
+    pub sign: Option<PathBuf>,
+    /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
     /// How the step is made [default: of an experiment its own, else expo]
@@ -603,6 +619,94 @@ pub struct Watch {
     pub restart: bool,
 }
 
+/// `fric inspect`
+#[derive(clap::Args, Debug)]
+pub struct Inspect {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub package: PathBuf,
+    /// Folder with public keys: the package must be signed by one of them
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub trusted: Option<PathBuf>,
+    /// Print the texts it was made from
+    #[arg(long)]
+    pub sources: bool,
+    /// Write all its sections into a folder
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub extract: Option<PathBuf>,
+}
+
+/// `fric key`
+#[derive(Subcommand, Debug)]
+pub enum Key {
+    /// Make a pair: NAME.key to sign with, NAME.pub to be trusted
+    New(KeyNew),
+}
+
+/// `fric key new`
+#[derive(clap::Args, Debug)]
+pub struct KeyNew {
+    /// Name of the two files, without their endings
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub name: PathBuf,
+}
+
+/// Another computer, and where things lie there.
+#[derive(clap::Args, Debug)]
+pub struct Host {
+    /// As ssh takes it
+    #[arg(value_name = "USER@HOST", value_hint = ValueHint::Hostname, value_parser = host)]
+    pub host: String,
+    /// Option for ssh and scp, such as Port=2222
+    #[arg(short = 'o', value_name = "NAME=VALUE")]
+    pub options: Vec<String>,
+    /// The program there
+    #[arg(long, value_name = "COMMAND", default_value = "fric-rig")]
+    pub rig: String,
+    /// Folder of packages and logs there
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/fric")]
+    pub dir: String,
+}
+
+/// `fric deploy`
+#[derive(clap::Args, Debug)]
+pub struct Deploy {
+    /// Where to
+    #[command(flatten)]
+    pub host: Host,
+    /// A text with a rig, or a package
+    #[arg(value_name = "RIG.fric|FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in the text; not needed if it is the only one
+    #[arg(value_name = "RIG")]
+    pub name: Option<String>,
+    /// Sign the package with a secret key
+    #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
+    pub sign: Option<PathBuf>,
+    /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
+    #[arg(long, value_name = "DIR")]
+    pub trusted: Option<String>,
+    /// Start it there, and go back to the package before if it refuses
+    #[arg(long)]
+    pub start: bool,
+}
+
+/// `fric fetch-log`
+#[derive(clap::Args, Debug)]
+pub struct FetchLog {
+    /// Where from
+    #[command(flatten)]
+    pub host: Host,
+    /// Which one [default: the newest]
+    pub log: Option<String>,
+    /// All of them
+    #[arg(long, conflicts_with = "log")]
+    pub all: bool,
+    /// Folder to write to
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = "out")]
+    pub out: PathBuf,
+}
+
 /// `fric new`
 #[derive(clap::Args, Debug)]
 pub struct New {
@@ -620,6 +724,11 @@ fn setting(text: &str) -> Result<(String, String), String> {
     Ok((path.into(), value.into()))
 }
 
+/// What begins with a dash would be an option of ssh.
+fn host(text: &str) -> Result<String, String> {
+    if text.is_empty() || text.starts_with('-') { Err("write it as USER@HOST".into()) } else { Ok(text.into()) }
+}
+
 fn solver(text: &str) -> Result<Method, String> {
     let names = || Method::ALL.map(Method::name).join(", ");
     Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
@@ -627,7 +736,7 @@ fn solver(text: &str) -> Result<Method, String> {
 
 fn target(text: &str) -> Result<Target, String> {
     let names = || Target::ALL.map(Target::name).join(", ");
-    Target::named(text).ok_or_else(|| format!("code is made for {}", names()))
+    Target::named(text.strip_suffix("-linux").unwrap_or(text)).ok_or_else(|| format!("code is made for {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {

@@ -1,6 +1,7 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
 use abi::Function;
+use abi::encode::Encode;
 use abi::image::Target;
 use abi::lanes::Lanes;
 pub use abi::plan::Method;
@@ -18,6 +19,7 @@ pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
     dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
+use grammar::diagnostic::Diagnostic;
 use std::time::Instant;
 
 /// What `fric build` makes of a model.
@@ -143,4 +145,48 @@ impl Stopwatch {
             None => self.stages.0.push((stage, seconds)),
         }
     }
+}
+
+/// A rig for a processor: its plan and its two programs, as sections of a package.
+pub struct PackedRig {
+    /// [`abi::rig::Rig`], encoded.
+    pub rig: Vec<u8>,
+    /// The system with one part crossed out: an [`abi::image::Image`].
+    pub control: Vec<u8>,
+    /// That part alone.
+    pub plant: Vec<u8>,
+}
+
+/// Compiles a rig for a target such as `aarch64-linux`.
+///
+/// # Errors
+/// In words, or none if what was found says it.
+pub fn packed_rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    target: &str,
+    found: &mut Vec<Diagnostic>,
+) -> Result<PackedRig, Option<String>> {
+    let named = target.strip_suffix("-linux").and_then(Target::named);
+    let Some(processor) = named else {
+        let all: Vec<String> = Target::ALL.iter().map(|target| format!("{}-linux", target.name())).collect();
+        return Err(Some(format!("there is no code for {target}; targets are {}", all.join(", "))));
+    };
+    let options = Options { interpret: true, ..Options::default() };
+    let ready = compiler::rig(loaded, sources, name, &options, found).map_err(|errors| {
+        found.extend(errors);
+        None
+    })?;
+    let image = |program: &compiler::program::Program, method| {
+        let functions = compiler::functions(program, method);
+        blob::image(&functions, &program.description, &program.params, processor)
+            .map(|image| image.to_bytes())
+            .map_err(|why| Some(why.to_string()))
+    };
+    Ok(PackedRig {
+        control: image(&ready.program, ready.rig.method)?,
+        plant: image(&ready.plant_program, Method::Expo)?,
+        rig: ready.rig.to_bytes(),
+    })
 }

@@ -106,7 +106,7 @@ fn exit_codes_tell_how_it_went() {
 #[test]
 fn wrong_usage_is_told_apart_from_wrong_input() {
     let folder = Folder::new("usage").with("pull.fric", PULL);
-    folder.check(&[], 2, "Usage: fric");
+    folder.check(&["--nothing"], 2, "unexpected argument '--nothing'");
     folder.check(&["rnu"], 2, "unrecognized subcommand 'rnu'");
     folder.check(&["run"], 2, "<FILE>");
     folder.check(&["run", "pull.fric", "--step", "10"], 2, "a time needs its unit, for example 10s");
@@ -321,6 +321,9 @@ fn a_sweep_is_one_figure_and_a_file_of_data_each() {
     let cases: Vec<Value> =
         out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
     assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
+    // What is said from outside takes the place of the sweep.
+    let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json", "--set", "k=3 N/m"], 0, "");
+    assert_eq!(out.lines().count(), 1, "{out}");
 }
 
 #[test]

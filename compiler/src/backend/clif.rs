@@ -221,6 +221,10 @@ impl Emitter<'_> {
     /// The instruction's value. Constants are made anew at each use: kept, they would fill the registers.
     fn get(&self, value: Value, b: &mut FunctionBuilder) -> clif::Value {
         match self.func.op(value) {
+            Op::Pool { base, len, index } if let Op::Int(index) = self.func.op(index) => {
+                let entry = (index as u64).min(u64::from(len) - 1) as u32;
+                b.ins().load(types::F64, MemFlagsData::trusted(), self.pool, offset(base + entry))
+            }
             Op::Real(bits) => b.ins().f64const(f64::from_bits(bits)),
             Op::Int(n) => b.ins().iconst(types::I64, n),
             Op::Bool(truth) => b.ins().iconst(types::I8, i64::from(truth)),
@@ -235,7 +239,8 @@ impl Emitter<'_> {
         let mut n = 0;
         // Of a table only the bits may be needed: then the number is never loaded.
         if let Op::Pool { base, len, index } = op {
-            if self.as_real[value.index()] {
+            let constant = matches!(self.func.op(index), Op::Int(_));
+            if !constant && self.as_real[value.index()] {
                 let (address, offset) = self.entry(self.pool, base, len, index, b);
                 self.values[value.index()] = Some(b.ins().load(types::F64, flags, address, offset));
             }
@@ -257,6 +262,12 @@ impl Emitter<'_> {
             operands[n] = Some(self.get(operand, b));
             n += 1;
         });
+        // What stands last can be taken from memory.
+        if let Op::Add(first, _) | Op::Mul(first, _) = op
+            && let Op::Real(_) = self.func.op(first)
+        {
+            operands.swap(0, 1);
+        }
         let x = |i: usize| operands[i].expect("an operand");
         let result = match op {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) => return,
