@@ -473,6 +473,9 @@ pub struct Compare {
 /// `fric doc`
 #[derive(clap::Args, Debug)]
 pub struct Doc {
+    /// Write the page only, and leave the plots as they are
+    #[arg(long, conflicts_with = "check")]
+    pub keep_plots: bool,
     /// The page; plots go into the folder of the same name
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "docs/models.md")]
     pub out: PathBuf,
@@ -761,9 +764,9 @@ fn looked_at(text: &str) -> Result<LookedAt, String> {
 /// 1 Hz to 20 kHz.
 fn frequency(text: &str) -> Result<f64, String> {
     let (value, unit) = value::parse(text)?;
-    let hertz = Unit::parse("1/s").expect("per second is known").dimension;
+    let hertz = Unit::parse("Hz").expect("the hertz is known").dimension;
     if unit.dimension != hertz {
-        return Err(format!("a frequency is needed, for example {text}Hz").replace("HzHz", "Hz"));
+        return Err("a frequency is needed, for example 1kHz".into());
     }
     if (1.0..=20e3).contains(&value) { Ok(value) } else { Err("a frequency from 1 Hz to 20 kHz is needed".into()) }
 }
