@@ -1,5 +1,6 @@
 //! How long a text takes from its first character to its first step, by stage, in a warm process; and how long the whole
-//! library takes to be checked. Medians over many rounds; run with `cargo bench --bench compile`.
+//! library takes to be checked; and how both grow with the size of a program. Medians over some rounds; run with
+//! `cargo bench --bench compile`.
 
 #[path = "../src/project.rs"]
 #[allow(dead_code, unused_imports, reason = "the command uses more of it")]
@@ -31,6 +32,8 @@ experiment hunting {
 fn main() {
     stages();
     library();
+    lines();
+    parts();
 }
 
 /// Milliseconds of each stage, in the order in which they ran.
@@ -86,6 +89,55 @@ fn library() {
         texts.len(),
         median(&mut times)
     );
+}
+
+/// A text of 1,000 equations, from its first character to its last warning.
+fn lines() {
+    let mut text = String::from("model M {\n  input v [m/s]\n  param a = 1 1/s\n  let x0 [m/s] = v\n");
+    for k in 1..1000 {
+        text += &format!("  let x{k} [m/s] = a * x{} / 1 1/s + v   // line {k}\n", k - 1);
+    }
+    text += "  output y [m/s] = x999\n}\n";
+    let mut times: Vec<f64> = (0..15)
+        .map(|_| {
+            let begin = Instant::now();
+            let mut loaded = load("lines.fric", &text, &project::Disk);
+            assert!(check(&mut loaded, &project::Disk).is_empty());
+            1e3 * begin.elapsed().as_secs_f64()
+        })
+        .collect();
+    println!("checking a text of 1,000 equations: {:.1} ms", median(&mut times));
+}
+
+/// A chain of parts: checked, and made ready to run interpreted, which leaves out what code takes to be made.
+fn parts() {
+    println!("a chain of so many parts: checked, compiled for `expo` but for its machine code");
+    for n in [10, 100, 1_000, 10_000] {
+        let mut text = String::from(
+            "model P {\n  input  u [1]\n  param  k = 0.5  in > 0\n  state  x [1] = 0\n  dx/dt  = (u - k * x) / 1 s\n\
+             \x20 output y [1] = x\n}\nmodel Chain {\n  part p1 = P(u = 1)\n",
+        );
+        for k in 2..=n {
+            text += &format!("  part p{k} = P(u = p{}.y)\n", k - 1);
+        }
+        text += &format!(
+            "  output y [1] = p{n}.y\n}}\nexperiment e {{\n  run Chain() for 1 s\n  solver expo step 10 ms\n  expect final(y) >= 0\n}}\n"
+        );
+        let rounds = if n < 10_000 { 9 } else { 3 };
+        let (mut checked, mut compiled) = (Vec::new(), Vec::new());
+        for _ in 0..rounds {
+            let begin = Instant::now();
+            let mut loaded = load("chain.fric", &text, &project::Disk);
+            assert!(check(&mut loaded, &project::Disk).is_empty());
+            checked.push(1e3 * begin.elapsed().as_secs_f64());
+            let begin = Instant::now();
+            let (mut warnings, options) = (Vec::new(), Options { interpret: true, ..Options::default() });
+            let cases = compiler::compile(&mut loaded, &project::Disk, "e", &options, &mut warnings, &mut |_| ());
+            black_box(cases.map_err(|found| found.len()).expect("the chain compiles"));
+            compiled.push(1e3 * begin.elapsed().as_secs_f64());
+        }
+        println!("  {n:>6}  {:9.2} ms  {:9.2} ms", median(&mut checked), median(&mut compiled));
+    }
 }
 
 fn median(times: &mut [f64]) -> f64 {

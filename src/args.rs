@@ -37,6 +37,8 @@ pub enum Command {
     Sweep(Sweep),
     /// A, B, C, D and the modes of a model or an experiment at a point
     Linearise(Linearise),
+    /// Time the step of an experiment: alone, in lanes, on all cores
+    Bench(Bench),
     /// Make C or machine code of a model, to take away
     Build(Build),
     /// Run a rig against the drives on its buses, or with --sim against simulated ones
@@ -61,6 +63,18 @@ pub enum Command {
     Repl(Repl),
     /// Run an experiment again on each save, states carried over
     Watch(Watch),
+    /// Show everything in a package, and verify it
+    Inspect(Inspect),
+    /// Make keys to sign packages with
+    Key {
+        /// What to do
+        #[command(subcommand)]
+        command: Key,
+    },
+    /// Put a rig onto the computer that runs it: build, copy, check there, swap at once
+    Deploy(Deploy),
+    /// Bring recordings back from the computer that runs a rig
+    FetchLog(FetchLog),
     /// Join CAN buses, open doors to them, and print their traffic
     Bus(Bus),
     /// Say what this machine lacks for real time, with the line that mends each
@@ -78,8 +92,9 @@ pub enum Command {
     Man {
         /// Such as run
         #[arg(value_parser = [
-            "run", "test", "sweep", "linearise", "build", "hil", "replay", "check", "fmt", "explain", "characterise",
-            "compare", "doc", "repl", "watch", "drives", "bus", "doctor", "bench-rt", "new", "completions",
+            "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
+            "characterise", "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "drives", "bus",
+            "doctor", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
@@ -241,22 +256,47 @@ pub struct Linearise {
     pub out: Option<PathBuf>,
 }
 
+/// `fric bench`
+#[derive(clap::Args, Debug)]
+pub struct Bench {
+    /// The text
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The experiment in it to time
+    pub experiment: String,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Print a JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// `fric build`
 #[derive(clap::Args, Debug)]
 pub struct Build {
     /// The text
     #[arg(value_hint = ValueHint::FilePath)]
     pub file: PathBuf,
-    /// A model, with its inputs free, or an experiment; the only one if none is named
-    #[arg(value_name = "MODEL|EXPERIMENT")]
+    /// A model, with its inputs free, an experiment, or a rig; the only one if none is named
+    #[arg(value_name = "MODEL|EXPERIMENT|RIG")]
     pub name: Option<String>,
-    /// What to make
+    /// What to make of a model or an experiment; a rig becomes a package
     #[arg(long, value_name = "WHAT", value_enum)]
-    pub emit: Emit,
+    pub emit: Option<Emit>,
     /// File to write [default: the standard output]
     #[arg(long, short, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub out: Option<PathBuf>,
-    /// Processor: x86_64 or aarch64 [default: this one]
+    /// Sign a package with a secret key, into a file beside it
+    #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
+    pub sign: Option<PathBuf>,
+    /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
     /// How the step is made [default: of an experiment its own, else expo]
@@ -300,6 +340,9 @@ pub struct Hil {
     /// Do the checks of the start-up and stop before arming
     #[arg(long)]
     pub check: bool,
+    /// Measure delay, lag and inertia by torque pulses instead of running the model; prints text to paste
+    #[arg(long, conflicts_with = "check")]
+    pub identify: bool,
     /// Enable and arm without being told: simulated drives only
     #[arg(long)]
     pub arm: bool,
@@ -430,6 +473,9 @@ pub struct Compare {
 /// `fric doc`
 #[derive(clap::Args, Debug)]
 pub struct Doc {
+    /// Write the page only, and leave the plots as they are
+    #[arg(long, conflicts_with = "check")]
+    pub keep_plots: bool,
     /// The page; plots go into the folder of the same name
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, default_value = "docs/models.md")]
     pub out: PathBuf,
@@ -526,15 +572,24 @@ const BUS_ADDRESSES: &str = "Addresses:\n  \
 /// `fric doctor`
 #[derive(clap::Args, Debug)]
 pub struct Doctor {
-    /// Buses to look at too, such as can0
-    #[arg(value_name = "ADDRESS", value_parser = address)]
-    pub addresses: Vec<Address>,
-    /// Bits a second that they should have
+    /// Rigs whose buses to look at too, and buses such as can0
+    #[arg(value_name = "RIG.fric|ADDRESS", value_hint = ValueHint::FilePath, value_parser = looked_at)]
+    pub targets: Vec<LookedAt>,
+    /// Bits a second that the buses named here should have
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
     /// Priority of the loop that will run
     #[arg(long, value_name = "N", default_value_t = 80, value_parser = clap::value_parser!(i32).range(1..=99))]
     pub priority: i32,
+}
+
+/// What `fric doctor` looks at besides the machine.
+#[derive(Clone, Debug)]
+pub enum LookedAt {
+    /// The buses of the rigs in a text.
+    Rigs(PathBuf),
+    /// A bus.
+    Bus(Address),
 }
 
 /// `fric bench-rt`
@@ -567,6 +622,94 @@ pub struct Watch {
     pub restart: bool,
 }
 
+/// `fric inspect`
+#[derive(clap::Args, Debug)]
+pub struct Inspect {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub package: PathBuf,
+    /// Folder with public keys: the package must be signed by one of them
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub trusted: Option<PathBuf>,
+    /// Print the texts it was made from
+    #[arg(long)]
+    pub sources: bool,
+    /// Write all its sections into a folder
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
+    pub extract: Option<PathBuf>,
+}
+
+/// `fric key`
+#[derive(Subcommand, Debug)]
+pub enum Key {
+    /// Make a pair: NAME.key to sign with, NAME.pub to be trusted
+    New(KeyNew),
+}
+
+/// `fric key new`
+#[derive(clap::Args, Debug)]
+pub struct KeyNew {
+    /// Name of the two files, without their endings
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub name: PathBuf,
+}
+
+/// Another computer, and where things lie there.
+#[derive(clap::Args, Debug)]
+pub struct Host {
+    /// As ssh takes it
+    #[arg(value_name = "USER@HOST", value_hint = ValueHint::Hostname, value_parser = host)]
+    pub host: String,
+    /// Option for ssh and scp, such as Port=2222
+    #[arg(short = 'o', value_name = "NAME=VALUE")]
+    pub options: Vec<String>,
+    /// The program there
+    #[arg(long, value_name = "COMMAND", default_value = "fric-rig")]
+    pub rig: String,
+    /// Folder of packages and logs there
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/fric")]
+    pub dir: String,
+}
+
+/// `fric deploy`
+#[derive(clap::Args, Debug)]
+pub struct Deploy {
+    /// Where to
+    #[command(flatten)]
+    pub host: Host,
+    /// A text with a rig, or a package
+    #[arg(value_name = "RIG.fric|FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    pub file: PathBuf,
+    /// The rig in the text; not needed if it is the only one
+    #[arg(value_name = "RIG")]
+    pub name: Option<String>,
+    /// Sign the package with a secret key
+    #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
+    pub sign: Option<PathBuf>,
+    /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
+    #[arg(long, value_name = "DIR")]
+    pub trusted: Option<String>,
+    /// Start it there, and go back to the package before if it refuses
+    #[arg(long)]
+    pub start: bool,
+}
+
+/// `fric fetch-log`
+#[derive(clap::Args, Debug)]
+pub struct FetchLog {
+    /// Where from
+    #[command(flatten)]
+    pub host: Host,
+    /// Which one [default: the newest]
+    pub log: Option<String>,
+    /// All of them
+    #[arg(long, conflicts_with = "log")]
+    pub all: bool,
+    /// Folder to write to
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = "out")]
+    pub out: PathBuf,
+}
+
 /// `fric new`
 #[derive(clap::Args, Debug)]
 pub struct New {
@@ -584,6 +727,11 @@ fn setting(text: &str) -> Result<(String, String), String> {
     Ok((path.into(), value.into()))
 }
 
+/// What begins with a dash would be an option of ssh.
+fn host(text: &str) -> Result<String, String> {
+    if text.is_empty() || text.starts_with('-') { Err("write it as USER@HOST".into()) } else { Ok(text.into()) }
+}
+
 fn solver(text: &str) -> Result<Method, String> {
     let names = || Method::ALL.map(Method::name).join(", ");
     Method::named(text).ok_or_else(|| format!("the solvers are {}", names()))
@@ -591,7 +739,7 @@ fn solver(text: &str) -> Result<Method, String> {
 
 fn target(text: &str) -> Result<Target, String> {
     let names = || Target::ALL.map(Target::name).join(", ");
-    Target::named(text).ok_or_else(|| format!("code is made for {}", names()))
+    Target::named(text.strip_suffix("-linux").unwrap_or(text)).ok_or_else(|| format!("code is made for {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {
@@ -609,12 +757,16 @@ fn address(text: &str) -> Result<Address, String> {
     text.parse()
 }
 
+fn looked_at(text: &str) -> Result<LookedAt, String> {
+    if text.ends_with(".fric") { Ok(LookedAt::Rigs(text.into())) } else { address(text).map(LookedAt::Bus) }
+}
+
 /// 1 Hz to 20 kHz.
 fn frequency(text: &str) -> Result<f64, String> {
     let (value, unit) = value::parse(text)?;
-    let hertz = Unit::parse("1/s").expect("per second is known").dimension;
+    let hertz = Unit::parse("Hz").expect("the hertz is known").dimension;
     if unit.dimension != hertz {
-        return Err(format!("a frequency is needed, for example {text}Hz").replace("HzHz", "Hz"));
+        return Err("a frequency is needed, for example 1kHz".into());
     }
     if (1.0..=20e3).contains(&value) { Ok(value) } else { Err("a frequency from 1 Hz to 20 kHz is needed".into()) }
 }

@@ -1,19 +1,25 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
+use abi::Function;
+use abi::encode::Encode;
 use abi::image::Target;
+use abi::lanes::Lanes;
 pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
-use compiler::backend::{blob, c};
+use compiler::backend::wide::{self, Width};
+use compiler::backend::{blob, c, jit};
 pub use compiler::explain::{Explanation, Listed};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
+use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
     dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
 };
+use grammar::diagnostic::Diagnostic;
 use std::time::Instant;
 
 /// What `fric build` makes of a model.
@@ -68,6 +74,33 @@ pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<
     Ok(text.into_bytes())
 }
 
+/// The step of an experiment, for who wants to know what it costs.
+pub struct StepCode {
+    /// Operations of the straight line.
+    pub operations: usize,
+    /// Bytes of machine code.
+    pub bytes: usize,
+    /// Cycles of the longest chain from one step to the next, by latencies of current processors.
+    pub critical_path: u32,
+    /// The step for many instances at once, or why there is none.
+    pub lanes: Result<Lanes, String>,
+}
+
+/// What a fixed step is made of.
+pub fn step_code(built: &Built, method: Method) -> StepCode {
+    let description = &built.program.description;
+    let (layout, pool) = (&description.layout, description.pool.len());
+    let mut functions = compiler::functions(&built.program, method);
+    functions.retain(|(function, _)| *function == Function::Step);
+    let func = &functions[0].1;
+    let bytes = jit::compile(&functions, layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
+    let lanes = match Width::here() {
+        None => Err("this processor has neither AVX2 nor AVX-512".to_string()),
+        Some(width) => wide::compile(func, layout, pool, width, width.vectors()).map_err(|why| why.to_string()),
+    };
+    StepCode { operations: func.ops.len(), bytes, critical_path: regroup::critical_path(func), lanes }
+}
+
 /// How long each stage took, in the order in which they ran.
 #[derive(Clone, Debug, Default)]
 pub struct Stages(pub Vec<(&'static str, f64)>);
@@ -112,4 +145,48 @@ impl Stopwatch {
             None => self.stages.0.push((stage, seconds)),
         }
     }
+}
+
+/// A rig for a processor: its plan and its two programs, as sections of a package.
+pub struct PackedRig {
+    /// [`abi::rig::Rig`], encoded.
+    pub rig: Vec<u8>,
+    /// The system with one part crossed out: an [`abi::image::Image`].
+    pub control: Vec<u8>,
+    /// That part alone.
+    pub plant: Vec<u8>,
+}
+
+/// Compiles a rig for a target such as `aarch64-linux`.
+///
+/// # Errors
+/// In words, or none if what was found says it.
+pub fn packed_rig(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    target: &str,
+    found: &mut Vec<Diagnostic>,
+) -> Result<PackedRig, Option<String>> {
+    let named = target.strip_suffix("-linux").and_then(Target::named);
+    let Some(processor) = named else {
+        let all: Vec<String> = Target::ALL.iter().map(|target| format!("{}-linux", target.name())).collect();
+        return Err(Some(format!("there is no code for {target}; targets are {}", all.join(", "))));
+    };
+    let options = Options { interpret: true, ..Options::default() };
+    let ready = compiler::rig(loaded, sources, name, &options, found).map_err(|errors| {
+        found.extend(errors);
+        None
+    })?;
+    let image = |program: &compiler::program::Program, method| {
+        let functions = compiler::functions(program, method);
+        blob::image(&functions, &program.description, &program.params, processor)
+            .map(|image| image.to_bytes())
+            .map_err(|why| Some(why.to_string()))
+    };
+    Ok(PackedRig {
+        control: image(&ready.program, ready.rig.method)?,
+        plant: image(&ready.plant_program, Method::Expo)?,
+        rig: ready.rig.to_bytes(),
+    })
 }

@@ -106,7 +106,7 @@ fn exit_codes_tell_how_it_went() {
 #[test]
 fn wrong_usage_is_told_apart_from_wrong_input() {
     let folder = Folder::new("usage").with("pull.fric", PULL);
-    folder.check(&[], 2, "Usage: fric");
+    folder.check(&["--nothing"], 2, "unexpected argument '--nothing'");
     folder.check(&["rnu"], 2, "unrecognized subcommand 'rnu'");
     folder.check(&["run"], 2, "<FILE>");
     folder.check(&["run", "pull.fric", "--step", "10"], 2, "a time needs its unit, for example 10s");
@@ -321,6 +321,47 @@ fn a_sweep_is_one_figure_and_a_file_of_data_each() {
     let cases: Vec<Value> =
         out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
     assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
+    // What is said from outside takes the place of the sweep.
+    let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json", "--set", "k=3 N/m"], 0, "");
+    assert_eq!(out.lines().count(), 1, "{out}");
+}
+
+#[test]
+fn a_model_can_be_taken_away() {
+    let folder = Folder::new("build").with("pull.fric", PULL);
+    let (source, _) = folder.check(&["build", "pull.fric", "Contact", "--emit", "c"], 0, "CONTACT_Fc");
+    assert!(source.contains("uint64_t contact_step(double *block, uint64_t count)"), "{source}");
+    folder.check(&["build", "pull.fric", "holds", "--emit", "c", "-o", "pull.c"], 0, "wrote pull.c");
+    let gcc = ["-std=c11", "-Wall", "-Wextra", "-pedantic", "-Werror", "-c", "pull.c", "-o", "pull.o"];
+    let built = Command::new("gcc").args(gcc).current_dir(&folder.0).output().expect("gcc runs");
+    assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+    for target in ["x86_64", "aarch64"] {
+        let out = format!("{target}.bin");
+        folder.check(&["build", "pull.fric", "Pull", "--emit", "blob", "--target", target, "-o", &out], 0, "wrote");
+        assert!(fs::read(folder.0.join(out)).unwrap().starts_with(b"FRICCODE"));
+    }
+    for emit in ["ir", "clif", "asm"] {
+        let (out, _) = folder.check(&["build", "pull.fric", "Pull", "--emit", emit, "--target", "aarch64"], 0, "");
+        assert!(out.contains("step") && out.lines().count() > 40, "{out}");
+    }
+    folder.check(&["build", "pull.fric", "--emit", "c"], 2, "Name one of Contact, Pull, holds, breaks, silent");
+    folder.check(&["build", "pull.fric", "Contakt", "--emit", "c"], 1, "did you mean `Contact`?");
+    folder.check(&["build", "pull.fric", "Pull", "--emit", "blob"], 2, "--out");
+    folder.check(&["build", "pull.fric", "Pull", "--emit", "c", "--set", "fr.Fz=2N"], 1, "Fz");
+    folder.check(&["build", "pull.fric", "Pull", "--emit", "blob", "--target", "z80", "-o", "x"], 2, "x86_64, aarch64");
+    assert!(!folder.0.join("x").exists());
+}
+
+#[test]
+fn a_step_can_be_timed() {
+    let folder = Folder::new("bench").with("pull.fric", PULL);
+    folder.check(&["bench", "pull.fric", "holds"], 0, "one instance:");
+    let (out, _) = folder.check(&["bench", "pull.fric", "holds", "--json"], 0, "");
+    let object: Value = serde_json::from_str(&out).unwrap();
+    assert!(object["ns_per_step"].as_f64().unwrap() > 0.0 && object["operations"].as_u64().unwrap() > 20, "{out}");
+    assert!(object["compile_seconds"]["code"].as_f64().unwrap() > 0.0, "{out}");
+    folder.check(&["bench", "pull.fric", "hold"], 1, "did you mean `holds`?");
+    folder.check(&["bench", "pull.fric", "holds", "--solver", "adaptive"], 2, "--solver expo");
 }
 
 #[test]

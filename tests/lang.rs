@@ -397,6 +397,7 @@ fn mutated_texts_are_read_formatted_and_checked() {
         });
         running.push((at, thread.unwrap()));
     }
+    let texts = corpus.clone();
     let mut since: Vec<(u64, Instant)> = vec![(u64::MAX, Instant::now()); running.len()];
     while running.iter().any(|(_, thread)| !thread.is_finished()) {
         thread::sleep(Duration::from_millis(20));
@@ -407,7 +408,8 @@ fn mutated_texts_are_read_formatted_and_checked() {
             }
             assert!(
                 since.elapsed() < Duration::from_secs(60),
-                "seed {seed} never ends (FRIC_SEED={seed} FRIC_MUTATIONS=1)"
+                "seed {seed} never ends (FRIC_SEED={seed} FRIC_MUTATIONS=1):\n{}",
+                mutated(&texts, &mut Chance(*seed))
             );
         }
     }

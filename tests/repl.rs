@@ -359,3 +359,57 @@ fn a_saved_file_is_run_again_where_it_was() {
     at.send("\x03");
     assert_eq!(at.end(), Some(0));
 }
+
+/// The blocks marked `session` of a page, with the place of each.
+fn sessions(page: &str) -> Vec<(usize, usize)> {
+    let mut found = Vec::new();
+    let mut from = 0;
+    while let Some(at) = page[from..].find("```session\n") {
+        let begin = from + at + "```session\n".len();
+        let end = begin + page[begin..].find("```").expect("a block ends");
+        found.push((begin, end));
+        from = end + 3;
+    }
+    found
+}
+
+/// What a session prints that types what a block types.
+fn transcript(block: &str) -> String {
+    let typed: String = block
+        .lines()
+        .filter_map(|line| line.strip_prefix("fric> ").or_else(|| line.strip_prefix("  ... ")))
+        .map(|line| format!("{line}\n"))
+        .collect();
+    let folder = folder("pages");
+    fs::write(folder.join("typed"), typed).unwrap();
+    let script = "exec \"$0\" repl --echo --keep-going < \"$1\" 2>&1";
+    let mut command = Command::new("sh");
+    command.args(["-c", script, env!("CARGO_BIN_EXE_fric")]).arg(folder.join("typed"));
+    let output = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+    let lines: Vec<String> = text(&output.stdout).lines().map(|line| line.trim_end().to_string()).collect();
+    lines.join("\n") + "\n"
+}
+
+/// `BLESS=1 cargo test --test repl` writes what is printed now.
+#[test]
+fn the_sessions_on_the_pages_print_what_they_show() {
+    for name in ["README.md", "docs/repl.md"] {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(name);
+        let page = fs::read_to_string(&path).unwrap();
+        let mut now = String::new();
+        let mut from = 0;
+        let blocks = sessions(&page);
+        assert!(!blocks.is_empty(), "{name} has no session");
+        for (begin, end) in blocks {
+            now += &page[from..begin];
+            now += &transcript(&page[begin..end]);
+            from = end;
+        }
+        now += &page[from..];
+        if std::env::var_os("BLESS").is_some() {
+            fs::write(&path, &now).unwrap();
+        }
+        let different = page.lines().zip(now.lines()).find(|(was, is)| was != is);
+        assert!(page == now, "{name}: {different:?}; BLESS=1 writes what is printed now");
+    }
+}

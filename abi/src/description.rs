@@ -72,6 +72,8 @@ pub struct Layout {
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
+    /// One adaptive step that is tried: see [`Trial`](crate::trial::Trial). Empty where `Rosenbrock` is not there.
+    pub trial: Segment,
     /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
     pub rings: Segment,
 }
@@ -79,16 +81,17 @@ pub struct Layout {
 impl Layout {
     /// Number of slots of the block.
     pub fn size(&self) -> usize {
-        let last = self.rings;
-        (last.start + last.len).max(Slot::FIXED) as usize
+        let segments = [self.due, self.trial, self.rings];
+        segments.map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
     }
 
     /// The same with so many slots for rings.
     pub fn with_rings(self, len: u32) -> Layout {
-        Layout { rings: Segment { start: self.due.start + self.due.len, len }, ..self }
+        let start = Layout { rings: Segment::default(), ..self.clone() }.size() as u32;
+        Layout { rings: Segment { start, len }, ..self }
     }
 
-    /// Lengths of the segments but the rings, in the order of the fields.
+    /// Lengths of the segments that [`Layout::new`] takes, in the order of the fields.
     pub fn lens(&self) -> [u32; 10] {
         let Layout { params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due, .. } = self;
         [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
@@ -114,6 +117,7 @@ impl Layout {
             roots: take(roots),
             jacobian: take(jacobian),
             due: take(due),
+            trial: Segment::default(),
             rings: take(0),
         }
     }

@@ -106,7 +106,19 @@ macro_rules! numbers {
     )*};
 }
 
-numbers!(u8, u32, u64, i32, f64);
+numbers!(u8, u16, u32, u64, i32, f64);
+
+/// As 64 bits.
+impl Encode for usize {
+    fn encode(&self, out: &mut Vec<u8>) {
+        (*self as u64).encode(out);
+    }
+
+    fn decode(reader: &mut Reader) -> Result<usize, Malformed> {
+        let number = u64::decode(reader)?;
+        usize::try_from(number).or_else(|_| reader.wrong(format!("{number} is no index")))
+    }
+}
 
 /// How many entries a list can have at most: each takes a byte at least, so a wrong length is found at once.
 fn length(reader: &mut Reader) -> Result<usize, Malformed> {
@@ -249,7 +261,7 @@ impl Encode for Slot {
 /// As the lengths of its segments, which lie one behind the other.
 impl Encode for Layout {
     fn encode(&self, out: &mut Vec<u8>) {
-        self.lens().iter().chain([&self.rings.len]).for_each(|len| len.encode(out));
+        self.lens().iter().chain([&self.trial.len, &self.rings.len]).for_each(|len| len.encode(out));
     }
 
     fn decode(reader: &mut Reader) -> Result<Layout, Malformed> {
@@ -257,13 +269,21 @@ impl Encode for Layout {
         for len in &mut lens {
             *len = u32::decode(reader)?;
         }
-        let rings = u32::decode(reader)?;
-        let size = lens.iter().chain([&rings]).fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
+        let (trial, rings) = (u32::decode(reader)?, u32::decode(reader)?);
+        let all = lens.iter().chain([&trial, &rings]);
+        let size = all.fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
         // Generated code addresses a block by 32-bit offsets in bytes.
         if size > i32::MAX as u64 / 8 {
             return reader.wrong(format!("a block of {size} slots is too large"));
         }
-        Ok(Layout::new(lens).with_rings(rings))
+        let layout = Layout::new(lens);
+        // Its length follows from the others; of more states it could not be counted.
+        let with_trial = (trial > 0 && lens[2] < 1 << 14).then(|| layout.clone().with_trial());
+        match with_trial {
+            Some(layout) if layout.trial.len == trial => Ok(layout.with_rings(rings)),
+            _ if trial == 0 => Ok(layout.with_rings(rings)),
+            _ => reader.wrong(format!("a trial step of {} states has not {trial} slots", lens[2])),
+        }
     }
 }
 

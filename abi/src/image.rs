@@ -6,7 +6,7 @@
 //!
 //! ```text
 //!    0  "FRICCODE"                     104  for each function: offset of its entry in the code, or all ones
-//!    8  version          u32           168  SHA-256 of everything, these 32 bytes taken as zeros
+//!    8  version          u32           176  SHA-256 of everything, these 32 bytes taken as zeros
 //!   12  target           u32           256  sections, each at its alignment, zeros between them:
 //!   16  features         u64                description (1), params (8), pool (64), code (4096)
 //!   24  length of all    u64
@@ -29,7 +29,7 @@ pub const VERSION: u32 = 1;
 pub const PAGE: usize = 4096;
 
 const HEADER: usize = 256;
-const HASH: std::ops::Range<usize> = 168..200;
+const HASH: std::ops::Range<usize> = 176..208;
 const NO_ENTRY: u64 = u64::MAX;
 
 /// Families of processors that code is made for. All are little endian with 64 bits.
@@ -455,7 +455,7 @@ mod tests {
             (12, 77, "77 is no target"),
             (23, 1, "are not all known"),
             (32, 200, "200 are told"),
-            (48, 1, "are left"),
+            (48, 1, "left"),
             (entry, 200, "begins at byte 200 of 40"),
             (94, 1, "lies outside"),
         ] {

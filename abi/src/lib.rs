@@ -5,6 +5,8 @@
 
 pub mod unit;
 pub mod description;
+pub mod trial;
+pub mod rodas5p;
 pub mod table;
 pub mod series;
 pub mod instance;
@@ -12,6 +14,7 @@ pub mod lanes;
 pub mod rig;
 pub mod plan;
 pub mod encode;
+pub mod packing;
 pub mod image;
 
 pub use description::{Description, Layout, Slot};

@@ -22,11 +22,14 @@ pub enum Function {
     Transitions,
     /// One fixed step with all that belongs to it: states, count, time, ticks, transitions, outputs, guards.
     Step,
+    /// One adaptive step, tried: t, h and the start in the segment `trial` → everything else there. Its status is 1
+    /// where the elimination met a pivot that is too small; then nothing it wrote counts.
+    Rosenbrock,
 }
 
 impl Function {
     /// All of them, in order.
-    pub const ALL: [Function; 8] = [
+    pub const ALL: [Function; 9] = [
         Function::Start,
         Function::Outputs,
         Function::Derivatives,
@@ -35,6 +38,7 @@ impl Function {
         Function::Tick,
         Function::Transitions,
         Function::Step,
+        Function::Rosenbrock,
     ];
 
     /// Its name in listings.
@@ -48,6 +52,7 @@ impl Function {
             Function::Tick => "tick",
             Function::Transitions => "transitions",
             Function::Step => "step",
+            Function::Rosenbrock => "rosenbrock",
         }
     }
 }

@@ -1,16 +1,7 @@
 /* Rodas5P by hand, for two loops with LuGre friction: what the generated code and the solver of `runtime` are measured
  * against. Dense elimination of fixed size, exp shared between rates and Jacobian, the error controlled as
- * `runtime/src/solver/adaptive.rs` does it; the kink of |v| is met by rejected steps, as such programs do.
- *
- * -DHUNTING chooses the loop. rosenbrock TOL ROUNDS: prints the median time of a run in s, then the position at 201 instants. */
-#define _POSIX_C_SOURCE 199309L
-#include <math.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
-
-enum { INSTANTS = 200 };
+ * `runtime/src/solver/adaptive.rs` does it; the kink of |v| is met by rejected steps, as such programs do. */
+#include "loops.h"
 
 static const double gamma_ = 0.21193756319429014;
 static const double c_[8] = {0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1, 1, 1};
@@ -43,48 +34,6 @@ static const double h_[3][8] = {
      15.98066361424651, -6.789040303419874, -6.710236069923372},
     {11.419903575922262, 2.8879645146136994, 72.92137995996029, 80.12511834622643, -52.072871366152654,
      -59.78993625266729, -0.15582684282751913, 4.883087185713722}};
-
-static const double sigma0 = 1e5, sigma1 = 316.22776601683796;
-
-#if HUNTING
-enum { N = 4 };
-static const double end = 100.0;
-static const double scale[N] = {1, 1, 1e-6, 1};
-static void rates(double t, const double *x, double *f) {
-    (void)t;
-    double v = x[1], q = v / 1e-3, g = 1 + 0.5 * exp(-q * q), dz = v - sigma0 * fabs(v) / g * x[2];
-    f[0] = v;
-    f[1] = 3 * (1 - x[0]) + x[3] - 6 * v - (sigma0 * x[2] + sigma1 * dz + 0.4 * v);
-    f[2] = dz;
-    f[3] = 4 * (1 - x[0]);
-}
-static void jacobian(double t, const double *x, double *j, double *ft) {
-    (void)t;
-    double v = x[1], q = v / 1e-3, e = 0.5 * exp(-q * q), g = 1 + e, k = sigma0 * fabs(v) / g;
-    double dk = sigma0 * (v < 0 ? -1 : 1) / g + k / g * e * 2 * q / 1e-3, zv = 1 - dk * x[2];
-    double m[16] = {0, 1, 0, 0, -3, -6.4 - sigma1 * zv, -sigma0 + sigma1 * k, 1, 0, zv, -k, 0, -4, 0, 0, 0};
-    memcpy(j, m, sizeof m);
-    memset(ft, 0, N * sizeof *ft);
-}
-#else
-enum { N = 3 };
-static const double end = 20.0;
-static const double scale[N] = {1, 1, 1e-6};
-static void rates(double t, const double *x, double *f) {
-    double v = x[1], q = v / 1e-3, g = 1 + 0.5 * exp(-q * q), dz = v - sigma0 * fabs(v) / g * x[2];
-    f[0] = v;
-    f[1] = 2 * (0.1 * t - x[0]) - (sigma0 * x[2] + sigma1 * dz + 0.4 * v);
-    f[2] = dz;
-}
-static void jacobian(double t, const double *x, double *j, double *ft) {
-    (void)t;
-    double v = x[1], q = v / 1e-3, e = 0.5 * exp(-q * q), g = 1 + e, k = sigma0 * fabs(v) / g;
-    double dk = sigma0 * (v < 0 ? -1 : 1) / g + k / g * e * 2 * q / 1e-3, zv = 1 - dk * x[2];
-    double m[9] = {0, 1, 0, -2, -0.4 - sigma1 * zv, -sigma0 + sigma1 * k, 0, zv, -k};
-    memcpy(j, m, sizeof m);
-    ft[0] = 0, ft[1] = 0.2, ft[2] = 0;
-}
-#endif
 
 static int factor(double *a, int *rows) {
     for (int k = 0; k < N; k++) {
@@ -122,11 +71,9 @@ static void solve(const double *a, const int *rows, double *b) {
     }
 }
 
-/* Positions at the instants. */
-static long run(double tol, double *positions) {
+static void run(double tol, double *positions) {
     double x[N] = {0}, f0[N] = {0}, j[N * N] = {0}, ft[N] = {0}, m[N * N], u[8][N], y[N], f[N], t = 0, h = 1e-4, last_h = 0, last_error = 0;
     int rows[N], next = 0, known = 0, rejected = 0;
-    long steps = 0;
     while (t < end) {
         int hits = h > 0.999 * (end - t);
         if (hits) h = end - t;
@@ -172,7 +119,6 @@ static long run(double tol, double *positions) {
         t = hits ? end : t + h;
         memcpy(x, y, sizeof x);
         known = 0;
-        steps++;
         error = fmax(error, 1e-10);
         double part = 0.9 * pow(error, -0.2);
         if (last_h > 0) part = fmin(part, 0.9 * h / last_h * pow(last_error / (error * error), 0.2));
@@ -181,26 +127,4 @@ static long run(double tol, double *positions) {
         h *= fmin(6, fmax(0.2, part));
         h = fmin(h, end / 50);
     }
-    return steps;
-}
-
-static int ascending(const void *a, const void *b) { return *(double *)a < *(double *)b ? -1 : *(double *)a > *(double *)b; }
-
-int main(int count, char **args) {
-    if (count != 3) return 2;
-    double tol = atof(args[1]), positions[INSTANTS + 1];
-    int rounds = atoi(args[2]);
-    double *times = malloc(sizeof *times * rounds);
-    for (int k = 0; k < rounds; k++) {
-        struct timespec from, to;
-        clock_gettime(CLOCK_MONOTONIC, &from);
-        run(tol, positions);
-        clock_gettime(CLOCK_MONOTONIC, &to);
-        times[k] = (to.tv_sec - from.tv_sec) + 1e-9 * (to.tv_nsec - from.tv_nsec);
-    }
-    qsort(times, rounds, sizeof *times, ascending);
-    printf("%.9e\n", times[rounds / 2]);
-    for (int k = 0; k <= INSTANTS; k++) printf("%.17g\n", positions[k]);
-    free(times);
-    return 0;
 }

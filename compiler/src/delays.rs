@@ -123,10 +123,13 @@ fn slots(most: f64, step: f64) -> f64 {
 }
 
 impl crate::program::Program {
-    /// Makes room for what is delayed in fixed steps of so many s: before code is made for them.
+    /// Makes room for what is delayed in fixed steps of so many s, and takes back that for adaptive ones: before code is
+    /// made for them.
     pub fn size_rings(&mut self, step: f64) {
         let mut len = 0;
-        let layout = self.description.layout.clone().with_rings(0);
+        let mut layout = self.description.layout.clone();
+        layout.trial = abi::description::Segment::default();
+        let layout = layout.with_rings(0);
         for delay in &mut self.description.delays {
             delay.ring = abi::description::Segment {
                 start: layout.rings.start + len,

@@ -5,6 +5,7 @@
 //! states and regimes are frozen while the states advance.
 
 use crate::derive::{self, Gradient};
+use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared, Truth};
 use crate::ir::{Func, Unary, Value, Write};
@@ -12,7 +13,6 @@ use crate::program::Program;
 use abi::Slot;
 use abi::description::Guard;
 use abi::plan::Method;
-use std::collections::{BTreeMap, HashMap};
 
 /// One fixed step by `method`, of the length in [`Slot::STEP`].
 ///
@@ -84,8 +84,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     for (k, guard) in guards.iter().enumerate().rev() {
         let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
         // Of something infinite or NaN this is NaN, and so is the sum.
-        let zero = 0.0 * x;
-        fine = Some(fine.map_or(zero, |sum| sum + zero));
+        fine = Some(fine.map_or_else(|| 0.0 * x, |sum| x.fma(0.0, sum)));
         let (low, high) = widened(guard.range);
         let mut bad = !x.finite();
         for (bounded, beyond) in [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))] {
@@ -288,7 +287,7 @@ impl<'a> Model<'a> {
         let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
         let (f, rows) = self.f_and_gradient(0.0, &self.x);
         let matrix = Matrix::identity_less(gamma * h, &rows);
-        let factors = matrix.factorise();
+        let factors = matrix.factorise(1e-12);
         let k1 = factors.solve(&f);
         let f = self.f(1.0, &self.moved(h, &k1));
         let right: Vec<Real> = f.iter().zip(&k1).map(|(f, k)| *f - 2.0 * *k).collect();
@@ -297,102 +296,6 @@ impl<'a> Model<'a> {
         let next = (0..self.x.len()).map(|k| self.x[k] + half * (3.0 * k1[k] + k2[k]));
         let Some(singular) = factors.singular else { return next.collect() };
         self.expo().into_iter().zip(next).map(|(expo, next)| singular.choose(expo, next)).collect()
-    }
-}
-
-/// A sparse square matrix, row by row.
-struct Matrix<'a> {
-    rows: Vec<BTreeMap<usize, Real<'a>>>,
-}
-
-/// A = L U, with the order in which rows and columns are eliminated.
-struct Factors<'a> {
-    order: Vec<usize>,
-    /// Below the pivots, in the columns eliminated before: the multipliers; the rest: U.
-    rows: Vec<BTreeMap<usize, Real<'a>>>,
-    /// 1/pivot of each row.
-    inverse: HashMap<usize, Real<'a>>,
-    /// Whether a pivot is too small.
-    singular: Option<Truth<'a>>,
-}
-
-impl<'a> Matrix<'a> {
-    /// I − c · J
-    fn identity_less(c: Real<'a>, jacobian: &[Gradient]) -> Matrix<'a> {
-        let row = |(i, gradient): (usize, &Gradient)| {
-            let mut row: BTreeMap<usize, Real> = BTreeMap::from([(i, c.constant(1.0))]);
-            for (j, d) in gradient {
-                let product = c * c.same(*d);
-                let entry = if i == *j as usize { 1.0 - product } else { -product };
-                row.insert(*j as usize, entry);
-            }
-            row
-        };
-        Matrix { rows: jacobian.iter().enumerate().map(row).collect() }
-    }
-
-    /// Gauss elimination, unrolled. The order is fixed: at each turn the diagonal entry whose elimination can fill in
-    /// least (Markowitz), the first among equals.
-    fn factorise(self) -> Factors<'a> {
-        let mut rows = self.rows;
-        let n = rows.len();
-        let mut left: Vec<usize> = (0..n).collect();
-        let mut factors = Factors { order: Vec::new(), rows: Vec::new(), inverse: HashMap::new(), singular: None };
-        while !left.is_empty() {
-            let in_row = |p: usize, left: &[usize]| left.iter().filter(|j| rows[p].contains_key(j)).count() - 1;
-            let in_column = |p: usize, left: &[usize]| left.iter().filter(|i| rows[**i].contains_key(&p)).count() - 1;
-            let cost = |p: &usize| (in_row(*p, &left) * in_column(*p, &left), *p);
-            let pivot = left.iter().copied().min_by_key(cost).expect("one is left");
-            left.retain(|i| *i != pivot);
-            let diagonal = rows[pivot][&pivot];
-            let others: Vec<Real> = left.iter().filter_map(|j| rows[pivot].get(j).copied()).collect();
-            // A row of its own pivot only is as good as its pivot is not 0.
-            let size = others.into_iter().map(Real::abs).reduce(|a, b| a.below(b).choose(b, a));
-            let small = match size {
-                Some(size) => !diagonal.abs().above(1e-12 * size),
-                None => !diagonal.abs().above(0.0),
-            };
-            factors.singular = Some(factors.singular.map_or(small, |any| any | small));
-            let inverse = 1.0 / diagonal;
-            factors.inverse.insert(pivot, inverse);
-            factors.order.push(pivot);
-            let of_pivot: Vec<(usize, Real)> =
-                left.iter().filter_map(|j| rows[pivot].get(j).map(|entry| (*j, *entry))).collect();
-            for &i in &left {
-                let Some(entry) = rows[i].get(&pivot).copied() else { continue };
-                let multiplier = entry * inverse;
-                rows[i].insert(pivot, multiplier);
-                for &(j, above) in &of_pivot {
-                    let product = multiplier * above;
-                    let reduced = rows[i].get(&j).map_or(-product, |entry| *entry - product);
-                    rows[i].insert(j, reduced);
-                }
-            }
-        }
-        factors.rows = rows;
-        factors
-    }
-}
-
-impl<'a> Factors<'a> {
-    fn solve(&self, right: &[Real<'a>]) -> Vec<Real<'a>> {
-        let mut x = right.to_vec();
-        for (k, &i) in self.order.iter().enumerate() {
-            for &j in &self.order[..k] {
-                if let Some(multiplier) = self.rows[i].get(&j) {
-                    x[i] = x[i] - *multiplier * x[j];
-                }
-            }
-        }
-        for (k, &i) in self.order.iter().enumerate().rev() {
-            for &j in &self.order[k + 1..] {
-                if let Some(entry) = self.rows[i].get(&j) {
-                    x[i] = x[i] - *entry * x[j];
-                }
-            }
-            x[i] = x[i] * self.inverse[&i];
-        }
-        x
     }
 }
 

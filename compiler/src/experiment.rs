@@ -131,7 +131,13 @@ pub fn read(
         experiment.to_mut().body.extend(also);
     }
     let experiment = &*experiment;
-    let Some(parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
+    let Some(mut parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
+    // What is said from outside counts: a value that is given, or varied there, is not swept here.
+    let plain = |text: &str| text.split_whitespace().collect::<String>();
+    let path = |path: &ast::Path| plain(loaded.files.slice(path.span));
+    let said: Vec<String> =
+        given.set.iter().map(|set| path(&set.path)).chain(given.vary.iter().map(|p| plain(p))).collect();
+    parts.sweeps.retain(|sweep| !said.contains(&path(&sweep.path)));
     let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
     let Some(data) = data else { return Err(diagnostics) };
     let grids = grids(loaded, &parts, &mut diagnostics);

@@ -73,6 +73,10 @@ struct Bench {
     force: Slot,
     /// Writes dV/dt into the first slot of the jacobian, if there is a `storage` and a state.
     flow: Option<Func>,
+    /// For each regime, whether it would be left: slots that are 1 where a level of a transition holds.
+    exits: Vec<Vec<Slot>>,
+    /// For each continuous state, whether force or storage depend on it.
+    matters: Vec<bool>,
     block: Vec<f64>,
 }
 
@@ -89,18 +93,35 @@ impl Bench {
             return None;
         }
         let energy = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0));
-        let wanted: Vec<Wanted> =
-            energy.map(|(_, expr)| Wanted { expr: *expr, text: "storage".into(), unit: None }).into_iter().collect();
+        let energy = energy.map(|(_, expr)| Wanted { expr: *expr, text: "storage".into(), unit: None });
+        let stored = energy.is_some();
+        let mut wanted: Vec<Wanted> = energy.into_iter().collect();
+        let automaton = system.automata.first();
+        for (k, regime) in automaton.iter().flat_map(|automaton| &automaton.regimes).enumerate() {
+            let exit = |(i, transition): (usize, &Transition)| {
+                let text = format!("exit {i} of regime {k}");
+                Wanted { expr: transition.condition, text, unit: None }
+            };
+            wanted.extend(regime.transitions.iter().enumerate().map(exit));
+        }
         let Lowered { program, observed } = lower(system, types, &wanted);
-        let flow = observed.first().and_then(|energy| energy_flow(&program, *energy));
+        let (energy, mut exit) = observed.split_at(usize::from(stored));
+        let flow = energy.first().and_then(|energy| energy_flow(&program, *energy));
+        let mut exits = Vec::new();
+        for regime in automaton.iter().flat_map(|automaton| &automaton.regimes) {
+            let (own, rest) = exit.split_at(regime.transitions.len());
+            exits.push(own.to_vec());
+            exit = rest;
+        }
         let slot = |id: VarId| program.description.quantity(&system.var(id).path).map(|quantity| quantity.slot);
         let (v, force) = (slot(contact.v)?, slot(contact.force)?);
         let external = contact.external.and_then(slot);
+        let matters = depends(&program, [force].into_iter().chain(energy.first().copied()));
         let outputs = crate::math::expand(&program.outputs);
         let start = crate::math::expand(&program.start);
         let mut block = vec![0.0; program.description.layout.size()];
         block[program.description.layout.params.range()].copy_from_slice(&program.params);
-        Some(Bench { program, outputs, start, v, external, force, flow, block })
+        Some(Bench { program, outputs, start, v, external, force, flow, exits, matters, block })
     }
 
     fn run(&mut self, func: &Func) {
@@ -210,7 +231,9 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
     let layout = bench.program.description.layout.clone();
     let n = layout.states.len as usize;
     let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
-    if n > 0 && storage.is_none() || !system.blocks.is_empty() {
+    // What the force does not depend on stores nothing.
+    let memory = bench.matters.contains(&true);
+    if memory && storage.is_none() || !system.blocks.is_empty() || !system.delays.is_empty() {
         return Verdict::NotChecked;
     }
     let flow = bench.flow.clone();
@@ -223,14 +246,15 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
             Some((low, high)) if low.is_finite() && high.is_finite() => {
                 vec![low, high, 0.0_f64.clamp(low, high), 0.5 * low, 0.5 * high]
             }
+            _ if !bench.matters[k] => Vec::new(),
             _ => return Verdict::NotChecked,
         });
     }
-    let regimes: usize = system.automata.iter().map(|automaton| automaton.regimes.len()).product();
-    if n > 4 || regimes > 1 {
+    if choices.iter().filter(|choice| !choice.is_empty()).count() > 4 || system.automata.len() > 1 {
         return Verdict::NotChecked;
     }
-    let corners: usize = choices.iter().map(Vec::len).product();
+    let corners: usize = choices.iter().map(|choice| choice.len().max(1)).product();
+    let regime = layout.regimes.range().next();
     let externals: &[f64] =
         if contact.external.is_some() { &[0.0, 0.3, -0.3, 1.0, -1.0, 3.0, -3.0, 10.0, -10.0] } else { &[0.0] };
     let mut points = 0;
@@ -238,20 +262,28 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
     let speeds = (-6..=1).map(|k| decade(k, 1)).chain((-60..=10).map(|k| decade(k, 10)));
     for v in speeds.flat_map(|v| [v, -v]) {
         for &external in externals {
-            for corner in 0..corners {
-                let mut rest = corner;
-                let states: Vec<f64> = choices
-                    .iter()
-                    .map(|choice| {
-                        let value = choice[rest % choice.len()];
-                        rest /= choice.len();
-                        value
-                    })
-                    .collect();
+            // A model without regimes is in its only one.
+            for at in 0..corners * bench.exits.len().max(1) {
                 bench.force_at(v, external);
-                bench.block[layout.states.range()].copy_from_slice(&states);
+                let mut rest = at % corners;
+                for (choice, state) in choices.iter().zip(&mut bench.block[layout.states.range()]) {
+                    // A state without choices stays where it starts.
+                    if !choice.is_empty() {
+                        *state = choice[rest % choice.len()];
+                        rest /= choice.len();
+                    }
+                }
+                let states = bench.block[layout.states.range()].to_vec();
+                if let Some(slot) = regime {
+                    bench.block[slot] = (at / corners) as f64;
+                }
                 let outputs = bench.outputs.clone();
                 bench.run(&outputs);
+                // Where a regime would be left at once it is not.
+                let left = bench.exits.get(at / corners);
+                if left.is_some_and(|exits| exits.iter().any(|slot| bench.block[slot.index()] > 0.5)) {
+                    continue;
+                }
                 let force = bench.block[bench.force.index()];
                 let rise = match &flow {
                     Some(flow) => {
@@ -271,6 +303,18 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
         }
     }
     Verdict::Holds(points)
+}
+
+/// For each continuous state, whether one of these outputs depends on it.
+fn depends(program: &Program, outputs: impl Iterator<Item = Slot>) -> Vec<bool> {
+    let states: Vec<Slot> = program.description.layout.states.range().map(|slot| Slot(slot as u32)).collect();
+    let build = Shared::new(Build::new("dependence"));
+    let gradients = derive::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let mut found = vec![false; states.len()];
+    for (k, _) in outputs.filter_map(|slot| gradients.get(&slot)).flatten() {
+        found[*k as usize] = true;
+    }
+    found
 }
 
 /// dV/dt = Σ ∂V/∂x · dx/dt, where V is the output in slot `energy`; none without states.

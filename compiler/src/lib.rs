@@ -9,7 +9,9 @@ pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod elimination;
 pub mod discretize;
+pub mod rosenbrock;
 pub mod backend;
 
 pub mod names;
@@ -334,12 +336,17 @@ pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, i
             if program.description.layout.jacobian.len > 0 {
                 out.push((Function::Jacobian, derive::jacobian(program)));
             }
+            out.extend(rosenbrock::rosenbrock(program).map(|step| (Function::Rosenbrock, step)));
             out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
             out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
         }
         method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
     }
-    out.into_iter().map(|(function, func)| (function, math::expand(&func))).collect()
+    let expanded = |(function, func): (Function, ir::Func)| match function {
+        Function::Rosenbrock => (function, rosenbrock::pooled(&math::expand(&func))),
+        _ => (function, math::expand(&func)),
+    };
+    out.into_iter().map(expanded).collect()
 }
 
 /// Machine code of functions, or the interpreter where there can be none, which is noted.

@@ -45,7 +45,7 @@ pub struct Lowered {
 
 /// Lowers a system.
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
-    let mut pool = crate::math::POOL.to_vec();
+    let mut pool = [&crate::math::POOL, crate::rosenbrock::constants()].concat();
     let tables = place_tables(system, &mut pool);
     let mut plan = Plan::new(system, types, wanted, tables);
     plan.description.pool = Arc::from(pool);
@@ -68,7 +68,11 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
         [l.params, l.inputs, l.states, l.memory, l.regimes, l.outputs, l.derivatives, l.roots, l.jacobian, l.due]
             .map(|segment| segment.len)
     };
-    let moved = Layout::new(lens);
+    let mut moved = Layout::new(lens);
+    // What is delayed is looked up outside, before each evaluation.
+    if (1..=MOST_FUSED).contains(&moved.states.len) && description.delays.is_empty() {
+        moved = moved.with_trial();
+    }
     let shift = |slot: Slot| match description.layout.due.contains(slot) {
         true => Slot(slot.0 - description.layout.due.start + moved.due.start),
         false => slot,
@@ -197,6 +201,8 @@ struct Plan<'a> {
     /// Quantity or expression of each output slot.
     outputs: Vec<Output>,
     observed: Vec<Slot>,
+    /// Expressions that are looked at while the model runs.
+    wanted: Vec<ExprId>,
     tables: Vec<u32>,
 }
 
@@ -346,6 +352,7 @@ impl<'a> Plan<'a> {
             delayed: system.delays.iter().enumerate().map(|(k, delay)| (*delay, k)).collect(),
             outputs,
             observed,
+            wanted: wanted.iter().map(|one| one.expr).collect(),
             tables,
         };
         plan.describe(wanted);
@@ -634,7 +641,8 @@ impl<'a> Plan<'a> {
         emit.build.finish()
     }
 
-    /// Surfaces on which a branch of what moves the states changes, or a transition or event happens.
+    /// Surfaces on which a branch of what moves the states or of what is looked at changes, or a transition or event
+    /// happens.
     fn roots(&self, mut emit: Emit) -> (Func, Vec<Root>) {
         // Conditions first: a surface that a branch shares with a condition counts as the condition's.
         let mut from: Vec<ExprId> = Vec::new();
@@ -648,6 +656,8 @@ impl<'a> Plan<'a> {
                 from.push(rate);
             }
         }
+        // What an output alone does is seen only where somebody looks.
+        from.extend(&self.wanted);
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
@@ -758,6 +768,9 @@ impl<'a> Plan<'a> {
 
 /// Largest number of states with a dense Jacobian in the block.
 pub const MOST_JACOBIAN: usize = 200;
+
+/// Largest number of states whose adaptive step is one function.
+const MOST_FUSED: u32 = 8;
 
 /// Which quantities are parameters whose value needs no other quantity.
 fn independent_params(system: &System) -> Vec<bool> {

@@ -22,6 +22,7 @@ pub mod steady;
 pub mod sweep;
 
 pub mod blob;
+pub mod package;
 
 pub mod modes;
 

@@ -357,7 +357,13 @@ impl Look<'_> {
             Some(points) => {
                 when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown()))
             }
-            None => when(true, format!("least work of six rounds {}; no `storage` to search with", least.shown())),
+            None => when(
+                true,
+                format!(
+                    "least work of six rounds {}; not searched: that needs a `storage` and ranges of its states",
+                    least.shown()
+                ),
+            ),
         }
     }
 

@@ -47,13 +47,9 @@ fn histogram(lateness: &Histogram) -> String {
     let most = octaves.iter().map(|(_, count)| *count).max().unwrap_or(1) as f64;
     let line = |(upper_ns, count): &(u64, u64)| {
         // One cycle in a million is still one to see.
-        let width = (BAR * *count as f64 / most).ceil() as usize;
-        format!(
-            "{:>10}  {:<40}  {}\n",
-            format!("≤ {}", value::duration(*upper_ns as f64 * 1e-9)),
-            "━".repeat(width),
-            value::count(*count)
-        )
+        let bar = "━".repeat((BAR * *count as f64 / most).ceil() as usize);
+        let upper = format!("≤ {}", value::duration(*upper_ns as f64 * 1e-9));
+        format!("{upper:>10}  {bar:<40}  {}\n", value::count(*count))
     };
     octaves.iter().map(line).collect()
 }

@@ -8,6 +8,25 @@ use crate::terminal::Terminal;
 use grammar::diagnostic::Diagnostic;
 
 pub fn build(args: &Build, terminal: &mut Terminal) -> End {
+    let packs =
+        args.out.as_ref().is_some_and(|out| out.extension().is_some_and(|it| it == runtime::package::EXTENSION));
+    let emit = match (args.emit, packs) {
+        (None, true) => return super::pack::build(args, terminal),
+        (Some(emit), false) if args.sign.is_none() => emit,
+        (Some(_), false) => {
+            terminal.error("--sign is for packages: a rig, with --out NAME.fricpkg");
+            return End::Misused;
+        }
+        (Some(_), true) => {
+            terminal.error("a package holds a rig: leave --emit out, or give --out another ending");
+            return End::Misused;
+        }
+        (None, false) => {
+            terminal
+                .error("make what? --emit c, ir, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg");
+            return End::Misused;
+        }
+    };
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let models: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
     let experiments: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
@@ -34,7 +53,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
     };
-    if args.emit == Emit::Blob && args.out.is_none() {
+    if emit == Emit::Blob && args.out.is_none() {
         terminal.error("an image is no text for a terminal: give it a file with --out");
         return End::Misused;
     }
@@ -56,7 +75,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
-    let bytes = match compile::emit(&built, args.emit, args.solver, args.target) {
+    let bytes = match compile::emit(&built, emit, args.solver, args.target) {
         Ok(bytes) => bytes,
         Err(why) => {
             terminal.error(&why);

@@ -26,7 +26,9 @@ pub fn doc(args: &Doc, terminal: &mut Terminal) -> End {
         terminal.error(&format!("{} is not what the library says; run `fric doc`", args.out.display()));
         return End::Failed;
     }
-    if let Err(why) = plots(&folder, terminal) {
+    if !args.keep_plots
+        && let Err(why) = plots(&folder, terminal)
+    {
         terminal.error(&why);
         return End::Failed;
     }

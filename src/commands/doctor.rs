@@ -1,13 +1,17 @@
 //! `fric doctor`: what this machine and its buses lack for a rig, with the line that mends each.
 
-use super::End;
-use crate::args::Doctor as Args;
+use super::{End, load, reported};
+use crate::args::{Doctor as Args, LookedAt};
+use crate::compile::{self, Options, Stopwatch};
+use crate::project;
 use crate::terminal::{Style, Terminal};
+use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
-use runtime::can::{self, Filter, Options, Received, State, names, socketcan};
+use runtime::can::{self, Filter, Received, State, names, socketcan};
 use runtime::clock::Clock;
 use runtime::host::{Finding, Host, Verdict};
+use std::path::Path;
 
 /// How long a bus is listened to for another master.
 const LISTEN_NS: u64 = 1_000_000_000;
@@ -15,12 +19,25 @@ const LISTEN_NS: u64 = 1_000_000_000;
 pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
     let host = Host::default();
     let mut found = host.findings();
-    for address in &args.addresses {
+    let mut buses: Vec<(Address, Option<u32>)> = Vec::new();
+    for target in &args.targets {
+        match target {
+            LookedAt::Bus(address) => buses.push((address.clone(), args.bit_rate)),
+            LookedAt::Rigs(path) => match of_rigs(path, terminal) {
+                Ok(more) => buses.extend(more),
+                Err(end) => return end,
+            },
+        }
+    }
+    for (address, bit_rate) in &buses {
         if let Address::SocketCan(name) = address {
             found.extend(host.interrupt(name, args.priority));
-            found.extend(interface(name, args.bit_rate));
+            found.extend(interface(name, *bit_rate));
         }
-        found.push(traffic(address, args.bit_rate));
+        // Nobody else can be on a bus in this process.
+        if !matches!(address, Address::Sim(_)) {
+            found.push(traffic(address, *bit_rate));
+        }
     }
     let widest = found.iter().map(|finding| finding.topic.chars().count()).max().unwrap_or(0);
     let widest_says = found.iter().map(|finding| finding.says.chars().count()).max().unwrap_or(0).min(60);
@@ -35,6 +52,37 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
     }
     let forbidden = found.iter().any(|finding| matches!(finding.verdict, Verdict::Forbids(_)));
     if forbidden { End::Failed } else { End::Fine }
+}
+
+/// The buses of all rigs in a text; what is wrong with it is reported.
+fn of_rigs(path: &Path, terminal: &Terminal) -> Result<Vec<(Address, Option<u32>)>, End> {
+    let mut loaded = load(path, terminal, &mut Stopwatch::start("read")).ok_or(End::Failed)?;
+    let items = &loaded.files.get(loaded.root()).ast.items;
+    let name = |item: &Item| if let Item::Rig(rig) = item { Some(rig.name.text.clone()) } else { None };
+    let rigs: Vec<String> = items.iter().filter_map(name).collect();
+    if rigs.is_empty() {
+        terminal.error(&format!("{} has no rig", path.display()));
+        return Err(End::Failed);
+    }
+    let mut buses = Vec::new();
+    for rig in rigs {
+        let ready = compile::rig(&mut loaded, &project::Disk, &rig, &Options::default(), &mut Vec::new());
+        let ready = ready.map_err(|diagnostics| {
+            reported(&loaded, &diagnostics, terminal);
+            End::Failed
+        })?;
+        for bus in ready.rig.buses {
+            let address: Address = bus.address.parse().map_err(|why: String| {
+                terminal.error(&format!("bus `{}` of rig `{rig}`: {why}", bus.name));
+                End::Failed
+            })?;
+            let known = (address, Some(bus.bit_rate).filter(|&bit_rate| bit_rate > 0));
+            if !buses.contains(&known) {
+                buses.push(known);
+            }
+        }
+    }
+    Ok(buses)
 }
 
 /// What the kernel says of an interface.
@@ -85,7 +133,7 @@ fn traffic(address: &Address, bit_rate: Option<u32>) -> Finding {
     let topic = address.to_string();
     let world = Simulation::real_time();
     let ours = [0x000, 0x080].into_iter().chain(0x601..=0x67F).chain(0x200..0x280).collect();
-    let options = Options { bit_rate, filter: Filter::Only(ours), listen_only: true };
+    let options = can::Options { bit_rate, filter: Filter::Only(ours), listen_only: true };
     let mut bus = match can::open(address, &options, &world, "doctor") {
         Ok(bus) => bus,
         Err(cannot) => {

@@ -1,19 +1,24 @@
 //! The commands, one file each. A command prints what it has to say and returns how it ended.
 
+mod bench;
 mod bench_rt;
 mod build;
 mod bus;
 mod characterise;
 mod check;
 mod cross;
+mod deploy;
 mod doc;
 mod drives;
 mod doctor;
 mod explain;
 mod fmt;
+mod inspect;
+mod key;
 mod hil;
 mod linearise;
 mod new;
+mod pack;
 mod repl;
 mod replay;
 mod run;
@@ -21,7 +26,7 @@ mod sweep;
 mod test;
 mod watch;
 
-use crate::args::{Args, Command, Repl};
+use crate::args::{Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
 use crate::terminal::Terminal;
 use crate::{project, report};
@@ -54,6 +59,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Test(test) => test::test(test, terminal),
         Command::Sweep(sweep) => sweep::sweep(sweep, terminal),
         Command::Linearise(linearise) => linearise::linearise(linearise, terminal),
+        Command::Bench(args) => bench::bench(args, terminal),
         Command::Build(build) => build::build(build, terminal),
         Command::Hil(args) => hil::hil(args, terminal),
         Command::Replay(args) => replay::replay(args, terminal),
@@ -66,6 +72,10 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Drives(args) => drives::drives(args, terminal),
         Command::Repl(args) => repl::repl(args, terminal),
         Command::Watch(args) => watch::watch(args, terminal),
+        Command::Inspect(args) => inspect::inspect(args, terminal),
+        Command::Key { command: Key::New(args) } => key::new(args, terminal),
+        Command::Deploy(args) => deploy::deploy(args, terminal),
+        Command::FetchLog(args) => deploy::fetch_log(args, terminal),
         Command::Bus(args) => bus::bus(args, terminal),
         Command::Doctor(args) => doctor::doctor(args, terminal),
         Command::BenchRt(args) => bench_rt::bench_rt(args, terminal),

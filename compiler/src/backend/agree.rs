@@ -132,7 +132,7 @@ fn iterations_in_one_call_equal_single_calls() {
 fn lanes_agree_with_instances_alone() {
     let widths: Vec<Width> = [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()).collect();
     let (mut compared, mut refused, mut stopped) = (0, 0, 0);
-    for seed in 0..1500 {
+    for seed in 0..6000 {
         let mut random = Random(seed);
         let len = 20 + random.below(120);
         let func = random::func(&mut random, len);
@@ -171,4 +171,31 @@ fn lanes_agree_with_instances_alone() {
     }
     println!("{compared} lanes agree, {stopped} of them with a status; {refused} programs refused");
     assert!(widths.is_empty() || compared > 20_000 && stopped > 500);
+}
+
+/// More states than registers can hold travel through the block.
+#[test]
+fn many_states_agree() {
+    let layout = Layout::new([0, 0, 60, 0, 0, 2, 0, 0, 0, 0]);
+    let mut build = Build::new("many");
+    let states: Vec<Value> = (0..60).map(|k| build.load(layout.states.slot(k))).collect();
+    let half = build.real(0.5);
+    for k in 0..60 {
+        let mixed = build.fma(states[(k + 7) % 60], half, states[k]);
+        // Some change places only.
+        build.store(layout.states.slot(k), if k % 9 == 0 { states[(k + 1) % 60] } else { mixed });
+    }
+    build.store(layout.outputs.slot(0), states[3]);
+    let limit = build.real(1e3);
+    let over = build.less(limit, states[11]);
+    let (zero, code) = (build.int(0), build.int(4));
+    let status = build.select(over, code, zero);
+    build.status(status);
+    let mut random = Random(7);
+    let blocks: Vec<Vec<f64>> =
+        (0..20).map(|_| (0..layout.size()).map(|_| random.within(-9.0, 9.0)).collect()).collect();
+    let func = build.finish();
+    for count in [1, 2, 3, 40] {
+        check(&func, &layout, &blocks, &[], count, "many states");
+    }
 }

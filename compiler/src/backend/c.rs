@@ -68,6 +68,9 @@ fn purpose(function: Function) -> &'static str {
             "Up to count fixed steps, with their ticks, transitions, outputs and guards.\n   \
              Returns 0, or the number of the guard that stopped it."
         }
+        Function::Rosenbrock => {
+            "One adaptive step, tried. Returns 0, or 1 where the elimination met too small a pivot."
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! entry:  load every slot that is read; compute what no iteration changes
-//! loop:   the rest, on the slots that are both read and written, which stay in registers
+//! loop:   the rest, on the slots that are both read and written, which stay in registers; if they are many, in the block
 //!         again while there are iterations left and the status is 0
 //! exit:   store; return the status
 //! ```
@@ -39,26 +39,31 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     let mut emitter = Emitter::new(func, block, pool);
     let ops = || (0..func.ops.len()).map(|i| Value(i as u32));
     let (watch, late) = Watch::of(func);
+    // The slots that an iteration hands to the next: in registers, or, if they are many, where the next one loads them.
+    let handed: Vec<(Value, Value)> = emitter.carried();
+    let (carried, in_block) =
+        if handed.len() > IN_REGISTERS { (&handed[..0], &handed[..]) } else { (&handed[..], &handed[..0]) };
+    let in_loop = |emitter: &Emitter, value: Value| {
+        emitter.varies[value.index()] && (!in_block.is_empty() || !matches!(func.op(value), Op::Load(_)))
+    };
     for value in ops().filter(|value| !late[value.index()]) {
-        if !emitter.varies[value.index()] || matches!(func.op(value), Op::Load(_)) {
+        if !in_loop(&emitter, value) {
             emitter.operation(value, &mut b);
         }
     }
-    // The slots that an iteration hands to the next.
-    let carried: Vec<(Value, Value)> = emitter.carried();
     let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, &mut b))).collect();
     // Nothing changes from one iteration to the next: one is enough.
-    let count = if carried.is_empty() && func.writes.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
+    let count = if handed.is_empty() && func.writes.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
     let first: Vec<BlockArg> = first.into_iter().chain([BlockArg::Value(count)]).collect();
     b.ins().jump(body, &first);
 
-    for (load, _) in &carried {
+    for (load, _) in carried {
         emitter.values[load.index()] = Some(b.append_block_param(body, types::F64));
     }
     let left = b.append_block_param(body, types::I64);
     b.switch_to_block(body);
-    for value in ops().filter(|value| !late[value.index()] && emitter.varies[value.index()]).collect::<Vec<_>>() {
-        if !matches!(func.op(value), Op::Load(_)) {
+    for value in ops().filter(|value| !late[value.index()]) {
+        if in_loop(&emitter, value) {
             emitter.operation(value, &mut b);
         }
     }
@@ -82,6 +87,11 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
         }
     }
     b.switch_to_block(more);
+    for (load, store) in in_block {
+        let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
+        let value = emitter.get(*store, &mut b);
+        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
+    }
     let next: Vec<BlockArg> = carried.iter().map(|(_, store)| BlockArg::Value(emitter.get(*store, &mut b))).collect();
     let next: Vec<BlockArg> = next.into_iter().chain([BlockArg::Value(left)]).collect();
     let zero = b.ins().iconst(types::I64, 0);
@@ -114,6 +124,10 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     b.finalize(isa.frontend_config());
 }
 
+/// Most slots that are handed from one iteration to the next in registers, as far as these reach. More only travel through
+/// the stack, and the time to place them grows with the square of their number.
+const IN_REGISTERS: usize = 24;
+
 /// What ends the loop before its count.
 #[derive(Clone, Copy)]
 enum Watch {
@@ -142,12 +156,12 @@ impl Watch {
             needed[value.index()] = true;
         }
         for i in (0..func.ops.len()).rev() {
+            // What the block holds is read before the iteration writes to it, and so is what says where.
+            needed[i] |= matches!(func.ops[i], Op::Load(_) | Op::Ring { .. });
             if needed[i] {
                 func.ops[i].each_operand(|operand| needed[operand.index()] = true);
             }
-            // What the block holds is read before the iteration writes to it.
-            let read = matches!(func.ops[i], Op::Load(_) | Op::Ring { .. });
-            late[i] = !needed[i] && !read;
+            late[i] = !needed[i];
         }
         (Watch::Failed { when, detail }, late)
     }
@@ -207,6 +221,10 @@ impl Emitter<'_> {
     /// The instruction's value. Constants are made anew at each use: kept, they would fill the registers.
     fn get(&self, value: Value, b: &mut FunctionBuilder) -> clif::Value {
         match self.func.op(value) {
+            Op::Pool { base, len, index } if let Op::Int(index) = self.func.op(index) => {
+                let entry = (index as u64).min(u64::from(len) - 1) as u32;
+                b.ins().load(types::F64, MemFlagsData::trusted(), self.pool, offset(base + entry))
+            }
             Op::Real(bits) => b.ins().f64const(f64::from_bits(bits)),
             Op::Int(n) => b.ins().iconst(types::I64, n),
             Op::Bool(truth) => b.ins().iconst(types::I8, i64::from(truth)),
@@ -221,7 +239,8 @@ impl Emitter<'_> {
         let mut n = 0;
         // Of a table only the bits may be needed: then the number is never loaded.
         if let Op::Pool { base, len, index } = op {
-            if self.as_real[value.index()] {
+            let constant = matches!(self.func.op(index), Op::Int(_));
+            if !constant && self.as_real[value.index()] {
                 let (address, offset) = self.entry(self.pool, base, len, index, b);
                 self.values[value.index()] = Some(b.ins().load(types::F64, flags, address, offset));
             }
@@ -243,6 +262,12 @@ impl Emitter<'_> {
             operands[n] = Some(self.get(operand, b));
             n += 1;
         });
+        // What stands last can be taken from memory.
+        if let Op::Add(first, _) | Op::Mul(first, _) = op
+            && let Op::Real(_) = self.func.op(first)
+        {
+            operands.swap(0, 1);
+        }
         let x = |i: usize| operands[i].expect("an operand");
         let result = match op {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) => return,

@@ -4,7 +4,7 @@
 //! clone of the code goes. The code has no symbols, calls nothing and needs no relocation.
 
 use super::clif::signature;
-use super::target::{Coder, here};
+use super::target::{Coder, here, in_order};
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
 use abi::table::{Entry, Machine};
@@ -45,11 +45,12 @@ fn generate(
     let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
-    let mut coder = Coder::new(isa);
+    let (mut coder, mut keeping) = (Coder::new(isa), Coder::new(in_order()?));
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+        let coder = if *function == Function::Rosenbrock { &mut keeping } else { &mut coder };
         let bytes = coder.function(func)?;
         let failed = |error| Unsupported(format!("no memory for the code of `{}`: {error}", func.name));
         let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;

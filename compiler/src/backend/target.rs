@@ -93,19 +93,27 @@ fn refused(func: &Func, error: &CodegenError) -> Unsupported {
 /// The processor this program runs on, with all it has.
 pub fn here() -> Result<&'static OwnedTargetIsa, Unsupported> {
     static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
-    ISA.get_or_init(|| {
-        // Without them fma, floor and nearest would be calls.
-        #[cfg(target_arch = "x86_64")]
-        for feature in [Feature::Fma, Feature::Sse41] {
-            if !feature.here() {
-                return Err(Unsupported(format!("this processor lacks {}", feature.name())));
-            }
+    ISA.get_or_init(|| native("speed")).as_ref().map_err(Clone::clone)
+}
+
+/// The same for functions of many hundred operations, which it keeps in their order. Else Cranelift makes one value of
+/// equal constants and computes things where their result is used: this fills the registers, and what does not fit goes
+/// through memory.
+pub fn in_order() -> Result<&'static OwnedTargetIsa, Unsupported> {
+    static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
+    ISA.get_or_init(|| native("none")).as_ref().map_err(Clone::clone)
+}
+
+fn native(level: &str) -> Result<OwnedTargetIsa, Unsupported> {
+    // Without them fma, floor and nearest would be calls.
+    #[cfg(target_arch = "x86_64")]
+    for feature in [Feature::Fma, Feature::Sse41] {
+        if !feature.here() {
+            return Err(Unsupported(format!("this processor lacks {}", feature.name())));
         }
-        let native = cranelift_native::builder().map_err(|what| Unsupported(what.into()))?;
-        native.finish(flags()).map_err(|what| Unsupported(what.to_string()))
-    })
-    .as_ref()
-    .map_err(Clone::clone)
+    }
+    let native = cranelift_native::builder().map_err(|what| Unsupported(what.into()))?;
+    native.finish(flags(level)).map_err(|what| Unsupported(what.to_string()))
 }
 
 /// A target, with nothing but what it [needs](Target::needs).
@@ -129,14 +137,14 @@ pub fn of(target: Target) -> &'static OwnedTargetIsa {
             };
             isa.enable(flag).expect("a flag of this version");
         }
-        isa.finish(flags()).expect("flags that fit together")
+        isa.finish(flags("speed")).expect("flags that fit together")
     })
 }
 
-fn flags() -> Flags {
+fn flags(level: &str) -> Flags {
     let mut flags = builder();
     for (flag, setting) in [
-        ("opt_level", "speed"),
+        ("opt_level", level),
         ("is_pic", "false"),
         // A frame larger than a page is touched page by page, in line.
         ("enable_probestack", "true"),

@@ -407,6 +407,10 @@ impl<'a> Flattener<'a> {
         let mut error = Diagnostic::error("E0204", format!("there is no function `{}`", function.text))
             .label(function.span, "not declared");
         let loaded = self.loaded;
+        self.unknowns += 1;
+        if self.unknowns > MOST_SUGGESTIONS {
+            return self.report(error);
+        }
         let mut known = loaded.visible(env.file, Space::Function);
         for name in Builtin::names() {
             known.push(name);

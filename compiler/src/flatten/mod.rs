@@ -29,6 +29,8 @@ pub const MOST_NODES: usize = 2_000_000;
 const MOST_NODES_OF_ITEM: usize = 100_000;
 /// For so many unknown names a suggestion is looked for; the rest is hardly read.
 const MOST_SUGGESTIONS: usize = 50;
+/// With so many mistakes nothing more is made.
+const MOST_MISTAKES: usize = 1000;
 /// Deepest nesting of parts in parts, and of functions in functions.
 const DEEPEST: usize = 64;
 
@@ -350,6 +352,9 @@ impl<'a> Flattener<'a> {
 
     /// Whether the program has grown too large to go on: reported once, at a place where it grows.
     fn full(&mut self, span: Span) -> bool {
+        if self.diagnostics.len() >= MOST_MISTAKES {
+            return true; // Thousands of parts with the same mistake say no more than some.
+        }
         let made = self.system.vars.len() + self.system.instances.len();
         let (most, what) = match () {
             () if made > MOST_VARS => (MOST_VARS, "quantities and parts"),

@@ -4,7 +4,7 @@
 //! Constants may stand wherever a value may.
 
 use super::build::Build;
-use super::{Unary, Value};
+use super::{Op, Unary, Value};
 use std::cell::RefCell;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Shl, Shr, Sub};
 
@@ -142,6 +142,12 @@ impl<'a> Real<'a> {
     /// An elementary function of it.
     pub fn of(self, function: Unary) -> Real<'a> {
         self.with(|b| b.unary(function, self.value))
+    }
+
+    /// Whether it is written as −(a · a): it is then not above 0, or NaN.
+    pub fn is_minus_square(self) -> bool {
+        let build = self.build.borrow();
+        matches!(build.get(self.value), Op::Neg(square) if matches!(build.get(square), Op::Mul(a, b) if a == b))
     }
 
     /// self · b + c, rounded once.

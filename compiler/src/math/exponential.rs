@@ -78,6 +78,13 @@ impl<'a> Parts<'a> {
         x.abs().below(707.0).choose(normal, beyond)
     }
 
+    /// e^x for x that is not above 0, or NaN.
+    fn scaled_below(self, x: Real<'a>) -> Real<'a> {
+        let nearer = self.scale + (1022 << 52);
+        let edge = Parts { scale: nearer, ..self }.normal() * two_to(-1022);
+        x.above(-707.0).choose(self.normal(), x.below(-746.0).choose(0.0, edge))
+    }
+
     /// e^x − 1 as high and low part, for −50 < x < 700.
     fn less_one(self) -> (Real<'a>, Real<'a>) {
         let scale = self.scale.real_of_bits();
@@ -95,7 +102,9 @@ impl<'a> Parts<'a> {
 
 /// Within 0.52 ulp where the result is normal.
 pub fn exp(x: Real) -> Real {
-    Parts::of(x).scaled(x, 0)
+    let parts = Parts::of(x);
+    // As in Stribeck's curve: the same bits, without what only large results need.
+    if x.is_minus_square() { parts.scaled_below(x) } else { parts.scaled(x, 0) }
 }
 
 /// e^x − 1, within 1 ulp.

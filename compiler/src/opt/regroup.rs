@@ -14,7 +14,7 @@
 use crate::ir::build::Build;
 use crate::ir::{Binary, Func, Op, Unary, Value};
 use abi::Slot;
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 
 /// When a value is ready, in processor cycles after the beginning of an iteration; none: it is constant in the loop.
 type Ready = Option<u32>;
@@ -23,15 +23,25 @@ type Ready = Option<u32>;
 pub fn regroup(func: &Func) -> Func {
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let carried: HashSet<Slot> = func.loads().into_iter().filter(|slot| stored.contains(slot)).collect();
-    let after = after(func, &carried);
+    shortened(func, &carried, &carried, false)
+}
+
+/// Regroups a long function for the shortest chain from the slots that `vary` from one call to the next to its
+/// `results`; other slots count as constant. What is affine in a late value is split along all its paths, and its factor
+/// need only be early.
+pub fn between(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>) -> Func {
+    shortened(func, vary, results, true)
+}
+
+fn shortened(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>, early: bool) -> Func {
+    let after = after(func, results);
     // First everything, to learn how short the longest chain can be; then only what is needed for that.
-    let (_, shortest) = rebuilt(func, &carried, &after, 0);
-    rebuilt(func, &carried, &after, shortest).0
+    let (_, shortest) = rebuilt(func, Pass::new(func, vary, early), results, &after, 0);
+    rebuilt(func, Pass::new(func, vary, early), results, &after, shortest).0
 }
 
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: u32) -> (Func, u32) {
-    let mut pass = Pass { build: Build::new(&func.name), ready: Vec::new(), carried };
+fn rebuilt(func: &Func, mut pass: Pass, results: &HashSet<Slot>, after: &[Option<u32>], enough: u32) -> (Func, u32) {
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
@@ -44,7 +54,7 @@ fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: 
     for (slot, value) in &func.stores {
         let value = values[value.index()];
         build.store(*slot, value);
-        if carried.contains(slot) {
+        if results.contains(slot) {
             longest = longest.max(pass.ready[value.index()].unwrap_or(0));
         }
     }
@@ -57,11 +67,11 @@ fn rebuilt(func: &Func, carried: &HashSet<Slot>, after: &[Option<u32>], enough: 
     (build.finish(), longest)
 }
 
-/// For each operation, the cycles from its result to the next value of a carried slot; none if it does not matter there.
-fn after(func: &Func, carried: &HashSet<Slot>) -> Vec<Option<u32>> {
+/// For each operation, the cycles from its value to a result; none if no result needs it.
+fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Option<u32>> {
     let mut after = vec![None; func.ops.len()];
     for (slot, value) in &func.stores {
-        if carried.contains(slot) {
+        if results.contains(slot) {
             after[value.index()] = Some(0);
         }
     }
@@ -74,8 +84,22 @@ fn after(func: &Func, carried: &HashSet<Slot>) -> Vec<Option<u32>> {
     after
 }
 
+/// Cycles of the longest chain from what an iteration takes over to what it hands on.
+pub fn critical_path(func: &Func) -> u32 {
+    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let mut ready: Vec<Ready> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let mut last = matches!(op, Op::Load(slot) if stored.contains(slot)).then_some(0);
+        op.each_operand(|operand| last = last.max(ready[operand.index()]));
+        ready.push(last.map(|last| last + latency(*op)));
+    }
+    let loaded: HashSet<Slot> = func.loads().into_iter().collect();
+    let handed = func.stores.iter().filter(|(slot, _)| loaded.contains(slot));
+    handed.filter_map(|(_, value)| ready[value.index()]).max().unwrap_or(0)
+}
+
 /// Latency in cycles, rounded from current processors; only its order of size matters.
-fn latency(op: Op) -> u32 {
+pub(super) fn latency(op: Op) -> u32 {
     match op {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
         Op::Neg(_) | Op::Abs(_) => 1,
@@ -106,6 +130,8 @@ struct Pass<'a> {
     /// Of every value of the builder.
     ready: Vec<Ready>,
     carried: &'a HashSet<Slot>,
+    /// Whether sums are split along all paths to a late value.
+    paths: bool,
 }
 
 /// A product of values over a product of values.
@@ -115,7 +141,18 @@ struct Product {
     below: Vec<Value>,
 }
 
-impl Pass<'_> {
+/// As an affine function of a late value: what it is without it, and its factor.
+#[derive(Clone, Copy)]
+struct Affine {
+    rest: Option<Value>,
+    factor: Option<Value>,
+}
+
+impl<'a> Pass<'a> {
+    fn new(func: &Func, carried: &'a HashSet<Slot>, paths: bool) -> Pass<'a> {
+        Pass { build: Build::new(&func.name), ready: Vec::new(), carried, paths }
+    }
+
     fn op(&mut self, op: Op) -> Value {
         let value = self.build.op(op);
         self.note();
@@ -142,12 +179,109 @@ impl Pass<'_> {
 
     /// The value, or the same computed earlier.
     fn sooner(&mut self, plain: Value) -> Value {
-        let better = match self.build.get(plain) {
-            Op::Mul(..) | Op::Div(..) => self.product(plain),
-            Op::Add(..) | Op::Sub(..) => self.split(plain),
-            _ => plain,
+        let op = self.build.get(plain);
+        let mut best = plain;
+        let mut consider = |better: Value, ready: &[Ready]| {
+            if ready[better.index()] < ready[best.index()] {
+                best = better;
+            }
         };
-        if self.at(better) < self.at(plain) { better } else { plain }
+        if let Op::Mul(..) | Op::Div(..) = op {
+            let product = self.product(plain);
+            consider(product, &self.ready);
+            if self.paths {
+                consider(self.along_paths(product), &self.ready);
+            }
+        }
+        match op {
+            Op::Add(..) | Op::Sub(..) if self.paths => consider(self.along_paths(plain), &self.ready),
+            Op::Add(..) | Op::Sub(..) => consider(self.split(plain), &self.ready),
+            _ => {}
+        }
+        best
+    }
+
+    /// A value that is affine in a late one, as what it is without it, plus factor · late.
+    fn along_paths(&mut self, value: Value) -> Value {
+        // Down the operand that is ready last, to what is not affine in its operands.
+        let mut late = value;
+        for _ in 0..32 {
+            let later = |a: Value, b: Value| if self.at(a) > self.at(b) { a } else { b };
+            late = match self.build.get(late) {
+                Op::Neg(a) => a,
+                Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) => later(a, b),
+                _ => break,
+            };
+        }
+        if late == value || self.at(late).is_none() {
+            return value;
+        }
+        let mut known = HashMap::new();
+        let Some(Affine { rest: Some(rest), factor: Some(factor) }) = self.affine(value, late, &mut known) else {
+            return value;
+        };
+        let product = self.op(Op::Mul(factor, late));
+        self.op(Op::Add(rest, product))
+    }
+
+    /// None if it is not affine, or too large a formula.
+    fn affine(&mut self, value: Value, late: Value, known: &mut HashMap<Value, Option<Affine>>) -> Option<Affine> {
+        if value == late {
+            return Some(Affine { rest: None, factor: Some(self.op(Op::Real(1f64.to_bits()))) });
+        }
+        // What is ready no later cannot depend on it.
+        if self.at(value) <= self.at(late) {
+            return Some(Affine { rest: Some(value), factor: None });
+        }
+        if let Some(found) = known.get(&value) {
+            return *found;
+        }
+        if known.len() > 64 {
+            return None;
+        }
+        known.insert(value, None);
+        let found = self.affine_op(value, late, known);
+        known.insert(value, found);
+        found
+    }
+
+    fn affine_op(&mut self, value: Value, late: Value, known: &mut HashMap<Value, Option<Affine>>) -> Option<Affine> {
+        match self.build.get(value) {
+            Op::Neg(a) => {
+                let a = self.affine(a, late, known)?;
+                let minus = |pass: &mut Self, value: Value| pass.op(Op::Neg(value));
+                Some(Affine { rest: a.rest.map(|v| minus(self, v)), factor: a.factor.map(|v| minus(self, v)) })
+            }
+            op @ (Op::Add(a, b) | Op::Sub(a, b)) => {
+                let (a, b) = (self.affine(a, late, known)?, self.affine(b, late, known)?);
+                let negative = matches!(op, Op::Sub(..));
+                let mut join = |a: Option<Value>, b: Option<Value>| match (a, b) {
+                    (Some(a), Some(b)) => Some(self.op(if negative { Op::Sub(a, b) } else { Op::Add(a, b) })),
+                    (None, Some(b)) if negative => Some(self.op(Op::Neg(b))),
+                    (one, other) => one.or(other),
+                };
+                Some(Affine { rest: join(a.rest, b.rest), factor: join(a.factor, b.factor) })
+            }
+            Op::Mul(a, b) => {
+                let (a, b) = (self.affine(a, late, known)?, self.affine(b, late, known)?);
+                let (of, by) = match (a.factor, b.factor) {
+                    (_, None) => (a, b.rest?),
+                    (None, _) => (b, a.rest?),
+                    _ => return None,
+                };
+                let mut times = |value: Option<Value>| value.map(|value| self.op(Op::Mul(by, value)));
+                Some(Affine { rest: times(of.rest), factor: times(of.factor) })
+            }
+            // What is not affine must not depend on the late value.
+            op => {
+                let mut free = true;
+                op.each_operand(|operand| {
+                    let operand = self.affine(operand, late, known);
+                    free &= operand.is_some_and(|operand| operand.factor.is_none());
+                });
+                free.then_some(Affine { rest: Some(value), factor: None })
+            }
+        }
     }
 
     /// A product with its factors in the order in which they are ready.

@@ -7,6 +7,7 @@
 //! Nothing here depends on the platform's elementary functions, so a run has the same bits everywhere.
 
 use super::explicit::Explicit;
+use super::fused::{Fused, Judged};
 use super::linear;
 use super::points::Points;
 use super::rosenbrock::Rosenbrock;
@@ -77,6 +78,9 @@ struct Adaptive<'a> {
     jacobian: Vec<f64>,
     room: Vec<f64>,
     rosenbrock: Rosenbrock,
+    /// The same as one function of the model, if it has it; and whether the last step was made by it.
+    fused: Option<Fused>,
+    was_fused: bool,
     explicit: Explicit,
     /// Which of the two is at work.
     stiff: bool,
@@ -127,6 +131,7 @@ impl<'a> Adaptive<'a> {
         let tol = experiment.solver.tol;
         assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
         let points = Points::new(instance, observer, experiment);
+        let fused = Fused::new(instance, tol, &scales);
         let system = System::new(instance);
         let n = system.n;
         Adaptive {
@@ -146,6 +151,8 @@ impl<'a> Adaptive<'a> {
             jacobian: vec![0.0; n * n + n],
             room: vec![0.0; 2 * n * n],
             rosenbrock: Rosenbrock::new(n),
+            fused,
+            was_fused: false,
             explicit: Explicit::new(n),
             stiff: true,
             doubts: 0,
@@ -240,25 +247,22 @@ impl<'a> Adaptive<'a> {
         }
         let stiff = self.stiff;
         self.was_stiff = stiff;
-        let solved = if stiff {
-            self.know_jacobian();
-            self.rosenbrock.attempt(&mut self.system, &mut self.step, &self.jacobian)
-        } else {
-            self.explicit.attempt(&mut self.system, &mut self.step);
-            true
-        };
-        let mut error = if solved { self.error() } else { f64::INFINITY };
-        if error <= 1.0 {
-            if stiff {
-                self.system.slope(self.step.end, &self.step.x1, &mut self.end_slope);
-                error = error.max(self.defect());
-            } else {
+        let judged = if stiff { self.fused_attempt() } else { None };
+        self.was_fused = judged.is_some();
+        let error = match judged {
+            Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
+            Some(Judged { error, defect }) if error <= 1.0 => error.max(defect),
+            Some(Judged { error, .. }) => error,
+            None if stiff => self.stiff_attempt(),
+            None => {
+                self.explicit.attempt(&mut self.system, &mut self.step);
                 self.end_slope.copy_from_slice(self.explicit.last_slope());
+                self.error()
             }
-        }
+        };
         if error.is_nan() || error > 1.0 {
             self.work.rejected += 1;
-            let part = if error.is_finite() { (SAFETY / fifth_root(error)).max(0.2) } else { 0.1 };
+            let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(0.2) } else { 0.1 };
             self.h = part.min(0.9) * h;
             // Where the step ran over a surface, that may be all that is wrong with it.
             if let Some(theta) = self.surfaces.guess(&mut self.system, &self.step) {
@@ -267,22 +271,51 @@ impl<'a> Adaptive<'a> {
             self.rejected = true;
             return false;
         }
-        let root = fifth_root(error.max(1e-10));
-        let mut part = SAFETY / root;
+        let error = error.max(1e-10);
+        let inverse = inverse_fifth_root(error);
+        let mut part = SAFETY * inverse;
         if let Some((last_h, last_root)) = self.last {
             // What the error did from step to step, it will do again.
-            part = part.min(SAFETY * (h / last_h) * last_root / (root * root));
+            part = part.min((SAFETY * (h / last_h) * last_root) * (inverse * inverse));
         }
         if self.rejected {
             part = part.min(1.0);
         }
         self.h = part.clamp(0.2, 6.0) * h;
-        self.last = Some((h, root.max(LEAST_ROOT)));
+        let square = inverse * inverse;
+        self.last = Some((h, (error * (square * square)).max(LEAST_ROOT)));
         self.rejected = false;
         self.work.steps += 1;
         self.work.stiff_steps += u64::from(stiff);
         self.consider_method();
         true
+    }
+
+    /// A stiff step by the model's own function, if it has it and its elimination went well.
+    fn fused_attempt(&mut self) -> Option<Judged> {
+        if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
+            self.know_jacobian();
+        }
+        let fused = self.fused.as_mut()?;
+        if !fused.ready {
+            fused.begin(&mut self.system, &self.x, &self.step.f0, &self.jacobian);
+        }
+        self.work.jacobians += 1;
+        fused.attempt(&mut self.system, &mut self.step, &mut self.end_slope)
+    }
+
+    /// A stiff step by the routine for any model. Gives its error as a part of what is allowed.
+    fn stiff_attempt(&mut self) -> f64 {
+        self.know_jacobian();
+        if !self.rosenbrock.attempt(&mut self.system, &mut self.step, &self.jacobian) {
+            return f64::INFINITY;
+        }
+        let error = self.error();
+        if error > 1.0 {
+            return error;
+        }
+        self.system.slope(self.step.end, &self.step.x1, &mut self.end_slope);
+        error.max(self.defect())
     }
 
     /// Largest estimated error as a part of what is allowed.
@@ -367,7 +400,9 @@ impl<'a> Adaptive<'a> {
 
     /// The Jacobian at the start of the step.
     fn know_jacobian(&mut self) {
-        if !self.jacobian_known {
+        if let Some(fused) = self.fused.as_ref().filter(|fused| fused.ready) {
+            self.jacobian.copy_from_slice(fused.jacobian(&self.system));
+        } else if !self.jacobian_known {
             let (f0, scales) = (&self.step.f0, &self.scales);
             self.system.jacobian(self.step.t, &self.step.x0, f0, scales, &mut self.jacobian);
             self.jacobian_known = true;
@@ -379,7 +414,8 @@ impl<'a> Adaptive<'a> {
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
         self.kept = 0.0;
-        self.surfaces.begin(&mut self.system, &self.step, self.fresh);
+        let known = self.fused.as_ref().filter(|_| self.was_fused);
+        self.surfaces.begin(&mut self.system, &self.step, self.fresh, known);
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
@@ -406,6 +442,12 @@ impl<'a> Adaptive<'a> {
         self.step.f0.copy_from_slice(&self.end_slope);
         self.slope_known = true;
         self.jacobian_known = false;
+        if let Some(fused) = &mut self.fused {
+            match self.was_fused {
+                true => fused.go_on(&mut self.system),
+                false => fused.ready = false,
+            }
+        }
         self.guard()
     }
 
@@ -637,6 +679,7 @@ impl<'a> Adaptive<'a> {
         self.surfaces.restart(&mut self.system, self.t, &self.x);
         self.slope_known = false;
         self.jacobian_known = false;
+        self.fused.iter_mut().for_each(|fused| fused.ready = false);
         self.last = None;
         self.fresh = true;
     }
@@ -652,10 +695,10 @@ impl<'a> Adaptive<'a> {
 
     /// Ranges that are watched, with the slack of a millionth that fixed steps have.
     fn guard(&mut self) -> Result<(), Stop> {
-        let description = self.system.instance.description().clone();
-        if description.guards.is_empty() {
+        if self.system.instance.description().guards.is_empty() {
             return Ok(());
         }
+        let description = self.system.instance.description().clone();
         self.system.place(self.t, &self.x);
         if description.guards.iter().any(|guard| !description.layout.states.contains(guard.slot)) {
             let status = self.system.instance.call(Function::Outputs);
@@ -732,23 +775,23 @@ impl<'a> Adaptive<'a> {
     }
 }
 
-/// The fifth root of a positive number to six digits, by Newton's method from its exponent: the same bits on every
-/// machine.
-fn fifth_root(x: f64) -> f64 {
-    // A fifth of the exponent, and of the fraction as if the logarithm were straight in between.
-    let bias = 1023u64 << 52;
-    let mut y = f64::from_bits(x.to_bits() / 5 + bias / 5 * 4);
-    for _ in 0..3 {
+/// x^(−1/5) of a positive number to four digits, by Newton's method from its exponent: the same bits on every machine, and
+/// no division, since the next step waits for it.
+fn inverse_fifth_root(x: f64) -> f64 {
+    // Minus a fifth of the exponent, and of the fraction as if the logarithm were straight in between; the constant
+    // makes the errors of both signs equal.
+    let mut y = f64::from_bits(0x4cb8_a7ef_9db2_2d0e - x.to_bits() / 5);
+    for _ in 0..2 {
         let square = y * y;
-        y += 0.2 * (x / (square * square) - y);
+        y *= 1.2 - (0.2 * x * y) * (square * square);
     }
     y
 }
 
 #[test]
-fn fifth_roots() {
+fn inverse_fifth_roots() {
     for n in -300..300 {
         let x = 10f64.powf(0.1 * f64::from(n));
-        assert!((fifth_root(x) / x.powf(0.2) - 1.0).abs() < 1e-6, "{x}");
+        assert!((inverse_fifth_root(x) * x.powf(0.2) - 1.0).abs() < 3e-5, "{x}");
     }
 }

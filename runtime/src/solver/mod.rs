@@ -1,8 +1,9 @@
 //! Adaptive runs: a stiff and an explicit method of order five, dense output, events, ticks.
 //!
 //! In: a model that offers derivatives, and if it can its Jacobian, switching surfaces, transitions and sampled
-//! blocks. Out: its points, shown to an observer. [`linear`] solves the small systems, [`rosenbrock`] and
-//! [`explicit`] make one [`Step`](step::Step) each, [`history`] keeps what is delayed, [`surfaces`] finds where one crosses a switching surface,
+//! blocks. Out: its points, shown to an observer. [`linear`] solves the small systems, [`rosenbrock`], [`fused`]
+//! and [`explicit`] make one [`Step`](step::Step) each, [`history`] keeps what is delayed, [`surfaces`] finds where one
+//! crosses a switching surface,
 //! [`points`] shows it, and [`adaptive`] chooses and joins steps.
 
 pub(crate) mod linear;
@@ -10,6 +11,7 @@ pub(crate) mod history;
 pub(crate) mod step;
 
 pub(crate) mod explicit;
+pub(crate) mod fused;
 pub(crate) mod rosenbrock;
 
 pub(crate) mod points;

@@ -3,6 +3,7 @@
 //! In: a [`Step`] and the values of the surfaces along it. Out: brackets, the earliest first, at whose near end every
 //! condition has its old value and at whose far end some have their new one.
 
+use super::fused::Fused;
 use super::step::{Step, System};
 
 /// Where the first crossing of a step lies, in θ.
@@ -86,7 +87,8 @@ impl Surfaces {
     /// Looks along a step. Between two points that are looked at, a surface that is touched and left again would be
     /// missed: so a parabola through the values says where to look besides. After a restart (`fresh`) the model may
     /// stand a rounding error beside a surface that it leaves at once: so the beginning is looked at more closely.
-    pub(crate) fn begin(&mut self, system: &mut System, step: &Step, fresh: bool) {
+    /// `known`: the values in the middle and at the end are in the block.
+    pub(crate) fn begin(&mut self, system: &mut System, step: &Step, fresh: bool, known: Option<&Fused>) {
         let m = self.sides.len();
         self.nodes.clear();
         self.values.clear();
@@ -98,8 +100,15 @@ impl Surfaces {
         if fresh {
             [1e-6, 1e-4, 1e-2, 0.1, 0.25].into_iter().for_each(|theta| self.look(system, step, theta));
         }
-        self.look(system, step, 0.5);
-        self.look(system, step, 1.0);
+        match known {
+            Some(fused) => {
+                for (theta, values) in [0.5, 1.0].into_iter().zip(fused.surfaces(system)) {
+                    self.nodes.push(theta);
+                    self.values.extend_from_slice(values);
+                }
+            }
+            None => [0.5, 1.0].into_iter().for_each(|theta| self.look(system, step, theta)),
+        }
         let (middle, end) = (self.values.len() - 2 * m, self.values.len() - m);
         for i in 0..m {
             let (a, b, c) = (self.here[i], self.values[middle + i], self.values[end + i]);

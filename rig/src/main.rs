@@ -1,0 +1,190 @@
+//! The `fric-rig` command: what runs on the computer beside the drives.
+//!
+//! In: a package that `fric build` made. Out: a running rig, or the reason why not. Has no compiler: what it runs was
+//! checked and compiled elsewhere, and is refused if a single bit of it changed on the way.
+
+#![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see words.rs")]
+
+mod words;
+
+mod packed;
+
+mod store;
+
+mod doctor;
+
+mod run;
+
+use clap::{Parser, Subcommand, ValueHint};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Checks and runs packed rigs
+#[derive(Parser, Debug)]
+#[command(name = "fric-rig", version, arg_required_else_help = true, after_help = EXIT_CODES)]
+struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+const EXIT_CODES: &str =
+    "Exit codes: 0 ended as asked, 1 refused or bad input, 2 wrong usage, 3 stopped by safety or a `stop` condition.";
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Verify a package: whole, for this computer, of this version, signed if keys are trusted
+    Check(Check),
+    /// Run the current package, or the one named; nothing moves before `say enable`, `say arm`
+    Run(Run),
+    /// Run the current package in the background; fails if it does not get through its first second
+    Start(Store),
+    /// Tell the rig that runs: enable, arm, stop or reset
+    Say(Say),
+    /// Say whether this computer can keep time, and what to change
+    Doctor,
+    /// Make a package the one that runs next; the one before is kept for `rollback`
+    Install(Install),
+    /// Make the package before the current one the current one again
+    Rollback(Store),
+    /// Say what is installed, and what runs
+    Status(Store),
+    /// Print the target that packages must be built for
+    Target,
+}
+
+#[derive(clap::Args, Debug)]
+struct Check {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    package: PathBuf,
+    #[command(flatten)]
+    trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct Trust {
+    /// Folder with the public keys that are trusted; with one in it, packages must be signed
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = runtime::package::signature::TRUSTED)]
+    trusted: PathBuf,
+}
+
+#[derive(clap::Args, Debug)]
+struct Run {
+    /// The package [default: the one that is installed]
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    package: Option<PathBuf>,
+    /// Simulated buses, drives and devices; arms itself
+    #[arg(long)]
+    sim: bool,
+    /// Simulated time: as fast as it computes, the same bits every time
+    #[arg(long, requires = "sim")]
+    fast: bool,
+    /// Do the checks of the start-up and stop before arming
+    #[arg(long)]
+    check: bool,
+    /// Time the model runs, such as 60s [default: until it is stopped]
+    #[arg(long = "for", value_name = "TIME", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Put another bus under the rig: can0=socketcan:can1
+    #[arg(long, value_name = "BUS=ADDRESS", value_parser = address)]
+    bus: Vec<(String, String)>,
+    /// The log [default: DIR/log/RIG-TIME.friclog]
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    log: Option<PathBuf>,
+    #[command(flatten)]
+    store: Store,
+    #[command(flatten)]
+    trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct Say {
+    /// enable, arm, stop or reset
+    #[arg(value_parser = ["enable", "arm", "stop", "reset"])]
+    what: String,
+    #[command(flatten)]
+    store: Store,
+}
+
+#[derive(clap::Args, Debug)]
+struct Install {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    package: PathBuf,
+    #[command(flatten)]
+    store: Store,
+    #[command(flatten)]
+    trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct Store {
+    /// Folder of the packages and logs
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = store::DEFAULT)]
+    dir: PathBuf,
+}
+
+/// A time with its unit: `60s`, `500 ms`.
+fn seconds(text: &str) -> Result<f64, String> {
+    let at = text.find(|c: char| c.is_ascii_alphabetic()).ok_or("a time needs its unit, for example 60s")?;
+    let unit = abi::unit::Unit::parse(text[at..].trim()).map_err(|part| format!("`{part}` is not a known unit"))?;
+    let number: f64 = text[..at].trim().parse().map_err(|_| format!("`{}` is not a number", &text[..at]))?;
+    let second = abi::unit::Unit::parse("s").expect("the second is known");
+    match unit.to_si(number) {
+        t if unit.dimension == second.dimension && t > 0.0 && t.is_finite() => Ok(t),
+        _ => Err("a time greater than 0 is needed, for example 60s".into()),
+    }
+}
+
+fn address(text: &str) -> Result<(String, String), String> {
+    let (bus, address) = text.split_once('=').ok_or("write it as BUS=ADDRESS, for example can0=socketcan:can1")?;
+    Ok((bus.into(), address.into()))
+}
+
+/// Runs a package; its exit code says how it ended.
+fn ran(args: &Run) -> ExitCode {
+    let wanted = run::Wanted {
+        package: args.package.as_deref(),
+        trusted: &args.trust.trusted,
+        dir: &args.store.dir,
+        sim: args.sim,
+        fast: args.fast,
+        check: args.check,
+        duration: args.duration,
+        buses: &args.bus,
+        log: args.log.as_deref(),
+    };
+    match run::run(&wanted) {
+        Ok(code) => ExitCode::from(code),
+        Err(why) => {
+            words::error(&why);
+            ExitCode::from(1)
+        }
+    }
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let done = match &args.command {
+        Command::Check(check) => packed::open(&check.package, &check.trust.trusted).map(|open| open.describe()),
+        Command::Run(run) => return ran(run),
+        Command::Start(store) => run::start(&store.dir),
+        Command::Say(say) => run::say(&say.store.dir, &say.what),
+        Command::Doctor => Ok(doctor::doctor()),
+        Command::Install(install) => packed::open(&install.package, &install.trust.trusted)
+            .and_then(|open| store::Store::at(&install.store.dir).install(&open)),
+        Command::Rollback(store) => store::Store::at(&store.dir).rollback(),
+        Command::Status(store) => store::Store::at(&store.dir).status(),
+        Command::Target => Ok(format!("{}\n", runtime::package::here())),
+    };
+    match done {
+        Ok(text) => {
+            words::print(&text);
+            ExitCode::SUCCESS
+        }
+        Err(why) => {
+            words::error(&why);
+            ExitCode::from(1)
+        }
+    }
+}

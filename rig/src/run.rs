@@ -1,0 +1,342 @@
+//! Runs a packed rig: against the drives on its buses, or against simulated ones.
+//!
+//! In: a package that has been verified. Out: recordings, and how it ended. Another package is taken over between two
+//! cycles, while no drive has torque, and never otherwise.
+
+use crate::packed::{self, Open};
+use crate::store::Store;
+use crate::words;
+use abi::encode::Encode;
+use abi::rig::Rig;
+use runtime::can::address::Address;
+use runtime::can::sim::Simulation;
+use runtime::can::{self, Bus};
+use runtime::clock::Clock;
+use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options};
+use runtime::hil::simulated::{MASTER, Pace, World};
+use runtime::hil::{emergency, words as told};
+use runtime::realtime::{self, Wishes};
+use runtime::record::log::{Sections, Settings, Sink};
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+/// Cycles whose loss a killed process may cost, as a time.
+const BLOCK_NS: u64 = 100_000_000;
+/// How often the state is told and the installed package looked at.
+const LOOK: Duration = Duration::from_millis(100);
+/// [`Gauges::stage`] from which on drives may have torque, and the one of torque off after a stop.
+const ENABLE: u64 = runtime::drive::Step::Enable as u64;
+const TORQUE_OFF: u64 = 103;
+
+/// What to run, and how.
+pub struct Wanted<'a> {
+    /// A package, or the current one of the store.
+    pub package: Option<&'a Path>,
+    /// Folder of the public keys that are trusted.
+    pub trusted: &'a Path,
+    /// Packages, logs, state.
+    pub dir: &'a Path,
+    /// Simulated buses, drives and devices.
+    pub sim: bool,
+    /// As fast as it computes, where it is simulated.
+    pub fast: bool,
+    /// The checks of the start-up only.
+    pub check: bool,
+    /// Time the model runs, s.
+    pub duration: Option<f64>,
+    /// `can0=ADDRESS`.
+    pub buses: &'a [(String, String)],
+    /// The recording.
+    pub log: Option<&'a Path>,
+}
+
+/// How it ended.
+pub enum Ended {
+    /// As asked.
+    Asked,
+    /// By safety or a condition: why.
+    Stopped(String),
+    /// Another package has been installed and may be taken over now.
+    Replaced,
+}
+
+/// Runs until it ends; gives the exit code.
+pub fn run(wanted: &Wanted) -> Result<u8, String> {
+    let store = Store::at(wanted.dir);
+    emergency::guard();
+    loop {
+        let path = wanted.package.map_or_else(|| store.current(), Path::to_path_buf);
+        let open = packed::open(&path, wanted.trusted)?;
+        let ended = match once(wanted, &open, &store) {
+            Ok(ended) => ended,
+            // What runs instead is what ran before it.
+            Err(why) if wanted.package.is_none() && store.took_over() => {
+                words::error(&format!("the new package does not start: {why}"));
+                words::error(&store.rollback()?);
+                continue;
+            }
+            Err(why) => return Err(why),
+        };
+        match ended {
+            Ended::Asked => return Ok(0),
+            Ended::Stopped(why) => {
+                words::error(&format!("stopped: {why}"));
+                return Ok(3);
+            }
+            Ended::Replaced => words::print("another package is installed: taking it over\n"),
+        }
+    }
+}
+
+fn once(wanted: &Wanted, open: &Open, store: &Store) -> Result<Ended, String> {
+    let mut rig = open.rig()?;
+    for (bus, address) in wanted.buses {
+        let Some(known) = rig.buses.iter_mut().find(|known| known.name == *bus) else {
+            let names: Vec<&str> = rig.buses.iter().map(|bus| bus.name.as_str()).collect();
+            return Err(format!("rig `{}` has no bus `{bus}`; it has {}", rig.name, names.join(", ")));
+        };
+        known.address.clone_from(address);
+    }
+    let control = open.program("control")?;
+    let log = log(wanted, open, &rig)?;
+    let path = match &log.0.sink {
+        Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
+    };
+    let simulated = wanted.sim || rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
+    let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
+    options.start.simulated = simulated;
+    options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
+    let fast = simulated && wanted.fast;
+    let world;
+    let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {
+        let pace = if fast { Pace::Fast } else { Pace::Wall };
+        let mut made = World::new(&rig, Some(open.program("plant")?), pace, 1)?;
+        let both = (made.clock(), made.masters());
+        world = Some(made);
+        both
+    } else {
+        world = None;
+        let time = Simulation::real_time();
+        let buses = buses(&rig, &time)?;
+        (Box::new(time), buses)
+    };
+    let real_time = (!fast)
+        .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
+    let refused: Vec<String> = real_time.iter().flat_map(|it| it.refused()).map(|it| format!("{it:?}")).collect();
+    if !simulated && !refused.is_empty() {
+        options.only_simulated = Some("this computer gives no real time: `fric-rig doctor` says why".into());
+    }
+    let (mut hil, operator) = Hil::new(&rig, control, clock, buses, options, Some(log))?;
+    if !fast {
+        let watchdog = emergency::Watchdog::new(Duration::from_nanos(rig.watchdog_ns), emergency::send);
+        hil.watched_by(watchdog.map_err(|error| format!("no watchdog: {error}"))?);
+        hil.prepare_emergency();
+    }
+    words::print(&format!(
+        "{}: {} Hz, {}\n",
+        rig.name,
+        1e9 / rig.period_ns as f64,
+        if simulated { "simulated drives" } else { "drives on their buses" }
+    ));
+    let attendant = (!fast).then(|| Attendant::new(wanted, store, hil.gauges(), operator));
+    let end = hil.run();
+    let replaced = attendant.as_ref().is_some_and(|it| it.replaced.load(Ordering::Relaxed));
+    drop(attendant);
+    drop(real_time);
+    drop(world);
+    let counts = told::counts(hil.counts());
+    let written = hil.finish();
+    words::print(&counts.lines().map(|line| format!("  {line}\n")).collect::<String>());
+    match written {
+        Ok(Some(_)) if path.exists() => words::print(&format!("  wrote {}\n", path.display())),
+        Ok(_) => {}
+        Err(error) => return Err(format!("the log {} is not whole: {error}", path.display())),
+    }
+    match end {
+        End::Asked if replaced => Ok(Ended::Replaced),
+        End::Asked => Ok(Ended::Asked),
+        End::Refused(why) => Err(format!("refused: {why}")),
+        End::Stopped(_, why) => Ok(Ended::Stopped(why)),
+    }
+}
+
+/// The buses of this computer.
+fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> {
+    let open = |bus: &abi::rig::Bus| {
+        let options = can::Options { bit_rate: Some(bus.bit_rate).filter(|rate| *rate > 0), ..can::Options::default() };
+        let address = bus.address.parse::<Address>().map_err(|why| why.to_string());
+        address
+            .and_then(|address| can::open(&address, &options, time, MASTER).map_err(|why| why.to_string()))
+            .map_err(|why| format!("bus `{}`: {why}; --bus {}=ADDRESS puts another under it", bus.name, bus.name))
+    };
+    rig.buses.iter().map(open).collect()
+}
+
+/// Where the recording goes, and its head: all that a replay needs.
+fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), String> {
+    let head = open.package.section("head").map_err(|why| why.to_string())?;
+    let mut head = Sections(Vec::from_bytes(head).map_err(|why| format!("the head of its logs: {why}"))?);
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let repeatable = wanted.fast && wanted.sim;
+    let started =
+        if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) };
+    head = head.with("started", started).with("package", runtime::package::hash(&open.bytes));
+    let path = match wanted.log {
+        Some(path) => path.to_path_buf(),
+        None => wanted.dir.join("log").join(format!("{}-{}.friclog", rig.name, now.as_millis())),
+    };
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        fs::create_dir_all(folder).map_err(|error| format!("cannot write {}: {error}", folder.display()))?;
+    }
+    let cycles_per_block = u32::try_from((BLOCK_NS / rig.period_ns).max(1)).unwrap_or(u32::MAX);
+    let settings = Settings { sink: Sink::File(path), cycles_per_block, patient: repeatable };
+    Ok((settings, head))
+}
+
+/// Threads beside the cycle: they tell the state, take commands, and see that another package has been installed.
+struct Attendant {
+    over: Arc<AtomicBool>,
+    replaced: Arc<AtomicBool>,
+    threads: Vec<std::thread::JoinHandle<()>>,
+    dir: PathBuf,
+}
+
+impl Attendant {
+    fn new(wanted: &Wanted, store: &Store, gauges: Arc<Gauges>, operator: Operator) -> Attendant {
+        let (over, replaced) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+        let operator = Arc::new(Mutex::new(operator));
+        let dir = wanted.dir.to_path_buf();
+        let mut threads = Vec::new();
+        {
+            let (over, replaced, dir, operator) = (over.clone(), replaced.clone(), dir.clone(), operator.clone());
+            let installed = wanted.package.is_none().then(|| (store.clone(), store.current_target()));
+            threads.push(std::thread::spawn(move || {
+                while !over.load(Ordering::Relaxed) {
+                    tell(&dir, &gauges);
+                    let stage = gauges.stage.load(Ordering::Relaxed);
+                    let idle = stage < ENABLE || stage == TORQUE_OFF;
+                    let other = installed.as_ref().is_some_and(|(store, ran)| store.current_target() != *ran);
+                    if other && idle && !replaced.swap(true, Ordering::Relaxed) {
+                        // It ends with the cycle that takes the command: no drive has torque then.
+                        let _ = operator.lock().map(|mut operator| operator.push(Command::Stop));
+                    }
+                    std::thread::sleep(LOOK);
+                }
+            }));
+        }
+        let socket = socket(&dir);
+        let _ = fs::remove_file(&socket);
+        if let Ok(listener) = UnixListener::bind(&socket) {
+            let over = over.clone();
+            threads.push(std::thread::spawn(move || {
+                for stream in listener.incoming().flatten() {
+                    if over.load(Ordering::Relaxed) {
+                        break;
+                    }
+                    answer(stream, &operator);
+                }
+            }));
+        }
+        Attendant { over, replaced, threads, dir }
+    }
+}
+
+impl Drop for Attendant {
+    fn drop(&mut self) {
+        self.over.store(true, Ordering::Relaxed);
+        // Wakes the one that waits for somebody to call.
+        let _ = UnixStream::connect(socket(&self.dir));
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+        let _ = fs::remove_file(socket(&self.dir));
+        let _ = fs::remove_file(self.dir.join("state"));
+    }
+}
+
+fn socket(dir: &Path) -> PathBuf {
+    dir.join("control")
+}
+
+/// Writes the state where `status` reads it.
+fn tell(dir: &Path, gauges: &Gauges) {
+    let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
+    let text = format!(
+        "{}, {} cycles, late {} us at most, {} missed\n",
+        told::stage(number(&gauges.stage)),
+        number(&gauges.cycles),
+        number(&gauges.late_ns_max) / 1000,
+        number(&gauges.missed),
+    );
+    let fresh = dir.join(".state");
+    // A disk that is full is no reason to disturb the cycle.
+    let _ = fs::write(&fresh, text).and_then(|()| fs::rename(&fresh, dir.join("state")));
+}
+
+/// Takes one command of the operator.
+fn answer(stream: UnixStream, operator: &Mutex<Operator>) {
+    let mut line = String::new();
+    let _ = stream.set_read_timeout(Some(Duration::from_secs(1)));
+    if BufReader::new(&stream).read_line(&mut line).is_err() {
+        return;
+    }
+    let command = match line.trim() {
+        "enable" => Command::Enable,
+        "arm" => Command::Arm,
+        "stop" => Command::Stop,
+        "reset" => Command::Reset,
+        _ => return,
+    };
+    let taken = operator.lock().map(|mut operator| operator.push(command)).unwrap_or(false);
+    let _ = (&stream).write_all(if taken { b"ok\n" } else { b"too much at once\n" });
+}
+
+/// Says something to the rig that runs.
+pub fn say(dir: &Path, what: &str) -> Result<String, String> {
+    let about = |error: std::io::Error| format!("no rig runs in {}: {error}", dir.display());
+    let mut stream = UnixStream::connect(socket(dir)).map_err(about)?;
+    stream.write_all(format!("{what}\n").as_bytes()).map_err(about)?;
+    let mut line = String::new();
+    BufReader::new(&stream).read_line(&mut line).map_err(about)?;
+    match line.trim() {
+        "ok" => Ok(format!("{what}\n")),
+        "" => Err("it did not answer".into()),
+        why => Err(why.into()),
+    }
+}
+
+/// How long a rig that was just started is looked at.
+const FIRST: Duration = Duration::from_secs(1);
+
+/// Starts the current package in a process of its own, which outlives this one.
+///
+/// # Errors
+/// What the rig said if it ended within its first second.
+pub fn start(dir: &Path) -> Result<String, String> {
+    if UnixStream::connect(socket(dir)).is_ok() {
+        return Ok("a rig runs already: it takes the package over as soon as no drive has torque\n".into());
+    }
+    let out = dir.join("log").join("rig.out");
+    let about = |error: std::io::Error| format!("cannot start a rig in {}: {error}", dir.display());
+    let file = fs::File::create(&out).map_err(about)?;
+    let program = std::env::current_exe().map_err(about)?;
+    let mut command = std::process::Command::new(program);
+    command.arg("run").arg("--dir").arg(dir).stdin(std::process::Stdio::null());
+    command.stdout(file.try_clone().map_err(about)?).stderr(file);
+    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    let mut child = command.spawn().map_err(about)?;
+    let begun = std::time::Instant::now();
+    while begun.elapsed() < FIRST {
+        if let Some(status) = child.try_wait().map_err(about)? {
+            let said = fs::read_to_string(&out).unwrap_or_default();
+            return Err(format!("it ended at once ({status}): {}", said.trim().lines().last().unwrap_or_default()));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(format!("started, process {}\n", child.id()))
+}

@@ -1,0 +1,188 @@
+//! Installed packages: one is current, the one before it is kept, and changing them is one step that happens or not.
+//!
+//! ```text
+//! DIR/packages/HASH.fricpkg    every package under its hash, with its signature
+//! DIR/current -> packages/…    what runs when the rig is started next
+//! DIR/previous -> packages/…   what `rollback` goes back to
+//! DIR/log/                     recordings
+//! ```
+//! A package is written under another name, flushed to the disk and renamed; a link is made under another name and
+//! renamed over the old one. So after a power cut there is the old state or the new one.
+
+use crate::packed::Open;
+use runtime::package::hash;
+use runtime::package::signature::EXTENSION as SIGNATURE;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+
+/// Where packages lie unless something else is asked for.
+pub const DEFAULT: &str = "/var/lib/fric";
+
+/// A folder of packages.
+#[derive(Clone)]
+pub struct Store {
+    dir: PathBuf,
+}
+
+impl Store {
+    /// At a folder, which need not exist yet.
+    pub fn at(dir: &Path) -> Store {
+        Store { dir: dir.to_path_buf() }
+    }
+
+    /// Makes a verified package the current one.
+    ///
+    /// # Errors
+    /// Why not; what was current then still is.
+    pub fn install(&self, open: &Open) -> Result<String, String> {
+        let packages = self.dir.join("packages");
+        let about = |path: &Path, error: io::Error| format!("cannot write {}: {error}", path.display());
+        for folder in [&packages, &self.dir.join("log")] {
+            fs::create_dir_all(folder).map_err(|error| about(folder, error))?;
+        }
+        let name = format!("{}.{}", &hash(&open.bytes)[..32], runtime::package::EXTENSION);
+        let path = packages.join(&name);
+        whole(&path, &open.bytes).map_err(|error| about(&path, error))?;
+        let signature = packages.join(format!("{name}.{SIGNATURE}"));
+        match &open.signature {
+            Some(text) => whole(&signature, text.as_bytes()).map_err(|error| about(&signature, error))?,
+            // An older signature of the same bytes does no harm.
+            None => {}
+        }
+        let target = Path::new("packages").join(&name);
+        let before = fs::read_link(self.dir.join("current")).ok();
+        if before.as_deref() == Some(&target) {
+            return Ok(format!("{} is the current package already\n", open.package.rig));
+        }
+        if let Some(before) = &before {
+            self.link("previous", before)?;
+        }
+        self.link("current", &target)?;
+        Ok(format!("{} is the current package: {name}\n", open.package.rig))
+    }
+
+    /// Makes the package before the current one current again.
+    ///
+    /// # Errors
+    /// If there is none, or why it cannot be done.
+    pub fn rollback(&self) -> Result<String, String> {
+        let link = |name: &str| fs::read_link(self.dir.join(name)).ok();
+        let Some(previous) = link("previous") else {
+            return Err(format!("there is no package before the current one in {}", self.dir.display()));
+        };
+        if !self.dir.join(&previous).is_file() {
+            return Err(format!("{} is gone", previous.display()));
+        }
+        let current = link("current");
+        self.link("current", &previous)?;
+        if let Some(current) = current.filter(|current| *current != previous) {
+            self.link("previous", &current)?;
+        }
+        Ok(format!("back to {}\n", previous.display()))
+    }
+
+    /// The package that is current.
+    pub fn current(&self) -> PathBuf {
+        self.current_target().map_or_else(|| self.dir.join("current"), |target| self.dir.join(target))
+    }
+
+    /// Where the link of the current package points.
+    pub fn current_target(&self) -> Option<PathBuf> {
+        fs::read_link(self.dir.join("current")).ok()
+    }
+
+    /// Whether there is a package before the current one to go back to.
+    pub fn took_over(&self) -> bool {
+        fs::read_link(self.dir.join("previous")).is_ok_and(|before| Some(before) != self.current_target())
+    }
+
+    /// What is installed, and what runs.
+    ///
+    /// # Errors
+    /// If nothing is.
+    pub fn status(&self) -> Result<String, String> {
+        let mut words = String::new();
+        for name in ["current", "previous"] {
+            if let Ok(target) = fs::read_link(self.dir.join(name)) {
+                words += &format!("{name}: {}\n", target.display());
+            }
+        }
+        if let Ok(state) = fs::read_to_string(self.dir.join("state")) {
+            words += &format!("runs: {state}");
+        }
+        if words.is_empty() { Err(format!("nothing is installed in {}", self.dir.display())) } else { Ok(words) }
+    }
+
+    /// Points a link at a package, at once.
+    fn link(&self, name: &str, target: &Path) -> Result<(), String> {
+        let (link, fresh) = (self.dir.join(name), self.dir.join(format!(".{name}.{}", std::process::id())));
+        let done = fs::remove_file(&fresh)
+            .or_else(|error| if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) })
+            .and_then(|()| symlink(target, &fresh))
+            .and_then(|()| fs::rename(&fresh, &link))
+            .and_then(|()| File::open(&self.dir)?.sync_all());
+        done.map_err(|error| format!("cannot set {}: {error}", link.display()))
+    }
+}
+
+/// Writes a file whole or not at all, and onto the disk before it has its name.
+fn whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let fresh = path.with_file_name(format!(".{name}.{}", std::process::id()));
+    let mut file = File::create(&fresh)?;
+    let written = file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&fresh, path));
+    if written.is_err() {
+        let _ = fs::remove_file(&fresh);
+    }
+    written
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use runtime::package::Package;
+
+    fn packed(rig: &str) -> Open {
+        let package = Package { rig: rig.into(), ..Package::default() };
+        Open { bytes: package.to_bytes(), signature: None, package, signer: None }
+    }
+
+    fn current(dir: &Path) -> Package {
+        Package::read(&fs::read(dir.join("current")).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn the_package_before_is_kept_and_comes_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::at(dir.path());
+        assert!(store.status().unwrap_err().starts_with("nothing is installed in "));
+        assert!(store.rollback().unwrap_err().starts_with("there is no package before"));
+        store.install(&packed("one")).unwrap();
+        assert_eq!(current(dir.path()).rig, "one");
+        assert!(store.rollback().is_err(), "there was none before the first");
+        store.install(&packed("two")).unwrap();
+        assert_eq!(current(dir.path()).rig, "two");
+        assert!(store.install(&packed("two")).unwrap().ends_with("already\n"));
+        store.rollback().unwrap();
+        assert_eq!(current(dir.path()).rig, "one");
+        store.rollback().unwrap();
+        assert_eq!(current(dir.path()).rig, "two", "there and back");
+        assert_eq!(store.status().unwrap().lines().count(), 2);
+    }
+
+    #[test]
+    fn what_was_interrupted_leaves_what_was_current() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::at(dir.path());
+        store.install(&packed("one")).unwrap();
+        // Half a copy, and a link that was not renamed any more.
+        let half = packed("two").bytes;
+        fs::write(dir.path().join("packages/.half.fricpkg.1"), &half[..half.len() / 2]).unwrap();
+        symlink("packages/.half.fricpkg.1", dir.path().join(format!(".current.{}", std::process::id()))).unwrap();
+        assert_eq!(current(dir.path()).rig, "one");
+        store.install(&packed("three")).unwrap();
+        assert_eq!(current(dir.path()).rig, "three");
+    }
+}

@@ -1,0 +1,110 @@
+//! `fric inspect`: everything in a package, verified.
+
+use super::End;
+use crate::args::Inspect;
+use crate::project;
+use crate::terminal::{Style, Terminal};
+use crate::value::count;
+use abi::image::Image;
+use abi::{Description, Function};
+use runtime::package::signature::{Trusted, beside};
+use runtime::package::{MOST_BYTES, Package, hash};
+use std::fs;
+
+pub fn inspect(args: &Inspect, terminal: &mut Terminal) -> End {
+    match words(args, terminal) {
+        Ok(text) => {
+            terminal.print(&text);
+            End::Fine
+        }
+        Err(why) => {
+            terminal.error(&why);
+            End::Failed
+        }
+    }
+}
+
+fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
+    let path = &args.package;
+    let about = |why: &dyn std::fmt::Display| format!("{}: {why}", path.display());
+    if fs::metadata(path).map_err(|error| about(&error))?.len() > MOST_BYTES {
+        return Err(about(&"it is larger than any package"));
+    }
+    let bytes = fs::read(path).map_err(|error| about(&error))?;
+    let package = Package::read(&bytes).map_err(|why| about(&why))?;
+    let signature = fs::read_to_string(beside(path)).ok();
+    let signed = match &args.trusted {
+        Some(folder) => {
+            let keys = Trusted::in_folder(folder)?;
+            match keys.signer(&bytes, signature.as_deref()).map_err(|why| about(&why))? {
+                Some(name) => format!("signed by {name}"),
+                None => return Err(format!("{} has no public key", folder.display())),
+            }
+        }
+        None if signature.is_some() => "signed; --trusted DIR says by whom".into(),
+        None => "not signed".into(),
+    };
+    let Package { fric, target, rig, sections } = &package;
+    let mut out = format!(
+        "{}\n  whole: {} bytes, SHA-256 {}\n  for {target}, made by fric {fric}; {signed}\n\n",
+        terminal.styled(Style::Bold, rig),
+        count(bytes.len() as u64),
+        hash(&bytes)
+    );
+    let width = sections.iter().map(|section| section.name.chars().count()).max().unwrap_or(0);
+    for section in sections {
+        let size = count(section.bytes.len() as u64);
+        out += &format!("  {:width$}  {size:>9} bytes  {}\n", section.name, &hash(&section.bytes)[..16]);
+    }
+    for name in ["control", "plant"] {
+        let Ok(bytes) = package.section(name) else { continue };
+        let image = Image::read(bytes).map_err(|why| about(&format!("its program `{name}`: {why}")))?;
+        out += &format!("\n  {name}: {}\n", program(&image));
+    }
+    if args.sources {
+        for section in sections {
+            if let Some(name) = section.name.strip_prefix("source/") {
+                out += &format!("\n--- {name}\n{}", String::from_utf8_lossy(&section.bytes));
+            }
+        }
+    }
+    if let Some(folder) = &args.extract {
+        for section in sections {
+            let path = folder.join(safe(&section.name));
+            project::write(&path, &section.bytes)
+                .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        }
+        out += &format!("\n  wrote {} files to {}\n", sections.len(), folder.display());
+    }
+    Ok(out)
+}
+
+/// A program in a line.
+fn program(image: &Image) -> String {
+    let Description { name, layout, .. } = &image.description;
+    let functions: Vec<&str> = Function::ALL
+        .into_iter()
+        .zip(&image.entries)
+        .filter(|(_, entry)| entry.is_some())
+        .map(|(function, _)| function.name())
+        .collect();
+    format!(
+        "{name}, {} states, {} parameters; {} bytes of code for {}: {}",
+        layout.states.len,
+        layout.params.len,
+        count(image.code.len() as u64),
+        image.target.name(),
+        functions.join(", ")
+    )
+}
+
+/// The name of a section as one inside a folder, whatever it says.
+fn safe(name: &str) -> std::path::PathBuf {
+    name.split('/').filter(|part| !matches!(*part, "" | "." | "..")).collect()
+}
+
+#[test]
+fn no_section_leaves_its_folder() {
+    assert_eq!(safe("source/../../etc/passwd"), std::path::Path::new("source/etc/passwd"));
+    assert_eq!(safe("/control"), std::path::Path::new("control"));
+}

@@ -1,0 +1,117 @@
+//! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
+
+use super::{End, load_from};
+use crate::args::Build;
+use crate::compile::{self, Stopwatch};
+use crate::kept::Keeping;
+use crate::terminal::Terminal;
+use crate::{project, report, sign};
+use abi::encode::Encode;
+use grammar::ast::Item;
+use runtime::package::signature::beside;
+use runtime::package::{Package, here};
+use runtime::record::log::Sections;
+use std::path::Path;
+
+/// `fric build RIG.fric -o NAME.fricpkg`
+pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
+    let target = args.target.map_or_else(here, |target| format!("{}-linux", target.name()));
+    let out = args.out.as_deref().expect("a package has a name");
+    let key = args.sign.as_deref();
+    let (bytes, signature) = match packed(&args.file, args.name.as_deref(), &target, key, terminal) {
+        Ok(packed) => packed,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    let beside = beside(out);
+    let written = match &signature {
+        Some(text) => project::write(&beside, text.as_bytes()),
+        // A signature of what was there before would be a wrong one.
+        None if beside.exists() => std::fs::remove_file(&beside),
+        None => Ok(()),
+    };
+    if let Err(error) = written.and_then(|()| project::write(out, &bytes)) {
+        terminal.error(&format!("cannot write {}: {error}", out.display()));
+        return End::Failed;
+    }
+    let signed =
+        if signature.is_some() { format!(", signed beside it in {}", beside.display()) } else { String::new() };
+    let size = crate::value::count(bytes.len() as u64);
+    terminal.report(&format!("wrote {}, {size} bytes, for {target}{signed}\n", out.display()));
+    End::Fine
+}
+
+/// The bytes of a package and its signature.
+///
+/// # Errors
+/// Why there is none; diagnostics are reported, and an empty text is left.
+pub(super) fn packed(
+    file: &Path,
+    name: Option<&str>,
+    target: &str,
+    key: Option<&Path>,
+    terminal: &mut Terminal,
+) -> Result<(Vec<u8>, Option<String>), String> {
+    let reported = || "the rig was not built".to_string();
+    let keeping = Keeping::new(&project::Disk);
+    let mut loaded = load_from(file, &keeping, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
+    let items = &loaded.files.get(loaded.root()).ast.items;
+    let rigs: Vec<String> = items
+        .iter()
+        .filter_map(|item| match item {
+            Item::Rig(rig) => Some(rig.name.text.clone()),
+            _ => None,
+        })
+        .collect();
+    let name = match (name, &rigs[..]) {
+        (_, []) => return Err(format!("{} has no rig", file.display())),
+        (Some(name), all) if all.iter().any(|rig| rig == name) => name.to_string(),
+        (None, [only]) => only.clone(),
+        (Some(name), all) => {
+            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => format!("it has {}", all.join(", ")),
+            };
+            return Err(format!("{} has no rig `{name}`; {help}", file.display()));
+        }
+        (None, all) => return Err(format!("which rig of {}? It has {}", file.display(), all.join(", "))),
+    };
+    let mut found = Vec::new();
+    let built = compile::packed_rig(&mut loaded, &keeping, &name, target, &mut found);
+    if !found.is_empty() {
+        terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
+    }
+    let built = built.map_err(|why| why.unwrap_or_else(reported))?;
+    let mut package =
+        Package { fric: env!("CARGO_PKG_VERSION").into(), target: target.into(), rig: name, sections: Vec::new() };
+    package.add("rig", built.rig);
+    package.add("control", built.control);
+    package.add("plant", built.plant);
+    // The head of every log of it, so that a recording can be computed again wherever it is brought.
+    let root = loaded.files.get(loaded.root());
+    let head = Sections::default()
+        .with("fric", package.fric.as_str())
+        .with("target", target)
+        .with("rig", package.rig.as_str())
+        .with("file", root.name.as_str())
+        .with("source", root.text.as_bytes())
+        .with("set", "");
+    package.add("head", keeping.into(head).0.to_bytes());
+    for source in loaded.files.0.iter().filter(|source| !source.name.starts_with("--")) {
+        let name = format!("source/{}", tidy(&source.name));
+        if package.section(&name).is_err() {
+            package.add(&name, source.text.as_bytes().to_vec());
+        }
+    }
+    let bytes = package.to_bytes();
+    let comment = format!("rig {}, {target}, fric {}", package.rig, package.fric);
+    let signature = key.map(|key| sign::sign(key, &bytes, &comment)).transpose()?;
+    Ok((bytes, signature))
+}
+
+/// The name of a text without what depends on where it lay: the same rig packs to the same bytes anywhere.
+fn tidy(name: &str) -> String {
+    Path::new(name).file_name().map_or_else(|| name.to_string(), |name| name.to_string_lossy().into_owned())
+}

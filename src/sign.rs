@@ -1,0 +1,86 @@
+//! Keys and signatures in the format of minisign. The only file that knows `minisign`.
+//!
+//! In: files of keys, bytes. Out: a pair of keys as texts, a signature as text. A signature depends on the bytes and the
+//! key alone, so that a package that is built twice is signed alike.
+
+use minisign::{KeyPair, PublicKey, SecretKey, SecretKeyBox};
+use std::path::Path;
+
+/// A new pair: the secret key without a password, as `minisign -G -W` makes it, and the public key.
+///
+/// # Errors
+/// Why there is none.
+pub fn new_pair() -> Result<(String, String), String> {
+    let KeyPair { pk, sk } = KeyPair::generate_unencrypted_keypair().map_err(|error| error.to_string())?;
+    let secret = sk.to_box(Some("fric secret key")).map_err(|error| error.to_string())?;
+    let public = pk.to_box().map_err(|error| error.to_string())?;
+    Ok((secret.into_string(), public.into_string()))
+}
+
+/// Signs bytes with the secret key in a file. A key with a password asks for it on the terminal.
+///
+/// # Errors
+/// Why not, in words.
+pub fn sign(key: &Path, bytes: &[u8], comment: &str) -> Result<String, String> {
+    let text = std::fs::read_to_string(key).map_err(|error| format!("cannot read {}: {error}", key.display()))?;
+    let about = |error: minisign::PError| format!("{} is no secret key of minisign: {error}", key.display());
+    let boxed = || SecretKeyBox::from_string(&text).map_err(about);
+    let secret = match SecretKey::from_unencrypted_box(boxed()?) {
+        Ok(secret) => secret,
+        Err(_) => SecretKey::from_box(boxed()?, None).map_err(about)?,
+    };
+    let public = PublicKey::from_secret_key(&secret).map_err(about)?;
+    let signature = minisign::sign(Some(&public), &secret, bytes, Some(comment), Some("signature of a fric package"));
+    Ok(signature.map_err(about)?.into_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use runtime::package::signature::Trusted;
+
+    #[test]
+    fn a_signature_is_that_of_its_bytes_and_key_and_of_no_others() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("target").join("tmp").join("sign");
+        let _ = std::fs::remove_dir_all(&folder);
+        let trusted = folder.join("trusted");
+        std::fs::create_dir_all(&trusted).unwrap();
+        let (secret, public) = new_pair().unwrap();
+        let (key, bytes) = (folder.join("a.key"), b"a package".as_slice());
+        std::fs::write(&key, secret).unwrap();
+        let signed = sign(&key, bytes, "rig rtfs").unwrap();
+        assert_eq!(signed, sign(&key, bytes, "rig rtfs").unwrap(), "signing twice gives the same");
+
+        let none = Trusted::in_folder(&folder.join("nothing")).unwrap();
+        assert_eq!(none.signer(bytes, None), Ok(None));
+        std::fs::write(trusted.join("anna.pub"), &public).unwrap();
+        let keys = Trusted::in_folder(&trusted).unwrap();
+        assert_eq!(keys.signer(bytes, Some(&signed)), Ok(Some("anna")));
+        let why = keys.signer(bytes, None).unwrap_err().to_string();
+        assert!(why.starts_with("it is not signed, and this computer trusts anna only"), "{why}");
+        for at in 0..bytes.len() {
+            let mut changed = bytes.to_vec();
+            changed[at] ^= 1;
+            assert!(keys.signer(&changed, Some(&signed)).is_err(), "byte {at}");
+        }
+        // Any flipped bit of what the signature consists of; the first line is a comment that nothing depends on.
+        let begin = signed.find('\n').unwrap() + 1;
+        for at in begin..signed.len() {
+            let mut changed = signed.clone().into_bytes();
+            changed[at] ^= 1;
+            let Ok(changed) = String::from_utf8(changed) else { continue };
+            if changed.lines().eq(signed.lines()) {
+                continue; // a line end in another form
+            }
+            assert!(keys.signer(bytes, Some(&changed)).is_err(), "byte {at}: {changed}");
+        }
+        let (_, other) = new_pair().unwrap();
+        std::fs::write(trusted.join("anna.pub"), other).unwrap();
+        let keys = Trusted::in_folder(&trusted).unwrap();
+        let why = keys.signer(bytes, Some(&signed)).unwrap_err().to_string();
+        assert_eq!(why, "its signature is not that of anna, whom this computer trusts");
+        std::fs::write(trusted.join("anna.pub"), "nonsense").unwrap();
+        assert!(Trusted::in_folder(&trusted).is_err(), "a key that protects is not passed over");
+        assert!(sign(&trusted.join("anna.pub"), bytes, "").unwrap_err().contains("is no secret key of minisign"));
+    }
+}
