@@ -342,6 +342,9 @@ pub struct Hil {
     /// Do the checks of the start-up and stop before arming
     #[arg(long)]
     pub check: bool,
+    /// Measure delay, lag and inertia by torque pulses instead of running the model; prints text to paste
+    #[arg(long, conflicts_with = "check")]
+    pub identify: bool,
     /// Enable and arm without being told: simulated drives only
     #[arg(long)]
     pub arm: bool,

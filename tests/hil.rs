@@ -1,5 +1,7 @@
 //! Rigs under way: the example against simulated drives, its log, its replay, kills, and what a cycle must not do.
 
+#![allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions")]
+
 mod support;
 
 use abi::rig::{Kind, Rig, Signal, What};
@@ -9,6 +11,7 @@ use runtime::hil::simulated::{Pace, World};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
@@ -43,13 +46,18 @@ fn asked() -> u64 {
 
 /// The example, changed by settings such as `fr = rotary Karnopp()`.
 fn ready(set: &[&str]) -> Ready {
+    rig_of("rtfs.fric", "rtfs", set)
+}
+
+/// A rig of a text beside the example.
+fn rig_of(file: &str, rig: &str, set: &[&str]) -> Ready {
     let folder = root().join("examples/rtfs");
     let read = |name: &str| fs::read_to_string(folder.join(name)).unwrap();
     let sources = Texts(vec![("shaft.dbc".into(), read("shaft.dbc"))]);
-    let mut loaded = compiler::load("rtfs.fric", &read("rtfs.fric"), &sources);
+    let mut loaded = compiler::load(file, &read(file), &sources);
     let changes = Changes { set: set.iter().map(|one| (*one).to_string()).collect(), ..Changes::default() };
     let options = Options { changes, ..Options::default() };
-    let made = compiler::rig(&mut loaded, &sources, "rtfs", &options, &mut Vec::new());
+    let made = compiler::rig(&mut loaded, &sources, rig, &options, &mut Vec::new());
     made.unwrap_or_else(|errors| panic!("{errors:?}"))
 }
 
@@ -98,6 +106,70 @@ fn another_model_is_put_on_the_shaft() {
         assert_eq!(end, End::Asked, "{model}");
         assert!(x.iter().any(|x| *x > 0.8), "{model}: it moved");
     }
+}
+
+/// One row a cycle of what a rig records, and of its readings, while the model runs.
+fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
+    let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
+    let mut options =
+        HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
+    options.start.sign_test = runtime::drive::sign::SignTest::Skip;
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&ready.rig, ready.control, world.clock(), masters, options, None).unwrap();
+    let mut rows = Vec::new();
+    loop {
+        hil.cycle();
+        if hil.counts().cycles as usize > rows.len() {
+            let model = hil.control().unwrap().model();
+            let series = ready.rig.record.iter().map(|series| model.get(series.slot)).collect();
+            let read = signals.iter().map(|signal| hil.fieldbus().reading(*signal).value).collect();
+            rows.push((series, read));
+        }
+        if let Some(end) = hil.ended() {
+            assert_eq!(*end, End::Asked);
+            return rows;
+        }
+    }
+}
+
+/// F(v) as the load drive gives it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow turning.
+#[test]
+fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
+    let torque = Signal { node: 0, what: What::Torque };
+    let speed = Signal { node: 0, what: What::Speed };
+    let rows = recorded(rig_of("characteristics.fric", "characteristic", &[]), 40.0, &[speed, torque]);
+    assert_eq!(rows.len(), 40_000);
+    let (mut worst, mut compared) = (0f64, 0);
+    for (_, read) in &rows[10_000..] {
+        let (v, friction) = (read[0], -read[1]);
+        // Behind a turning point the bristles go from one side to the other within 2 z = 3 mrad: at 0.157 rad/s² that is
+        // over, several times, when 0.05 rad/s is reached.
+        if v.abs() < 0.05 {
+            continue;
+        }
+        let g = 0.28 + (0.42 - 0.28) * (-(v / 0.01f64).powi(2)).exp();
+        let own = g * v.signum() + 0.018 * v;
+        worst = worst.max((friction - own).abs() / own.abs());
+        compared += 1;
+    }
+    assert!(compared > 20_000, "{compared}");
+    assert!(worst < 0.02, "measured and own friction differ by up to {} %", 100.0 * worst);
+    // T_friction against T_ref: what the drive says it applies is what it was told, but for its step of 4 mN·m and its lag.
+    let apart = rows[10_000..].iter().map(|(series, read)| (series[1] + read[1]).powi(2)).sum::<f64>();
+    let rms = (apart / 30_000.0).sqrt();
+    assert!(rms < 0.02, "{rms} N·m between asked and applied");
+}
+
+#[test]
+fn an_observer_of_the_friction_makes_the_servo_follow() {
+    let rms = |share: &str| {
+        let rows = recorded(rig_of("characteristics.fric", "tracking", &[share]), 15.0, &[]);
+        let squares: f64 = rows[5_000..].iter().map(|(series, _)| series[0].powi(2)).sum();
+        (squares / 10_000.0).sqrt()
+    };
+    let (with, without) = (rms("share = 1"), rms("share = 0"));
+    assert!(without > 0.05, "{without} rad without it");
+    assert!(with < without / 50.0, "{with} rad with it, {without} without");
 }
 
 #[test]
@@ -182,6 +254,21 @@ fn what_stops_a_rig_is_told_and_is_exit_code_3() {
 }
 
 #[test]
+fn what_the_drives_are_like_is_measured() {
+    let folder = folder("hil-identify");
+    let said = run(&folder, &["hil", "--sim", "--fast", "--identify", &example()], 0);
+    let line = said.lines().find(|line| line.contains("drive load")).unwrap_or_else(|| panic!("{said}"));
+    let number = |after: &str| -> f64 {
+        let rest = &line[line.find(after).unwrap() + after.len()..];
+        rest.trim_start().split(' ').next().unwrap().parse().unwrap()
+    };
+    // 0.8 and 0.6 ms in the text of the rig; a command is some 0.1 ms on the bus.
+    assert!((0.6..1.1).contains(&number("delay =")), "{line}");
+    assert!((0.5..0.7).contains(&number("lag =")), "{line}");
+    assert!((0.011..0.013).contains(&number("inertia")), "{line}");
+}
+
+#[test]
 fn wrong_usage_is_told() {
     let folder = folder("hil-usage");
     let example = example();
@@ -199,22 +286,66 @@ fn wrong_usage_is_told() {
     assert!(said.contains("not a log of fric"), "{said}");
 }
 
+/// A run at the pace of the wall that counts what this machine misses, once its log is there.
+fn under_way(folder: &Path, log: &str) -> std::process::Child {
+    let example = example();
+    let args = ["hil", "--sim", "--count-overruns", "--log", log, &example];
+    let mut command = fric(folder, &args);
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    while !folder.join(log).exists() {
+        std::thread::sleep(Duration::from_millis(20));
+        assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
+    }
+    child
+}
+
+#[test]
+fn control_c_is_a_controlled_stop() {
+    let folder = folder("hil-interrupt");
+    for signal in ["-INT", "-TERM"] {
+        let mut child = under_way(&folder, "log");
+        std::thread::sleep(Duration::from_millis(1500));
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        assert_eq!(child.wait().unwrap().code(), Some(0), "{signal}");
+        let said = run(&folder, &["replay", "log"], 0);
+        assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
+        fs::remove_file(folder.join("log")).unwrap();
+    }
+}
+
+#[test]
+fn parameters_change_while_it_runs_and_the_log_knows() {
+    let folder = folder("hil-set");
+    let mut child = under_way(&folder, "log");
+    let mut say = |line: &str| {
+        std::thread::sleep(Duration::from_millis(700));
+        writeln!(child.stdin.as_mut().unwrap(), "{line}").unwrap();
+    };
+    say("");
+    say("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
+    say("set fr.Fs = -1 N·m");
+    say("set fr.Fz = 1 N·m");
+    say("set fr.Fs = 1 s");
+    say("stop");
+    let output = child.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    for words in ["must lie in", "no parameter `fr.Fz`; did you mean `fr.F", "`fr.Fs` is a"] {
+        assert!(said.contains(words), "no `{words}` in {said}");
+    }
+    let said = run(&folder, &["replay", "log"], 0);
+    assert!(said.contains("agree to the bit"), "{said}");
+}
+
 /// `FRIC_KILLS` says how often; 200 is the full measure.
 #[test]
 fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
     let folder = folder("hil-kill");
-    let example = example();
     let kills = std::env::var("FRIC_KILLS").ok().and_then(|text| text.parse().ok()).unwrap_or(4);
     for kill in 0..kills {
         let log = format!("killed-{kill}");
-        let args = ["hil", "--sim", "--count-overruns", "--log", &log, &example];
-        let mut child = fric(&folder, &args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        // Into the run, at another time each time.
+        let mut child = under_way(&folder, &log);
         let path = folder.join(&log);
-        while !path.exists() {
-            std::thread::sleep(Duration::from_millis(20));
-            assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
-        }
         let before = std::time::Instant::now();
         std::thread::sleep(Duration::from_millis(1500 + 97 * kill % 1000));
         child.kill().unwrap();

@@ -8,12 +8,15 @@ use crate::terminal::{Style, Terminal};
 use crate::{project, report, value};
 use abi::Description;
 use abi::description::Kind;
+use abi::rig::{self, Mode, Node, Rig};
 use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
+use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
+use runtime::hil::identify::{self, Identification};
 use runtime::hil::simulated::{MASTER, Pace, World};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
@@ -26,6 +29,8 @@ use std::time::Duration;
 
 /// Cycles whose loss a killed process may cost, as a time.
 const BLOCK_NS: u64 = 100_000_000;
+/// Without a cycle for so long even a run that only counts what it misses is over.
+const PATIENT_NS: u64 = 60_000_000_000;
 /// What a black box holds.
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
@@ -62,6 +67,10 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         terminal.error(&why);
         return End::Misused;
     }
+    if args.count_overruns {
+        // Neither the drives nor the watchdog stop what is only to be counted.
+        ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(PATIENT_NS);
+    }
     let root = loaded.files.get(loaded.root());
     let head = Sections::default()
         .with("fric", env!("CARGO_PKG_VERSION"))
@@ -80,8 +89,11 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
+    if args.identify {
+        return identified(args, ready, simulated, terminal);
+    }
     emergency::guard();
-    if simulated { in_process(args, ready, log, terminal) } else { on_buses(args, ready, log, terminal) }
+    if simulated { in_process(args, ready, log, None, terminal) } else { on_buses(args, ready, log, None, terminal) }
 }
 
 /// The rig to run: the one named, or the only one.
@@ -156,20 +168,77 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
     Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
 }
 
-fn hil_options(args: &Args, simulated: bool) -> HilOptions {
+/// Whether one drive holds speed or position while another gives torque.
+fn holds_and_pushes(rig: &Rig) -> bool {
+    let pushes = |node: &Node| match &node.kind {
+        rig::Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),
+        rig::Kind::Frames(_) => None,
+    };
+    let all = || rig.nodes.iter().filter_map(pushes);
+    all().any(|pushes| pushes) && all().any(|pushes| !pushes)
+}
+
+fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     let mut options = HilOptions::default();
     options.control.count_overruns = args.count_overruns;
     options.start.simulated = simulated;
+    // What is late between this process and itself says nothing of the drives.
+    options.start.missed = match (simulated, args.count_overruns) {
+        (_, true) => 1.0,
+        (true, false) => 0.05,
+        (false, false) => 0.0,
+    };
+    options.start.timeout_test = !args.count_overruns;
+    if simulated && holds_and_pushes(rig) {
+        // A drive that holds its speed would not let another one push the shaft.
+        options.start.sign_test = SignTest::Skip;
+    }
     options.arms_itself = args.sim || simulated || args.arm;
     options.checks_only = args.check;
     options.duration_ns = args.duration.map(|seconds| (seconds * 1e9).round() as u64);
     options
 }
 
+/// Torque pulses in place of the model.
+fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Terminal) -> End {
+    let asked = match Identification::new(&ready.rig) {
+        Ok(asked) => asked,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    };
+    emergency::guard();
+    ready.rig = asked.rig.clone();
+    ready.control = asked.program.clone();
+    if simulated {
+        in_process(args, ready, None, Some(&asked), terminal)
+    } else {
+        on_buses(args, ready, None, Some(&asked), terminal)
+    }
+}
+
+/// Says what was measured, as text to paste.
+fn measured(asked: &Identification, rows: &[identify::Row], sends: f64, terminal: &mut Terminal) {
+    let milli = |seconds: f64| value::significant(seconds * 1e3, 3);
+    for found in asked.evaluate(rows, sends) {
+        let name = &asked.rig.nodes[found.node].name;
+        let inertia = found
+            .inertia
+            .map_or("it hardly moved".into(), |inertia| format!("inertia {} kg·m²", value::significant(inertia, 3)));
+        terminal.line(&format!(
+            "  drive {name}: delay = {} ms, lag = {} ms    ({inertia}; {} N·m rms unexplained)",
+            milli(found.delay),
+            milli(found.lag),
+            value::significant(found.residual, 2)
+        ));
+    }
+}
+
 type Log = Option<(Settings, Sections)>;
 
 /// Buses, drives and devices in this process.
-fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+fn in_process(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
     let pace = if args.fast { Pace::Fast } else { Pace::Wall };
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
@@ -189,11 +258,11 @@ fn in_process(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> E
         }
     }
     let (clock, masters) = (world.clock(), world.masters());
-    run(args, ready, clock, masters, true, log, terminal)
+    run(args, ready, clock, masters, true, log, asked, terminal)
 }
 
 /// Buses of this machine.
-fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End {
+fn on_buses(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
     for bus in &ready.rig.buses {
@@ -215,9 +284,10 @@ fn on_buses(args: &Args, ready: Ready, log: Log, terminal: &mut Terminal) -> End
             }
         }
     }
-    run(args, ready, Box::new(world), buses, false, log, terminal)
+    run(args, ready, Box::new(world), buses, false, log, asked, terminal)
 }
 
+#[allow(clippy::too_many_arguments, reason = "what a rig consists of")]
 fn run(
     args: &Args,
     ready: Ready,
@@ -225,6 +295,7 @@ fn run(
     buses: Vec<Box<dyn Bus>>,
     simulated: bool,
     log: Log,
+    asked: Option<&Identification>,
     terminal: &mut Terminal,
 ) -> End {
     let Ready { rig, control, notes, .. } = ready;
@@ -233,7 +304,11 @@ fn run(
         Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
     });
     let fast = simulated && args.fast;
-    let mut options = hil_options(args, simulated);
+    let mut options = hil_options(args, &rig, simulated);
+    if let Some(asked) = asked {
+        options.duration_ns = Some(asked.duration_ns);
+        options.control.ramp_ns = 0;
+    }
     let real_time = (!fast)
         .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
     let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
@@ -272,7 +347,13 @@ fn run(
     if !fast {
         std::thread::spawn(move || prompt(operator, &description));
     }
-    let end = hil.run();
+    if let Some(asked) = asked {
+        let rows = identify::rows(&mut hil, asked);
+        if hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
+            measured(asked, &rows, hil.collect_ns() as f64 * 1e-9, terminal);
+        }
+    }
+    let end = hil.ended().cloned().unwrap_or_else(|| hil.run());
     over.store(true, Ordering::Relaxed);
     if let Some(view) = view {
         let _ = view.join();
@@ -286,14 +367,7 @@ fn said(refusal: &realtime::Refusal) -> String {
     format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
 }
 
-fn begin(
-    rig: &abi::rig::Rig,
-    simulated: bool,
-    fast: bool,
-    refusals: &[String],
-    notes: &[String],
-    terminal: &mut Terminal,
-) {
+fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[String], terminal: &mut Terminal) {
     let rate = 1e9 / rig.period_ns as f64;
     let kind = match (simulated, fast) {
         (false, _) => "drives on their buses",
@@ -313,6 +387,7 @@ fn begin(
 /// Tells how it ended, after the log was closed.
 fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
     let counts = words::counts(hil.counts());
+    let missed = hil.counts().missed;
     let misuse = hil.is_misuse();
     let written = hil.finish();
     if !args.quiet {
@@ -328,6 +403,12 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
         }
         cycle::End::Stopped(_, why) => {
             terminal.error(&format!("stopped: {why}"));
+            if missed > 0 && !args.count_overruns {
+                terminal.report(&format!(
+                    "  {missed} ticks were missed: this host was too late, and a drive that hears nothing stops.\n  \
+                     With simulated drives: --fast, or --count-overruns; `fric doctor` says what would help\n"
+                ));
+            }
             End::Stopped
         }
     };
@@ -348,7 +429,7 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
 }
 
 /// Shows the gauges, some times a second, until it is over.
-fn view(gauges: &Gauges, rig: &abi::rig::Rig, over: &AtomicBool) {
+fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
     let mut terminal = Terminal::new();
     let names: Vec<String> = (rig.outputs.iter())
         .map(|output| words::signal(rig, output.signal))

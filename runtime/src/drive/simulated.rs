@@ -111,6 +111,8 @@ pub struct SimulatedDrive {
     torque_scale: Scale,
     /// Gains of the speed loop: N·m per rad/s, N·m per rad.
     gains: (f64, f64),
+    /// The state that its status word shows.
+    told: State,
     /// The mode it is in.
     mode: i8,
     /// Targets with the time at which they act: (ns, number).
@@ -193,6 +195,7 @@ impl SimulatedDrive {
             lag,
             torque_scale: Scale::signed(config.rated_torque / full, 16),
             gains: (inertia * bandwidth, inertia * bandwidth * bandwidth / 8.0),
+            told: State::NotReady,
             mode: 0,
             queue: [(0, 0); QUEUE],
             first: 0,
@@ -425,6 +428,10 @@ impl SimulatedDrive {
         if self.wrong.silent {
             return;
         }
+        if frame.id() == 0x600 + u32::from(self.config.node) {
+            // Whoever asks shall hear what is, not what was told last.
+            self.tell(now_ns);
+        }
         let happening = self.with_node(now_ns, send, |node, send| node.receive(frame, now_ns, send));
         if let Some(happening) = happening {
             self.happened(happening, now_ns, send);
@@ -443,7 +450,7 @@ impl SimulatedDrive {
             }
             self.holding = self.held.iter().any(|(_, frame)| frame.is_some());
         }
-        if self.machine.advance(now_ns) {
+        if self.machine.advance(now_ns) || self.machine.state() != self.told {
             self.tell(now_ns);
         }
         while let Some(happening) = self.with_node(now_ns, send, |node, send| node.poll(now_ns, send)) {
@@ -565,6 +572,7 @@ impl SimulatedDrive {
         let refresh = self.profile.refresh_ns;
         let objects = &mut self.node.objects;
         let state = self.machine.state();
+        self.told = state;
         let mut word = state.bits() | status::VOLTAGE | status::REMOTE;
         if objects.get(Object(0x1001, 0)).unwrap_or(0) != 0 {
             word |= status::WARNING;

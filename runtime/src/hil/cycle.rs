@@ -108,7 +108,7 @@ pub struct Counts {
     pub overruns: u64,
     /// Ticks missed by them.
     pub missed: u64,
-    /// Readings that a model's cycle had to hold.
+    /// Readings of drives that a model's cycle had to hold.
     pub stale: u64,
     /// Frames lost before they were read.
     pub lost_frames: u64,
@@ -374,6 +374,11 @@ impl Hil {
         self.control.as_ref().map_or(&[], Control::seen)
     }
 
+    /// From SYNC to the computing, ns.
+    pub fn collect_ns(&self) -> u64 {
+        self.collect_ns
+    }
+
     /// What was counted until now.
     pub fn counts(&self) -> &Counts {
         &self.counts
@@ -426,7 +431,10 @@ impl Hil {
         self.wires.drain(&mut self.fieldbus);
         let Hil { fieldbus, wires, .. } = self;
         fieldbus.begin(begin_ns, &mut |bus, frame| wires.send(bus, frame));
-        wires.clock.sleep_until(self.due_ns + self.collect_ns);
+        // A cycle that begins late still waits for its answers, as far as its period has room for them.
+        let room_ns = self.due_ns + self.rig.period_ns / 10 * 9;
+        let collect_ns = (begin_ns + self.collect_ns).min(room_ns).max(self.due_ns + self.collect_ns);
+        wires.clock.sleep_until(collect_ns);
         wires.drain(fieldbus);
         let read_ns = wires.clock.now_ns();
 
@@ -689,7 +697,9 @@ impl Hil {
             counts.receive.count(receive);
             counts.compute.count(compute);
             counts.send.count(send);
-            counts.stale += self.cycle.readings.iter().filter(|reading| reading.age > 0).count() as u64;
+            let held = self.cycle.readings.iter().zip(&self.signals);
+            let held = held.filter(|(reading, signal)| reading.age > 0 && self.rig.nodes[signal.node].moves);
+            counts.stale += held.count() as u64;
             for clamps in &self.cycle.clamps {
                 for (count, kind) in counts.clamped.iter_mut().zip([Clamps::RANGE, Clamps::SLEW, Clamps::POWER]) {
                     *count += u64::from(clamps.has(kind));

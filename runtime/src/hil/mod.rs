@@ -9,6 +9,7 @@ pub mod replay;
 pub mod emergency;
 pub mod cycle;
 pub mod words;
+pub mod identify;
 pub mod simulated;
 
 #[cfg(test)]
