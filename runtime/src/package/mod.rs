@@ -16,8 +16,8 @@
 
 pub mod signature;
 
-use abi::image::{sha256, sha256_without};
 use abi::encode::{Encode, Malformed, Reader};
+use abi::image::{sha256, sha256_without};
 use std::fmt;
 
 /// The first bytes. The line feed shows a transfer that took the file for a text.
