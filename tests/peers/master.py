@@ -48,6 +48,8 @@ def dictionary():
 def main(where):
     network = connect(where)
     node = network.add_node(3, dictionary())
+    # Neither side need be prompt on a busy computer.
+    node.sdo.RESPONSE_TIMEOUT = 3
     state = lambda: node.sdo[0x6041].raw & 0x6F
 
     node.nmt.send_command(0x82)
@@ -79,7 +81,10 @@ def main(where):
     node.sdo[0x6060].raw = 10
     assert node.sdo[0x6061].raw == 10
     node.nmt.state = "OPERATIONAL"
-    node.nmt.wait_for_heartbeat(2)
+    # One that was on its way may still tell of the state before.
+    deadline = time.time() + 2
+    while node.nmt.wait_for_heartbeat(2) != "OPERATIONAL":
+        assert time.time() < deadline, "stays " + node.nmt.state
     print("nmt", node.nmt.state)
 
     answers = {0x183: [], 0x283: []}
@@ -97,6 +102,10 @@ def main(where):
         network.sync.transmit()
         network.send_message(0x203, struct.pack("<Hh", 0x0F, 100))
         time.sleep(0.002)
+    deadline = time.time() + 3
+    while min(map(len, answers.values())) < cycles and time.time() < deadline:
+        time.sleep(0.01)
+    # None too many.
     time.sleep(0.1)
     status, torque, speed = struct.unpack("<Hhi", answers[0x183][-1])
     positions = [struct.unpack("<i", data)[0] for data in answers[0x283]]
