@@ -387,7 +387,8 @@ fn runs(dir: &Path) -> Option<PathBuf> {
 fn said(out: &Path) -> String {
     let said = fs::read_to_string(out).unwrap_or_default();
     let why = said.lines().rev().find_map(|line| line.split_once(NOT_STARTED).map(|(_, why)| why));
-    why.or_else(|| said.trim().lines().last()).unwrap_or_default().to_string()
+    let error = || said.lines().rev().find_map(|line| line.strip_prefix("error: "));
+    why.or_else(error).or_else(|| said.trim().lines().last()).unwrap_or_default().to_string()
 }
 
 /// Goes back to the package before the one that does not start, unless the rig has done so itself.
