@@ -346,13 +346,25 @@ impl From<Malformed> for Refusal {
     }
 }
 
-/// SHA-256 of a file whose own hash counts as zeros.
-fn hash(bytes: &[u8]) -> [u8; 32] {
+/// SHA-256 of some bytes.
+pub fn sha256(bytes: &[u8]) -> [u8; 32] {
+    Sha256::digest(bytes).into()
+}
+
+/// SHA-256 of a file whose own hash, which lies at `own`, counts as zeros.
+///
+/// # Panics
+/// If the file ends before its hash does: a mistake of the caller.
+pub fn sha256_without(bytes: &[u8], own: std::ops::Range<usize>) -> [u8; 32] {
     let mut hasher = Sha256::new();
-    hasher.update(&bytes[..HASH.start]);
+    hasher.update(&bytes[..own.start]);
     hasher.update([0; 32]);
-    hasher.update(&bytes[HASH.end..]);
+    hasher.update(&bytes[own.end..]);
     hasher.finalize().into()
+}
+
+fn hash(bytes: &[u8]) -> [u8; 32] {
+    sha256_without(bytes, HASH)
 }
 
 #[cfg(test)]

@@ -586,7 +586,8 @@ impl<'s, 't> Layout<'s, 't> {
     /// Blanks by which something stands exactly under or above something of the neighbouring statement stay:
     /// `F_ext >  Fs` over `F_ext < -Fs`.
     fn chosen(&mut self) {
-        let mut kept: Vec<(usize, (usize, usize), (usize, usize))> = Vec::new();
+        type Mark = (usize, usize);
+        let mut kept: Vec<(usize, Mark, Mark)> = Vec::new();
         let statement = |layout: &Self, line: usize| {
             let piece = layout.lines[line].piece;
             layout.starts.get(piece.start).copied().flatten().filter(|start| start.place.is_some()).map(|s| s.block)

@@ -134,7 +134,7 @@ impl Steps {
                 }
             };
             // The first way of every other push is the other way.
-            let sign = if self.done % 2 == 0 { 1.0 } else { -1.0 };
+            let sign = if self.done.is_multiple_of(2) { 1.0 } else { -1.0 };
             let next = match self.part {
                 Part::Rest => 0.0,
                 Part::Forth => sign * self.amplitude,

@@ -147,13 +147,13 @@ fn misfit(told: &[f64], torque: &[f64], period: f64, delayed: f64, lag: f64) -> 
     let rest = ((1.0 - x / 2.0) / (1.0 + x / 2.0)).max(0.0);
     let shift = (delayed / h).round() as usize;
     let (mut q, mut sum) = (0.0, 0.0);
-    for k in 1..told.len() {
+    for (k, measured) in torque.iter().enumerate().skip(1) {
         for i in 0..SUBSTEPS {
             let at = ((k - 1) * SUBSTEPS + i).checked_sub(shift);
             let u = at.map_or(0.0, |at| told[at / SUBSTEPS]);
             q = u + (q - u) * rest;
         }
-        sum += (q - torque[k]).powi(2);
+        sum += (q - measured) * (q - measured);
     }
     (sum / told.len() as f64).sqrt()
 }

@@ -17,7 +17,7 @@
 pub mod signature;
 
 use abi::encode::{Encode, Malformed, Reader};
-use sha2::{Digest, Sha256};
+use abi::image::{sha256, sha256_without};
 use std::fmt;
 
 /// The first bytes. The line feed shows a transfer that took the file for a text.
@@ -128,7 +128,7 @@ pub fn here() -> String {
 
 /// SHA-256 of some bytes in hexadecimal digits.
 pub fn hash(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+    sha256(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 impl Package {
@@ -162,7 +162,7 @@ impl Package {
                 section.name.encode(&mut out);
                 offset.encode(&mut out);
                 (section.bytes.len() as u64).encode(&mut out);
-                out.extend(Sha256::digest(&section.bytes));
+                out.extend(sha256(&section.bytes));
             }
             out
         };
@@ -181,7 +181,7 @@ impl Package {
         for section in &self.sections {
             out.extend(&section.bytes);
         }
-        let hash = Sha256::digest(&out);
+        let hash = sha256(&out);
         out[HASH].copy_from_slice(&hash);
         out
     }
@@ -208,11 +208,7 @@ impl Package {
         if said != bytes.len() as u64 {
             return Err(short(said));
         }
-        let mut hash = Sha256::new();
-        hash.update(&bytes[..HASH.start]);
-        hash.update([0; 32]);
-        hash.update(&bytes[HASH.end..]);
-        if hash.finalize()[..] != bytes[HASH] {
+        if sha256_without(bytes, HASH)[..] != bytes[HASH] {
             return Err(Refusal::Changed);
         }
         let mut reader = Reader::new(&bytes[HASH.end..]);
@@ -232,7 +228,7 @@ impl Package {
             if package.sections.last().is_some_and(|last| last.name >= name) {
                 return Err(Refusal::Malformed(format!("section `{name}` is out of order")));
             }
-            if Sha256::digest(content)[..] != *hash {
+            if sha256(content)[..] != *hash {
                 return Err(Refusal::Malformed(format!("section `{name}` has another hash than the table says")));
             }
             expected = Some(offset + length);
@@ -311,7 +307,7 @@ mod tests {
         let mut bytes = package().to_bytes();
         let rehash = |bytes: &mut Vec<u8>| {
             bytes[HASH].fill(0);
-            let hash = Sha256::digest(&*bytes);
+            let hash = sha256(bytes);
             bytes[HASH].copy_from_slice(&hash);
         };
         bytes[12] = 2;

@@ -246,7 +246,7 @@ impl<'a> Body<'a> {
             let candidates = (first..table.len()).filter(|register| !locked(*register));
             let last = candidates.max_by_key(|register| {
                 let copy = table[*register].expect("none is free");
-                self.next_use(copy).map_or(usize::MAX, |place| place)
+                self.next_use(copy).unwrap_or(usize::MAX)
             });
             last.expect("an instruction locks fewer registers than there are")
         });
