@@ -83,11 +83,6 @@ impl Store {
         Ok(format!("back to {}\n", previous.display()))
     }
 
-    /// The package that is current.
-    pub fn current(&self) -> PathBuf {
-        self.current_target().map_or_else(|| self.dir.join("current"), |target| self.dir.join(target))
-    }
-
     /// Where the link of the current package points.
     pub fn current_target(&self) -> Option<PathBuf> {
         fs::read_link(self.dir.join("current")).ok()
