@@ -616,10 +616,11 @@ impl Supervisor {
         words.extend(self.clamped.iter().map(|cycles| u64::from(*cycles)));
     }
 
-    /// Takes over what [`Supervisor::save`] gave; limits are not among it. None if it does not fit.
+    /// Takes over what [`Supervisor::save`] gave; limits are not among it. None, and nothing taken over, if it
+    /// does not fit.
     pub fn restore(&mut self, words: &mut dyn Iterator<Item = u64>) -> Option<()> {
         let (stage, cycles) = (words.next()?, u32::try_from(words.next()?).ok()?);
-        self.stage = match stage {
+        let stage = match stage {
             0 => Stage::Idle,
             1 => Stage::Armed(cycles),
             2 => Stage::Slewing(cycles),
@@ -627,16 +628,19 @@ impl Supervisor {
             4 => Stage::Disabled,
             _ => return None,
         };
-        self.cause = match [words.next()?, words.next()?] {
+        let cause = match [words.next()?, words.next()?] {
             [0, 0] => None,
             words => Some(Cause::from_words(words)?),
         };
-        for x in self.permitted.iter_mut().chain(&mut self.least) {
-            *x = f64::from_bits(words.next()?);
-        }
-        for cycles in &mut self.clamped {
-            *cycles = u32::try_from(words.next()?).ok()?;
-        }
+        let numbers = self.permitted.len() + self.least.len();
+        let numbers: Option<Vec<f64>> = (0..numbers).map(|_| words.next().map(f64::from_bits)).collect();
+        let clamped = (0..self.clamped.len()).map(|_| u32::try_from(words.next()?).ok());
+        let (numbers, clamped) = (numbers?, clamped.collect::<Option<Vec<u32>>>()?);
+        let (permitted, least) = numbers.split_at(self.permitted.len());
+        (self.stage, self.cause) = (stage, cause);
+        self.permitted.copy_from_slice(permitted);
+        self.least.copy_from_slice(least);
+        self.clamped.copy_from_slice(&clamped);
         Some(())
     }
 
