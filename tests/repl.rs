@@ -172,7 +172,7 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     let wrong = at.line("f.F + 1 m/s");
     assert!(wrong.contains("E0101") && wrong.contains("cannot add a force and a velocity"), "{wrong}");
     assert!(wrong.contains("[input:1:1]") && wrong.contains("1 │ f.F + 1 m/s"), "{wrong}");
-    assert!(at.line("f.Fs = 0.5 N").contains("stiction must not be below Coulomb friction"));
+    assert!(at.line("f.Fs = 0.5 N").contains("requires Fs >= Fc"));
     assert!(at.line("f.Fs").contains("1.5 N"), "a refused setting changes nothing");
     assert!(at.line("1 N + 1 N").contains("2 N"));
 
@@ -302,7 +302,7 @@ fn mistakes_are_named_with_their_remedy() {
     says("f = LuGre()\nplot f.F against f.w = 0 m/s .. 1 m/s", "there is no `f.w` here; did you mean `f.v`?");
     says("f = LuGre()\nplot f.F against f.v = 0 m .. 1 m", "`f.v` is a velocity, in m/s, and 0 m is a length");
     says("f = LuGre()\nplot f.F against f.z = 0 um .. 1 um", "`f.z` is computed: a curve goes over an input");
-    says("f = LuGre()\nplot f.F against f.Fs = 0 N .. 2 N", "stiction must not be below Coulomb friction");
+    says("f = LuGre()\nplot f.F against f.Fs = 0 N .. 2 N", "requires Fs >= Fc");
     says("f = LuGre(Fss = 1 N)", "did you mean `Fs`");
     says("f = LuGree()", "did you mean `LuGre`?");
     says("f.Fs = 1 N", "there is no `f` here to set");

@@ -137,11 +137,13 @@ impl Loaded {
 
     /// Rigs of the asked-for file, in order.
     pub fn rigs(&self) -> Vec<&ast::Rig> {
-        let rig = |item| match item {
-            &Item::Rig(ref rig) => Some(rig),
-            _ => None,
-        };
-        self.files.get(self.root()).ast.items.iter().filter_map(rig).collect()
+        let items = self.files.get(self.root()).ast.items.iter();
+        items
+            .filter_map(|item| match item {
+                Item::Rig(rig) => Some(rig),
+                _ => None,
+            })
+            .collect()
     }
 
     /// Models of the asked-for file, in order.

@@ -69,15 +69,19 @@ pub enum Ended {
 pub fn run(wanted: &Wanted) -> Result<u8, String> {
     let store = Store::at(wanted.dir);
     emergency::guard();
+    let mut fell_back = false;
     loop {
-        let path = wanted.package.map_or_else(|| store.current(), Path::to_path_buf);
-        let open = packed::open(&path, wanted.trusted)?;
-        let ended = match once(wanted, &open, &store) {
+        let installed = || store.current_target().unwrap_or_else(|| "current".into());
+        let target = wanted.package.map_or_else(installed, Path::to_path_buf);
+        let path = if wanted.package.is_some() { target.clone() } else { wanted.dir.join(&target) };
+        let ended = packed::open(&path, wanted.trusted).and_then(|open| once(wanted, &open, &store, &target));
+        let ended = match ended {
             Ok(ended) => ended,
-            // What runs instead is what ran before it.
-            Err(why) if wanted.package.is_none() && store.took_over() => {
-                words::error(&format!("the new package does not start: {why}"));
+            // What runs instead is what ran before it; if that does not start either, nothing runs.
+            Err(why) if wanted.package.is_none() && !fell_back && store.took_over() => {
+                words::error(&format!("{NOT_STARTED}{why}"));
                 words::error(&store.rollback()?);
+                fell_back = true;
                 continue;
             }
             Err(why) => return Err(why),
@@ -88,12 +92,15 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
                 words::error(&format!("stopped: {why}"));
                 return Ok(3);
             }
-            Ended::Replaced => words::print("another package is installed: taking it over\n"),
+            Ended::Replaced => {
+                fell_back = false;
+                words::print("another package is installed: taking it over\n");
+            }
         }
     }
 }
 
-fn once(wanted: &Wanted, open: &Open, store: &Store) -> Result<Ended, String> {
+fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
     let mut rig = open.rig()?;
     for (bus, address) in wanted.buses {
         let Some(known) = rig.buses.iter_mut().find(|known| known.name == *bus) else {
@@ -143,7 +150,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store) -> Result<Ended, String> {
         1e9 / rig.period_ns as f64,
         if simulated { "simulated drives" } else { "drives on their buses" }
     ));
-    let attendant = (!fast).then(|| Attendant::new(wanted, store, hil.gauges(), operator));
+    let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator));
     let end = hil.run();
     let replaced = attendant.as_ref().is_some_and(|it| it.replaced.load(Ordering::Relaxed));
     drop(attendant);
@@ -207,20 +214,22 @@ struct Attendant {
 }
 
 impl Attendant {
-    fn new(wanted: &Wanted, store: &Store, gauges: Arc<Gauges>, operator: Operator) -> Attendant {
+    fn new(wanted: &Wanted, store: &Store, target: &Path, gauges: Arc<Gauges>, operator: Operator) -> Attendant {
         let (over, replaced) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
         let operator = Arc::new(Mutex::new(operator));
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
             let (over, replaced, dir, operator) = (over.clone(), replaced.clone(), dir.clone(), operator.clone());
-            let installed = wanted.package.is_none().then(|| (store.clone(), store.current_target()));
+            let installed = wanted.package.is_none().then(|| store.clone());
+            let target = target.to_path_buf();
             threads.push(std::thread::spawn(move || {
                 while !over.load(Ordering::Relaxed) {
-                    tell(&dir, &gauges);
+                    tell(&dir, &target, &gauges);
                     let stage = gauges.stage.load(Ordering::Relaxed);
                     let idle = stage < ENABLE || stage == TORQUE_OFF;
-                    let other = installed.as_ref().is_some_and(|(store, ran)| store.current_target() != *ran);
+                    let other =
+                        installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
                     if other && idle && !replaced.swap(true, Ordering::Relaxed) {
                         // It ends with the cycle that takes the command: no drive has torque then.
                         let _ = operator.lock().map(|mut operator| operator.push(Command::Stop));
@@ -264,10 +273,11 @@ fn socket(dir: &Path) -> PathBuf {
 }
 
 /// Writes the state where `status` reads it.
-fn tell(dir: &Path, gauges: &Gauges) {
+fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
     let text = format!(
-        "{}, {} cycles, late {} us at most, {} missed\n",
+        "{}: {}, {} cycles, late {} us at most, {} missed\n",
+        target.display(),
         told::stage(number(&gauges.stage)),
         number(&gauges.cycles),
         number(&gauges.late_ns_max) / 1000,
@@ -312,31 +322,82 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
 
 /// How long a rig that was just started is looked at.
 const FIRST: Duration = Duration::from_secs(1);
+/// How long it may take to tell which package it runs, and one that runs already to take another over.
+const TELLS: Duration = Duration::from_secs(10);
+/// What the rig says when it goes back.
+const NOT_STARTED: &str = "the new package does not start: ";
 
 /// Starts the current package in a process of its own, which outlives this one.
 ///
 /// # Errors
-/// What the rig said if it ended within its first second.
+/// What the rig said if it ended within its first second, or runs another package than the current one.
 pub fn start(dir: &Path) -> Result<String, String> {
-    if UnixStream::connect(socket(dir)).is_ok() {
-        return Ok("a rig runs already: it takes the package over as soon as no drive has torque\n".into());
-    }
+    let store = Store::at(dir);
+    let Some(asked) = store.current_target() else {
+        return Err(format!("nothing is installed in {}", dir.display()));
+    };
     let out = dir.join("log").join("rig.out");
     let about = |error: std::io::Error| format!("cannot start a rig in {}: {error}", dir.display());
-    let file = fs::File::create(&out).map_err(about)?;
-    let program = std::env::current_exe().map_err(about)?;
-    let mut command = std::process::Command::new(program);
-    command.arg("run").arg("--dir").arg(dir).stdin(std::process::Stdio::null());
-    command.stdout(file.try_clone().map_err(about)?).stderr(file);
-    std::os::unix::process::CommandExt::process_group(&mut command, 0);
-    let mut child = command.spawn().map_err(about)?;
-    let begun = std::time::Instant::now();
-    while begun.elapsed() < FIRST {
-        if let Some(status) = child.try_wait().map_err(about)? {
-            let said = fs::read_to_string(&out).unwrap_or_default();
-            return Err(format!("it ended at once ({status}): {}", said.trim().lines().last().unwrap_or_default()));
-        }
-        std::thread::sleep(Duration::from_millis(20));
+    let mut child = None;
+    if UnixStream::connect(socket(dir)).is_err() {
+        // That of a process that was killed.
+        let _ = fs::remove_file(dir.join("state"));
+        let file = fs::File::create(&out).map_err(about)?;
+        let program = std::env::current_exe().map_err(about)?;
+        let mut command = std::process::Command::new(program);
+        command.arg("run").arg("--dir").arg(dir).stdin(std::process::Stdio::null());
+        command.stdout(file.try_clone().map_err(about)?).stderr(file);
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        child = Some(command.spawn().map_err(about)?);
     }
-    Ok(format!("started, process {}\n", child.id()))
+    let begun = std::time::Instant::now();
+    loop {
+        if let Some(child) = &mut child
+            && let Some(status) = child.try_wait().map_err(about)?
+        {
+            return Err(format!("it does not start ({status}): {}; {}", said(&out), back(&store, &asked)));
+        }
+        if store.current_target().as_ref() != Some(&asked) {
+            // What was started by somebody else writes elsewhere.
+            let why = if child.is_some() { said(&out) } else { "the rig that runs told why".into() };
+            return Err(format!("it does not start: {why}; {}", back(&store, &asked)));
+        }
+        let runs = runs(dir).is_some_and(|runs| runs == asked);
+        match &child {
+            Some(child) if runs && begun.elapsed() >= FIRST => return Ok(format!("started, process {}\n", child.id())),
+            None if runs && begun.elapsed() >= FIRST => return Ok("it runs\n".into()),
+            Some(_) if begun.elapsed() > TELLS => {
+                return Err(format!("it does not say that it runs; {} may tell more", out.display()));
+            }
+            None if begun.elapsed() > TELLS => {
+                return Ok("a rig runs already: it takes the package over as soon as no drive has torque\n".into());
+            }
+            _ => std::thread::sleep(Duration::from_millis(20)),
+        }
+    }
+}
+
+/// The package that the state tells of.
+fn runs(dir: &Path) -> Option<PathBuf> {
+    let state = fs::read_to_string(dir.join("state")).ok()?;
+    state.split_once(": ").map(|(target, _)| PathBuf::from(target))
+}
+
+/// Why the rig did not start, from what it said.
+fn said(out: &Path) -> String {
+    let said = fs::read_to_string(out).unwrap_or_default();
+    let why = said.lines().rev().find_map(|line| line.split_once(NOT_STARTED).map(|(_, why)| why));
+    let error = || said.lines().rev().find_map(|line| line.strip_prefix("error: "));
+    why.or_else(error).or_else(|| said.trim().lines().last()).unwrap_or_default().to_string()
+}
+
+/// Goes back to the package before the one that does not start, unless the rig has done so itself.
+fn back(store: &Store, asked: &Path) -> String {
+    match store.current_target() {
+        Some(current) if current != asked => format!("back to {}", current.display()),
+        _ => match store.rollback() {
+            Ok(said) => said.trim().to_string(),
+            Err(why) => format!("and there is nothing to go back to: {why}"),
+        },
+    }
 }

@@ -65,22 +65,12 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     Ok(())
 }
 
-/// Starts what has been installed; if it refuses, goes back to what was there.
+/// Starts what has been installed; if that refuses, the computer itself goes back to what was there.
 fn start(args: &Deploy, remote: &Remote, terminal: &mut Terminal) -> Result<(), String> {
     let Host { host, rig, dir, .. } = &args.host;
-    match remote.run(&[rig, "start", "--dir", dir]) {
-        Ok(said) => {
-            terminal.print(&said);
-            Ok(())
-        }
-        Err(why) => {
-            let back = match remote.run(&[rig, "rollback", "--dir", dir]) {
-                Ok(said) => said.trim().to_string(),
-                Err(again) => format!("and there is nothing to go back to: {}", again.words()),
-            };
-            Err(format!("{host}: it does not start: {}; {back}", why.words()))
-        }
-    }
+    let said = remote.run(&[rig, "start", "--dir", dir]).map_err(|why| format!("{host}: {}", why.words()))?;
+    terminal.print(&said);
+    Ok(())
 }
 
 fn no_rig(remote: &Remote, rig: &str, why: &Failed) -> String {

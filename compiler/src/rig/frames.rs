@@ -165,7 +165,7 @@ pub fn what(read: Read, laid: &Laid) -> What {
 
 /// Least and greatest SI value that a field can carry.
 pub fn carries(field: &Field) -> (f64, f64) {
-    let top = |bits: u16| 2f64.powi(i32::from(bits));
+    let top = |bits: u16| (1u128 << bits) as f64;
     let (low, high) = match field.format {
         abi::rig::Format::Unsigned => (0.0, top(field.bits) - 1.0),
         abi::rig::Format::Signed => (-top(field.bits - 1), top(field.bits - 1) - 1.0),

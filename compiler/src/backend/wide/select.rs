@@ -133,18 +133,15 @@ pub fn select(func: &Func, width: Width) -> Result<Nodes, Unsupported> {
         of.push(node);
     }
     let at = |value: Value| of[value.index()];
-    let failed = match func.status {
-        None => None,
-        Some(status) => Some(match func.op(status) {
-            Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => at(when),
-            _ => {
-                let zero = selection.add(What::Constant(0));
-                let fine = selection.add(What::CompareInt(0, at(status), zero));
-                let not = selection.not(fine);
-                selection.add(not)
-            }
-        }),
-    };
+    let failed = func.status.map(|status| match func.op(status) {
+        Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => at(when),
+        _ => {
+            let zero = selection.add(What::Constant(0));
+            let fine = selection.add(What::CompareInt(0, at(status), zero));
+            let not = selection.not(fine);
+            selection.add(not)
+        }
+    });
     let stores = func.stores.iter().map(|(slot, value)| (*slot, at(*value))).collect();
     Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes })
 }
