@@ -870,7 +870,7 @@ impl Reader<'_> {
         let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
         match solver.method {
             Method::Adaptive => {
-                let error = Diagnostic::error("E0702", "between the ticks of a rig, steps have a fixed length")
+                let error = Diagnostic::error("E0905", "between the ticks of a rig, steps have a fixed length")
                     .label(span, "takes as many as it needs");
                 self.diagnostics
                     .push(error.help("write `solver rk4 step 10 us`, or leave it out for 50 steps of `expo`"));

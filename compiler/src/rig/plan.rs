@@ -151,7 +151,7 @@ impl Reader<'_, '_> {
         let Some(solver) = self.statements.solver else { return Method::Expo };
         match Method::named(&solver.method.text) {
             Some(Method::Adaptive) => {
-                let error = Diagnostic::error("E0702", "a rig takes steps of fixed length")
+                let error = Diagnostic::error("E0905", "a rig takes steps of fixed length")
                     .label(solver.method.span, "takes as many as it needs");
                 self.report(
                     error.help("write `solver expo`, `implicit`, `rk4` or `euler`, or leave it out for `expo`"),

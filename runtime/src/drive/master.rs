@@ -536,7 +536,7 @@ impl Drive {
         self.ticks = self.ticks.wrapping_add(1);
     }
 
-    /// The command for the next [`end`](Drive::end), SI.
+    /// The command for the next `end`, SI.
     pub fn command(&mut self, value: f64) {
         self.command = value;
     }
