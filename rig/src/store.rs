@@ -46,10 +46,9 @@ impl Store {
         let path = packages.join(&name);
         whole(&path, &open.bytes).map_err(|error| about(&path, error))?;
         let signature = packages.join(format!("{name}.{SIGNATURE}"));
-        match &open.signature {
-            Some(text) => whole(&signature, text.as_bytes()).map_err(|error| about(&signature, error))?,
-            // An older signature of the same bytes does no harm.
-            None => {}
+        // Where it has none, an older signature of the same bytes does no harm.
+        if let Some(text) = &open.signature {
+            whole(&signature, text.as_bytes()).map_err(|error| about(&signature, error))?;
         }
         let target = Path::new("packages").join(&name);
         let before = fs::read_link(self.dir.join("current")).ok();
