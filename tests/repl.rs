@@ -160,6 +160,8 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert!(explained.contains("dz/dt = v - sigma0 * abs(v) / g * z"), "{explained}");
     at.send("f.F + f.\t");
     at.wait("Coulomb friction");
+    // The list ends with the line once more.
+    at.wait("fric> f.F + f.");
     at.send("\x03");
     at.wait("\n");
     at.wait("fric> ");

@@ -358,6 +358,13 @@ pub fn start(dir: &Path) -> Result<String, String> {
             return Err(format!("it does not start ({status}): {}; {}", said(&out), back(&store, &asked)));
         }
         if store.current_target().as_ref() != Some(&asked) {
+            // Only once it can be spoken to is it seen that a rig runs, and no second one started beside it.
+            while UnixStream::connect(socket(dir)).is_err() && begun.elapsed() < TELLS {
+                if child.as_mut().is_some_and(|child| !matches!(child.try_wait(), Ok(None))) {
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(20));
+            }
             // What was started by somebody else writes elsewhere.
             let why = if child.is_some() { said(&out) } else { "the rig that runs told why".into() };
             return Err(format!("it does not start: {why}; {}", back(&store, &asked)));
