@@ -96,7 +96,7 @@ pub enum Command {
         #[arg(value_parser = [
             "run", "test", "sweep", "linearise", "bench", "build", "hil", "replay", "check", "fmt", "explain",
             "characterise", "compare", "doc", "repl", "watch", "inspect", "key", "deploy", "fetch-log", "drives", "bus",
-            "doctor", "bench-rt", "new", "completions",
+            "doctor", "predict", "bench-rt", "new", "completions",
         ])]
         command: Option<String>,
     },
