@@ -127,6 +127,6 @@ mod tests {
         let mut energy = Energy::new(1e-3, 1e-3);
         energy.see(1.0, 1.0, 1.0);
         assert_eq!(energy.see(-1.0, 1.0, -1.0), Sign::Healthy, "one store given back at a reversal");
-        assert_eq!(energy.see(-1.0, 1.0, -1.0), Sign::Warning);
+        assert_eq!(energy.see(-1.1, 1.0, -1.0), Sign::Warning, "more than two stores");
     }
 }
