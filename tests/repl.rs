@@ -178,17 +178,6 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert!(at.line("f.Fs").contains("1.5 N"), "a refused setting changes nothing");
     assert!(at.line("1 N + 1 N").contains("2 N"));
 
-    // An open bracket goes on on the next line.
-    at.send("model Damper {\r");
-    at.send("input v [m/s]\r");
-    at.send("output F [N] = 2 N·s/m * v\r");
-    at.send("allow creep \"a damper\"\r");
-    at.wait("a damper");
-    at.wait("\n");
-    at.line("}");
-    assert!(at.line("d = Damper(v = 3 m/s)").contains("d: Damper, 0 states"));
-    assert!(at.line("d.F").contains("6 N"));
-
     at.send("\x04");
     assert_eq!(at.end(), Some(0));
 }
