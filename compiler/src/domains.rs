@@ -104,6 +104,8 @@ pub struct Prover<'a> {
     facts: Vec<Fact>,
     known: HashMap<ExprId, Interval>,
     open: Vec<VarId>,
+    /// Quantities whose declared range is being read: a range that leads back to its own quantity says nothing.
+    bounding: Vec<VarId>,
     /// Parameters whose range is taken without its ends: what if it were declared so?
     strict: Vec<VarId>,
 }
@@ -123,7 +125,15 @@ impl<'a> Prover<'a> {
                 _ => {}
             }
         }
-        Prover { system, relations, facts: Vec::new(), known: HashMap::new(), open: Vec::new(), strict: Vec::new() }
+        Prover {
+            system,
+            relations,
+            facts: Vec::new(),
+            known: HashMap::new(),
+            open: Vec::new(),
+            bounding: Vec::new(),
+            strict: Vec::new(),
+        }
     }
 
     /// What an expression can be.
@@ -227,6 +237,10 @@ impl<'a> Prover<'a> {
         let range = self.system.var(id).range;
         let strict = self.strict.contains(&id);
         let mut out = Interval::ALL;
+        if self.bounding.contains(&id) {
+            return out;
+        }
+        self.bounding.push(id);
         if let Some((bound, open)) = range.low {
             let bound = self.plain(bound);
             (out.low, out.above_low) = (bound.low, open || strict || bound.above_low);
@@ -235,6 +249,7 @@ impl<'a> Prover<'a> {
             let bound = self.plain(bound);
             (out.high, out.below_high) = (bound.high, open || strict || bound.below_high);
         }
+        self.bounding.pop();
         out
     }
 
