@@ -92,7 +92,7 @@ fn the_example_hunts_on_simulated_drives_as_it_does_without_them() {
     assert_eq!(x.len(), 60_000);
     let late = &x[40_000..];
     let (least, greatest) = late.iter().fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(*x), b.max(*x)));
-    // The dry run of the example expects more than 50 mrad after 40 s.
+    // The dry run of the example expects some 89 mrad after 40 s.
     assert!(greatest - least > 0.05, "peak to peak {} rad", greatest - least);
     assert!((least + greatest - 2.0).abs() < 0.1, "around 1 rad: {least} .. {greatest}");
 }
