@@ -12,7 +12,7 @@ use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
-use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options};
+use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options, look_ahead};
 use runtime::hil::simulated::{MASTER, Pace, World};
 use runtime::hil::{emergency, words as told};
 use runtime::realtime::{self, Wishes};
@@ -118,6 +118,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
     options.start.simulated = simulated;
     options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
+    options.look = look_ahead(&rig, &open.program("plant")?)?;
     let fast = simulated && wanted.fast;
     let world;
     let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {
