@@ -461,8 +461,8 @@ mod tests {
         assert!(radius < 1.0, "{radius}");
         let limit = looking.limit();
         assert!(limit.is_none_or(|limit| limit > 6e-3), "{limit:?}");
-        // An observer that is told of no delay sees no further than the plain coupling.
-        looking.told.dead = 0.0;
+        // An observer that takes the torque for its opposite drives the shaft.
+        looking.sign = -1.0;
         assert!(looking.radius() > 1.0);
     }
 

@@ -316,6 +316,7 @@ impl Control {
     }
 
     /// One cycle. Who asks for outputs must have armed the supervisor.
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn cycle(&mut self, told: &Told) -> Order {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;

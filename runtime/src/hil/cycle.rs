@@ -690,6 +690,7 @@ impl Hil {
         self.order = order;
     }
 
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     fn count(&mut self, ticks: u32) {
         let counts = &mut self.counts;
         counts.all += 1;

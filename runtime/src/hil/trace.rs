@@ -139,6 +139,7 @@ impl Cycle {
     }
 
     /// As words, appended.
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn write(&self, words: &mut Vec<u64>) {
         let [receive, compute, send] = self.phases_ns.map(u64::from);
         words.extend([self.k, self.due_ns, u64::from(self.late_ns) | u64::from(self.ticks) << 32]);
