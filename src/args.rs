@@ -3,7 +3,7 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
-use crate::compile::Emit;
+use crate::compile::{Changes, Emit};
 use crate::value;
 use crate::vary::{self, Vary};
 use abi::image::Target;
@@ -102,6 +102,68 @@ pub enum Command {
     },
 }
 
+/// What of a text is changed before it is compiled.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Set {
+    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub all: Vec<(String, String)>,
+}
+
+impl Set {
+    /// As the compiler reads them: `fr.Fs=2N`.
+    pub fn texts(&self) -> Vec<String> {
+        self.all.iter().map(|(path, value)| format!("{path}={value}")).collect()
+    }
+
+    /// The changes that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { set: self.texts(), ..Changes::default() }
+    }
+}
+
+/// Changes, and how steps are made.
+#[derive(clap::Args, Debug)]
+pub struct Stepped {
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+}
+
+impl Stepped {
+    /// The changes to an experiment that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { method: self.solver, step: self.step, ..self.set.changes() }
+    }
+}
+
+/// All that can be changed of an experiment.
+#[derive(clap::Args, Debug)]
+pub struct Changed {
+    /// What of the text is changed, and how steps are made
+    #[command(flatten)]
+    pub stepped: Stepped,
+    /// Relative tolerance of an adaptive run, such as 1e-8
+    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
+    pub tol: Option<f64>,
+    /// Simulated time, such as 20s
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+}
+
+impl Changed {
+    /// The changes to an experiment that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { tol: self.tol, duration: self.duration, ..self.stepped.changes() }
+    }
+}
+
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
@@ -110,21 +172,9 @@ pub struct Run {
     pub file: PathBuf,
     /// Experiments in it; all if none is named
     pub experiments: Vec<String>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Relative tolerance of an adaptive run, such as 1e-8
-    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
-    pub tol: Option<f64>,
-    /// Simulated time, such as 20s
-    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
-    pub duration: Option<f64>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub changed: Changed,
     /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --csv or --json]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
@@ -203,21 +253,9 @@ pub struct Sweep {
     /// Over which parameter to draw [default: the first]
     #[arg(long, value_name = "PATH", requires = "plot")]
     pub against: Option<String>,
-    /// Change a parameter or a slot for all runs: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Relative tolerance of an adaptive run, such as 1e-8
-    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
-    pub tol: Option<f64>,
-    /// Simulated time, such as 20s
-    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
-    pub duration: Option<f64>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub changed: Changed,
     /// Print nothing but errors
     #[arg(long, short)]
     pub quiet: bool,
@@ -247,9 +285,9 @@ pub struct Linearise {
     /// Outputs, or other quantities [default: the outputs of the whole]
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub outputs: Vec<String>,
-    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Print a JSON object
     #[arg(long)]
     pub json: bool,
@@ -266,15 +304,9 @@ pub struct Bench {
     pub file: PathBuf,
     /// The experiment in it to time
     pub experiment: String,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub stepped: Stepped,
     /// Print a JSON object
     #[arg(long)]
     pub json: bool,
@@ -301,15 +333,9 @@ pub struct Build {
     /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
-    /// How the step is made [default: of an experiment its own, else expo]
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step of an experiment, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of it is changed, and how it is stepped
+    #[command(flatten)]
+    pub stepped: Stepped,
 }
 
 /// `fric hil`
@@ -333,9 +359,9 @@ pub struct Hil {
     /// Put another bus under the rig: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
     pub bus: Vec<(String, String)>,
-    /// Change a parameter or a slot: `fr.Fs=2N.m`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Make simulated drives and devices fail: 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
@@ -391,9 +417,9 @@ pub struct Predict {
     /// The rig [default: that of the experiment, or the only one]
     #[arg(long, value_name = "RIG")]
     pub rig: Option<String>,
-    /// Change a parameter or a slot: `load.delay=2ms`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// One JSON object
     #[arg(long)]
     pub json: bool,
@@ -528,9 +554,9 @@ pub struct Drives {
     /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
-    /// Change a parameter: `m=0.02kg.m^2`, `load.delay=2ms`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// From which all that is random follows
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,

@@ -2,7 +2,7 @@
 
 use super::{End, compiled, load, reported};
 use crate::args::Bench;
-use crate::compile::{self, Changes, Method, Options, Stages, Stopwatch};
+use crate::compile::{self, Method, Options, Stages, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
 use crate::value::{count, duration, significant};
@@ -29,12 +29,7 @@ pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
         terminal.error(&format!("{} has no experiment `{}`; {help}", args.file.display(), args.experiment));
         return End::Failed;
     }
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        ..Changes::default()
-    };
+    let changes = args.stepped.changes();
     let options = Options { changes: changes.clone(), interpret: false };
     let Ok((mut cases, stages)) = compiled(&mut loaded, &args.experiment, &options, &before, false, terminal) else {
         return End::Failed;

@@ -2,7 +2,7 @@
 
 use super::{End, load, reported};
 use crate::args::Build;
-use crate::compile::{self, Changes, Emit, Stopwatch};
+use crate::compile::{self, Emit, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
 use grammar::diagnostic::Diagnostic;
@@ -57,12 +57,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error("an image is no text for a terminal: give it a file with --out");
         return End::Misused;
     }
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        ..Changes::default()
-    };
+    let changes = args.stepped.changes();
     let mut found = Vec::new();
     let built = match compile::build(&mut loaded, &project::Disk, &name, &changes, &mut found) {
         Ok(built) => built,
@@ -75,7 +70,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
-    let bytes = match compile::emit(&built, emit, args.solver, args.target) {
+    let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target) {
         Ok(bytes) => bytes,
         Err(why) => {
             terminal.error(&why);

@@ -1,11 +1,10 @@
 //! `fric drives`: the drives and devices of a rig, simulated, on a bus that other programs can reach.
 
-use super::{End, load, reported};
+use super::{End, chosen_rig, load, reported};
 use crate::args::Drives as Args;
-use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
-use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::hub::Hub;
 use runtime::can::sim::{SimBus, Simulation};
@@ -26,15 +25,14 @@ const BIT_RATE: u32 = 1_000_000;
 
 pub fn drives(args: &Args, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
-    let name = match chosen(args, &loaded) {
+    let name = match chosen_rig(&args.file, args.rig.as_deref(), &loaded) {
         Ok(name) => name,
         Err(why) => {
             terminal.error(&why);
             return End::Failed;
         }
     };
-    let set = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let options = Options { changes: Changes { set, ..Changes::default() }, ..Options::default() };
+    let options = Options { changes: args.set.changes(), ..Options::default() };
     let ready = match compile::rig(&mut loaded, &project::Disk, &name, &options, &mut Vec::new()) {
         Ok(ready) => ready,
         Err(diagnostics) => {
@@ -53,28 +51,6 @@ pub fn drives(args: &Args, terminal: &mut Terminal) -> End {
     let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
     serve(args, &ready, served, terminal);
     End::Fine
-}
-
-/// The rig whose drives are meant: the one named, or the only one.
-fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let rigs = items.iter().filter_map(|item| match item {
-        Item::Rig(rig) => Some(rig.name.text.clone()),
-        _ => None,
-    });
-    let rigs: Vec<String> = rigs.collect();
-    let file = args.file.display();
-    match (&args.rig, rigs.as_slice()) {
-        (_, []) => Err(format!("{file} has no rig")),
-        (Some(name), all) if all.contains(name) => Ok(name.clone()),
-        (Some(name), all) => {
-            let near = compile::nearest(name, all.iter().map(String::as_str));
-            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
-            Err(format!("{file} has no rig `{name}`; {help}"))
-        }
-        (None, [one]) => Ok(one.clone()),
-        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
-    }
 }
 
 /// What runs: a simulated bus for each of the rig, joined with ways to the outside.

@@ -1,15 +1,14 @@
 //! `fric hil`: runs a rig against drives on its buses, real or simulated.
 
-use super::{End, load_from};
+use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
-use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::kept::Keeping;
 use crate::terminal::{Style, Terminal};
 use crate::{project, report, stability, value};
 use abi::Description;
 use abi::description::Kind;
 use abi::rig::{self, Mode, Node, Rig};
-use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
@@ -38,15 +37,15 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
     let keeping = Keeping::new(&project::Disk);
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load_from(&args.file, &keeping, terminal, &mut watch) else { return End::Failed };
-    let name = match chosen(args, &loaded) {
+    let name = match chosen_rig(&args.file, args.rig.as_deref(), &loaded) {
         Ok(name) => name,
         Err(why) => {
             terminal.error(&why);
             return End::Failed;
         }
     };
-    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: args.interpret };
+    let set = args.set.texts();
+    let options = Options { changes: args.set.changes(), interpret: args.interpret };
     let mut found = Vec::new();
     let ready = compile::rig(&mut loaded, &keeping, &name, &options, &mut found);
     found.extend(ready.as_ref().err().into_iter().flatten().cloned());
@@ -123,28 +122,6 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
         "  `fric predict` says what would help; with simulated drives --accept-unstable lets an unstable rig run\n",
     );
     None
-}
-
-/// The rig to run: the one named, or the only one.
-fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let rigs = items.iter().filter_map(|item| match item {
-        Item::Rig(rig) => Some(rig.name.text.clone()),
-        _ => None,
-    });
-    let rigs: Vec<String> = rigs.collect();
-    let file = args.file.display();
-    match (&args.rig, rigs.as_slice()) {
-        (_, []) => Err(format!("{file} has no rig")),
-        (Some(name), all) if all.contains(name) => Ok(name.clone()),
-        (Some(name), all) => {
-            let near = compile::nearest(name, all.iter().map(String::as_str));
-            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
-            Err(format!("{file} has no rig `{name}`; {help}"))
-        }
-        (None, [one]) => Ok(one.clone()),
-        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
-    }
 }
 
 /// What cannot be asked for together.

@@ -139,6 +139,26 @@ fn load_text(
     Some(loaded)
 }
 
+/// The rig that is meant: the one named, or the only one.
+///
+/// # Errors
+/// What there is instead, in words.
+fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String, String> {
+    let file = file.display();
+    let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
+    match (name, rigs.as_slice()) {
+        (_, []) => Err(format!("{file} has no rig")),
+        (Some(name), all) if all.contains(&name) => Ok(name.into()),
+        (Some(name), all) => {
+            let near = compile::nearest(name, all.iter().copied());
+            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
+            Err(format!("{file} has no rig `{name}`; {help}"))
+        }
+        (None, [one]) => Ok((*one).into()),
+        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
+    }
+}
+
 /// Refuses what `fric check` refuses in the models of a text, and reports it; counts its warnings in one line.
 fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
     watch.stage("models");

@@ -1,13 +1,12 @@
 //! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
 
-use super::{End, load_from};
+use super::{End, chosen_rig, load_from};
 use crate::args::Build;
 use crate::compile::{self, Stopwatch};
 use crate::kept::Keeping;
 use crate::terminal::Terminal;
 use crate::{project, report, sign};
 use abi::encode::Encode;
-use grammar::ast::Item;
 use runtime::package::signature::beside;
 use runtime::package::{Package, here};
 use runtime::record::log::Sections;
@@ -57,27 +56,7 @@ pub(super) fn packed(
     let reported = || "the rig was not built".to_string();
     let keeping = Keeping::new(&project::Disk);
     let mut loaded = load_from(file, &keeping, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let rigs: Vec<String> = items
-        .iter()
-        .filter_map(|item| match item {
-            Item::Rig(rig) => Some(rig.name.text.clone()),
-            _ => None,
-        })
-        .collect();
-    let name = match (name, &rigs[..]) {
-        (_, []) => return Err(format!("{} has no rig", file.display())),
-        (Some(name), all) if all.iter().any(|rig| rig == name) => name.to_string(),
-        (None, [only]) => only.clone(),
-        (Some(name), all) => {
-            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all.join(", ")),
-            };
-            return Err(format!("{} has no rig `{name}`; {help}", file.display()));
-        }
-        (None, all) => return Err(format!("which rig of {}? It has {}", file.display(), all.join(", "))),
-    };
+    let name = chosen_rig(file, name, &loaded)?;
     let mut found = Vec::new();
     let built = compile::packed_rig(&mut loaded, &keeping, &name, target, &mut found);
     if !found.is_empty() {

@@ -2,7 +2,7 @@
 //!
 //! The loops come from `stability`, judged by runtime::predict. Advice comes as numbers.
 
-use super::{End, load};
+use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
 use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
 use crate::stability::{self, Contact, contacts};
@@ -28,8 +28,8 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: false };
+    let set = args.set.texts();
+    let options = Options { changes: args.set.changes(), interpret: false };
     let mut found = Vec::new();
     let ready = compile::rig(&mut loaded, &project::Disk, &name, &options, &mut found);
     found.extend(ready.as_ref().err().into_iter().flatten().cloned());
@@ -72,35 +72,26 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     if stable { End::Fine } else { End::Failed }
 }
 
-/// The rig that is meant.
+/// The rig that is meant: the one named, the one that the experiment runs, or the only one.
 fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
+    let run = args.experiment.as_ref().map(|name| run_by(name, args, loaded)).transpose()?;
+    chosen_rig(&args.file, args.rig.as_deref().or(run.as_deref()), loaded)
+}
+
+/// The rig that an experiment runs.
+fn run_by(name: &str, args: &Args, loaded: &Loaded) -> Result<String, String> {
     let file = args.file.display();
-    let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
-    let runs = args.experiment.as_ref().map(|name| {
-        let items = &loaded.files.get(loaded.root()).ast.items;
-        let experiment = items.iter().find_map(|item| match item {
-            Item::Experiment(one) if one.name.text == *name => Some(one),
-            _ => None,
-        });
-        let run =
-            experiment.ok_or(format!("{file} has no experiment `{name}`"))?.body.iter().find_map(|one| match one {
-                ExperimentStatement::Run(run) => Some(run.instance.model.text.clone()),
-                _ => None,
-            });
-        run.filter(|run| rigs.contains(&run.as_str())).ok_or(format!("experiment `{name}` runs no rig of {file}"))
+    let items = &loaded.files.get(loaded.root()).ast.items;
+    let experiment = items.iter().find_map(|item| match item {
+        Item::Experiment(one) if one.name.text == name => Some(one),
+        _ => None,
     });
-    match (&args.rig, runs, rigs.as_slice()) {
-        (_, Some(Err(why)), _) => Err(why),
-        (None, Some(Ok(run)), _) => Ok(run),
-        (Some(name), _, all) if all.contains(&name.as_str()) => Ok(name.clone()),
-        (Some(name), _, all) => match compile::nearest(name, all.iter().copied()) {
-            Some(near) => Err(format!("{file} has no rig `{name}`; did you mean `{near}`?")),
-            None => Err(format!("{file} has no rig `{name}`")),
-        },
-        (None, None, []) => Err(format!("{file} has no rig")),
-        (None, None, [one]) => Ok((*one).to_string()),
-        (None, None, all) => Err(format!("{file} has several rigs: name one with --rig, of {}", all.join(", "))),
-    }
+    let run = experiment.ok_or(format!("{file} has no experiment `{name}`"))?.body.iter().find_map(|one| match one {
+        ExperimentStatement::Run(run) => Some(run.instance.model.text.clone()),
+        _ => None,
+    });
+    let of_a_rig = |run: &String| loaded.rigs().iter().any(|rig| rig.name.text == *run);
+    run.filter(of_a_rig).ok_or(format!("experiment `{name}` runs no rig of {file}"))
 }
 
 /// Stability of one contact at rest, at the Stribeck speed and while sliding, and what would help.

@@ -622,18 +622,7 @@ pub(super) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
     if plots.is_empty() {
         return None;
     }
-    let cases: Vec<figure::Recorded> = ran
-        .cases
-        .iter()
-        .zip(&ran.results)
-        .map(|(case, result)| {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
-            (case.label.as_str(), recording)
-        })
-        .collect();
+    let cases = figure::recorded(&ran.cases, &ran.results);
     let subtitle = results::solver(&first.experiment.solver);
     Some(figure::figure(&ran.name, &subtitle, plots, &cases))
 }

@@ -3,7 +3,7 @@
 use super::cross::{Crossed, cross};
 use super::{Done, End, compiled, done, load, sound};
 use crate::args::Run;
-use crate::compile::{self, Changes, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{self, Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
@@ -37,15 +37,7 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     let stages = watch.stop();
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        tol: args.tol,
-        duration: args.duration,
-        ..Changes::default()
-    };
-    let options = Options { changes, interpret: args.interpret };
+    let options = Options { changes: args.changed.changes(), interpret: args.interpret };
     let mut end = End::Fine;
     for name in &names {
         if experiment(args, &mut loaded, name, &options, &stages, terminal) != End::Fine {
@@ -181,18 +173,7 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
     if first.experiment.plots.is_empty() {
         return None;
     }
-    let cases: Vec<figure::Recorded> = done
-        .cases
-        .iter()
-        .zip(&done.results)
-        .map(|(case, result)| {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
-            (case.label.as_str(), recording)
-        })
-        .collect();
+    let cases = figure::recorded(&done.cases, &done.results);
     let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
     Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
 }
@@ -212,15 +193,11 @@ fn write(
             let png = path.extension().is_some_and(|extension| extension == "png");
             files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
         }
-        for (case, result) in done.cases.iter().zip(&done.results) {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
+        for (label, recording) in figure::recorded(&done.cases, &done.results) {
             let mut bytes = Vec::new();
             csv::write(recording, &mut bytes).expect("writing to memory does not fail");
             for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {
-                files.push((for_case(&path, &case.label), bytes.clone()));
+                files.push((for_case(&path, label), bytes.clone()));
             }
         }
     }

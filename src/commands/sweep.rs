@@ -66,17 +66,8 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
 
 /// The experiment with its parameters open; a parameter that follows from others, or has no value, is given one first.
 fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
-    let given: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
     let mut options = Options {
-        changes: Changes {
-            set: given.clone(),
-            method: args.solver,
-            step: args.step,
-            tol: args.tol,
-            duration: args.duration,
-            vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
-            ..Changes::default()
-        },
+        changes: Changes { vary: args.vary.iter().map(|vary| vary.path.clone()).collect(), ..args.changed.changes() },
         interpret: args.interpret,
     };
     let name = &args.experiment;
@@ -402,8 +393,8 @@ impl Table {
         let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
         let solver = results::solver(&self.cases[0].experiment.solver);
         asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
-        for (path, value) in &args.set {
-            asked += &format!("--set {path}={value}\n");
+        for set in args.changed.stepped.set.texts() {
+            asked += &format!("--set {set}\n");
         }
         for vary in &self.vary {
             let how = match &vary.how {
