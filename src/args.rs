@@ -554,6 +554,9 @@ pub struct Drives {
     /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
+    /// Give a drive the further objects of a data sheet (EDS, DCF): `load=servo.eds`
+    #[arg(long, value_name = "DRIVE=FILE", value_parser = setting)]
+    pub eds: Vec<(String, String)>,
     /// What of the text is changed
     #[command(flatten)]
     pub set: Set,
@@ -601,7 +604,7 @@ pub struct Bus {
     /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
-    /// Name frames and what they carry by this text with rigs, or by a DBC file; may be given several times
+    /// Name frames and what they carry by this text with rigs, DBC file, or data sheet (EDS, DCF); any number of them
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub names: Vec<PathBuf>,
     /// Print traffic as `candump -L` does, for `replay:`

@@ -207,7 +207,10 @@ fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
     }
 }
 
-/// The friction by itself, at the same instants: 0.55 ms after each tick.
+/// Tenths of a millisecond between two samples of the friction by itself.
+const FINE: usize = 10;
+
+/// The friction by itself, every 0.1 ms from -3 ms on.
 fn unbroken() -> Vec<f64> {
     let folder = root().join("examples/rtfs");
     let text = fs::read_to_string(folder.join("stick_slip.fric")).unwrap();
@@ -216,21 +219,25 @@ fn unbroken() -> Vec<f64> {
     let made = compiler::compile(&mut loaded, &sources, "contact", &Options::default(), &mut Vec::new(), &mut |_| ());
     let case = made.unwrap_or_else(|errors| panic!("{errors:?}")).swap_remove(0);
     let slot = case.experiment.plots[0].series[0].slot;
-    let instants: Vec<f64> = (0..20_000).map(|k| (f64::from(k) + 0.55) * 1e-3).collect();
+    let instants: Vec<f64> = (0..200_000).map(|k| f64::from(k) * 1e-4).collect();
     let go = &mut |_| runtime::engine::Continue::Continue(());
     let (course, ended) = runtime::engine::sample(case.instance, &case.experiment, &instants, &[slot], go);
     assert!(ended.is_ok());
-    course
+    vec![0.0; 3 * FINE].into_iter().chain(course).collect()
 }
 
-/// What a late drive does to stick and slip, and what looking ahead saves: rms error of the friction in % of F_C. 2 ms in
-/// the suite; `FRIC_TABLE=1` prints the table of docs/prediction.md.
+/// What a late drive does to stick and slip, and what looking ahead saves: rms error of the friction in % of F_C. The
+/// servo that pulls is late too, by less than 3 ms, which is no fault of the contact: what only that shifts is left out.
+/// 2 ms in the suite; `FRIC_TABLE=1` prints the table of docs/prediction.md.
 #[test]
 fn friction_is_right_at_2_ms_of_delay_when_commands_look_ahead() {
     let own = unbroken();
     let error = |course: &[f64]| {
-        let sum: f64 = course.iter().zip(&own).map(|(a, b)| (a - b) * (a - b)).sum();
-        100.0 * (sum / own.len() as f64).sqrt()
+        let shifted = |shift: usize| {
+            let pairs = course.iter().enumerate().map(|(k, a)| a - own[k * FINE + 3 * FINE - shift]);
+            100.0 * (pairs.map(|d| d * d).sum::<f64>() / course.len() as f64).sqrt()
+        };
+        (0..3 * FINE).map(shifted).fold(f64::INFINITY, f64::min)
     };
     let whole = std::env::var_os("FRIC_TABLE").is_some();
     let delays: &[f64] = if whole { &[0.7, 1.0, 1.5, 2.0, 3.0, 4.5] } else { &[2.0] };
@@ -241,11 +248,36 @@ fn friction_is_right_at_2_ms_of_delay_when_commands_look_ahead() {
         });
         println!("{delay} ms  plain {plain:.1?}  pull told {known:.1?}  pull unknown {unknown:.1?}");
         if *delay == 2.0 {
-            assert!(plain.0 > 15.0, "plain: {plain:?}");
+            assert!(plain.0 > 20.0, "plain: {plain:?}");
             assert!(known.0 <= 1.0 && known.1 == 2, "{known:?}");
-            assert!(unknown.0 <= 1.0 && unknown.1 == 2, "{unknown:?}");
+            assert!(unknown.0 <= 1.5 && unknown.1 == 2, "{unknown:?}");
         }
     }
+}
+
+/// The limit that `fric predict` finds from the compiled step is where the rig begins to chatter, within 5 %.
+#[test]
+fn the_predicted_limit_is_where_the_simulated_rig_begins_to_chatter() {
+    let folder = folder("hil-onset");
+    let text = root().join("examples/rtfs/stick_slip.fric").display().to_string();
+    let said = run(&folder, &["predict", "--json", "--rig", "plain", "--set", "load.delay=1ms", &text], 0);
+    let number = |after: &str| -> f64 {
+        let from = said.find(after).unwrap_or_else(|| panic!("no {after} in {said}")) + after.len();
+        said[from..].split([',', '}']).next().unwrap().parse().unwrap()
+    };
+    let (tau, margin) = (number("\"tau\":"), number("\"delay_margin\":"));
+    // Total delay of the formula: 2.25 ms; of the discrete loop 2.37.
+    assert!((tau + margin - 2.37e-3).abs() < 0.03e-3, "{tau} + {margin}");
+    // Ripple of the speed while the spring winds up, 3 to 4 s after the start.
+    let ripple = |part: f64| {
+        let delay_ms = 1.0 + 1e3 * (part * (tau + margin) - tau);
+        let (course, _) = pulled("plain", delay_ms, true);
+        let held = &course[3000..4000];
+        let smooth = held.windows(3).map(|w| (w[0] - 2.0 * w[1] + w[2]).powi(2)).sum::<f64>();
+        (smooth / held.len() as f64).sqrt()
+    };
+    let (below, above) = (ripple(0.95), ripple(1.05));
+    assert!(above > 10.0 * below, "ripple of the torque {below} below, {above} N·m above the limit");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! `fric bench-rt`: a loop as a rig has it, how late it woke, and what that means.
 
-use super::{End, load, reported};
+use super::{End, chosen_rig, load, reported};
 use crate::args::BenchRt as Args;
 use crate::compile::{self, Stopwatch};
 use crate::terminal::{Style, Terminal};
@@ -46,12 +46,9 @@ pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
 /// The cycle of a rig with its model, its drives simulated in this process at the pace of the wall.
 fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
-    let rigs: Vec<String> = loaded.rigs().iter().map(|rig| rig.name.text.clone()).collect();
-    let name = match (&args.rig, rigs.as_slice()) {
-        (Some(name), all) if all.contains(name) => name.clone(),
-        (None, [one]) => one.clone(),
-        (_, []) => return refused(terminal, &format!("{} has no rig", file.display())),
-        (_, all) => return refused(terminal, &format!("name a rig of {}: {}", file.display(), all.join(", "))),
+    let name = match chosen_rig(file, args.rig.as_deref(), &loaded) {
+        Ok(name) => name,
+        Err(why) => return refused(terminal, &why),
     };
     let ready = compile::rig(&mut loaded, &project::Disk, &name, &compile::Options::default(), &mut Vec::new());
     let mut ready = match ready {

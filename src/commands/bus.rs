@@ -13,6 +13,7 @@ use runtime::can::sim::Simulation;
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Server;
 use runtime::can::{self, CannotOpen, Event, Filter, Frame, Options, Received, names};
+use runtime::canopen::eds;
 use runtime::clock::Clock;
 use runtime::drive::frames;
 use std::collections::BTreeMap;
@@ -134,6 +135,8 @@ struct Known {
     messages: BTreeMap<(u32, bool), (String, Message)>,
     /// Drives by their number.
     drives: BTreeMap<u32, String>,
+    /// Objects of a data sheet, by index and sub-index as they are shown.
+    objects: BTreeMap<String, String>,
 }
 
 impl Known {
@@ -148,6 +151,16 @@ impl Known {
             for message in messages {
                 self.messages.insert((message.id, message.extended), (message.name.clone(), message));
             }
+            return Ok(());
+        }
+        if path
+            .extension()
+            .is_some_and(|extension| ["eds", "dcf"].iter().any(|kind| extension.eq_ignore_ascii_case(kind)))
+        {
+            let bytes = std::fs::read(path).map_err(|error| failed(error.to_string()))?;
+            let sheet = eds::read(&String::from_utf8_lossy(&bytes), 1);
+            let sheet = sheet.map_err(|mistakes| failed(mistakes[0].to_string()))?;
+            self.objects.extend(sheet.entries().iter().map(|entry| (entry.object.to_string(), entry.name.clone())));
             return Ok(());
         }
         let mut loaded = load(path, terminal, &mut Stopwatch::start("read")).ok_or(End::Failed)?;
@@ -188,7 +201,11 @@ impl Known {
             let values: Vec<String> = message.fields.iter().enumerate().filter_map(field).collect();
             return format!("{who}: {}", values.join(", "));
         }
-        let name = names::canopen(frame).unwrap_or_default();
+        let mut name = names::canopen(frame).unwrap_or_default();
+        let object = name.split(' ').find_map(|word| self.objects.get_key_value(word.trim_end_matches(',')));
+        if let (Some((object, says)), true) = (object, name.starts_with("SDO")) {
+            name = name.replace(object, &format!("{object} ({says})"));
+        }
         match self.drives.get(&(frame.id() & 0x7F)).filter(|_| frame.id() >= 0x80) {
             Some(drive) => name.replace(&format!("node {}", frame.id() & 0x7F), drive),
             None => name,

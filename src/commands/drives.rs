@@ -5,12 +5,14 @@ use crate::args::Drives as Args;
 use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
+use abi::rig::Kind;
 use runtime::can::address::Address;
 use runtime::can::hub::Hub;
 use runtime::can::sim::{SimBus, Simulation};
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Server;
 use runtime::can::{self};
+use runtime::canopen::eds;
 use runtime::clock::Clock;
 use runtime::drive::{Bench, attend, hooks};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -81,6 +83,24 @@ fn open(args: &Args, ready: &Ready) -> Result<Served, (String, End)> {
         addresses[at].1 = address;
     }
     let mut bench = Bench::new(rig, Some(ready.plant.clone()), args.seed).map_err(failed)?;
+    for (name, path) in &args.eds {
+        let at = rig.nodes.iter().position(|node| node.name == *name);
+        let Some((at, Kind::Cia402(config))) = at.map(|at| (at, &rig.nodes[at].kind)) else {
+            return Err(misused(format!("the rig has no drive `{name}`")));
+        };
+        let bytes = std::fs::read(path).map_err(|error| failed(format!("{path}: {error}")))?;
+        let sheet = eds::read(&String::from_utf8_lossy(&bytes), config.node).map_err(|mistakes| {
+            let all: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
+            failed(format!("{path} is no data sheet: {}", all.join("; ")))
+        })?;
+        let objects = bench.drive(at).expect("it is a drive").objects();
+        // What the drive simulates it knows better.
+        for entry in
+            sheet.entries().iter().filter(|entry| objects.entry(entry.object).is_none()).cloned().collect::<Vec<_>>()
+        {
+            objects.add(entry);
+        }
+    }
     for text in &args.inject {
         bench.hook(hooks::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?);
     }
