@@ -597,9 +597,7 @@ fn row_23_more_energy_comes_back_than_a_contact_can_hold() {
         assert!(coupling.warnings > 0 && coupling.returned_max > 3.0, "{coupling:?}");
     }
     // In time, the same contact gives back what it holds, having no damping, and no more.
-    let mut options = quick();
-    options.control.energy_stops = true;
-    let mut healthy = Stand::of(late_bristle(0.8e-3, true, 0.4), options, 1, None);
+    let mut healthy = Stand::of(late_bristle(0.8e-3, true, 0.4), quick(), 1, None);
     healthy.reach(Step::Armed);
     healthy.goes_on(2_000 * MS);
     let coupling = healthy.hil.counts().coupling.unwrap();
