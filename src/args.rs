@@ -381,6 +381,9 @@ pub struct Hil {
     /// Run although the loop is predicted to be unstable: simulated drives only
     #[arg(long)]
     pub accept_unstable: bool,
+    /// Stop when a contact gives back more energy than it can hold [default: count it]
+    #[arg(long)]
+    pub stop_on_energy: bool,
     /// Run although the host gives no real time: simulated drives only
     #[arg(long)]
     pub accept_jitter: bool,
@@ -555,6 +558,9 @@ pub struct Drives {
     /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
+    /// Give a drive the further objects of a data sheet (EDS, DCF): `load=servo.eds`
+    #[arg(long, value_name = "DRIVE=FILE", value_parser = setting)]
+    pub eds: Vec<(String, String)>,
     /// What of the text is changed
     #[command(flatten)]
     pub set: Set,
@@ -602,6 +608,9 @@ pub struct Bus {
     /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
+    /// Name frames and what they carry by this text with rigs, DBC file, or data sheet (EDS, DCF); any number of them
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub names: Vec<PathBuf>,
     /// Print traffic as `candump -L` does, for `replay:`
     #[arg(long)]
     pub log: bool,
@@ -646,8 +655,14 @@ pub enum LookedAt {
 /// `fric bench-rt`
 #[derive(clap::Args, Debug)]
 pub struct BenchRt {
-    /// Cycles a second, such as 1kHz
-    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency)]
+    /// A text with a rig: its own cycle with its model and simulated drives, instead of one SYNC and its echo
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: Option<PathBuf>,
+    /// The rig in it [default: the only one]
+    #[arg(requires = "file")]
+    pub rig: Option<String>,
+    /// Cycles a second, such as 1kHz; a rig has its own
+    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency, conflicts_with = "file")]
     pub rate: f64,
     /// How long to run
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86_400))]

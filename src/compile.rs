@@ -14,7 +14,7 @@ pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
-pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
+pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,

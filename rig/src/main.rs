@@ -192,6 +192,7 @@ fn served(args: &Drives) -> Result<u8, String> {
         buses: args.bus.clone(),
         pty: args.pty.clone(),
         tcp: args.tcp,
+        sheets: Vec::new(),
         inject: args.inject.clone(),
         seed: args.seed,
     };

@@ -13,7 +13,7 @@ use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
-use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options};
+use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options, look_ahead};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, words as told};
 use runtime::realtime::{self, Wishes};
@@ -130,6 +130,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         options.start.sign_test = SignTest::Skip;
     }
     options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
+    options.look = look_ahead(&rig, &open.program("plant")?)?;
     let fast = simulated && wanted.fast;
     let world;
     let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {

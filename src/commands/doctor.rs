@@ -31,7 +31,13 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
     for (address, bit_rate) in &buses {
         if let Address::SocketCan(name) = address {
             found.extend(host.interrupt(name, args.priority));
-            found.extend(interface(name, *bit_rate));
+            let of_it = interface(name, *bit_rate);
+            let forbids = of_it.iter().any(|finding| matches!(finding.verdict, Verdict::Forbids(_)));
+            found.extend(of_it);
+            // What cannot be listened to has been told.
+            if forbids {
+                continue;
+            }
         }
         // Nobody else can be on a bus in this process.
         if !matches!(address, Address::Sim(_)) {

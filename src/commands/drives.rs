@@ -5,7 +5,7 @@ use crate::args::Drives as Args;
 use crate::compile::{self, Options, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
-use runtime::drive::serve::{Doors, Refused, Served};
+use runtime::drive::serve::{Doors, Refused, Served, Sheet};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Ctrl-C.
@@ -29,7 +29,22 @@ pub fn drives(args: &Args, terminal: &mut Terminal) -> End {
         }
     };
     drop(loaded);
+    let mut sheets = Vec::new();
+    for (drive, file) in &args.eds {
+        match std::fs::read(file) {
+            Ok(bytes) => sheets.push(Sheet {
+                drive: drive.clone(),
+                file: file.clone(),
+                text: String::from_utf8_lossy(&bytes).into_owned(),
+            }),
+            Err(error) => {
+                terminal.error(&format!("{file}: {error}"));
+                return End::Failed;
+            }
+        }
+    }
     let doors = Doors {
+        sheets,
         buses: args.bus.clone(),
         pty: args.pty.clone(),
         tcp: args.tcp,

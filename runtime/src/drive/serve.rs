@@ -11,9 +11,10 @@ use crate::can::sim::{SimBus, Simulation};
 use crate::can::slcan::Slcan;
 use crate::can::socketcand::Server;
 use crate::can::{self};
+use crate::canopen::eds;
 use crate::clock::Clock;
 use abi::Instance;
-use abi::rig::Rig;
+use abi::rig::{Kind, Rig};
 use std::path::PathBuf;
 
 /// How soon the end is heard of, and changes of state are told, on a silent bus.
@@ -30,10 +31,23 @@ pub struct Doors {
     pub pty: Vec<PathBuf>,
     /// A TCP port that speaks like socketcand, 0 for a free one.
     pub tcp: Option<u16>,
+    /// What drives say they have besides what their simulation knows.
+    pub sheets: Vec<Sheet>,
     /// What fails, as [`hooks::read`] takes it.
     pub inject: Vec<String>,
     /// From which all that is random follows.
     pub seed: u64,
+}
+
+/// The data sheet (EDS) of a drive.
+#[derive(Clone, Debug)]
+pub struct Sheet {
+    /// The drive's name in the rig.
+    pub drive: String,
+    /// Where the text is from, for messages.
+    pub file: String,
+    /// The text.
+    pub text: String,
 }
 
 /// Why nothing is served.
@@ -76,6 +90,23 @@ impl Served {
             addresses[at].1 = address;
         }
         let mut bench = Bench::new(rig, plant, doors.seed).map_err(failed)?;
+        for Sheet { drive, file, text } in &doors.sheets {
+            let at = rig.nodes.iter().position(|node| node.name == *drive);
+            let Some((at, Kind::Cia402(config))) = at.map(|at| (at, &rig.nodes[at].kind)) else {
+                return Err(misused(format!("the rig has no drive `{drive}`")));
+            };
+            let sheet = eds::read(text, config.node).map_err(|mistakes| {
+                let all: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
+                failed(format!("{file} is no data sheet: {}", all.join("; ")))
+            })?;
+            let objects = bench.drive(at).expect("it is a drive").objects();
+            // What the drive simulates it knows better.
+            for entry in sheet.entries() {
+                if objects.entry(entry.object).is_none() {
+                    objects.add(entry.clone());
+                }
+            }
+        }
         for text in &doors.inject {
             bench.hook(hooks::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?);
         }
