@@ -6,7 +6,7 @@
 use crate::compile::{Changes, Emit};
 use crate::value;
 use crate::vary::{self, Vary};
-use abi::image::Target;
+use abi::image::{Feature, Target};
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
@@ -333,6 +333,10 @@ pub struct Build {
     /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
+    /// What the code may use besides what all code for x86_64 does: avx2, bmi1, bmi2, lzcnt, popcnt; it then runs where
+    /// they are only, with the same bits
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',', value_parser = feature)]
+    pub features: Vec<Feature>,
     /// What of it is changed, and how it is stepped
     #[command(flatten)]
     pub stepped: Stepped,
@@ -745,15 +749,22 @@ pub struct Deploy {
     /// The rig in the text; not needed if it is the only one
     #[arg(value_name = "RIG")]
     pub name: Option<String>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Sign the package with a secret key
     #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
     pub sign: Option<PathBuf>,
     /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
     #[arg(long, value_name = "DIR")]
     pub trusted: Option<String>,
-    /// Start it there, and go back to the package before if it refuses
+    /// Start it there, and go back to the package before if it refuses; on a terminal, then tell its state until Ctrl-C,
+    /// which does not end the rig
     #[arg(long)]
     pub start: bool,
+    /// Tell its state until Ctrl-C also where the output is no terminal
+    #[arg(long, requires = "start")]
+    pub follow: bool,
 }
 
 /// `fric fetch-log`
@@ -802,6 +813,11 @@ fn solver(text: &str) -> Result<Method, String> {
 fn target(text: &str) -> Result<Target, String> {
     let names = || Target::ALL.map(Target::name).join(", ");
     Target::named(text.strip_suffix("-linux").unwrap_or(text)).ok_or_else(|| format!("code is made for {}", names()))
+}
+
+fn feature(text: &str) -> Result<Feature, String> {
+    let names = || Feature::ALL.map(|feature| feature.name().to_ascii_lowercase()).join(", ");
+    Feature::named(text.trim()).ok_or_else(|| format!("the features are {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {

@@ -1,6 +1,6 @@
 //! `fric bench`: what a step of an experiment costs, alone, in lanes and on all cores, and what compiling it took.
 
-use super::{End, compiled, load, reported};
+use super::{End, compiled, has_experiment, load, reported};
 use crate::args::Bench;
 use crate::compile::{self, Method, Options, Stages, Stopwatch};
 use crate::project;
@@ -21,12 +21,8 @@ pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
     let before = watch.stop();
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    if !all.contains(&args.experiment) {
-        let help = match compile::nearest(&args.experiment, all.iter().map(String::as_str)) {
-            Some(near) => format!("did you mean `{near}`?"),
-            None => format!("it has {}", all.join(", ")),
-        };
-        terminal.error(&format!("{} has no experiment `{}`; {help}", args.file.display(), args.experiment));
+    if let Err(message) = has_experiment(&args.file, &args.experiment, &all) {
+        terminal.error(&message);
         return End::Failed;
     }
     let changes = args.stepped.changes();

@@ -27,6 +27,10 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
     };
+    if !args.features.is_empty() && !matches!(emit, Emit::Blob | Emit::Asm) {
+        terminal.error("--features is for machine code: --emit blob or asm, or a package");
+        return End::Misused;
+    }
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let models: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
     let experiments: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
@@ -70,7 +74,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
-    let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target) {
+    let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target, &args.features) {
         Ok(bytes) => bytes,
         Err(why) => {
             terminal.error(&why);

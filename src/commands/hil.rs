@@ -8,7 +8,7 @@ use crate::terminal::{Style, Terminal};
 use crate::{project, report, stability, value};
 use abi::Description;
 use abi::description::Kind;
-use abi::rig::{self, Mode, Node, Rig};
+use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
@@ -16,7 +16,7 @@ use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::identify::{self, Identification};
-use runtime::hil::simulated::{MASTER, Pace, World};
+use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
@@ -172,16 +172,6 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
     let cycles_per_block = cycles(BLOCK_NS);
     // Where time stands meanwhile, the log may take its time.
     Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
-}
-
-/// Whether one drive holds speed or position while another gives torque.
-fn holds_and_pushes(rig: &Rig) -> bool {
-    let pushes = |node: &Node| match &node.kind {
-        rig::Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),
-        rig::Kind::Frames(_) => None,
-    };
-    let all = || rig.nodes.iter().filter_map(pushes);
-    all().any(|pushes| pushes) && all().any(|pushes| !pushes)
 }
 
 fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {

@@ -103,6 +103,19 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
     }
 }
 
+/// Says if there is no experiment of this name among all of a file, and which one may be meant.
+fn has_experiment(file: &Path, name: &str, all: &[String]) -> Result<(), String> {
+    if all.iter().any(|one| one == name) {
+        return Ok(());
+    }
+    let help = match compile::nearest(name, all.iter().map(String::as_str)) {
+        Some(near) => format!("did you mean `{near}`?"),
+        None if all.is_empty() => "it has none".into(),
+        None => format!("it has {}", all.join(", ")),
+    };
+    Err(format!("{} has no experiment `{name}`; {help}", file.display()))
+}
+
 /// Reads and loads a text; reports what is wrong with it. None if it cannot be used.
 fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
     load_from(path, &project::Disk, terminal, watch)

@@ -1,9 +1,9 @@
 //! `fric run`: compiles experiments, runs them, shows and writes what they did.
 
 use super::cross::{Crossed, cross};
-use super::{Done, End, compiled, done, load, sound};
+use super::{Done, End, compiled, done, has_experiment, load, sound};
 use crate::args::Run;
-use crate::compile::{self, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
@@ -56,19 +56,10 @@ fn refused(args: &Run, loaded: &Loaded, name: &str, diagnostics: &[Diagnostic], 
 /// The experiments to run: those named, else all.
 fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    let file = args.file.display();
     if all.is_empty() {
-        return Err(format!("{file} has no experiment to run"));
+        return Err(format!("{} has no experiment to run", args.file.display()));
     }
-    for name in &args.experiments {
-        if !all.contains(name) {
-            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all.join(", ")),
-            };
-            return Err(format!("{file} has no experiment `{name}`; {help}"));
-        }
-    }
+    args.experiments.iter().try_for_each(|name| has_experiment(&args.file, name, &all))?;
     Ok(if args.experiments.is_empty() { all } else { args.experiments.clone() })
 }
 

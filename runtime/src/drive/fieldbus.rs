@@ -639,8 +639,9 @@ impl Fieldbus {
             Step::Listen if lasted_ns >= self.options.listen_ns => self.go(Step::Reset),
             Step::Listen => {}
             Step::Reset => {
-                // Once more after a second: a drive may have been booting.
-                let again = lasted_ns % 1_000_000_000 < self.period_ns;
+                // Once more after a second: a drive may have been booting. Never in the cycle after the first, which may come
+                // a little early: who has just booted would boot anew.
+                let again = first || (lasted_ns >= 1_000_000_000 && lasted_ns % 1_000_000_000 < self.period_ns);
                 let all = self.each(send, |drive, send| {
                     if first {
                         drive.forget();

@@ -19,6 +19,7 @@ pub mod hooks;
 pub mod simulated;
 pub mod bench;
 pub mod attend;
+pub mod serve;
 
 pub use attend::attend;
 pub use bench::{Bench, Shaft};
