@@ -1,6 +1,8 @@
 //! How long a text takes from its first character to its first step, by stage, in a warm process; and how long the whole
-//! library takes to be checked; and how both grow with the size of a program. Medians over some rounds; run with
-//! `cargo bench --bench compile`.
+//! library takes to be checked and compiled; and how both grow with the size of a program. Medians over some rounds of
+//! processor time; run with `cargo bench --bench compile`.
+
+mod clock;
 
 #[path = "../src/project.rs"]
 #[allow(dead_code, unused_imports, reason = "the command uses more of it")]
@@ -10,9 +12,10 @@ mod compile {
     pub use compiler::Sources;
 }
 
-use compiler::{Options, Sources, check, load};
+use abi::plan::Method;
+use clock::processor_time;
+use compiler::{Changes, Options, Sources, check, load};
 use std::hint::black_box;
-use std::time::Instant;
 
 const ROUNDS: usize = 60;
 
@@ -40,20 +43,20 @@ fn main() {
 fn stages() {
     let mut all: Vec<(&'static str, Vec<f64>)> = Vec::new();
     for _ in 0..ROUNDS {
-        let mut marks: Vec<(&'static str, Instant)> = vec![("parse", Instant::now())];
+        let mut marks: Vec<(&'static str, f64)> = vec![("parse", processor_time())];
         let mut loaded = load("servo.fric", SERVO, &project::Disk);
         let (mut warnings, options) = (Vec::new(), Options::default());
-        let mut mark = |stage| marks.push((stage, Instant::now()));
+        let mut mark = |stage| marks.push((stage, processor_time()));
         let cases = compiler::compile(&mut loaded, &project::Disk, "hunting", &options, &mut warnings, &mut mark);
         let Ok(mut cases) = cases else { panic!("the servo compiles") };
-        marks.push(("first step", Instant::now()));
+        marks.push(("first step", processor_time()));
         let instance = &mut cases[0].instance;
         instance.start(1e-5);
         assert_eq!(instance.advance(1), 0);
         black_box(&instance);
-        marks.push(("", Instant::now()));
+        marks.push(("", processor_time()));
         for pair in marks.windows(2) {
-            let ms = 1e3 * (pair[1].1 - pair[0].1).as_secs_f64();
+            let ms = 1e3 * (pair[1].1 - pair[0].1);
             match all.iter_mut().find(|(stage, _)| *stage == pair[0].0) {
                 Some((_, times)) => times.push(ms),
                 None => all.push((pair[0].0, vec![ms])),
@@ -76,17 +79,44 @@ fn library() {
         modules.iter().filter_map(|module| project::Disk.library(module)).flatten().collect();
     let mut times: Vec<f64> = (0..5)
         .map(|_| {
-            let begin = Instant::now();
+            let begin = processor_time();
             for (name, text) in &texts {
                 let mut loaded = load(name, text, &project::Disk);
                 black_box(check(&mut loaded, &project::Disk));
             }
-            1e3 * begin.elapsed().as_secs_f64()
+            1e3 * (processor_time() - begin)
         })
         .collect();
     println!(
         "checking each of the library's {} texts on its own, imports read anew: {:.0} ms",
         texts.len(),
+        median(&mut times)
+    );
+    let mut models = 0;
+    let mut times: Vec<f64> = (0..5)
+        .map(|_| {
+            models = 0;
+            let begin = processor_time();
+            for (name, text) in &texts {
+                let mut loaded = load(name, text, &project::Disk);
+                let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
+                for model in names {
+                    let (changes, mut warnings) = (Changes::default(), Vec::new());
+                    let Ok(mut built) = compiler::build(&mut loaded, &project::Disk, &model, &changes, &mut warnings)
+                    else {
+                        continue;
+                    };
+                    built.program.size_rings(1e-3);
+                    let functions = compiler::functions(&built.program, Method::Expo);
+                    black_box(compiler::code(&functions, &built.program.description, false));
+                    models += 1;
+                }
+            }
+            1e3 * (processor_time() - begin)
+        })
+        .collect();
+    println!(
+        "compiling each of their {models} models on its own for `expo`, to machine code: {:.0} ms",
         median(&mut times)
     );
 }
@@ -100,10 +130,10 @@ fn lines() {
     text += "  output y [m/s] = x999\n}\n";
     let mut times: Vec<f64> = (0..15)
         .map(|_| {
-            let begin = Instant::now();
+            let begin = processor_time();
             let mut loaded = load("lines.fric", &text, &project::Disk);
             assert!(check(&mut loaded, &project::Disk).is_empty());
-            1e3 * begin.elapsed().as_secs_f64()
+            1e3 * (processor_time() - begin)
         })
         .collect();
     println!("checking a text of 1,000 equations: {:.1} ms", median(&mut times));
@@ -126,15 +156,15 @@ fn parts() {
         let rounds = if n < 10_000 { 9 } else { 3 };
         let (mut checked, mut compiled) = (Vec::new(), Vec::new());
         for _ in 0..rounds {
-            let begin = Instant::now();
+            let begin = processor_time();
             let mut loaded = load("chain.fric", &text, &project::Disk);
             assert!(check(&mut loaded, &project::Disk).is_empty());
-            checked.push(1e3 * begin.elapsed().as_secs_f64());
-            let begin = Instant::now();
+            checked.push(1e3 * (processor_time() - begin));
+            let begin = processor_time();
             let (mut warnings, options) = (Vec::new(), Options { interpret: true, ..Options::default() });
             let cases = compiler::compile(&mut loaded, &project::Disk, "e", &options, &mut warnings, &mut |_| ());
             black_box(cases.map_err(|found| found.len()).expect("the chain compiles"));
-            compiled.push(1e3 * begin.elapsed().as_secs_f64());
+            compiled.push(1e3 * (processor_time() - begin));
         }
         println!("  {n:>6}  {:9.2} ms  {:9.2} ms", median(&mut checked), median(&mut compiled));
     }

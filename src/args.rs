@@ -3,10 +3,10 @@
 //! Help, completions and the man page are made from it. Values with units are read here, so that a wrong one is wrong
 //! usage and not a failed run.
 
-use crate::compile::Emit;
+use crate::compile::{Changes, Emit};
 use crate::value;
 use crate::vary::{self, Vary};
-use abi::image::Target;
+use abi::image::{Feature, Target};
 use abi::plan::Method;
 use abi::unit::{Dimension, Unit};
 use clap::{Parser, Subcommand, ValueHint};
@@ -102,6 +102,68 @@ pub enum Command {
     },
 }
 
+/// What of a text is changed before it is compiled.
+#[derive(clap::Args, Clone, Debug)]
+pub struct Set {
+    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
+    pub all: Vec<(String, String)>,
+}
+
+impl Set {
+    /// As the compiler reads them: `fr.Fs=2N`.
+    pub fn texts(&self) -> Vec<String> {
+        self.all.iter().map(|(path, value)| format!("{path}={value}")).collect()
+    }
+
+    /// The changes that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { set: self.texts(), ..Changes::default() }
+    }
+}
+
+/// Changes, and how steps are made.
+#[derive(clap::Args, Debug)]
+pub struct Stepped {
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
+    /// Solver in place of the experiment's own
+    #[arg(long, value_name = "NAME", value_parser = solver)]
+    pub solver: Option<Method>,
+    /// Fixed step, such as 10us
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub step: Option<f64>,
+}
+
+impl Stepped {
+    /// The changes to an experiment that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { method: self.solver, step: self.step, ..self.set.changes() }
+    }
+}
+
+/// All that can be changed of an experiment.
+#[derive(clap::Args, Debug)]
+pub struct Changed {
+    /// What of the text is changed, and how steps are made
+    #[command(flatten)]
+    pub stepped: Stepped,
+    /// Relative tolerance of an adaptive run, such as 1e-8
+    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
+    pub tol: Option<f64>,
+    /// Simulated time, such as 20s
+    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
+    pub duration: Option<f64>,
+}
+
+impl Changed {
+    /// The changes to an experiment that they are.
+    pub fn changes(&self) -> Changes {
+        Changes { tol: self.tol, duration: self.duration, ..self.stepped.changes() }
+    }
+}
+
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
@@ -110,21 +172,9 @@ pub struct Run {
     pub file: PathBuf,
     /// Experiments in it; all if none is named
     pub experiments: Vec<String>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Relative tolerance of an adaptive run, such as 1e-8
-    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
-    pub tol: Option<f64>,
-    /// Simulated time, such as 20s
-    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
-    pub duration: Option<f64>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub changed: Changed,
     /// Folder for a plot (SVG) and the data (CSV) of each experiment [default: out, unless --plot, --csv or --json]
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
@@ -203,21 +253,9 @@ pub struct Sweep {
     /// Over which parameter to draw [default: the first]
     #[arg(long, value_name = "PATH", requires = "plot")]
     pub against: Option<String>,
-    /// Change a parameter or a slot for all runs: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Relative tolerance of an adaptive run, such as 1e-8
-    #[arg(long, value_name = "NUMBER", value_parser = tolerance)]
-    pub tol: Option<f64>,
-    /// Simulated time, such as 20s
-    #[arg(long = "for", value_name = "TIME", value_parser = positive_time)]
-    pub duration: Option<f64>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub changed: Changed,
     /// Print nothing but errors
     #[arg(long, short)]
     pub quiet: bool,
@@ -247,9 +285,9 @@ pub struct Linearise {
     /// Outputs, or other quantities [default: the outputs of the whole]
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub outputs: Vec<String>,
-    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Print a JSON object
     #[arg(long)]
     pub json: bool,
@@ -266,15 +304,9 @@ pub struct Bench {
     pub file: PathBuf,
     /// The experiment in it to time
     pub experiment: String,
-    /// Solver in place of the experiment's own
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the experiment is changed
+    #[command(flatten)]
+    pub stepped: Stepped,
     /// Print a JSON object
     #[arg(long)]
     pub json: bool,
@@ -301,15 +333,13 @@ pub struct Build {
     /// Processor: x86_64 or aarch64, also written x86_64-linux [default: this one]
     #[arg(long, value_name = "NAME", value_parser = target)]
     pub target: Option<Target>,
-    /// How the step is made [default: of an experiment its own, else expo]
-    #[arg(long, value_name = "NAME", value_parser = solver)]
-    pub solver: Option<Method>,
-    /// Fixed step of an experiment, such as 10us
-    #[arg(long, value_name = "TIME", value_parser = positive_time)]
-    pub step: Option<f64>,
-    /// Change a parameter or a slot: `fr.Fs=2N`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What the code may use besides what all code for x86_64 does: avx2, bmi1, bmi2, lzcnt, popcnt; it then runs where
+    /// they are only, with the same bits
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',', value_parser = feature)]
+    pub features: Vec<Feature>,
+    /// What of it is changed, and how it is stepped
+    #[command(flatten)]
+    pub stepped: Stepped,
 }
 
 /// `fric hil`
@@ -333,9 +363,9 @@ pub struct Hil {
     /// Put another bus under the rig: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`
     #[arg(long, value_name = "BUS=ADDRESS", value_parser = setting)]
     pub bus: Vec<(String, String)>,
-    /// Change a parameter or a slot: `fr.Fs=2N.m`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Make simulated drives and devices fail: 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
@@ -351,6 +381,9 @@ pub struct Hil {
     /// Run although the loop is predicted to be unstable: simulated drives only
     #[arg(long)]
     pub accept_unstable: bool,
+    /// Stop when a contact gives back more energy than it can hold [default: count it]
+    #[arg(long)]
+    pub stop_on_energy: bool,
     /// Run although the host gives no real time: simulated drives only
     #[arg(long)]
     pub accept_jitter: bool,
@@ -388,9 +421,9 @@ pub struct Predict {
     /// The rig [default: that of the experiment, or the only one]
     #[arg(long, value_name = "RIG")]
     pub rig: Option<String>,
-    /// Change a parameter or a slot: `load.delay=2ms`, `fr=Karnopp()`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// One JSON object
     #[arg(long)]
     pub json: bool,
@@ -525,9 +558,12 @@ pub struct Drives {
     /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
-    /// Change a parameter: `m=0.02kg.m^2`, `load.delay=2ms`
-    #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
-    pub set: Vec<(String, String)>,
+    /// Give a drive the further objects of a data sheet (EDS, DCF): `load=servo.eds`
+    #[arg(long, value_name = "DRIVE=FILE", value_parser = setting)]
+    pub eds: Vec<(String, String)>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// From which all that is random follows
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
@@ -572,6 +608,9 @@ pub struct Bus {
     /// Bits a second of buses whose address does not say: simulated ones get it, interfaces are compared with it
     #[arg(long, value_name = "BITS", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub bit_rate: Option<u32>,
+    /// Name frames and what they carry by this text with rigs, DBC file, or data sheet (EDS, DCF); any number of them
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub names: Vec<PathBuf>,
     /// Print traffic as `candump -L` does, for `replay:`
     #[arg(long)]
     pub log: bool,
@@ -616,8 +655,14 @@ pub enum LookedAt {
 /// `fric bench-rt`
 #[derive(clap::Args, Debug)]
 pub struct BenchRt {
-    /// Cycles a second, such as 1kHz
-    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency)]
+    /// A text with a rig: its own cycle with its model and simulated drives, instead of one SYNC and its echo
+    #[arg(value_hint = ValueHint::FilePath)]
+    pub file: Option<PathBuf>,
+    /// The rig in it [default: the only one]
+    #[arg(requires = "file")]
+    pub rig: Option<String>,
+    /// Cycles a second, such as 1kHz; a rig has its own
+    #[arg(long, value_name = "FREQUENCY", default_value = "1kHz", value_parser = frequency, conflicts_with = "file")]
     pub rate: f64,
     /// How long to run
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=86_400))]
@@ -704,15 +749,22 @@ pub struct Deploy {
     /// The rig in the text; not needed if it is the only one
     #[arg(value_name = "RIG")]
     pub name: Option<String>,
+    /// What of the text is changed
+    #[command(flatten)]
+    pub set: Set,
     /// Sign the package with a secret key
     #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
     pub sign: Option<PathBuf>,
     /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
     #[arg(long, value_name = "DIR")]
     pub trusted: Option<String>,
-    /// Start it there, and go back to the package before if it refuses
+    /// Start it there, and go back to the package before if it refuses; on a terminal, then tell its state until Ctrl-C,
+    /// which does not end the rig
     #[arg(long)]
     pub start: bool,
+    /// Tell its state until Ctrl-C also where the output is no terminal
+    #[arg(long, requires = "start")]
+    pub follow: bool,
 }
 
 /// `fric fetch-log`
@@ -761,6 +813,11 @@ fn solver(text: &str) -> Result<Method, String> {
 fn target(text: &str) -> Result<Target, String> {
     let names = || Target::ALL.map(Target::name).join(", ");
     Target::named(text.strip_suffix("-linux").unwrap_or(text)).ok_or_else(|| format!("code is made for {}", names()))
+}
+
+fn feature(text: &str) -> Result<Feature, String> {
+    let names = || Feature::ALL.map(|feature| feature.name().to_ascii_lowercase()).join(", ");
+    Feature::named(text.trim()).ok_or_else(|| format!("the features are {}", names()))
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {

@@ -2,7 +2,7 @@
 
 use abi::Function;
 use abi::encode::Encode;
-use abi::image::Target;
+use abi::image::{Feature, Target};
 use abi::lanes::Lanes;
 pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
@@ -14,7 +14,7 @@ pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
-pub use compiler::rig::{StepDerivative, bus_load, linear as linear_of};
+pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
@@ -39,11 +39,17 @@ pub enum Emit {
 }
 
 /// Makes it. A model on its own is stepped by `solver`, else by `expo`; an experiment by its own; `target`: for which
-/// processor, else for this one.
+/// processor, else for this one; `features`: what it uses there besides.
 ///
 /// # Errors
 /// Why it cannot be made, in words.
-pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<Target>) -> Result<Vec<u8>, String> {
+pub fn emit(
+    built: &Built,
+    emit: Emit,
+    solver: Option<Method>,
+    made_for: Option<Target>,
+    features: &[Feature],
+) -> Result<Vec<u8>, String> {
     let method = built.solver.map(|solver| solver.method).or(solver).unwrap_or(Method::Expo);
     let functions = compiler::functions(&built.program, method);
     let description = &built.program.description;
@@ -52,8 +58,16 @@ pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<
         Emit::C => c::source(&functions, description, &built.program.params),
         Emit::Ir => functions.iter().map(|(_, func)| func.to_string()).collect::<Vec<_>>().join("\n"),
         Emit::Clif | Emit::Asm => {
-            let isa = match made_for {
-                Some(made_for) => target::of(made_for),
+            let chosen = match (made_for, Target::here()) {
+                (Some(made_for), _) => Some(made_for),
+                (None, here) => here.filter(|_| !features.is_empty()),
+            };
+            let own;
+            let isa = match chosen {
+                Some(made_for) => {
+                    own = target::with(made_for, usable(made_for, features)?);
+                    &own
+                }
                 None => target::here().map_err(told)?,
             };
             let mut coder = Coder::new(isa);
@@ -68,11 +82,25 @@ pub fn emit(built: &Built, emit: Emit, solver: Option<Method>, made_for: Option<
             let Some(made_for) = made_for.or(Target::here()) else {
                 return Err(format!("no code is made for {}: choose a --target", std::env::consts::ARCH));
             };
-            let image = blob::image(&functions, description, &built.program.params, made_for).map_err(told)?;
+            let more = usable(made_for, features)?;
+            let image = blob::image(&functions, description, &built.program.params, made_for, more).map_err(told)?;
             return Ok(image.to_bytes());
         }
     };
     Ok(text.into_bytes())
+}
+
+/// Features, if code for a target may use them.
+fn usable(target: Target, features: &[Feature]) -> Result<&[Feature], String> {
+    let names = |features: &[Feature]| features.iter().map(|it| it.name()).collect::<Vec<_>>().join(", ");
+    let known = |feature: &&Feature| !target.may_use().contains(feature) && !target.needs().contains(feature);
+    match (features.iter().find(known), target.may_use()) {
+        (None, _) => Ok(features),
+        (Some(_), []) => Err(format!("code for {} uses its base alone: leave --features out", target.name())),
+        (Some(other), all) => {
+            Err(format!("code for {} uses no {}; it may use {}", target.name(), other.name(), names(all)))
+        }
+    }
 }
 
 /// The step of an experiment, for who wants to know what it costs.
@@ -158,7 +186,7 @@ pub struct PackedRig {
     pub plant: Vec<u8>,
 }
 
-/// Compiles a rig for a target such as `aarch64-linux`.
+/// Compiles a rig for a target such as `aarch64-linux`. Of the changes only `set` counts.
 ///
 /// # Errors
 /// In words, or none if what was found says it.
@@ -167,6 +195,8 @@ pub fn packed_rig(
     sources: &dyn Sources,
     name: &str,
     target: &str,
+    features: &[Feature],
+    changes: Changes,
     found: &mut Vec<Diagnostic>,
 ) -> Result<PackedRig, Option<String>> {
     let named = target.strip_suffix("-linux").and_then(Target::named);
@@ -174,14 +204,15 @@ pub fn packed_rig(
         let all: Vec<String> = Target::ALL.iter().map(|target| format!("{}-linux", target.name())).collect();
         return Err(Some(format!("there is no code for {target}; targets are {}", all.join(", "))));
     };
-    let options = Options { interpret: true, ..Options::default() };
+    let more = usable(processor, features).map_err(Some)?;
+    let options = Options { changes, interpret: true };
     let ready = compiler::rig(loaded, sources, name, &options, found).map_err(|errors| {
         found.extend(errors);
         None
     })?;
     let image = |program: &compiler::program::Program, method| {
         let functions = compiler::functions(program, method);
-        blob::image(&functions, &program.description, &program.params, processor)
+        blob::image(&functions, &program.description, &program.params, processor, more)
             .map(|image| image.to_bytes())
             .map_err(|why| Some(why.to_string()))
     };

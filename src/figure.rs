@@ -2,12 +2,26 @@
 //!
 //! In: the plots of an experiment and what its cases recorded. Out: one [`Figure`]; cases of a sweep share its axes.
 
+use crate::compile::Case;
 use crate::plot::{Axis, Band, Curve, Figure, Panel};
 use abi::plan::{Plot, Series};
+use runtime::engine::{Failure, Outcome};
 use runtime::record::Recording;
 
 /// One case: what sets it apart, empty if it is the only one, and what it recorded.
 pub type Recorded<'a> = (&'a str, &'a Recording);
+
+/// What each case recorded, as far as it came.
+pub fn recorded<'a>(cases: &'a [Case], results: &'a [Result<Outcome, Failure>]) -> Vec<Recorded<'a>> {
+    let of = |(case, result): (&'a Case, &'a Result<Outcome, Failure>)| {
+        let recording = match result {
+            Ok(outcome) => &outcome.recording,
+            Err(failure) => &failure.recording,
+        };
+        (case.label.as_str(), recording)
+    };
+    cases.iter().zip(results).map(of).collect()
+}
 
 /// Draws the plots of an experiment.
 ///

@@ -21,6 +21,7 @@ mod repl;
 mod report;
 mod results;
 mod sign;
+mod stability;
 mod terminal;
 mod value;
 mod vary;

@@ -132,12 +132,12 @@ pub fn texts_in(folder: &Path) -> io::Result<Vec<PathBuf>> {
 /// The files a command is given, each folder replaced by the texts in it.
 ///
 /// # Errors
-/// The folder that cannot be read, and why.
-pub fn expanded(paths: &[PathBuf]) -> Result<Vec<PathBuf>, (PathBuf, io::Error)> {
+/// Which folder cannot be read, and why, in words.
+pub fn expanded(paths: &[PathBuf]) -> Result<Vec<PathBuf>, String> {
     let mut files = Vec::new();
     for path in paths {
         if path.is_dir() {
-            files.extend(texts_in(path).map_err(|error| (path.clone(), error))?);
+            files.extend(texts_in(path).map_err(|error| format!("cannot read {}: {error}", path.display()))?);
         } else {
             files.push(path.clone());
         }

@@ -2,8 +2,9 @@
 //!
 //! In: a host and options, commands, files. Out: what the command printed, or why it failed. Knows no packages.
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 
 /// A computer that ssh reaches.
 pub struct Remote {
@@ -48,11 +49,29 @@ impl Remote {
     /// # Errors
     /// Why it failed.
     pub fn run(&self, words: &[&str]) -> Result<String, Failed> {
+        done("ssh", &mut self.command(words))
+    }
+
+    /// Runs a command there that goes on for a while; `told` gets each line as it comes. Ctrl-C ends ssh too.
+    ///
+    /// # Errors
+    /// Why it failed.
+    pub fn follow(&self, words: &[&str], told: &mut dyn FnMut(&str)) -> Result<(), Failed> {
+        let failed = |error: std::io::Error| Failed::Unreachable(format!("cannot run ssh: {error}"));
+        let mut command = self.command(words);
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().map_err(failed)?;
+        let lines = BufReader::new(child.stdout.take().expect("it is piped")).lines();
+        lines.map_while(Result::ok).for_each(|line| told(&line));
+        ended("ssh", child.wait_with_output().map_err(failed)?).map(|_| ())
+    }
+
+    fn command(&self, words: &[&str]) -> Command {
         let line = words.iter().map(|word| quoted(word)).collect::<Vec<_>>().join(" ");
         let mut command = Command::new("ssh");
         // Nobody answers questions here: without a key that works, it fails and says so.
         command.args(["-o", "BatchMode=yes"]).args(&self.options).arg("--").arg(&self.host).arg(line);
-        done("ssh", &mut command)
+        command
     }
 
     /// Copies files there, into a folder that exists.
@@ -83,6 +102,11 @@ fn done(what: &str, command: &mut Command) -> Result<String, Failed> {
         .stdin(Stdio::null())
         .output()
         .map_err(|error| Failed::Unreachable(format!("cannot run {what}: {error}")))?;
+    ended(what, output)
+}
+
+/// What a command printed that has ended.
+fn ended(what: &str, output: Output) -> Result<String, Failed> {
     let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
     match output.status.code() {
         Some(0) => Ok(String::from_utf8_lossy(&output.stdout).into_owned()),

@@ -1,8 +1,9 @@
-//! Keys and signatures in the format of minisign. The only file that knows `minisign`.
+//! Keys and signatures in the format of minisign. The only file that knows `minisign` and `ct_codecs`.
 //!
 //! In: files of keys, bytes. Out: a pair of keys as texts, a signature as text. A signature depends on the bytes and the
 //! key alone, so that a package that is built twice is signed alike.
 
+use ct_codecs::{Base64, Decoder};
 use minisign::{KeyPair, PublicKey, SecretKey, SecretKeyBox};
 use std::path::Path;
 
@@ -25,13 +26,23 @@ pub fn sign(key: &Path, bytes: &[u8], comment: &str) -> Result<String, String> {
     let text = std::fs::read_to_string(key).map_err(|error| format!("cannot read {}: {error}", key.display()))?;
     let about = |error: minisign::PError| format!("{} is no secret key of minisign: {error}", key.display());
     let boxed = || SecretKeyBox::from_string(&text).map_err(about);
-    let secret = match SecretKey::from_unencrypted_box(boxed()?) {
+    let secret = match SecretKey::from_unencrypted_box(boxed()?).or_else(|why| unchecked(&text).ok_or(why)) {
         Ok(secret) => secret,
         Err(_) => SecretKey::from_box(boxed()?, None).map_err(about)?,
     };
     let public = PublicKey::from_secret_key(&secret).map_err(about)?;
     let signature = minisign::sign(Some(&public), &secret, bytes, Some(comment), Some("signature of a fric package"));
     Ok(signature.map_err(about)?.into_string())
+}
+
+/// A key without a password as the stock tool writes it: with zeros where its checksum would be.
+fn unchecked(text: &str) -> Option<SecretKey> {
+    // Where the way from a password to a key stands, and how long the checksum at the end is.
+    const KDF: std::ops::Range<usize> = 2..4;
+    const CHECKSUM: usize = 32;
+    let bytes = Base64::decode_to_vec(text.lines().nth(1)?, None).ok()?;
+    let plain = bytes.get(KDF)? == [0, 0] && bytes.iter().rev().take(CHECKSUM).all(|byte| *byte == 0);
+    if plain { SecretKey::from_bytes(&bytes).ok() } else { None }
 }
 
 #[cfg(test)]

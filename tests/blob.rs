@@ -31,7 +31,7 @@ fn servo(target: Target) -> (Image, Instance) {
     let variants = experiment::read(&mut loaded, &sources, "hunting", &changes, &mut Vec::new(), &mut |_| ());
     let program = variants.expect("the servo compiles").remove(0).program;
     let functions = functions(&program, Method::Expo);
-    let image = image(&functions, &program.description, &program.params, target).expect("code for any target");
+    let image = image(&functions, &program.description, &program.params, target, &[]).expect("code for any target");
     let (code, notes) = compiler::code(&functions, &program.description, false);
     assert_eq!(notes, [""; 0]);
     (image, Instance::new(program.description.clone().into(), code, &program.params))

@@ -268,7 +268,7 @@ fn a_relaxed_sign_and_a_regime_that_races_it_are_chatter() {
     );
     fs::write(folder.0.join("m.fric"), text).unwrap();
     for (experiment, named) in [("race", "`v crosses 0`"), ("alone", "`sign(v)`")] {
-        for rate in ["C=100/s", "C=1e4/s", "C=1e6/s", "C=1e9/s"] {
+        for rate in ["C=100 1/s", "C=1e4 1/s", "C=1e6 1/s", "C=1e9 1/s"] {
             let begin = Instant::now();
             let (_, err) = folder.run(&["run", "m.fric", experiment, "--set", rate, "-q"], 1);
             assert!(begin.elapsed() < Duration::from_secs(5), "{rate}: {:?}", begin.elapsed());

@@ -36,6 +36,8 @@ struct Terminal {
     seen: String,
     /// Up to where it has been looked at.
     at: usize,
+    /// All that came, as it came.
+    raw: String,
 }
 
 impl Terminal {
@@ -70,7 +72,7 @@ impl Terminal {
                 }
             }
         });
-        Terminal { child, keys, screen, seen: String::new(), at: 0 }
+        Terminal { child, keys, screen, seen: String::new(), at: 0, raw: String::new() }
     }
 
     fn send(&mut self, keys: &str) {
@@ -89,10 +91,30 @@ impl Terminal {
             }
             let left = PATIENCE.saturating_sub(begun.elapsed());
             match self.screen.recv_timeout(left) {
-                Ok(bytes) => self.seen += &plain(&String::from_utf8_lossy(&bytes)),
+                Ok(bytes) => {
+                    self.raw += &String::from_utf8_lossy(&bytes);
+                    self.seen += &plain(&String::from_utf8_lossy(&bytes));
+                }
                 Err(_) => panic!("`{text}` did not come; this came:\n{}", &self.seen[self.at..]),
             }
         }
+    }
+
+    /// Sends keys again and again until they are answered.
+    #[track_caller]
+    fn send_until(&mut self, keys: &str, answer: &str) {
+        let begun = Instant::now();
+        while !self.seen[self.at..].contains(answer) {
+            assert!(begun.elapsed() < PATIENCE, "`{answer}` did not come; this came:\n{}", &self.seen[self.at..]);
+            self.send(keys);
+            let sent = Instant::now();
+            while sent.elapsed() < Duration::from_secs(1) && !self.seen[self.at..].contains(answer) {
+                if let Ok(bytes) = self.screen.recv_timeout(Duration::from_millis(100)) {
+                    self.seen += &plain(&String::from_utf8_lossy(&bytes));
+                }
+            }
+        }
+        self.wait(answer);
     }
 
     /// Types a line and waits for the prompt behind what it gives.
@@ -182,6 +204,73 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert_eq!(at.end(), Some(0));
 }
 
+/// What is typed is drawn anew with each key, all lines of it: so answers are waited for, not prompts.
+#[test]
+fn an_item_is_typed_over_several_lines_or_pasted() {
+    let folder = folder("lines");
+    let mut at = Terminal::new(&folder, &[]);
+    at.wait("fric> ");
+    for line in ["model Damper {", "input v [m/s]", "output F [N] = 2 N·s/m * v", "allow creep \"a damper\"", "}"] {
+        at.send(&format!("{line}\r"));
+    }
+    at.send("d = Damper(v = 3 m/s)\r");
+    at.wait("d: Damper, 0 states, 0 parameters");
+    at.send("d.F\r");
+    at.wait("6 N\n");
+    // An operator at the end waits for its right side.
+    at.send("d.F +\r");
+    at.send("1 N\r");
+    at.wait("7 N\n");
+    // As a terminal hands over what is pasted: line ends in it end nothing.
+    at.send("\x1b[200~const m = 2 kg\nm / 2\n1 N + 1 m\n5 N\x1b[201~\r");
+    at.wait("1 kg\n");
+    at.wait("E0101");
+    at.wait("the lines behind it were not done");
+    at.send("\x1b[200~model Twice {\n  input v [m/s]\n  output F [N] = 4 N·s/m * v\n\x1b[201~");
+    at.send("allow creep \"a damper\"\r}\r");
+    at.send("e = Twice(v = 1 m/s)\r");
+    at.wait("e: Twice, 0 states, 0 parameters");
+    // It comes back whole from the history.
+    at.send("\x1b[A");
+    at.wait("e = Twice(v = 1 m/s)");
+    at.send("\x1b[A");
+    at.wait("model Twice {");
+    at.wait("}");
+    at.send("\x03");
+    at.send_until("e.F\r", "4 N\n");
+    at.send("\x04");
+    assert_eq!(at.end(), Some(0));
+}
+
+#[test]
+fn words_are_coloured_and_what_comes_next_is_hinted() {
+    let folder = folder("colours");
+    let mut at = Terminal::new(&folder, &[]);
+    at.wait("fric> ");
+    at.send("f = LuGre(vd = 10 mm/s)");
+    at.wait("10 mm/s)");
+    for coloured in ["\x1b[36mLuGre\x1b[0m", "\x1b[33m10\x1b[0m", "\x1b[32mmm/s\x1b[0m"] {
+        assert!(at.raw.contains(coloured), "{coloured:?} is not in {:?}", at.raw);
+    }
+    at.send("\r");
+    at.wait("f: LuGre, 1 state");
+    // In grey, and not taken over: Enter takes what was typed.
+    at.send("step");
+    at.wait("step 1 ms");
+    assert!(at.raw.contains("\x1b[2m 1 ms\x1b[0m"), "{:?}", at.raw);
+    at.send("\r");
+    at.wait("a step of what length? `step 1 ms`");
+    at.send("f.Fs");
+    at.wait("[N] stiction");
+    at.send("\r");
+    at.wait("1.5 N\n");
+    // A line without anything has no hint.
+    at.wait("fric> ");
+    at.send("1 N\r");
+    at.wait("1 N\n");
+    assert!(!at.raw.contains("plot EXPR"), "{:?}", at.raw);
+}
+
 #[test]
 fn history_is_there_in_the_next_session() {
     let folder = folder("history");
@@ -217,24 +306,9 @@ fn an_interrupt_stops_a_run_and_keeps_the_session() {
     at.line("7 N");
     at.send("run long\r");
     at.wait("\n");
-    // The run has begun when the terminal echoes again; the interrupt is sent until it is taken.
-    let begun = Instant::now();
-    let stopped = loop {
-        std::thread::sleep(Duration::from_millis(200));
-        at.send("\x03");
-        if let Ok(bytes) = at.screen.recv_timeout(Duration::from_millis(500)) {
-            at.seen += &plain(&String::from_utf8_lossy(&bytes));
-        }
-        if at.seen[at.at..].contains("the session goes on") {
-            break true;
-        }
-        if begun.elapsed() > PATIENCE {
-            break false;
-        }
-    };
-    assert!(stopped, "{}", &at.seen[at.at..]);
-    at.send("ans + 1 N\r");
-    at.wait("8 N\n");
+    at.send_until("\x03", "the session goes on");
+    // What is typed ahead of a prompt that is interrupted is lost, as in a shell.
+    at.send_until("ans\r", "7 N\n");
 }
 
 /// What a script gives.

@@ -100,3 +100,27 @@ fn the_example_becomes_two_programs_and_a_plan() {
         .collect();
     assert_eq!(states, ["fr.z"]);
 }
+
+/// The textbook's bristle at rest, one step of 1 ms: z' = z + h v, F = σ0 z' + (σ1 + σ2) v. By hand.
+#[test]
+fn the_derivative_of_a_step_at_rest_is_that_of_its_formulas() {
+    let folder = support::root().join("examples/rtfs");
+    let text = std::fs::read_to_string(folder.join("stick_slip.fric")).unwrap();
+    let sources = support::Texts(Vec::new());
+    let mut loaded = compiler::load("stick_slip.fric", &text, &sources);
+    let made = compiler::rig(&mut loaded, &sources, "plain", &compiler::Options::default(), &mut Vec::new());
+    let made = made.unwrap_or_else(|errors| panic!("{errors:?}"));
+    let speed = made.rig.inputs.iter().find(|input| input.signal.what == abi::rig::What::Speed).unwrap();
+    let load = made.rig.outputs.iter().find(|output| output.signal.node == 0).unwrap();
+    let derivative = compiler::rig::StepDerivative::new(&made.program, made.rig.method, &[speed.slot], &[load.slot]);
+    let mut control = made.control.clone();
+    control.start(1e-3);
+    let step = derivative.at(control.block(), 1);
+    let near =
+        |found: f64, expected: f64| assert!((found - expected).abs() <= 1e-9 * expected.abs(), "{found} {expected}");
+    assert_eq!((step.states, step.inputs, step.outputs), (1, 1, 1));
+    near(step.a[0], 1.0);
+    near(step.b[0], 1e-3);
+    near(step.c[0], -1e5);
+    near(step.d[0], -(1e5 * 1e-3 + 316.0 + 0.4));
+}

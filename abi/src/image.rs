@@ -66,7 +66,15 @@ impl Target {
     /// What code for it takes for granted.
     pub fn needs(self) -> &'static [Feature] {
         match self {
-            Target::X86_64 => &Feature::ALL,
+            Target::X86_64 => &Feature::ALL[..6],
+            Target::Aarch64 => &[],
+        }
+    }
+
+    /// What code for it may use besides, if it is asked to: it then runs on processors that have it only.
+    pub fn may_use(self) -> &'static [Feature] {
+        match self {
+            Target::X86_64 => &Feature::ALL[6..],
             Target::Aarch64 => &[],
         }
     }
@@ -89,12 +97,33 @@ pub enum Feature {
     Sse42,
     Avx,
     Fma,
+    Avx2,
+    Bmi1,
+    Bmi2,
+    Lzcnt,
+    Popcnt,
 }
 
 impl Feature {
-    /// All of them; the place is the bit in the header.
-    pub const ALL: [Feature; 6] =
-        [Feature::Sse3, Feature::Ssse3, Feature::Sse41, Feature::Sse42, Feature::Avx, Feature::Fma];
+    /// All of them; the place is the bit in the header. Those that code for x86-64 needs come first.
+    pub const ALL: [Feature; 11] = [
+        Feature::Sse3,
+        Feature::Ssse3,
+        Feature::Sse41,
+        Feature::Sse42,
+        Feature::Avx,
+        Feature::Fma,
+        Feature::Avx2,
+        Feature::Bmi1,
+        Feature::Bmi2,
+        Feature::Lzcnt,
+        Feature::Popcnt,
+    ];
+
+    /// The feature of this name, in letters of any size.
+    pub fn named(name: &str) -> Option<Feature> {
+        Feature::ALL.into_iter().find(|feature| feature.name().eq_ignore_ascii_case(name))
+    }
 
     /// As the processor's maker calls it.
     pub fn name(self) -> &'static str {
@@ -105,6 +134,11 @@ impl Feature {
             Feature::Sse42 => "SSE4.2",
             Feature::Avx => "AVX",
             Feature::Fma => "FMA",
+            Feature::Avx2 => "AVX2",
+            Feature::Bmi1 => "BMI1",
+            Feature::Bmi2 => "BMI2",
+            Feature::Lzcnt => "LZCNT",
+            Feature::Popcnt => "POPCNT",
         }
     }
 
@@ -118,6 +152,11 @@ impl Feature {
             Feature::Sse42 => std::arch::is_x86_feature_detected!("sse4.2"),
             Feature::Avx => std::arch::is_x86_feature_detected!("avx"),
             Feature::Fma => std::arch::is_x86_feature_detected!("fma"),
+            Feature::Avx2 => std::arch::is_x86_feature_detected!("avx2"),
+            Feature::Bmi1 => std::arch::is_x86_feature_detected!("bmi1"),
+            Feature::Bmi2 => std::arch::is_x86_feature_detected!("bmi2"),
+            Feature::Lzcnt => std::arch::is_x86_feature_detected!("lzcnt"),
+            Feature::Popcnt => std::arch::is_x86_feature_detected!("popcnt"),
         }
     }
 

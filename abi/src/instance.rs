@@ -1,6 +1,6 @@
 //! A model that runs: its block of numbers and its code, with every access checked.
 
-use crate::description::{Automaton, Description, Kind, Quantity, Slot};
+use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
 use crate::table::{Code, Function};
 use std::sync::Arc;
 
@@ -95,9 +95,9 @@ pub struct Carried {
 
 impl Instance {
     /// Goes on where another instance is: states take over the value of the state with the same path and dimension,
-    /// automata the regime of the same name. Sampled memory that has no name (held outputs, crossings) is taken over where
-    /// both have the same; else it stays as it is after a start. Time stays this instance's own; outputs are computed
-    /// anew.
+    /// automata the regime of the same name. What has no name (held outputs, crossings, what is delayed) is taken over where
+    /// both have the same; else it stays as it is after a start. Time stays this instance's own, and so do periods and
+    /// dead times; outputs are computed anew. A past that reaches back behind this instance's own start is lost.
     pub fn carry(&mut self, from: &Instance) -> Carried {
         let mut carried = Carried::default();
         let (new, old) = (self.description.clone(), from.description.clone());
@@ -110,8 +110,20 @@ impl Instance {
                 .filter(is_state)
                 .map(|q| &q.path));
         if same_memory {
+            let own: Vec<Slot> =
+                new.ticks.iter().map(|tick| tick.period).chain(new.delays.iter().map(|delay| delay.time)).collect();
+            let own: Vec<(Slot, f64)> = own.into_iter().map(|slot| (slot, self.get(slot))).collect();
             let memory = &from.block[old.layout.memory.range()];
             self.block[new.layout.memory.range()].copy_from_slice(memory);
+            own.into_iter().for_each(|(slot, value)| self.set(slot, value));
+        }
+        let mut begins = false;
+        for (k, delay) in new.delays.iter().enumerate() {
+            let before = old.delays.get(k).filter(|_| same_memory && new.delays.len() == old.delays.len());
+            begins |= !before.is_some_and(|before| self.carry_past(delay, from, before));
+        }
+        if begins {
+            carried.fresh.push("what is delayed".into());
         }
         for state in new.quantities.iter().filter(is_state) {
             let fits = |before: &&Quantity| {
@@ -147,5 +159,28 @@ impl Instance {
             old.quantities.iter().filter(is_state).map(|q| q.path.clone()).filter(|path| gone(path)).collect();
         self.call(Function::Outputs);
         carried
+    }
+
+    /// Fills a ring with the samples of another one, between which lie straight lines; returns whether they reach back far
+    /// enough. Rings are of fixed steps: there is none where either instance has no step.
+    fn carry_past(&mut self, delay: &Delay, from: &Instance, before: &Delay) -> bool {
+        let (len, count, h) = (delay.ring.len as usize, self.get(Slot::COUNT) as usize, self.get(Slot::STEP));
+        let (old_len, old_count, old_h) =
+            (before.ring.len as usize, from.get(Slot::COUNT) as usize, from.get(Slot::STEP));
+        if len == 0 || old_len == 0 || h <= 0.0 || old_h <= 0.0 {
+            return false;
+        }
+        // So many steps of the other one ago, at most to where its ring or its time begins.
+        let sample = |ago: usize| {
+            let number = old_count - ago.min(old_count).min(old_len - 1);
+            from.get(before.ring.slot(number % old_len))
+        };
+        for k in 0..len.min(count + 1) {
+            let ago = k as f64 * (h / old_h);
+            let (newer, older) = (sample(ago as usize), sample(ago as usize + 1));
+            let value = newer + ago.fract() * (older - newer);
+            self.set(delay.ring.slot((count - k) % len), value);
+        }
+        old_count == 0 || count as f64 * h >= self.get(delay.time)
     }
 }

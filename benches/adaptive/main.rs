@@ -5,8 +5,12 @@
 //! wall, taken in turn in one run, and their ratios are what counts. Needs gcc, and CVODE of SUNDIALS to compare with
 //! that; what is missing is said.
 
+#[path = "../clock.rs"]
+mod clock;
+
 use abi::Slot;
 use abi::plan::Experiment;
+use clock::processor_time;
 use compiler::{Case, Changes, NoSources, Options};
 use runtime::engine::{self, Continue};
 use std::path::{Path, PathBuf};
@@ -152,12 +156,6 @@ fn sundials() -> Result<(Vec<String>, Vec<String>), String> {
     let named = LIBRARIES.iter().map(|name| format!("-l:libsundials_{name}.a"));
     let libraries = [libraries].into_iter().chain(named).chain(["-lm".into()]).collect();
     Ok((vec![format!("-I{}/include", prefix.display())], libraries))
-}
-
-/// Seconds this thread has had the processor: other programs count little.
-fn processor_time() -> f64 {
-    let now = nix::time::clock_gettime(nix::time::ClockId::CLOCK_THREAD_CPUTIME_ID).expect("a clock of this system");
-    now.tv_sec() as f64 + 1e-9 * now.tv_nsec() as f64
 }
 
 fn compiled(name: &str) -> Case {

@@ -73,8 +73,10 @@ impl<'a> Matrix<'a> {
                 let multiplier = entry * inverse;
                 rows[i].insert(pivot, multiplier);
                 for &(j, above) in &of_pivot {
-                    let product = multiplier * above;
-                    let reduced = rows[i].get(&j).map_or(-product, |entry| *entry - product);
+                    let reduced = match rows[i].get(&j) {
+                        Some(entry) => (-multiplier).fma(above, *entry),
+                        None => -(multiplier * above),
+                    };
                     rows[i].insert(j, reduced);
                 }
             }
@@ -91,14 +93,14 @@ impl<'a> Factors<'a> {
         for (k, &i) in self.order.iter().enumerate() {
             for &j in &self.order[..k] {
                 if let Some(multiplier) = self.rows[i].get(&j) {
-                    x[i] = x[i] - *multiplier * x[j];
+                    x[i] = (-*multiplier).fma(x[j], x[i]);
                 }
             }
         }
         for (k, &i) in self.order.iter().enumerate().rev() {
             for &j in &self.order[k + 1..] {
                 if let Some(entry) = self.rows[i].get(&j) {
-                    x[i] = x[i] - *entry * x[j];
+                    x[i] = (-*entry).fma(x[j], x[i]);
                 }
             }
             x[i] = x[i] * self.inverse[&i];

@@ -134,26 +134,13 @@ pub fn build(
 ) -> Result<Built, Vec<Diagnostic>> {
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
-    let model = ast.items.iter().find_map(|item| match item {
-        Item::Model(model) if model.name.text == name => Some(model),
-        _ => None,
-    });
-    let Some(model) = model else {
-        let variants = experiment::read(loaded, sources, name, changes, warnings, &mut |_| ())?;
-        let variant = variants.into_iter().next().expect("there is at least one combination");
+    let Some(model) = model_of(&ast, name) else {
+        let variant = first(loaded, sources, name, changes, warnings)?;
         return Ok(Built { program: variant.program, solver: Some(variant.experiment.solver) });
     };
     let given = experiment::overrides(loaded, changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
-    let (system, types, mut diagnostics) = alone(loaded, sources, model, root, overrides);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
-    }
-    diagnostics.extend(std::mem::take(warnings));
-    if diagnostics.iter().any(Diagnostic::is_error) {
-        return Err(once(diagnostics));
-    }
-    warnings.extend(diagnostics);
+    let (system, types, ()) = sound(loaded, sources, model, overrides, warnings, |_, _| ())?;
     Ok(Built { program: lower::lower(&system, &types, &[]).program, solver: None })
 }
 
@@ -171,13 +158,8 @@ pub fn linear(
 ) -> Result<linearise::Linear, Vec<Diagnostic>> {
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
-    let model = ast.items.iter().find_map(|item| match item {
-        Item::Model(model) if model.name.text == name => Some(model),
-        _ => None,
-    });
-    let Some(model) = model else {
-        let variants = experiment::read(loaded, sources, name, &options.changes, warnings, &mut |_| ())?;
-        let variant = variants.into_iter().next().expect("there is at least one combination");
+    let Some(model) = model_of(&ast, name) else {
+        let variant = first(loaded, sources, name, &options.changes, warnings)?;
         if let Some(error) = delays::linear(&variant.system) {
             return Err(vec![error]);
         }
@@ -189,29 +171,13 @@ pub fn linear(
         let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
         return Ok(linearise::Linear::new(&variant.program, instance, Some(variant.experiment), &variant.ports));
     };
-    let overrides = experiment::overrides(loaded, &options.changes, warnings);
-    let request = flatten::Request {
-        instance: flatten::Instance::Alone(model, root),
-        overrides: overrides.iter().map(|change| change.override_in(root)).collect(),
-        observed: Vec::new(),
-        data: Vec::new(),
-        frame: None,
-    };
-    let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
-    diagnostics.extend(delays::linear(&system));
+    let given = experiment::overrides(loaded, &options.changes, warnings);
+    let overrides = given.iter().map(|change| change.override_in(root)).collect();
     let ports = options.changes.ports.clone().unwrap_or_default();
-    let opened = linearise::open(&mut system, &ports, &mut diagnostics);
-    let types = units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        causality::check(&system, &loaded.files, &mut diagnostics);
-    }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
-    }
-    if diagnostics.iter().any(Diagnostic::is_error) {
-        return Err(diagnostics);
-    }
-    warnings.extend(diagnostics);
+    let (system, types, opened) = sound(loaded, sources, model, overrides, warnings, |system, diagnostics| {
+        diagnostics.extend(delays::linear(system));
+        linearise::open(system, &ports, diagnostics)
+    })?;
     let wanted: Vec<lower::Wanted> = opened
         .outputs
         .iter()
@@ -480,7 +446,7 @@ pub fn quantities(
     experiment: &str,
     changes: &Changes,
 ) -> Result<Vec<explain::Listed>, Vec<Diagnostic>> {
-    let variant = first(loaded, sources, experiment, changes)?;
+    let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
     Ok(explain::quantities(&variant.system, &variant.types, &loaded.files))
 }
 
@@ -494,7 +460,7 @@ pub fn explain_run(
     experiment: &str,
     changes: &Changes,
 ) -> Result<explain::Explanation, Vec<Diagnostic>> {
-    let variant = first(loaded, sources, experiment, changes)?;
+    let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
     Ok(explain::explain(&variant.system, &variant.types, &loaded.files))
 }
 
@@ -504,9 +470,39 @@ fn first(
     sources: &dyn Sources,
     experiment: &str,
     changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
 ) -> Result<experiment::Variant, Vec<Diagnostic>> {
-    let variants = experiment::read(loaded, sources, experiment, changes, &mut Vec::new(), &mut |_| ())?;
+    let variants = experiment::read(loaded, sources, experiment, changes, warnings, &mut |_| ())?;
     Ok(variants.into_iter().next().expect("there is at least one combination"))
+}
+
+/// The model of this name.
+fn model_of<'a>(file: &'a grammar::ast::File, name: &str) -> Option<&'a grammar::ast::Model> {
+    file.items.iter().find_map(|item| match item {
+        Item::Model(model) if model.name.text == name => Some(model),
+        _ => None,
+    })
+}
+
+/// A model of the text on its own, changed by `open` before its units are checked, if nothing is wrong with it.
+fn sound<T>(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    overrides: Vec<flatten::Override>,
+    warnings: &mut Vec<Diagnostic>,
+    open: impl FnOnce(&mut system::System, &mut Vec<Diagnostic>) -> T,
+) -> Result<(system::System, units::Types, T), Vec<Diagnostic>> {
+    let (system, types, mut diagnostics, opened) = opened(loaded, sources, model, loaded.root(), overrides, open);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+    }
+    diagnostics.extend(std::mem::take(warnings));
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(once(diagnostics));
+    }
+    warnings.extend(diagnostics);
+    Ok((system, types, opened))
 }
 
 /// A model on its own, flat and typed, its circles reported.
@@ -517,6 +513,19 @@ fn alone(
     file: FileId,
     overrides: Vec<flatten::Override>,
 ) -> (system::System, units::Types, Vec<Diagnostic>) {
+    let (system, types, diagnostics, ()) = opened(loaded, sources, model, file, overrides, |_, _| ());
+    (system, types, diagnostics)
+}
+
+/// As [`alone`], changed by `open` before its units are checked.
+fn opened<T>(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &grammar::ast::Model,
+    file: FileId,
+    overrides: Vec<flatten::Override>,
+    open: impl FnOnce(&mut system::System, &mut Vec<Diagnostic>) -> T,
+) -> (system::System, units::Types, Vec<Diagnostic>, T) {
     let request = flatten::Request {
         instance: flatten::Instance::Alone(model, file),
         overrides,
@@ -524,13 +533,13 @@ fn alone(
         data: Vec::new(),
         frame: None,
     };
-    let flat = flatten::flatten(loaded, sources, &request);
-    let mut diagnostics = flat.diagnostics;
-    let types = units::check(&flat.system, &loaded.files, &mut diagnostics);
+    let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    let opened = open(&mut system, &mut diagnostics);
+    let types = units::check(&system, &loaded.files, &mut diagnostics);
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        causality::check(&flat.system, &loaded.files, &mut diagnostics);
+        causality::check(&system, &loaded.files, &mut diagnostics);
     }
-    (flat.system, types, diagnostics)
+    (system, types, diagnostics, opened)
 }
 
 /// Checks everything in a loaded text: each model on its own, each experiment.

@@ -40,8 +40,9 @@ pub fn rosenbrock(program: &Program) -> Option<Func> {
     let (one, zero) = (build.int(1), build.int(0));
     let status = build.select(singular, one, zero);
     build.status(status);
-    // In the order of the text: a contact that sticks holds by differences that are exactly zero, and neither regrouping
-    // nor contraction keeps those.
+    // The model's equations stand in the order of the text: a contact that sticks holds by differences that are exactly
+    // zero, which neither regrouping nor contraction would keep. What the method adds is contracted: its sums weigh
+    // stages that are zero then.
     Some(build.finish())
 }
 
@@ -137,11 +138,10 @@ impl<'a> Step<'a> {
                         early = Some(D[stage] * h * gh * df_dt);
                     }
                     for (weight, u) in W[stage].iter().zip(&u) {
-                        let weight = u[i].constant(GAMMA * weight);
-                        early = Some(early.map_or(weight * u[i], |sum| sum + weight * u[i]));
+                        let weight = GAMMA * weight;
+                        early = Some(early.map_or(weight * u[i], |sum| u[i].fma(weight, sum)));
                     }
-                    let late = gh * f[i];
-                    early.map_or(late, |early| early + late)
+                    early.map_or(gh * f[i], |early| f[i].fma(gh, early))
                 })
                 .collect();
             u.push(factors.solve(&right));
@@ -205,7 +205,7 @@ impl<'a> Step<'a> {
         if stage > 5 {
             return last[i] + u[stage - 1][i];
         }
-        A[stage].iter().zip(u).fold(x0[i], |sum, (weight, u)| sum + *weight * u[i])
+        A[stage].iter().zip(u).fold(x0[i], |sum, (weight, u)| u[i].fma(*weight, sum))
     }
 
     /// Rows of ∂f/∂x at the start, and ∂f/∂t. What depends on neither time nor states is computed, what does is loaded:

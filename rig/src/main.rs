@@ -15,7 +15,10 @@ mod doctor;
 
 mod run;
 
+mod drives;
+
 use clap::{Parser, Subcommand, ValueHint};
+use runtime::drive::serve::Doors;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -38,6 +41,8 @@ enum Command {
     Run(Run),
     /// Run the current package in the background; fails if it does not get through its first second
     Start(Store),
+    /// Simulate the drives and devices of a package on a bus that other programs can reach
+    Drives(Drives),
     /// Tell the rig that runs: enable, arm, stop or reset
     Say(Say),
     /// Say whether this computer can keep time, and what to change
@@ -47,7 +52,7 @@ enum Command {
     /// Make the package before the current one the current one again
     Rollback(Store),
     /// Say what is installed, and what runs
-    Status(Store),
+    Status(Status),
     /// Print the target that packages must be built for
     Target,
 }
@@ -98,6 +103,36 @@ struct Run {
 }
 
 #[derive(clap::Args, Debug)]
+struct Drives {
+    /// The package
+    #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
+    package: PathBuf,
+    /// Serve them on another bus: can0=socketcan:can1
+    #[arg(long, value_name = "BUS=ADDRESS", value_parser = address)]
+    bus: Vec<(String, String)>,
+    /// Open a pseudo-terminal that speaks like an slcan adapter, with a link to it here
+    #[arg(long, value_name = "PATH", value_hint = ValueHint::FilePath)]
+    pty: Vec<PathBuf>,
+    /// Open a TCP port that speaks like socketcand, 0 for a free one
+    #[arg(long, value_name = "PORT")]
+    tcp: Option<u16>,
+    /// Make them fail: 'load fault 0x2310 at 3 s', 'panel.enable = 0 at 5 s'
+    #[arg(long, value_name = "FAULT")]
+    inject: Vec<String>,
+    /// From which all that is random follows
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    seed: u64,
+    /// End after this time, such as 10s [default: Ctrl-C]
+    #[arg(long = "for", value_name = "TIME", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Don't tell how their states change
+    #[arg(long, short)]
+    quiet: bool,
+    #[command(flatten)]
+    trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
 struct Say {
     /// enable, arm, stop or reset
     #[arg(value_parser = ["enable", "arm", "stop", "reset"])]
@@ -115,6 +150,15 @@ struct Install {
     store: Store,
     #[command(flatten)]
     trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct Status {
+    /// Go on telling the state of the rig that runs until it ends, or Ctrl-C; that does not end the rig
+    #[arg(long)]
+    follow: bool,
+    #[command(flatten)]
+    store: Store,
 }
 
 #[derive(clap::Args, Debug)]
@@ -141,8 +185,22 @@ fn address(text: &str) -> Result<(String, String), String> {
     Ok((bus.into(), address.into()))
 }
 
-/// Runs a package; its exit code says how it ended.
-fn ran(args: &Run) -> ExitCode {
+/// Serves the drives of a package.
+fn served(args: &Drives) -> Result<u8, String> {
+    let open = packed::open(&args.package, &args.trust.trusted)?;
+    let doors = Doors {
+        buses: args.bus.clone(),
+        pty: args.pty.clone(),
+        tcp: args.tcp,
+        sheets: Vec::new(),
+        inject: args.inject.clone(),
+        seed: args.seed,
+    };
+    drives::drives(&open, &doors, args.duration, args.quiet)
+}
+
+/// Runs a package.
+fn ran(args: &Run) -> Result<u8, String> {
     let wanted = run::Wanted {
         package: args.package.as_deref(),
         trusted: &args.trust.trusted,
@@ -154,7 +212,12 @@ fn ran(args: &Run) -> ExitCode {
         buses: &args.bus,
         log: args.log.as_deref(),
     };
-    match run::run(&wanted) {
+    run::run(&wanted)
+}
+
+/// What a command that goes on for a while came to: its own exit code, or why it failed.
+fn ended(code: Result<u8, String>) -> ExitCode {
+    match code {
         Ok(code) => ExitCode::from(code),
         Err(why) => {
             words::error(&why);
@@ -167,14 +230,16 @@ fn main() -> ExitCode {
     let args = Args::parse();
     let done = match &args.command {
         Command::Check(check) => packed::open(&check.package, &check.trust.trusted).map(|open| open.describe()),
-        Command::Run(run) => return ran(run),
+        Command::Run(run) => return ended(ran(run)),
+        Command::Drives(drives) => return ended(served(drives)),
         Command::Start(store) => run::start(&store.dir),
         Command::Say(say) => run::say(&say.store.dir, &say.what),
         Command::Doctor => Ok(doctor::doctor()),
         Command::Install(install) => packed::open(&install.package, &install.trust.trusted)
             .and_then(|open| store::Store::at(&install.store.dir).install(&open)),
         Command::Rollback(store) => store::Store::at(&store.dir).rollback(),
-        Command::Status(store) => store::Store::at(&store.dir).status(),
+        Command::Status(status) if status.follow => run::follow(&status.store.dir),
+        Command::Status(status) => store::Store::at(&status.store.dir).status(),
         Command::Target => Ok(format!("{}\n", runtime::package::here())),
     };
     match done {

@@ -12,8 +12,9 @@ use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
-use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options};
-use runtime::hil::simulated::{MASTER, Pace, World};
+use runtime::drive::sign::SignTest;
+use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options, look_ahead};
+use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, words as told};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
@@ -68,6 +69,12 @@ pub enum Ended {
 /// Runs until it ends; gives the exit code.
 pub fn run(wanted: &Wanted) -> Result<u8, String> {
     let store = Store::at(wanted.dir);
+    if wanted.package.is_none() && store.current_target().is_none() {
+        let current = wanted.dir.join("current");
+        return Err(format!("nothing is installed in {}: there is no {}", wanted.dir.display(), current.display()));
+    }
+    // One rig in a folder: its socket and its state are there. In simulated time there is neither.
+    let _alone = (!wanted.fast).then(|| store.lock()).transpose()?;
     emergency::guard();
     let mut fell_back = false;
     loop {
@@ -117,7 +124,13 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     let simulated = wanted.sim || rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
     let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
     options.start.simulated = simulated;
+    // What is late between this process and itself says nothing of the drives.
+    options.start.missed = if simulated { 0.05 } else { 0.0 };
+    if simulated && holds_and_pushes(&rig) {
+        options.start.sign_test = SignTest::Skip;
+    }
     options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
+    options.look = look_ahead(&rig, &open.program("plant")?)?;
     let fast = simulated && wanted.fast;
     let world;
     let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {
@@ -164,8 +177,11 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         Ok(_) => {}
         Err(error) => return Err(format!("the log {} is not whole: {error}", path.display())),
     }
+    // Whoever stops a rig for which another package waits wants that one next, unless the process itself is to end.
+    let waits = wanted.package.is_none() && store.current_target().is_some_and(|current| current != target);
+    let goes_on = waits && wanted.duration.is_none() && !wanted.check && emergency::asked().is_none();
     match end {
-        End::Asked if replaced => Ok(Ended::Replaced),
+        End::Asked if replaced || goes_on => Ok(Ended::Replaced),
         End::Asked => Ok(Ended::Asked),
         End::Refused(why) => Err(format!("refused: {why}")),
         End::Stopped(_, why) => Ok(Ended::Stopped(why)),
@@ -320,6 +336,40 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
     }
 }
 
+/// How often the state is looked at for somebody who follows it, and how often it is told at least.
+const FOLLOWS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(1));
+
+/// Tells the state of the rig that runs: at once when it goes on to another stage, else once a second; until it ends, or
+/// nobody reads any more.
+///
+/// # Errors
+/// If none runs.
+pub fn follow(dir: &Path) -> Result<String, String> {
+    let read = || fs::read_to_string(dir.join("state")).ok();
+    // The stage stands between the package and the counters.
+    let stage =
+        |state: &str| state.split(" cycles").next().and_then(|head| head.rsplit_once(", ")).map(|it| it.0.to_string());
+    let store = Store::at(dir);
+    let mut last: Option<(String, std::time::Instant)> = None;
+    while store.is_locked() {
+        // Between two packages there is none for a moment.
+        let state = read().unwrap_or_default();
+        let now = stage(&state).unwrap_or_default();
+        if !state.is_empty() && last.as_ref().is_none_or(|(before, told)| *before != now || told.elapsed() >= FOLLOWS.1)
+        {
+            if !words::is_read(&state) {
+                return Ok(String::new());
+            }
+            last = Some((now, std::time::Instant::now()));
+        }
+        std::thread::sleep(FOLLOWS.0);
+    }
+    if last.is_none() {
+        return Err(format!("no rig runs in {}", dir.display()));
+    }
+    Ok(format!("the rig has ended; {} says how, if `start` started it\n", dir.join("log").join("rig.out").display()))
+}
+
 /// How long a rig that was just started is looked at.
 const FIRST: Duration = Duration::from_secs(1);
 /// How long it may take to tell which package it runs, and one that runs already to take another over.
@@ -352,10 +402,14 @@ pub fn start(dir: &Path) -> Result<String, String> {
     }
     let begun = std::time::Instant::now();
     loop {
-        if let Some(child) = &mut child
-            && let Some(status) = child.try_wait().map_err(about)?
+        if let Some(one) = &mut child
+            && let Some(status) = one.try_wait().map_err(about)?
         {
-            return Err(format!("it does not start ({status}): {}; {}", said(&out), back(&store, &asked)));
+            // Unless somebody else started one in the same moment.
+            if !store.is_locked() {
+                return Err(format!("it does not start ({status}): {}; {}", said(&out), back(&store, &asked)));
+            }
+            child = None;
         }
         if store.current_target().as_ref() != Some(&asked) {
             // Only once it can be spoken to is it seen that a rig runs, and no second one started beside it.

@@ -5,6 +5,7 @@
 //! DIR/current -> packages/…    what runs when the rig is started next
 //! DIR/previous -> packages/…   what `rollback` goes back to
 //! DIR/log/                     recordings
+//! DIR/lock                     locked by the rig that runs here
 //! ```
 //! A package is written under another name, flushed to the disk and renamed; a link is made under another name and
 //! renamed over the old one. So after a power cut there is the old state or the new one.
@@ -12,13 +13,17 @@
 use crate::packed::Open;
 use runtime::package::hash;
 use runtime::package::signature::EXTENSION as SIGNATURE;
-use std::fs::{self, File};
+use std::fs::{self, File, TryLockError};
 use std::io::{self, Write};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Where packages lie unless something else is asked for.
 pub const DEFAULT: &str = "/var/lib/fric";
+
+/// Locked by the rig that runs here; its process stands in it.
+const LOCK: &str = "lock";
 
 /// A folder of packages.
 #[derive(Clone)]
@@ -82,6 +87,46 @@ impl Store {
         Ok(format!("back to {}\n", previous.display()))
     }
 
+    /// Keeps others from running a rig here, for as long as the file lives: the system lets go of it however the process
+    /// ends.
+    ///
+    /// # Errors
+    /// Who runs one, or why the folder cannot be used.
+    pub fn lock(&self) -> Result<File, String> {
+        let path = self.dir.join(LOCK);
+        let about = |error: io::Error| format!("cannot use {}: {error}; --dir names another folder", path.display());
+        fs::create_dir_all(&self.dir).map_err(about)?;
+        let mut file =
+            File::options().read(true).write(true).create(true).truncate(false).open(&path).map_err(about)?;
+        let mut looks = 5;
+        while let Err(why) = file.try_lock() {
+            match why {
+                TryLockError::Error(error) => return Err(about(error)),
+                // Somebody may just look whether a rig runs.
+                TryLockError::WouldBlock if looks > 0 => {
+                    looks -= 1;
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                TryLockError::WouldBlock => {
+                    let process = fs::read_to_string(&path).unwrap_or_default();
+                    return Err(format!(
+                        "a rig runs in {} already, process {}: `fric-rig status` says which, `fric-rig say stop` ends it",
+                        self.dir.display(),
+                        process.trim()
+                    ));
+                }
+            }
+        }
+        file.set_len(0).and_then(|()| writeln!(file, "{}", std::process::id())).map_err(about)?;
+        Ok(file)
+    }
+
+    /// Whether a rig runs here.
+    pub fn is_locked(&self) -> bool {
+        let file = File::open(self.dir.join(LOCK));
+        file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    }
+
     /// Where the link of the current package points.
     pub fn current_target(&self) -> Option<PathBuf> {
         fs::read_link(self.dir.join("current")).ok()
@@ -103,7 +148,10 @@ impl Store {
                 words += &format!("{name}: {}\n", target.display());
             }
         }
-        if let Ok(state) = fs::read_to_string(self.dir.join("state")) {
+        // That of a process that was killed stays behind it.
+        if let Ok(state) = fs::read_to_string(self.dir.join("state"))
+            && self.is_locked()
+        {
             words += &format!("runs: {state}");
         }
         if words.is_empty() { Err(format!("nothing is installed in {}", self.dir.display())) } else { Ok(words) }
@@ -164,6 +212,19 @@ mod tests {
         store.rollback().unwrap();
         assert_eq!(current(dir.path()).rig, "two", "there and back");
         assert_eq!(store.status().unwrap().lines().count(), 2);
+    }
+
+    #[test]
+    fn one_rig_runs_in_a_folder() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::at(&dir.path().join("new"));
+        assert!(!store.is_locked());
+        let held = store.lock().unwrap();
+        assert!(store.is_locked());
+        let why = store.lock().unwrap_err();
+        assert!(why.contains(&format!("already, process {}:", std::process::id())), "{why}");
+        drop(held);
+        assert!(!store.is_locked() && store.lock().is_ok());
     }
 
     #[test]

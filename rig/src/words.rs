@@ -4,8 +4,18 @@ use std::io::Write;
 
 /// Prints to the standard output.
 pub fn print(text: &str) {
+    let _ = is_read(text);
+}
+
+/// Prints to the standard output; returns whether somebody reads it.
+pub fn is_read(text: &str) -> bool {
     let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    out.write_all(text.as_bytes()).and_then(|()| out.flush()).is_ok()
+}
+
+/// Says something on the standard error that is no failure.
+pub fn report(text: &str) {
+    let _ = std::io::stderr().lock().write_all(text.as_bytes());
 }
 
 /// Reports a failure on the standard error.

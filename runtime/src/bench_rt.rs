@@ -47,9 +47,16 @@ pub enum Fit {
 impl Report {
     /// What it means.
     pub fn fit(&self) -> Fit {
-        match self.lateness.max_ns() {
-            late if late < self.period_ns / 20 && self.overruns == 0 => Fit::Fit,
-            late if late < self.period_ns / 5 && self.overruns == 0 => Fit::AtSync,
+        if self.overruns > 0 { Fit::NotForTorque } else { Fit::of(self.lateness.max_ns(), self.period_ns) }
+    }
+}
+
+impl Fit {
+    /// That of a loop without overruns whose cycles began so late at most.
+    pub fn of(late_ns_max: u64, period_ns: u64) -> Fit {
+        match late_ns_max {
+            late if late < period_ns / 20 => Fit::Fit,
+            late if late < period_ns / 5 => Fit::AtSync,
             _ => Fit::NotForTorque,
         }
     }

@@ -66,7 +66,7 @@ pub(crate) fn run(
     let readings = readings(rig, &paths);
     let unable = |why| Stop { cause: Cause::Rig { condition: "predict".into(), why }, time: 0.0 };
     let mut look =
-        Ahead { wired: Wired::of(rig, &bench.plant).map_err(unable)?, seen: None, speed: None, position: None };
+        Ahead { wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?, seen: None, speed: None, position: None };
     if let Some(wired) = &look.wired {
         let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
         look.seen = slot(What::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
@@ -151,9 +151,8 @@ impl Ahead {
 
     fn sent(&mut self, paths: &[Path]) {
         let Some(wired) = &mut self.wired else { return };
-        for (torque, (output, sign)) in wired.outputs.iter().enumerate() {
-            let path = &paths[*output];
-            wired.lookahead.sent(torque, sign * in_steps(path.permitted, path.step));
+        for (torque, (output, sign, step)) in wired.outputs.iter().enumerate() {
+            wired.lookahead.sent(torque, sign * in_steps(paths[*output].permitted, *step));
         }
     }
 }

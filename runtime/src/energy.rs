@@ -72,6 +72,35 @@ impl Energy {
         }
     }
 
+    /// Largest energy that the model stores, J.
+    pub fn store(&self) -> f64 {
+        self.store
+    }
+
+    /// Forgets what was.
+    pub fn restart(&mut self) {
+        self.window.fill((0.0, false));
+        (self.at, self.absorbed, self.highest, self.other) = (0, 0.0, 0.0, 0.0);
+    }
+
+    /// All that the future depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        words.extend([self.at as u64, self.absorbed.to_bits(), self.highest.to_bits(), self.other.to_bits()]);
+        words.extend(self.window.iter().flat_map(|(back, reversed)| [back.to_bits(), u64::from(*reversed)]));
+    }
+
+    /// Takes over what [`Energy::save`] gave. None if the words do not fit.
+    pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
+        self.at = usize::try_from(words.next()?).ok().filter(|at| *at < self.window.len())?;
+        for number in [&mut self.absorbed, &mut self.highest, &mut self.other] {
+            *number = f64::from_bits(words.next()?);
+        }
+        for place in &mut self.window {
+            *place = (f64::from_bits(words.next()?), words.next()? != 0);
+        }
+        Some(())
+    }
+
     /// Energy given back within the window, in units of the store.
     pub fn returned(&self) -> f64 {
         self.window.iter().map(|(back, _)| back).sum::<f64>() / self.store

@@ -28,7 +28,7 @@ pub fn remaining(x: f64) -> f64 {
 }
 
 /// What a drive applies.
-#[derive(Clone, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Lag {
     /// Time constant, s; 0 for none.
     constant: f64,
@@ -58,9 +58,29 @@ impl Lag {
         self.applied
     }
 
-    /// What is applied, told from outside: an observer knows better.
-    pub fn set_applied(&mut self, applied: f64) {
-        self.applied = applied;
+    /// At rest again, nothing on its way, with this command acting for long.
+    pub fn settle(&mut self, value: f64) {
+        (self.first, self.waiting, self.acting, self.applied) = (0, 0, value, value);
+    }
+
+    /// All that the future depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        words.extend([self.acting.to_bits(), self.applied.to_bits(), self.waiting as u64]);
+        for k in 0..self.waiting {
+            let (acts_ns, value) = self.queue[(self.first + k) % QUEUE];
+            words.extend([acts_ns, value.to_bits()]);
+        }
+    }
+
+    /// Takes over what [`Lag::save`] gave. None if the words are not enough.
+    pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
+        self.acting = f64::from_bits(words.next()?);
+        self.applied = f64::from_bits(words.next()?);
+        (self.first, self.waiting) = (0, usize::try_from(words.next()?).ok().filter(|n| *n <= QUEUE)?);
+        for place in &mut self.queue[..self.waiting] {
+            *place = (words.next()?, f64::from_bits(words.next()?));
+        }
+        Some(())
     }
 
     /// A command that acts from this instant on; later ones must not act before it. When too many are on their way, the

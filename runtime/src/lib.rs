@@ -3,8 +3,10 @@
 //! In: an [`abi::Instance`] and the plan of an experiment. Out: verdicts, recordings, final values, or the reason
 //! why the run stopped. Knows neither the language nor the compiler: a model is whatever fills the contract of `abi`.
 
+#![cfg_attr(rtsan, feature(sanitize))]
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
+pub mod chance;
 pub mod show;
 pub mod queue;
 

@@ -24,7 +24,7 @@ const UNUSUAL: f64 = 5.0;
 const CYCLES: u32 = 3;
 
 /// One drive on the shaft.
-#[derive(Clone, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Torque {
     /// From a command to its effect, ns.
     pub dead_ns: u64,
@@ -39,7 +39,7 @@ impl Torque {
 }
 
 /// What the shaft looks like from its encoder.
-#[derive(Clone, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Lookahead {
     inertia: f64,
     period_ns: u64,
@@ -71,25 +71,27 @@ pub struct Ahead {
 }
 
 /// The look ahead of a rig, and how it is wired.
-#[derive(Clone, Debug)]
+#[derive(Clone, PartialEq, Debug)]
 pub struct Wired {
     /// The observer.
     pub lookahead: Lookahead,
     /// The position it takes.
     pub position: Signal,
-    /// Of each of its torques the output of the rig, as an index, and the sign with which it speeds the shaft up.
-    pub outputs: Vec<(usize, f64)>,
+    /// Of each of its torques the output of the rig, as an index, the sign with which it speeds the shaft up, and one step
+    /// of the command, N·m.
+    pub outputs: Vec<(usize, f64, f64)>,
     /// The drive that emulates: its speed and position are those ahead.
     pub node: usize,
 }
 
 impl Wired {
     /// The look ahead that `predict` of a rig asks for; none if it asks for none. The crossed-out part says with which
-    /// sign each torque turns what the emulating drive sees.
+    /// sign each torque turns what the emulating drive sees. `least_ns`: of each node how long after a reading a command
+    /// reaches it at the earliest; its `delay` counts from the reading and is not shorter.
     ///
     /// # Errors
     /// What is missing for it, in words.
-    pub fn of(rig: &Rig, plant: &Instance) -> Result<Option<Wired>, String> {
+    pub fn of(rig: &Rig, plant: &Instance, least_ns: impl Fn(usize) -> u64) -> Result<Option<Wired>, String> {
         let Some(node) = rig.predict else { return Ok(None) };
         let Some(inertia) = rig.plant.inertia else {
             return Err("`predict` needs the inertia of the shaft, which the hardware part does not show".into());
@@ -106,14 +108,40 @@ impl Wired {
         let mut outputs: Vec<usize> = (0..rig.outputs.len()).filter(torque).collect();
         outputs.sort_by_key(|k| rig.outputs[*k].signal.node != node);
         let torques = outputs.iter().map(|k| {
-            let node = &rig.nodes[rig.outputs[*k].signal.node];
-            let at_sync = drive(rig.outputs[*k].signal.node).is_some_and(|drive| drive.at_sync);
-            let dead = (node.delay * 1e9).round() as u64 + if at_sync { rig.period_ns } else { 0 };
+            let at = rig.outputs[*k].signal.node;
+            let node = &rig.nodes[at];
+            let delay = (node.delay * 1e9).round() as u64;
+            let dead = match drive(at).is_some_and(|drive| drive.at_sync) {
+                true => rig.period_ns + delay,
+                false => delay.max(least_ns(at)),
+            };
             Torque::new(dead, node.lag)
         });
         let lookahead = Lookahead::new(inertia, rig.period_ns, emulating.count, torques.collect());
-        let outputs = outputs.into_iter().map(|k| (k, sign(rig, plant, rig.outputs[k].signal, node))).collect();
+        let wired = |k: usize| {
+            let signal = rig.outputs[k].signal;
+            let step = drive(signal.node).map_or(0.0, |drive| 1e-3 * drive.rated_torque);
+            (k, sign(rig, plant, signal, node), step)
+        };
+        let outputs = outputs.into_iter().map(wired).collect();
         Ok(Some(Wired { lookahead, position: Signal { node, what: What::Position }, outputs, node }))
+    }
+
+    /// Tells the observer what was permitted, one value an output of the rig: rounded as the drives hear it.
+    pub fn sent(&mut self, permitted: &[f64]) {
+        for (torque, (output, sign, step)) in self.outputs.iter().enumerate() {
+            let value = permitted[*output];
+            let heard = if *step > 0.0 { (value / step).round() * step } else { value };
+            self.lookahead.sent(torque, sign * heard);
+        }
+    }
+
+    /// A shaft at rest again, with these values permitted for long.
+    pub fn restart(&mut self, permitted: &[f64]) {
+        self.lookahead.restart();
+        for (torque, (output, sign, _)) in self.lookahead.torques.iter_mut().zip(&self.outputs) {
+            torque.lag.settle(sign * permitted[*output]);
+        }
     }
 }
 
@@ -170,11 +198,32 @@ impl Lookahead {
         self.horizon_ns
     }
 
+    /// Forgets the shaft: the next position is believed.
+    fn restart(&mut self) {
+        (self.started, self.now_ns, self.unusual_for) = (false, 0, 0);
+        (self.position, self.speed, self.disturbance, self.residual, self.usual) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    }
+
     /// Takes the position at a tick, rad, as its encoder tells it: whole counts, cut down. The first one is believed.
     pub fn observe(&mut self, now_ns: u64, position: f64) {
         let middle = position + 0.5 * self.count;
         if !self.started {
             (self.started, self.now_ns, self.position) = (true, now_ns, middle);
+            return;
+        }
+        self.coast(now_ns);
+        let (t, theta) = (self.period_ns as f64 * 1e-9, self.theta);
+        let error = middle - self.position;
+        let left = 1.0 - theta;
+        self.position += (1.0 - theta * theta * theta) * error;
+        self.speed += 1.5 * left * left * (1.0 + theta) * error / t;
+        self.disturbance += left * left * left * self.inertia * error / (t * t);
+        self.judge(error);
+    }
+
+    /// Goes on to an instant from which no position came.
+    pub fn coast(&mut self, now_ns: u64) {
+        if !self.started {
             return;
         }
         let steps = STEPS * ((now_ns - self.now_ns) / self.period_ns).clamp(1, 16);
@@ -188,13 +237,6 @@ impl Lookahead {
             self.speed += s * acceleration;
         }
         self.now_ns = now_ns;
-        let (t, theta) = (self.period_ns as f64 * 1e-9, self.theta);
-        let error = middle - self.position;
-        let left = 1.0 - theta;
-        self.position += (1.0 - theta * theta * theta) * error;
-        self.speed += 1.5 * left * left * (1.0 + theta) * error / t;
-        self.disturbance += left * left * left * self.inertia * error / (t * t);
-        self.judge(error);
     }
 
     fn judge(&mut self, error: f64) {
@@ -240,6 +282,26 @@ impl Lookahead {
             speed += s * acceleration;
         }
         Ahead { speed, position }
+    }
+
+    /// All that the future depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        words.extend([self.now_ns, u64::from(self.started), u64::from(self.unusual_for)]);
+        let numbers = [self.position, self.speed, self.disturbance, self.residual, self.usual];
+        words.extend(numbers.map(f64::to_bits));
+        self.torques.iter().for_each(|torque| torque.lag.save(words));
+    }
+
+    /// Takes over what [`Lookahead::save`] gave. None if the words do not fit.
+    pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
+        self.now_ns = words.next()?;
+        self.started = words.next()? != 0;
+        self.unusual_for = u32::try_from(words.next()?).ok()?;
+        let numbers = [&mut self.position, &mut self.speed, &mut self.disturbance, &mut self.residual, &mut self.usual];
+        for number in numbers {
+            *number = f64::from_bits(words.next()?);
+        }
+        self.torques.iter_mut().try_for_each(|torque| torque.lag.restore(words))
     }
 
     /// Tells what was sent at this tick to the torque of this number: after every limit, as it left.

@@ -6,8 +6,13 @@
 //!
 //! A dead time n T + r is n + 1 set-points that wait; over one period the shaft feels the older one for r, the next for
 //! the rest. Eigenvalues at 1 are positions that turn freely, and what a program keeps constant; they are left out.
+//!
+//! A loop whose command looks ahead ([`Ahead`]) is run instead, observer and all, from a small push: how fast it dies out or
+//! grows is its radius.
 
+use crate::lookahead::{Lookahead, Torque};
 use nalgebra::DMatrix;
+use std::collections::VecDeque;
 
 /// Eigenvalues this near to 1 are free motion.
 const FREE: f64 = 1e-6;
@@ -217,6 +222,116 @@ impl Loop {
     }
 }
 
+/// Periods in which the greatest deflection is looked for.
+const WINDOW: usize = 64;
+/// Windows that are run at most.
+const WINDOWS: usize = 48;
+/// What has died out, or grown, so far is enough; less than that would be rounding.
+const ENOUGH: f64 = 1e9;
+
+/// A loop of one command that looks ahead.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Ahead {
+    /// The loop without it: one command.
+    pub plain: Loop,
+    /// The position that the observer sees, from the states of the shaft.
+    pub position: Vec<f64>,
+    /// Of each signal whether the program reads it as it will be.
+    pub ahead: Vec<bool>,
+    /// As the observer is told, kg·m².
+    pub inertia: f64,
+    /// With which sign the command speeds up what is seen.
+    pub sign: f64,
+    /// Dead time and lag as the observer is told.
+    pub told: Late,
+}
+
+impl Ahead {
+    /// By how much a deflection grows in one period, once the fast motions have died out: below 1 the loop is stable.
+    #[allow(clippy::disallowed_methods, reason = "a figure to be shown and compared with 1: decides nothing that runs")]
+    pub fn radius(&self) -> f64 {
+        let Loop { period, step, shaft, late } = &self.plain;
+        let (n, late) = (shaft.states, late[0]);
+        let period_ns = (period * 1e9).round() as u64;
+        let dead_ns = (self.told.dead * 1e9).round() as u64;
+        let mut look = Lookahead::new(self.inertia, period_ns, 0.0, vec![Torque::new(dead_ns, self.told.lag)]);
+        let whole = (late.dead / period + 1e-9).floor();
+        let rest = (late.dead - whole * period).max(0.0);
+        let [before, after] = [rest, period - rest].map(|h| self.plain.transition(h));
+        let mut waiting: VecDeque<f64> = vec![0.0; whole as usize + 1].into();
+        // States of the shaft, then the torque that is applied.
+        let mut moving: Vec<f64> = (0..=n).map(|i| if i < n { 1.0 / (1.0 + i as f64) } else { 0.0 }).collect();
+        let mut program = vec![0.0; step.states];
+        let mut peaks = Vec::new();
+        for k in 0..WINDOW * WINDOWS {
+            let seen = |row: &[f64]| row.iter().zip(&moving).map(|(c, x)| c * x).sum::<f64>();
+            look.observe(k as u64 * period_ns, seen(&self.position));
+            let ahead = look.ahead().speed;
+            let signals: Vec<f64> = (0..step.signals)
+                .map(|j| if self.ahead[j] { ahead } else { seen(&shaft.c[j * n..(j + 1) * n]) })
+                .collect();
+            let row = |of_states: &[f64], of_signals: &[f64], i: usize| -> f64 {
+                let states = of_states[i * step.states..].iter().zip(&program).map(|(a, s)| a * s).sum::<f64>();
+                states + of_signals[i * step.signals..].iter().zip(&signals).map(|(b, u)| b * u).sum::<f64>()
+            };
+            let command = row(&step.c, &step.d, 0);
+            program = (0..step.states).map(|i| row(&step.a, &step.b, i)).collect();
+            look.sent(0, self.sign * command);
+            waiting.push_front(command);
+            // The oldest acts for the rest of the dead time, then the next one.
+            for (transition, acting) in [(&before, waiting[waiting.len() - 1]), (&after, waiting[waiting.len() - 2])] {
+                let all = DMatrix::from_iterator(n + 2, 1, moving.iter().copied().chain([acting]));
+                moving.copy_from_slice(&(transition * all).as_slice()[..=n]);
+            }
+            waiting.pop_back();
+            let deflection = signals.iter().map(|v| v.abs()).sum::<f64>() * step.d[0].abs().max(1e-3) + command.abs();
+            if !deflection.is_finite() {
+                return f64::INFINITY;
+            }
+            match k % WINDOW {
+                0 => peaks.push(deflection),
+                _ => *peaks.last_mut().expect("one was just begun") = peaks[peaks.len() - 1].max(deflection),
+            }
+            let whole_windows = (k + 1).is_multiple_of(WINDOW) && peaks.len() > 2;
+            if whole_windows && !(peaks[1] / ENOUGH..=peaks[1] * ENOUGH).contains(&peaks[peaks.len() - 1]) {
+                break;
+            }
+        }
+        let spans = (WINDOW * (peaks.len() - 2)) as f64;
+        (peaks[peaks.len() - 1] / peaks[1]).powf(1.0 / spans)
+    }
+
+    /// The least dead time, s, known to the observer, from which on the loop is unstable; none if it is stable up to 40
+    /// periods. 0 if it is never stable.
+    pub fn limit(&self) -> Option<f64> {
+        let period = self.plain.period;
+        let stable = |dead: f64| {
+            let mut other = self.clone();
+            (other.plain.late[0].dead, other.told.dead) = (dead, dead);
+            other.radius() < 1.0
+        };
+        if !stable(0.0) {
+            return Some(0.0);
+        }
+        let mut low = 0.0;
+        let mut high = loop {
+            let next = low + 2.0 * period;
+            if next > PERIODS * period {
+                return None;
+            }
+            if !stable(next) {
+                break next;
+            }
+            low = next;
+        };
+        for _ in 0..8 {
+            let middle = 0.5 * (low + high);
+            if stable(middle) { low = middle } else { high = middle }
+        }
+        Some(0.5 * (low + high))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -306,6 +421,46 @@ mod tests {
         }
         let _ = x;
         last < 0.5 * early
+    }
+
+    fn ahead(plain: Loop, inertia: f64) -> Ahead {
+        let late = plain.late[0];
+        // The shaft with its angle: x' = v.
+        let mut plain = plain;
+        plain.shaft = Shaft {
+            states: 2,
+            torques: 1,
+            signals: 1,
+            a: vec![0.0, 0.0, 1.0, 0.0],
+            b: vec![1.0 / inertia, 0.0],
+            c: vec![1.0, 0.0],
+        };
+        Ahead { plain, position: vec![0.0, 1.0], ahead: vec![false], inertia, sign: 1.0, told: late }
+    }
+
+    /// Without looking ahead the run must say what the eigenvalues say.
+    #[test]
+    fn the_radius_of_a_run_is_that_of_the_matrix() {
+        for (dead, zeta) in [(0.2e-3, 0.5), (0.8e-3, 0.5), (1.6e-3, 0.5), (2.4e-3, 0.5), (0.3e-3, 0.1)] {
+            let late = Late { dead, lag: lag_of(500.0) };
+            let plain = contact(1.0, 1e5, 2.0 * zeta * f64::sqrt(1e5), 1e-3, late);
+            let (exact, run) = (plain.radius(), ahead(plain, 1.0).radius());
+            assert!((run - exact).abs() < 2e-3, "{dead} {zeta}: {run} for {exact}");
+        }
+    }
+
+    /// The contact of the textbook: plain it is unstable from 2.4 ms on, looking ahead not before three times that.
+    #[test]
+    fn looking_ahead_makes_a_late_contact_stable() {
+        let late = Late { dead: 4.5e-3, lag: lag_of(500.0) };
+        let plain = contact(1.0, 1e5, f64::sqrt(1e5), 1e-3, late);
+        assert!(plain.radius() > 1.0);
+        let mut looking = ahead(plain, 1.0);
+        looking.ahead = vec![true];
+        let radius = looking.radius();
+        assert!(radius < 1.0, "{radius}");
+        let limit = looking.limit();
+        assert!(limit.is_none_or(|limit| limit > 6e-3), "{limit:?}");
     }
 
     /// Predicted limit and observed onset over a seeded grid of J, σ0, ζ, lag and period.

@@ -99,6 +99,8 @@ pub enum Cause {
     Foreign(usize, u32),
     /// More energy came back than a friction can hold.
     Energy,
+    /// The shaft is not as told, and the loop is stable only while its commands look ahead.
+    Unpredictable,
     /// No cycle ended in time.
     Watchdog,
 }
@@ -124,7 +126,8 @@ impl Cause {
             | Cause::Overrun(_)
             | Cause::NotFollowing(_)
             | Cause::Overload(_)
-            | Cause::Energy => Reaction::Controlled,
+            | Cause::Energy
+            | Cause::Unpredictable => Reaction::Controlled,
             Cause::Speed(..)
             | Cause::Travel(..)
             | Cause::RunAway(_)
@@ -160,6 +163,7 @@ impl Cause {
             Cause::Foreign(i, id) => (16, i, u64::from(id)),
             Cause::Energy => (17, 0, 0),
             Cause::Watchdog => (18, 0, 0),
+            Cause::Unpredictable => (19, 0, 0),
         };
         [kind << 32 | index as u64, value]
     }
@@ -186,6 +190,7 @@ impl Cause {
             16 => Cause::Foreign(i, small?),
             17 => Cause::Energy,
             18 => Cause::Watchdog,
+            19 => Cause::Unpredictable,
             _ => return None,
         })
     }

@@ -1,8 +1,8 @@
 //! `fric bench`: what a step of an experiment costs, alone, in lanes and on all cores, and what compiling it took.
 
-use super::{End, compiled, load, reported};
+use super::{End, compiled, has_experiment, load, reported};
 use crate::args::Bench;
-use crate::compile::{self, Changes, Method, Options, Stages, Stopwatch};
+use crate::compile::{self, Method, Options, Stages, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
 use crate::value::{count, duration, significant};
@@ -21,20 +21,11 @@ pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut watch) else { return End::Failed };
     let before = watch.stop();
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    if !all.contains(&args.experiment) {
-        let help = match compile::nearest(&args.experiment, all.iter().map(String::as_str)) {
-            Some(near) => format!("did you mean `{near}`?"),
-            None => format!("it has {}", all.join(", ")),
-        };
-        terminal.error(&format!("{} has no experiment `{}`; {help}", args.file.display(), args.experiment));
+    if let Err(message) = has_experiment(&args.file, &args.experiment, &all) {
+        terminal.error(&message);
         return End::Failed;
     }
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        ..Changes::default()
-    };
+    let changes = args.stepped.changes();
     let options = Options { changes: changes.clone(), interpret: false };
     let Ok((mut cases, stages)) = compiled(&mut loaded, &args.experiment, &options, &before, false, terminal) else {
         return End::Failed;

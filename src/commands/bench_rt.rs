@@ -1,13 +1,19 @@
 //! `fric bench-rt`: a loop as a rig has it, how late it woke, and what that means.
 
-use super::End;
+use super::{End, chosen_rig, load, reported};
 use crate::args::BenchRt as Args;
+use crate::compile::{self, Stopwatch};
 use crate::terminal::{Style, Terminal};
-use crate::value;
+use crate::{project, value};
 use runtime::bench_rt::{self, Fit, Report};
+use runtime::drive::sign::SignTest;
+use runtime::hil::cycle::{Hil, Options, look_ahead};
+use runtime::hil::simulated::{Pace, World};
+use runtime::hil::{emergency, words};
 use runtime::histogram::Histogram;
 use runtime::host::Host;
 use runtime::realtime::{self, Wishes};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Ctrl-C: ends the run, and what it has shown so far is told.
@@ -17,6 +23,9 @@ static STOP: AtomicBool = AtomicBool::new(false);
 const BAR: f64 = 40.0;
 
 pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
+    if let Some(file) = &args.file {
+        return of_rig(file, args, terminal);
+    }
     let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
     let period_ns = (1e9 / args.rate).round() as u64;
     let cycles = (args.seconds as f64 * args.rate).round() as u64;
@@ -32,6 +41,76 @@ pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
     }
     terminal.print(&histogram(&report.lateness));
     tell(&report, args, terminal)
+}
+
+/// The cycle of a rig with its model, its drives simulated in this process at the pace of the wall.
+fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
+    let Some(mut loaded) = load(file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
+    let name = match chosen_rig(file, args.rig.as_deref(), &loaded) {
+        Ok(name) => name,
+        Err(why) => return refused(terminal, &why),
+    };
+    let ready = compile::rig(&mut loaded, &project::Disk, &name, &compile::Options::default(), &mut Vec::new());
+    let mut ready = match ready {
+        Ok(ready) => ready,
+        Err(found) => {
+            reported(&loaded, &found, terminal);
+            return End::Failed;
+        }
+    };
+    // What is late is to be counted: neither the drives nor the watchdog stop it.
+    ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(60_000_000_000);
+    let mut options = Options { arms_itself: true, ..Options::default() };
+    (options.control.count_overruns, options.start.simulated, options.start.missed) = (true, true, 1.0);
+    (options.start.timeout_test, options.start.sign_test) = (false, SignTest::Skip);
+    options.duration_ns = Some(args.seconds * 1_000_000_000);
+    let rig = &ready.rig;
+    let made = look_ahead(rig, &ready.plant).and_then(|look| {
+        options.look = look;
+        let mut world = World::new(rig, Some(ready.plant.clone()), Pace::Wall, 1)?;
+        let masters = world.masters();
+        Ok((Hil::new(rig, ready.control.clone(), world.clock(), masters, options, None)?, world))
+    });
+    let ((mut hil, _operator), _world) = match made {
+        Ok(made) => made,
+        Err(why) => return refused(terminal, &why),
+    };
+    let core = args.core.or_else(realtime::isolated_core);
+    let real_time = realtime::enter(&Wishes { priority: args.priority, core, ..Wishes::default() });
+    for refusal in real_time.refused() {
+        terminal.report(&format!("refused: {:?}: {}\n  mend: {}\n", refusal.what, refusal.reason, refusal.remedy));
+    }
+    emergency::guard();
+    let end = hil.run();
+    drop(real_time);
+    let counts = hil.counts();
+    if counts.cycles == 0 {
+        return refused(terminal, &format!("the model did not run: {end:?}"));
+    }
+    terminal.print(&histogram(&counts.late));
+    words::counts(counts).lines().for_each(|line| terminal.line(line));
+    let (period_ns, late_ns) = (ready.rig.period_ns, counts.late.max_ns());
+    let fit = if counts.missed > 0 { Fit::NotForTorque } else { Fit::of(late_ns, period_ns) };
+    let (verdict, style, end) = judged(fit, &rate(1e9 / period_ns as f64));
+    terminal.line(&format!("verdict: {}", terminal.styled(style, &verdict)));
+    end
+}
+
+fn refused(terminal: &Terminal, why: &str) -> End {
+    terminal.error(why);
+    End::Failed
+}
+
+fn rate(hertz: f64) -> String {
+    if hertz >= 1000.0 { format!("{} kHz", hertz / 1000.0) } else { format!("{hertz} Hz") }
+}
+
+fn judged(fit: Fit, rate: &str) -> (String, Style, End) {
+    match fit {
+        Fit::Fit => (format!("fit for {rate} (max < T/20)"), Style::Good, End::Fine),
+        Fit::AtSync => (format!("fit for {rate} with at_sync (max < T/5)"), Style::Good, End::Fine),
+        Fit::NotForTorque => ("not for torque".to_string(), Style::Bad, End::Failed),
+    }
 }
 
 /// A bar an octave: the bins in between are for quantiles.
@@ -70,12 +149,8 @@ fn tell(report: &Report, args: &Args, terminal: &mut Terminal) -> End {
         us(report.answer.quantile_ns(0.5)),
         us(report.answer.max_ns()),
     ));
-    let rate = if args.rate >= 1000.0 { format!("{} kHz", args.rate / 1000.0) } else { format!("{} Hz", args.rate) };
-    let (verdict, style, end) = match report.fit() {
-        Fit::Fit => (format!("fit for {rate} (max < T/20)"), Style::Good, End::Fine),
-        Fit::AtSync => (format!("fit for {rate} with at_sync (max < T/5)"), Style::Good, End::Fine),
-        Fit::NotForTorque => ("not for torque".to_string(), Style::Bad, End::Failed),
-    };
+    let rate = rate(args.rate);
+    let (verdict, style, end) = judged(report.fit(), &rate);
     terminal.line(&format!(
         "{} cycles at {rate}: {} missed, {} overruns, {} page faults      verdict: {}",
         value::count(report.cycles),

@@ -2,7 +2,7 @@
 
 use super::{End, load, reported};
 use crate::args::Build;
-use crate::compile::{self, Changes, Emit, Stopwatch};
+use crate::compile::{self, Emit, Stopwatch};
 use crate::project;
 use crate::terminal::Terminal;
 use grammar::diagnostic::Diagnostic;
@@ -27,6 +27,10 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
     };
+    if !args.features.is_empty() && !matches!(emit, Emit::Blob | Emit::Asm) {
+        terminal.error("--features is for machine code: --emit blob or asm, or a package");
+        return End::Misused;
+    }
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let models: Vec<String> = loaded.models().into_iter().map(|model| model.name.text.clone()).collect();
     let experiments: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
@@ -57,12 +61,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error("an image is no text for a terminal: give it a file with --out");
         return End::Misused;
     }
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        ..Changes::default()
-    };
+    let changes = args.stepped.changes();
     let mut found = Vec::new();
     let built = match compile::build(&mut loaded, &project::Disk, &name, &changes, &mut found) {
         Ok(built) => built,
@@ -75,7 +74,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
-    let bytes = match compile::emit(&built, emit, args.solver, args.target) {
+    let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target, &args.features) {
         Ok(bytes) => bytes,
         Err(why) => {
             terminal.error(&why);

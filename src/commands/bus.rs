@@ -1,16 +1,24 @@
 //! `fric bus`: joins buses of any kind, opens doors to them, and prints what goes over them.
 
-use super::End;
+use super::{End, load, reported};
 use crate::args::Bus as Args;
+use crate::compile::{self, Stopwatch};
 use crate::terminal::Terminal;
+use crate::{project, value};
+use abi::rig::{Kind, Message};
+use runtime::can::address::Address;
 use runtime::can::hub::Hub;
 use runtime::can::log::Entry;
 use runtime::can::sim::Simulation;
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Server;
-use runtime::can::{self, CannotOpen, Event, Options, Received, names};
+use runtime::can::{self, CannotOpen, Event, Filter, Frame, Options, Received, names};
+use runtime::canopen::eds;
 use runtime::clock::Clock;
+use runtime::drive::frames;
+use std::collections::BTreeMap;
 use std::fmt::Write;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -22,7 +30,13 @@ const LOOK_NS: u64 = 50_000_000;
 
 pub fn bus(args: &Args, terminal: &mut Terminal) -> End {
     let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
-    match run(args, terminal) {
+    let mut known = Known::default();
+    for path in &args.names {
+        if let Err(end) = known.read(path, terminal) {
+            return end;
+        }
+    }
+    match run(args, &known, terminal) {
         Ok(()) => End::Fine,
         Err(cannot) => {
             terminal.error(&cannot.to_string());
@@ -31,15 +45,21 @@ pub fn bus(args: &Args, terminal: &mut Terminal) -> End {
     }
 }
 
-fn run(args: &Args, terminal: &mut Terminal) -> Result<(), CannotOpen> {
+fn run(args: &Args, known: &Known, terminal: &mut Terminal) -> Result<(), CannotOpen> {
     let world = Simulation::real_time();
     let clock = world.monotonic().expect("this world's time is real");
     let options = Options { bit_rate: args.bit_rate, ..Options::default() };
     let mut hub = Hub::new();
+    let mut listeners = Vec::new();
     for address in &args.addresses {
         let name = address.to_string();
         let name = name.strip_prefix("socketcan:").unwrap_or(&name);
         hub.join(name, can::open(address, &options, &world, name)?);
+        if matches!(address, Address::Sim(_)) {
+            // Somebody must acknowledge what comes through a door, or it would be sent again for ever.
+            let deaf = Options { filter: Filter::Only(Vec::new()), ..options.clone() };
+            listeners.push(can::open(address, &deaf, &world, "listener")?);
+        }
     }
     for path in &args.pty {
         let door = Slcan::door(Some(path), clock)?;
@@ -68,7 +88,7 @@ fn run(args: &Args, terminal: &mut Terminal) -> Result<(), CannotOpen> {
             if args.log {
                 log_line(&mut page, from, received, origin_ns);
             } else if !args.quiet {
-                traffic_line(&mut page, from, received);
+                traffic_line(&mut page, from, received, known);
             }
         });
         if !page.is_empty() {
@@ -89,7 +109,7 @@ fn run(args: &Args, terminal: &mut Terminal) -> Result<(), CannotOpen> {
 }
 
 /// As candump prints it, and what CANopen calls it.
-fn traffic_line(page: &mut String, from: &str, received: &Received) {
+fn traffic_line(page: &mut String, from: &str, received: &Received, known: &Known) {
     let seconds = |ns: u64| format!("({:03}.{:06})", ns / 1_000_000_000, ns / 1000 % 1_000_000);
     match received {
         Received::Frame(frame, at_ns) => {
@@ -98,12 +118,97 @@ fn traffic_line(page: &mut String, from: &str, received: &Received) {
                 true => "remote request".into(),
                 false => frame.data().iter().map(|byte| format!("{byte:02X} ")).collect(),
             };
-            let name = names::canopen(frame).unwrap_or_default();
+            let name = known.name(frame);
             let line = format!("{}  {from}  {id:>8}  [{}]  {data:<24} {name}", seconds(*at_ns), frame.length());
             let _ = writeln!(page, "{}", line.trim_end());
         }
         Received::Event(event, at_ns) => {
             let _ = writeln!(page, "{}  {from}  {}", seconds(*at_ns), describe(*event));
+        }
+    }
+}
+
+/// What rigs and DBC files say of frames.
+#[derive(Default)]
+struct Known {
+    /// By identifier, and whether it has 29 bits: who sends or takes it, and what it carries.
+    messages: BTreeMap<(u32, bool), (String, Message)>,
+    /// Drives by their number.
+    drives: BTreeMap<u32, String>,
+    /// Objects of a data sheet, by index and sub-index as they are shown.
+    objects: BTreeMap<String, String>,
+}
+
+impl Known {
+    fn read(&mut self, path: &Path, terminal: &Terminal) -> Result<(), End> {
+        let failed = |why: String| {
+            terminal.error(&format!("{}: {why}", path.display()));
+            End::Failed
+        };
+        if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("dbc")) {
+            let bytes = std::fs::read(path).map_err(|error| failed(error.to_string()))?;
+            let messages = compile::dbc_messages(&String::from_utf8_lossy(&bytes)).map_err(failed)?;
+            for message in messages {
+                self.messages.insert((message.id, message.extended), (message.name.clone(), message));
+            }
+            return Ok(());
+        }
+        if path
+            .extension()
+            .is_some_and(|extension| ["eds", "dcf"].iter().any(|kind| extension.eq_ignore_ascii_case(kind)))
+        {
+            let bytes = std::fs::read(path).map_err(|error| failed(error.to_string()))?;
+            let sheet = eds::read(&String::from_utf8_lossy(&bytes), 1);
+            let sheet = sheet.map_err(|mistakes| failed(mistakes[0].to_string()))?;
+            self.objects.extend(sheet.entries().iter().map(|entry| (entry.object.to_string(), entry.name.clone())));
+            return Ok(());
+        }
+        let mut loaded = load(path, terminal, &mut Stopwatch::start("read")).ok_or(End::Failed)?;
+        let rigs: Vec<String> = loaded.rigs().iter().map(|rig| rig.name.text.clone()).collect();
+        if rigs.is_empty() {
+            return Err(failed("it has no rig".into()));
+        }
+        for rig in rigs {
+            let options = compile::Options::default();
+            let ready = compile::rig(&mut loaded, &project::Disk, &rig, &options, &mut Vec::new());
+            let ready = ready.map_err(|found| {
+                reported(&loaded, &found, terminal);
+                End::Failed
+            })?;
+            for node in ready.rig.nodes {
+                match node.kind {
+                    Kind::Cia402(drive) => _ = self.drives.insert(drive.node.into(), node.name),
+                    Kind::Frames(messages) => {
+                        for message in messages {
+                            self.messages.insert((message.id, message.extended), (node.name.clone(), message));
+                        }
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Who a frame is of, and what it carries: by rig and DBC file, else by CANopen.
+    fn name(&self, frame: &Frame) -> String {
+        if let Some((who, message)) = self.messages.get(&(frame.id(), frame.is_extended()))
+            && !frame.is_remote()
+        {
+            let field = |(k, field): (usize, &abi::rig::Field)| {
+                let si = frames::read(message, k, frame.data())?;
+                Some(format!("{} = {}", field.name, value::show(si, &field.unit, 4)))
+            };
+            let values: Vec<String> = message.fields.iter().enumerate().filter_map(field).collect();
+            return format!("{who}: {}", values.join(", "));
+        }
+        let mut name = names::canopen(frame).unwrap_or_default();
+        let object = name.split(' ').find_map(|word| self.objects.get_key_value(word.trim_end_matches(',')));
+        if let (Some((object, says)), true) = (object, name.starts_with("SDO")) {
+            name = name.replace(object, &format!("{object} ({says})"));
+        }
+        match self.drives.get(&(frame.id() & 0x7F)).filter(|_| frame.id() >= 0x80) {
+            Some(drive) => name.replace(&format!("node {}", frame.id() & 0x7F), drive),
+            None => name,
         }
     }
 }

@@ -14,8 +14,8 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
     let (mut errors, mut warnings, mut unread) = (0, 0, 0);
     let files = match project::expanded(&args.files) {
         Ok(files) => files,
-        Err((path, error)) => {
-            terminal.error(&format!("cannot read {}: {error}", path.display()));
+        Err(message) => {
+            terminal.error(&message);
             return End::Failed;
         }
     };

@@ -12,7 +12,9 @@ use crate::terminal::Terminal;
 use runtime::package::signature::{EXTENSION as SIGNATURE, beside};
 use runtime::package::{Package, hash};
 use std::fs;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 pub fn deploy(args: &Deploy, terminal: &mut Terminal) -> End {
     match deployed(args, terminal) {
@@ -65,13 +67,25 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     Ok(())
 }
 
-/// Starts what has been installed; if that refuses, the computer itself goes back to what was there.
+/// Starts what has been installed, and tells its state; if it refuses, the computer itself goes back to what was there.
 fn start(args: &Deploy, remote: &Remote, terminal: &mut Terminal) -> Result<(), String> {
     let Host { host, rig, dir, .. } = &args.host;
     let said = remote.run(&[rig, "start", "--dir", dir]).map_err(|why| format!("{host}: {}", why.words()))?;
     terminal.print(&said);
+    if args.follow || std::io::stdout().is_terminal() {
+        // Whoever has seen enough presses Ctrl-C: what was asked for is done.
+        let _ = ctrlc::set_handler(|| ENOUGH.store(true, Ordering::Relaxed));
+        let followed = remote.follow(&[rig, "status", "--follow", "--dir", dir], &mut |line| terminal.line(line));
+        return match followed {
+            Err(why) if !ENOUGH.load(Ordering::Relaxed) => Err(format!("{host}: {}", why.words())),
+            Ok(()) | Err(_) => Ok(()),
+        };
+    }
     Ok(())
 }
+
+/// Ctrl-C, once the rig runs.
+static ENOUGH: AtomicBool = AtomicBool::new(false);
 
 fn no_rig(remote: &Remote, rig: &str, why: &Failed) -> String {
     match why {
@@ -87,10 +101,20 @@ fn no_rig(remote: &Remote, rig: &str, why: &Failed) -> String {
 fn packed(args: &Deploy, target: &str, terminal: &mut Terminal) -> Result<(Vec<u8>, Option<String>), String> {
     let path = &args.file;
     if path.extension().is_some_and(|extension| extension == runtime::package::EXTENSION) {
+        if args.name.is_some() || args.sign.is_some() || !args.set.all.is_empty() {
+            return Err(format!("{} is a package: it goes as it was built, signed and set", path.display()));
+        }
         let bytes = fs::read(path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
         return Ok((bytes, fs::read_to_string(beside(path)).ok()));
     }
-    super::pack::packed(path, args.name.as_deref(), target, args.sign.as_deref(), terminal)
+    let wanted = super::pack::Wanted {
+        name: args.name.as_deref(),
+        target,
+        features: &[],
+        set: &args.set,
+        key: args.sign.as_deref(),
+    };
+    super::pack::packed(path, &wanted, terminal)
 }
 
 /// A folder of this computer with the files to send, removed when it goes.

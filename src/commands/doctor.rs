@@ -5,7 +5,6 @@ use crate::args::{Doctor as Args, LookedAt};
 use crate::compile::{self, Options, Stopwatch};
 use crate::project;
 use crate::terminal::{Style, Terminal};
-use grammar::ast::Item;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Filter, Received, State, names, socketcan};
@@ -32,7 +31,13 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
     for (address, bit_rate) in &buses {
         if let Address::SocketCan(name) = address {
             found.extend(host.interrupt(name, args.priority));
-            found.extend(interface(name, *bit_rate));
+            let of_it = interface(name, *bit_rate);
+            let forbids = of_it.iter().any(|finding| matches!(finding.verdict, Verdict::Forbids(_)));
+            found.extend(of_it);
+            // What cannot be listened to has been told.
+            if forbids {
+                continue;
+            }
         }
         // Nobody else can be on a bus in this process.
         if !matches!(address, Address::Sim(_)) {
@@ -57,9 +62,7 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
 /// The buses of all rigs in a text; what is wrong with it is reported.
 fn of_rigs(path: &Path, terminal: &Terminal) -> Result<Vec<(Address, Option<u32>)>, End> {
     let mut loaded = load(path, terminal, &mut Stopwatch::start("read")).ok_or(End::Failed)?;
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let name = |item: &Item| if let Item::Rig(rig) = item { Some(rig.name.text.clone()) } else { None };
-    let rigs: Vec<String> = items.iter().filter_map(name).collect();
+    let rigs: Vec<String> = loaded.rigs().iter().map(|rig| rig.name.text.clone()).collect();
     if rigs.is_empty() {
         terminal.error(&format!("{} has no rig", path.display()));
         return Err(End::Failed);

@@ -12,8 +12,8 @@ pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
     let mut end = End::Fine;
     let files = match project::expanded(&args.files) {
         Ok(files) => files,
-        Err((path, error)) => {
-            terminal.error(&format!("cannot read {}: {error}", path.display()));
+        Err(message) => {
+            terminal.error(&message);
             return End::Failed;
         }
     };

@@ -1,15 +1,14 @@
 //! `fric hil`: runs a rig against drives on its buses, real or simulated.
 
-use super::{End, load_from};
+use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
-use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::kept::Keeping;
 use crate::terminal::{Style, Terminal};
-use crate::{project, report, value};
+use crate::{project, report, stability, value};
 use abi::Description;
 use abi::description::Kind;
-use abi::rig::{self, Mode, Node, Rig};
-use grammar::ast::Item;
+use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
@@ -17,7 +16,7 @@ use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::identify::{self, Identification};
-use runtime::hil::simulated::{MASTER, Pace, World};
+use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
@@ -38,15 +37,15 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
     let keeping = Keeping::new(&project::Disk);
     let mut watch = Stopwatch::start("read");
     let Some(mut loaded) = load_from(&args.file, &keeping, terminal, &mut watch) else { return End::Failed };
-    let name = match chosen(args, &loaded) {
+    let name = match chosen_rig(&args.file, args.rig.as_deref(), &loaded) {
         Ok(name) => name,
         Err(why) => {
             terminal.error(&why);
             return End::Failed;
         }
     };
-    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: args.interpret };
+    let set = args.set.texts();
+    let options = Options { changes: args.set.changes(), interpret: args.interpret };
     let mut found = Vec::new();
     let ready = compile::rig(&mut loaded, &keeping, &name, &options, &mut found);
     found.extend(ready.as_ref().err().into_iter().flatten().cloned());
@@ -92,30 +91,37 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
     if args.identify {
         return identified(args, ready, simulated, terminal);
     }
+    let Some(needs_look) = bearable(args, &ready, terminal) else { return End::Failed };
     emergency::guard();
-    if simulated { in_process(args, ready, log, None, terminal) } else { on_buses(args, ready, log, None, terminal) }
+    let asked = Asked { log, needs_look, ..Asked::default() };
+    if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
 }
 
-/// The rig to run: the one named, or the only one.
-fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let rigs = items.iter().filter_map(|item| match item {
-        Item::Rig(rig) => Some(rig.name.text.clone()),
-        _ => None,
-    });
-    let rigs: Vec<String> = rigs.collect();
-    let file = args.file.display();
-    match (&args.rig, rigs.as_slice()) {
-        (_, []) => Err(format!("{file} has no rig")),
-        (Some(name), all) if all.contains(name) => Ok(name.clone()),
-        (Some(name), all) => {
-            let near = compile::nearest(name, all.iter().map(String::as_str));
-            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
-            Err(format!("{file} has no rig `{name}`; {help}"))
-        }
-        (None, [one]) => Ok(one.clone()),
-        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
+/// Whether a rig may run: whether it is stable only while it looks ahead; none if it must not.
+fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool> {
+    let (mut against, needs_look) = stability::objections(ready);
+    if args.accept_unstable {
+        against.clear();
     }
+    let (median, period) = (stability::step_time(ready).0, ready.rig.period_ns as f64 * 1e-9);
+    // Time that stands meanwhile bears any step.
+    if median > 0.5 * period && !args.fast {
+        against.push(format!(
+            "a step takes {} on this computer, more than half of a period of {}",
+            value::duration(median),
+            value::duration(period)
+        ));
+    }
+    for why in &against {
+        terminal.error(&format!("refused: {why}"));
+    }
+    if against.is_empty() {
+        return Some(needs_look);
+    }
+    terminal.report(
+        "  `fric predict` says what would help; with simulated drives --accept-unstable lets an unstable rig run\n",
+    );
+    None
 }
 
 /// What cannot be asked for together.
@@ -168,16 +174,6 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
     Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
 }
 
-/// Whether one drive holds speed or position while another gives torque.
-fn holds_and_pushes(rig: &Rig) -> bool {
-    let pushes = |node: &Node| match &node.kind {
-        rig::Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),
-        rig::Kind::Frames(_) => None,
-    };
-    let all = || rig.nodes.iter().filter_map(pushes);
-    all().any(|pushes| pushes) && all().any(|pushes| !pushes)
-}
-
 fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     let mut options = HilOptions::default();
     options.control.count_overruns = args.count_overruns;
@@ -211,17 +207,14 @@ fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Ter
     emergency::guard();
     ready.rig = asked.rig.clone();
     ready.control = asked.program.clone();
-    if simulated {
-        in_process(args, ready, None, Some(&asked), terminal)
-    } else {
-        on_buses(args, ready, None, Some(&asked), terminal)
-    }
+    let asked = Asked { pulses: Some(&asked), ..Asked::default() };
+    if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
 }
 
 /// Says what was measured, as text to paste.
-fn measured(asked: &Identification, rows: &[identify::Row], sends: f64, terminal: &mut Terminal) {
+fn measured(asked: &Identification, rows: &[identify::Row], terminal: &mut Terminal) {
     let milli = |seconds: f64| value::significant(seconds * 1e3, 3);
-    for found in asked.evaluate(rows, sends) {
+    for found in asked.evaluate(rows) {
         let name = &asked.rig.nodes[found.node].name;
         let inertia = found
             .inertia
@@ -235,10 +228,18 @@ fn measured(asked: &Identification, rows: &[identify::Row], sends: f64, terminal
     }
 }
 
-type Log = Option<(Settings, Sections)>;
+/// What a run is to do besides running.
+#[derive(Default)]
+struct Asked<'a> {
+    log: Option<(Settings, Sections)>,
+    /// Torque pulses in place of the model.
+    pulses: Option<&'a Identification>,
+    /// It is stable only while it looks ahead.
+    needs_look: bool,
+}
 
 /// Buses, drives and devices in this process.
-fn in_process(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
+fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
     let pace = if args.fast { Pace::Fast } else { Pace::Wall };
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
     let mut world = match world {
@@ -258,11 +259,11 @@ fn in_process(args: &Args, ready: Ready, log: Log, asked: Option<&Identification
         }
     }
     let (clock, masters) = (world.clock(), world.masters());
-    run(args, ready, clock, masters, true, log, asked, terminal)
+    run(args, ready, clock, masters, true, asked, terminal)
 }
 
 /// Buses of this machine.
-fn on_buses(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>, terminal: &mut Terminal) -> End {
+fn on_buses(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
     for bus in &ready.rig.buses {
@@ -284,27 +285,35 @@ fn on_buses(args: &Args, ready: Ready, log: Log, asked: Option<&Identification>,
             }
         }
     }
-    run(args, ready, Box::new(world), buses, false, log, asked, terminal)
+    run(args, ready, Box::new(world), buses, false, asked, terminal)
 }
 
-#[allow(clippy::too_many_arguments, reason = "what a rig consists of")]
 fn run(
     args: &Args,
     ready: Ready,
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
     simulated: bool,
-    log: Log,
-    asked: Option<&Identification>,
+    asked: Asked,
     terminal: &mut Terminal,
 ) -> End {
-    let Ready { rig, control, notes, .. } = ready;
+    let Asked { log, pulses: asked, needs_look } = asked;
+    let Ready { rig, control, plant, notes, .. } = ready;
     let description = control.description().clone();
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
         Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
     });
     let fast = simulated && args.fast;
     let mut options = hil_options(args, &rig, simulated);
+    options.control.needs_look = needs_look;
+    options.control.energy_stops = args.stop_on_energy;
+    match cycle::look_ahead(&rig, &plant) {
+        Ok(look) => options.look = look,
+        Err(why) => {
+            terminal.error(&why);
+            return End::Failed;
+        }
+    }
     if let Some(asked) = asked {
         options.duration_ns = Some(asked.duration_ns);
         options.control.ramp_ns = 0;
@@ -350,7 +359,7 @@ fn run(
     if let Some(asked) = asked {
         let rows = identify::rows(&mut hil, asked);
         if hil.ended() == Some(&cycle::End::Asked) && rows.len() >= asked.drives().len() * 10 {
-            measured(asked, &rows, hil.collect_ns() as f64 * 1e-9, terminal);
+            measured(asked, &rows, terminal);
         }
     }
     let end = hil.ended().cloned().unwrap_or_else(|| hil.run());

@@ -4,11 +4,14 @@ use super::End;
 use crate::args::Inspect;
 use crate::project;
 use crate::terminal::{Style, Terminal};
-use crate::value::count;
+use crate::value::{count, significant};
+use abi::encode::Encode;
 use abi::image::Image;
+use abi::rig::Rig;
 use abi::{Description, Function};
 use runtime::package::signature::{Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
+use runtime::record::log::Sections;
 use std::fs;
 
 pub fn inspect(args: &Inspect, terminal: &mut Terminal) -> End {
@@ -57,9 +60,17 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
         out += &format!("  {:width$}  {size:>9} bytes  {}\n", section.name, &hash(&section.bytes)[..16]);
     }
     for name in ["control", "plant"] {
-        let Ok(bytes) = package.section(name) else { continue };
+        let bytes = package.section(name).map_err(|why| about(&why))?;
         let image = Image::read(bytes).map_err(|why| about(&format!("its program `{name}`: {why}")))?;
         out += &format!("\n  {name}: {}\n", program(&image));
+    }
+    let plan = package.section("rig").map_err(|why| about(&why))?;
+    let plan = Rig::from_bytes(plan).map_err(|why| about(&format!("the plan of its rig: {why}")))?;
+    out += &format!("\n  {}\n", planned(&plan));
+    let head = package.section("head").map_err(|why| about(&why))?;
+    let head = Vec::from_bytes(head).map_err(|why| about(&format!("the head of its logs: {why}")))?;
+    for set in Sections(head).text("set").unwrap_or_default().lines() {
+        out += &format!("  set {set}\n");
     }
     if args.sources {
         for section in sections {
@@ -79,6 +90,16 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
     Ok(out)
 }
 
+/// The plan of a rig: how often, on which buses, who is there.
+fn planned(rig: &Rig) -> String {
+    let mut out = format!("rig: {} Hz", significant(1e9 / rig.period_ns as f64, 6));
+    for (at, bus) in rig.buses.iter().enumerate() {
+        let nodes: Vec<&str> = rig.nodes.iter().filter(|node| node.bus == at).map(|node| node.name.as_str()).collect();
+        out += &format!("; bus {} on {}: {}", bus.name, bus.address, nodes.join(", "));
+    }
+    out
+}
+
 /// A program in a line.
 fn program(image: &Image) -> String {
     let Description { name, layout, .. } = &image.description;
@@ -88,8 +109,10 @@ fn program(image: &Image) -> String {
         .filter(|(_, entry)| entry.is_some())
         .map(|(function, _)| function.name())
         .collect();
+    let features: Vec<&str> = image.features.iter().map(|feature| feature.name()).collect();
+    let with = if features.is_empty() { String::new() } else { format!(" with {}", features.join(", ")) };
     format!(
-        "{name}, {} states, {} parameters; {} bytes of code for {}: {}",
+        "{name}, {} states, {} parameters; {} bytes of code for {}{with}: {}",
         layout.states.len,
         layout.params.len,
         count(image.code.len() as u64),

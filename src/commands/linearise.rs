@@ -19,11 +19,7 @@ use std::f64::consts::TAU;
 pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone() };
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        ports: Some(ports),
-        ..Changes::default()
-    };
+    let changes = Changes { ports: Some(ports), ..args.set.changes() };
     let options = Options { changes, ..Options::default() };
     let mut linear = match compile::linear(&mut loaded, &project::Disk, &args.name, &options, &mut Vec::new()) {
         Ok(linear) => linear,

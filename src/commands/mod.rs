@@ -103,6 +103,19 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
     }
 }
 
+/// Says if there is no experiment of this name among all of a file, and which one may be meant.
+fn has_experiment(file: &Path, name: &str, all: &[String]) -> Result<(), String> {
+    if all.iter().any(|one| one == name) {
+        return Ok(());
+    }
+    let help = match compile::nearest(name, all.iter().map(String::as_str)) {
+        Some(near) => format!("did you mean `{near}`?"),
+        None if all.is_empty() => "it has none".into(),
+        None => format!("it has {}", all.join(", ")),
+    };
+    Err(format!("{} has no experiment `{name}`; {help}", file.display()))
+}
+
 /// Reads and loads a text; reports what is wrong with it. None if it cannot be used.
 fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
     load_from(path, &project::Disk, terminal, watch)
@@ -137,6 +150,26 @@ fn load_text(
         return None;
     }
     Some(loaded)
+}
+
+/// The rig that is meant: the one named, or the only one.
+///
+/// # Errors
+/// What there is instead, in words.
+fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String, String> {
+    let file = file.display();
+    let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
+    match (name, rigs.as_slice()) {
+        (_, []) => Err(format!("{file} has no rig")),
+        (Some(name), all) if all.contains(&name) => Ok(name.into()),
+        (Some(name), all) => {
+            let near = compile::nearest(name, all.iter().copied());
+            let help = near.map_or(format!("it has {}", all.join(", ")), |near| format!("did you mean `{near}`?"));
+            Err(format!("{file} has no rig `{name}`; {help}"))
+        }
+        (None, [one]) => Ok((*one).into()),
+        (None, all) => Err(format!("{file} has several rigs: name one of {}", all.join(", "))),
+    }
 }
 
 /// Refuses what `fric check` refuses in the models of a text, and reports it; counts its warnings in one line.

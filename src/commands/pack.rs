@@ -1,13 +1,13 @@
 //! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
 
-use super::{End, load_from};
-use crate::args::Build;
+use super::{End, chosen_rig, load_from};
+use crate::args::{Build, Set};
 use crate::compile::{self, Stopwatch};
 use crate::kept::Keeping;
 use crate::terminal::Terminal;
 use crate::{project, report, sign};
 use abi::encode::Encode;
-use grammar::ast::Item;
+use abi::image::Feature;
 use runtime::package::signature::beside;
 use runtime::package::{Package, here};
 use runtime::record::log::Sections;
@@ -17,8 +17,18 @@ use std::path::Path;
 pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
     let target = args.target.map_or_else(here, |target| format!("{}-linux", target.name()));
     let out = args.out.as_deref().expect("a package has a name");
-    let key = args.sign.as_deref();
-    let (bytes, signature) = match packed(&args.file, args.name.as_deref(), &target, key, terminal) {
+    if args.stepped.solver.is_some() || args.stepped.step.is_some() {
+        terminal.error("a rig has its own step and solver: change them in its text");
+        return End::Misused;
+    }
+    let wanted = Wanted {
+        name: args.name.as_deref(),
+        target: &target,
+        features: &args.features,
+        set: &args.stepped.set,
+        key: args.sign.as_deref(),
+    };
+    let (bytes, signature) = match packed(&args.file, &wanted, terminal) {
         Ok(packed) => packed,
         Err(why) => {
             terminal.error(&why);
@@ -43,43 +53,36 @@ pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
     End::Fine
 }
 
+/// What to pack, and how.
+pub(super) struct Wanted<'a> {
+    /// The rig; the only one of the text if none is named.
+    pub name: Option<&'a str>,
+    /// Such as `aarch64-linux`.
+    pub target: &'a str,
+    /// What its code may use there besides.
+    pub features: &'a [Feature],
+    /// Parameters and slots that are changed.
+    pub set: &'a Set,
+    /// The secret key to sign with.
+    pub key: Option<&'a Path>,
+}
+
 /// The bytes of a package and its signature.
 ///
 /// # Errors
 /// Why there is none; diagnostics are reported, and an empty text is left.
 pub(super) fn packed(
     file: &Path,
-    name: Option<&str>,
-    target: &str,
-    key: Option<&Path>,
+    wanted: &Wanted,
     terminal: &mut Terminal,
 ) -> Result<(Vec<u8>, Option<String>), String> {
+    let Wanted { name, target, features, set, key } = *wanted;
     let reported = || "the rig was not built".to_string();
     let keeping = Keeping::new(&project::Disk);
     let mut loaded = load_from(file, &keeping, terminal, &mut Stopwatch::start("read")).ok_or_else(reported)?;
-    let items = &loaded.files.get(loaded.root()).ast.items;
-    let rigs: Vec<String> = items
-        .iter()
-        .filter_map(|item| match item {
-            Item::Rig(rig) => Some(rig.name.text.clone()),
-            _ => None,
-        })
-        .collect();
-    let name = match (name, &rigs[..]) {
-        (_, []) => return Err(format!("{} has no rig", file.display())),
-        (Some(name), all) if all.iter().any(|rig| rig == name) => name.to_string(),
-        (None, [only]) => only.clone(),
-        (Some(name), all) => {
-            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all.join(", ")),
-            };
-            return Err(format!("{} has no rig `{name}`; {help}", file.display()));
-        }
-        (None, all) => return Err(format!("which rig of {}? It has {}", file.display(), all.join(", "))),
-    };
+    let name = chosen_rig(file, name, &loaded)?;
     let mut found = Vec::new();
-    let built = compile::packed_rig(&mut loaded, &keeping, &name, target, &mut found);
+    let built = compile::packed_rig(&mut loaded, &keeping, &name, target, features, set.changes(), &mut found);
     if !found.is_empty() {
         terminal.report(&report::full(&loaded.files.0, &found, terminal.error_colour()));
     }
@@ -97,7 +100,7 @@ pub(super) fn packed(
         .with("rig", package.rig.as_str())
         .with("file", root.name.as_str())
         .with("source", root.text.as_bytes())
-        .with("set", "");
+        .with("set", set.texts().join("\n"));
     package.add("head", keeping.into(head).0.to_bytes());
     for source in loaded.files.0.iter().filter(|source| !source.name.starts_with("--")) {
         let name = format!("source/{}", tidy(&source.name));

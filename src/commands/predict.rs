@@ -1,31 +1,22 @@
 //! `fric predict`: says before anything moves whether an emulated contact is stable, and what is too coarse for it.
 //!
-//! The loop is that of the compiled step, differentiated, with the shaft and the drives around it; runtime::predict
-//! judges it. Advice comes as numbers.
+//! The loops come from `stability`, judged by runtime::predict. Advice comes as numbers.
 
-use super::{End, load};
+use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
-use crate::compile::{self, Changes, Loaded, Options, Ready, StepDerivative, Stopwatch};
+use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
+use crate::stability::{self, Contact, contacts};
 use crate::terminal::Terminal;
 use crate::value::significant;
 use crate::{project, report};
 use abi::Slot;
 use abi::description::{Kind as QuantityKind, Quantity};
-use abi::rig::{Kind, Mode, Signal, What};
+use abi::rig::Kind;
 use grammar::ast::{ExperimentStatement, Item};
 use runtime::engine::{self, Continue};
-use runtime::predict::{Late, Loop, Shaft, Step};
+use runtime::modes::modes;
+use runtime::predict::Loop;
 use serde_json::{Value, json};
-
-/// The emulated contact of one drive.
-struct Contact {
-    drive: String,
-    command: usize,
-    inputs: Vec<Slot>,
-    derivative: StepDerivative,
-    shaft: Shaft,
-    late: Late,
-}
 
 pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
@@ -37,8 +28,8 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let set: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let options = Options { changes: Changes { set: set.clone(), ..Changes::default() }, interpret: false };
+    let set = args.set.texts();
+    let options = Options { changes: args.set.changes(), interpret: false };
     let mut found = Vec::new();
     let ready = compile::rig(&mut loaded, &project::Disk, &name, &options, &mut found);
     found.extend(ready.as_ref().err().into_iter().flatten().cloned());
@@ -59,6 +50,8 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     }
     let (text, resolution) = resolution(&ready);
     words += &text;
+    let (text, step) = step_time(&ready);
+    words += &text;
     let mut twin = Value::Null;
     if let Some(experiment) = &args.experiment {
         match twins(&mut loaded, &ready, experiment, &set) {
@@ -71,8 +64,7 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     }
     match args.json {
         true => {
-            let object =
-                json!({"rig": name, "stable": stable, "contacts": all, "resolution": resolution, "twin": twin});
+            let object = json!({"rig": name, "stable": stable, "contacts": all, "resolution": resolution, "step": step, "twin": twin});
             terminal.line(&object.to_string());
         }
         false => terminal.print(&words),
@@ -80,109 +72,26 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     if stable { End::Fine } else { End::Failed }
 }
 
-/// The rig that is meant.
+/// The rig that is meant: the one named, the one that the experiment runs, or the only one.
 fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
+    let run = args.experiment.as_ref().map(|name| run_by(name, args, loaded)).transpose()?;
+    chosen_rig(&args.file, args.rig.as_deref().or(run.as_deref()), loaded)
+}
+
+/// The rig that an experiment runs.
+fn run_by(name: &str, args: &Args, loaded: &Loaded) -> Result<String, String> {
     let file = args.file.display();
-    let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
-    let runs = args.experiment.as_ref().map(|name| {
-        let items = &loaded.files.get(loaded.root()).ast.items;
-        let experiment = items.iter().find_map(|item| match item {
-            Item::Experiment(one) if one.name.text == *name => Some(one),
-            _ => None,
-        });
-        let run =
-            experiment.ok_or(format!("{file} has no experiment `{name}`"))?.body.iter().find_map(|one| match one {
-                ExperimentStatement::Run(run) => Some(run.instance.model.text.clone()),
-                _ => None,
-            });
-        run.filter(|run| rigs.contains(&run.as_str())).ok_or(format!("experiment `{name}` runs no rig of {file}"))
+    let items = &loaded.files.get(loaded.root()).ast.items;
+    let experiment = items.iter().find_map(|item| match item {
+        Item::Experiment(one) if one.name.text == name => Some(one),
+        _ => None,
     });
-    match (&args.rig, runs, rigs.as_slice()) {
-        (_, Some(Err(why)), _) => Err(why),
-        (None, Some(Ok(run)), _) => Ok(run),
-        (Some(name), _, all) if all.contains(&name.as_str()) => Ok(name.clone()),
-        (Some(name), _, all) => match compile::nearest(name, all.iter().copied()) {
-            Some(near) => Err(format!("{file} has no rig `{name}`; did you mean `{near}`?")),
-            None => Err(format!("{file} has no rig `{name}`")),
-        },
-        (None, None, []) => Err(format!("{file} has no rig")),
-        (None, None, [one]) => Ok((*one).to_string()),
-        (None, None, all) => Err(format!("{file} has several rigs: name one with --rig, of {}", all.join(", "))),
-    }
-}
-
-/// Drives whose torque answers the speed of the shaft.
-fn contacts(ready: &Ready) -> Vec<Contact> {
-    let rig = &ready.rig;
-    let seen = |signal: Signal| rig.plant.seen.iter().find(|(other, _)| *other == signal).map(|(_, slot)| *slot);
-    let signals: Vec<(Slot, Slot)> = rig
-        .inputs
-        .iter()
-        .filter(|input| input.signal.what == What::Speed)
-        .filter_map(|input| Some((input.slot, seen(input.signal)?)))
-        .collect();
-    let mut out = Vec::new();
-    for output in &rig.outputs {
-        let node = &rig.nodes[output.signal.node];
-        let Kind::Cia402(drive) = &node.kind else { continue };
-        let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == output.signal);
-        let Some((_, torque)) = applied.filter(|_| drive.mode == Mode::Torque) else { continue };
-        let (inputs, outputs): (Vec<Slot>, Vec<Slot>) = signals.iter().copied().unzip();
-        let Some((shaft, states)) = compile::linear_of(&ready.plant_program, &[*torque], &outputs) else { continue };
-        let derivative = StepDerivative::new(&ready.program, rig.method, &inputs, &[output.slot]);
-        let late =
-            Late { dead: node.delay + if drive.at_sync { rig.period_ns as f64 * 1e-9 } else { 0.0 }, lag: node.lag };
-        let shaft = Shaft { states, torques: 1, signals: outputs.len(), a: shaft.a, b: shaft.b, c: shaft.c };
-        let contact =
-            Contact { drive: node.name.clone(), command: output.signal.node, inputs, derivative, shaft, late };
-        let at_rest = contact.at(ready, &[], 0.0);
-        if at_rest.step.b.iter().any(|b| *b != 0.0) && contact.stiffness(&at_rest) != 0.0
-            || at_rest.step.d.iter().any(|d| *d != 0.0)
-        {
-            out.push(contact);
-        }
-    }
-    out
-}
-
-impl Contact {
-    /// The loop with these parameters, near a speed that has lasted.
-    fn at(&self, ready: &Ready, params: &[(Slot, f64)], speed: f64) -> Loop {
-        let rig = &ready.rig;
-        let period = rig.period_ns as f64 * 1e-9;
-        let mut control = ready.control.clone();
-        for (slot, value) in params {
-            control.set(*slot, *value);
-        }
-        for input in &self.inputs {
-            control.set(*input, speed);
-        }
-        control.start(period / f64::from(rig.steps));
-        if speed != 0.0 {
-            // What a contact has to forget is forgotten in so many steps of a speed that lasts.
-            for _ in 0..2000 * rig.steps {
-                control.advance(1);
-            }
-        }
-        let discrete = self.derivative.at(control.block(), rig.steps);
-        let step = Step {
-            states: discrete.states,
-            signals: discrete.inputs,
-            commands: discrete.outputs,
-            a: discrete.a,
-            b: discrete.b,
-            c: discrete.c,
-            d: discrete.d,
-        };
-        Loop { period, step, shaft: self.shaft.clone(), late: vec![self.late] }
-    }
-
-    /// How the torque goes on answering a speed, N·m/rad: the stiffness.
-    fn stiffness(&self, near: &Loop) -> f64 {
-        let (step, signals) = (&near.step, near.step.signals);
-        let kept = |j: usize| (0..step.states).map(|i| step.c[i] * step.b[i * signals + j]).sum::<f64>();
-        (0..signals).map(kept).sum::<f64>().abs() / near.period
-    }
+    let run = experiment.ok_or(format!("{file} has no experiment `{name}`"))?.body.iter().find_map(|one| match one {
+        ExperimentStatement::Run(run) => Some(run.instance.model.text.clone()),
+        _ => None,
+    });
+    let of_a_rig = |run: &String| loaded.rigs().iter().any(|rig| rig.name.text == *run);
+    run.filter(of_a_rig).ok_or(format!("experiment `{name}` runs no rig of {file}"))
 }
 
 /// Stability of one contact at rest, at the Stribeck speed and while sliding, and what would help.
@@ -198,7 +107,7 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
         points.push(("stribeck", smallest));
         points.push(("sliding", 100.0 * smallest));
     }
-    let predicted = ready.rig.predict == Some(contact.command);
+    let standing = contact.standing(ready);
     let (mut words, mut regimes, mut stable) = (String::new(), Vec::new(), true);
     for (regime, speed) in points {
         let near = contact.at(ready, &[], speed);
@@ -207,8 +116,7 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
         let limit = (regime == "presliding").then(|| near.limit(0)).flatten();
         words += &format!("{regime:<11} {}  radius {}", contact.drive, significant(radius, 4));
         if regime == "presliding" {
-            let holds = radius < 1.0;
-            stable &= holds || predicted;
+            stable &= standing.is_stable();
             match limit {
                 Some(limit) => {
                     let total = limit - contact.late.dead + tau;
@@ -219,22 +127,59 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
                         ms(total)
                     );
                 }
-                None => words += "  no delay makes it unstable",
+                None => words += "  no delay up to 40 periods makes it unstable",
             }
-            words += if holds { "  stable" } else { "  UNSTABLE" };
-            if predicted {
-                words += "; its commands look ahead: the limit is that of the plain coupling";
-            }
+            words += if radius < 1.0 { "  stable" } else { "  UNSTABLE" };
         }
         words += "\n";
         let margin = limit.map(|limit| limit - contact.late.dead);
         regimes.push(json!({"regime": regime, "speed": speed, "radius": radius, "delay_margin": margin}));
     }
+    let ahead = contact.looking(contact.at(ready, &[], 0.0)).zip(standing.ahead);
+    let ahead = ahead.map(|(ahead, radius)| {
+        let limit = ahead.limit();
+        words += &format!("look ahead  {}  radius {}", contact.drive, significant(radius, 4));
+        let margin = limit.map(|limit| limit - contact.late.dead);
+        words += &match margin {
+            Some(margin) => format!("  delay margin {} ms (tau {}, limit {})", ms(margin), ms(tau), ms(margin + tau)),
+            None => "  no delay up to 40 periods makes it unstable".into(),
+        };
+        words += if radius < 1.0 { "  stable\n" } else { "  UNSTABLE\n" };
+        json!({"radius": radius, "delay_margin": margin})
+    });
+    let (text, resonances) = resonances(ready, contact);
+    words += &text;
     let (text, advice) = advised(ready, contact, tau);
     words += &text;
-    let object =
-        json!({"drive": contact.drive, "tau": tau, "regimes": regimes, "advice": advice, "looks_ahead": predicted});
+    let object = json!({
+        "drive": contact.drive, "tau": tau, "regimes": regimes, "look_ahead": ahead, "resonances": resonances,
+        "advice": advice
+    });
     (words, object, stable)
+}
+
+/// Poles of the look ahead's observer at a period of 1 ms, and how far above them, in units of (1 − θ)/T, a resonance of the
+/// shaft must lie for it to be taken as rigid.
+const RIGID: f64 = 6.0 * (1.0 - 0.9) / 1e-3;
+
+/// Where the shaft by itself swings.
+fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
+    let (states, a) = contact.shaft();
+    let (mut words, mut out) = (String::new(), Vec::new());
+    for mode in modes(states, a).unwrap_or_default().iter().filter(|mode| mode.imaginary > 0.0) {
+        let hertz = mode.frequency() / (2.0 * std::f64::consts::PI);
+        words += &format!("resonance   {} Hz", significant(hertz, 3));
+        if let Some(damping) = mode.damping() {
+            words += &format!("  damping {}", significant(damping, 2));
+        }
+        if ready.rig.predict.is_some() && mode.frequency() < RIGID {
+            let least = RIGID / (2.0 * std::f64::consts::PI);
+            words += &format!("  too low to look ahead, which needs {} Hz", significant(least, 3));
+        }
+        words += "\n";
+        out.push(json!({"frequency": hertz, "damping": mode.damping()}));
+    }
+    (words, Value::Array(out))
 }
 
 /// The stiffness and the damping of the contact: params, and how far each may go.
@@ -288,13 +233,16 @@ fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
             }
             factor *= 1.15;
         }
-        let total = most - contact.late.dead + tau;
+        let total = Some(most - contact.late.dead + tau).filter(|total| total.is_finite());
         words += &format!(
-            "advice      {} = {} {} allows the most delay, {} ms (it is {})\n",
+            "advice      {} = {} {} allows {} (it is {})\n",
             damper.path,
             significant(damper.unit.from_si(best * value), 3),
             damper.unit,
-            significant(1e3 * total, 3),
+            match total {
+                Some(total) => format!("the most delay, {} ms", significant(1e3 * total, 3)),
+                None => "any delay up to 40 periods".into(),
+            },
             significant(damper.unit.from_si(value), 3)
         );
         out.insert(
@@ -356,6 +304,19 @@ fn resolution(ready: &Ready) -> (String, Value) {
         buses.push(json!({"bus": bus.name, "load": load}));
     }
     (words, json!({"drives": out, "buses": buses}))
+}
+
+/// What a step takes on this machine, and of its period.
+fn step_time(ready: &Ready) -> (String, Value) {
+    let (median, greatest) = stability::step_time(ready);
+    let period = ready.rig.period_ns as f64 * 1e-9;
+    let words = format!(
+        "step        {} here, at most {}, of {}\n",
+        crate::value::duration(median),
+        crate::value::duration(greatest),
+        crate::value::duration(period)
+    );
+    (words, json!({"median": median, "greatest": greatest, "period": period}))
 }
 
 /// The dry run beside one whose drives act at once: how far what is drawn differs.

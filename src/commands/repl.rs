@@ -79,15 +79,23 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
         if args.echo && !typed {
             terminal.print(&repl::as_typed(&text));
         }
-        let mut at = Prompt { session: &mut session.borrow_mut(), terminal };
-        match at.line(&text) {
-            Ok(Next::Quit) => return if typed { End::Fine } else { end },
-            Ok(Next::Line) => {}
-            Ok(Next::Missed) => end = End::Failed,
-            Err(fault) => {
-                tell_fault(&fault, terminal);
-                end = End::Failed;
+        let mut rest = repl::inputs(&text).into_iter();
+        while let Some(input) = rest.next() {
+            let mut at = Prompt { session: &mut session.borrow_mut(), terminal };
+            match at.line(input) {
+                Ok(Next::Quit) => return if typed { End::Fine } else { end },
+                Ok(Next::Line) => continue,
+                Ok(Next::Missed) => end = End::Failed,
+                Err(fault) => {
+                    tell_fault(&fault, terminal);
+                    end = End::Failed;
+                }
             }
+            // What was pasted behind a mistake may build on it.
+            if rest.any(|line| !line.trim().is_empty()) {
+                terminal.error("the lines behind it were not done");
+            }
+            break;
         }
         if end == End::Failed && !typed && !args.keep_going {
             return end;
@@ -622,18 +630,7 @@ pub(super) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
     if plots.is_empty() {
         return None;
     }
-    let cases: Vec<figure::Recorded> = ran
-        .cases
-        .iter()
-        .zip(&ran.results)
-        .map(|(case, result)| {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
-            (case.label.as_str(), recording)
-        })
-        .collect();
+    let cases = figure::recorded(&ran.cases, &ran.results);
     let subtitle = results::solver(&first.experiment.solver);
     Some(figure::figure(&ran.name, &subtitle, plots, &cases))
 }

@@ -8,6 +8,7 @@ use crate::terminal::Terminal;
 use crate::{project, report, value};
 use abi::rig::{Rig, Signal};
 use runtime::hil::control::Control;
+use runtime::hil::cycle::look_ahead;
 use runtime::hil::replay::{Replay, Stopped, What};
 use runtime::hil::trace::{self, Cycle, Passed, Shape};
 use runtime::hil::words;
@@ -45,7 +46,9 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
             return fail(terminal, "the rig in it does not compile");
         }
     };
-    let control = match Control::new(&ready.rig, ready.control, &bounds, settings) {
+    let made = look_ahead(&ready.rig, &ready.plant)
+        .and_then(|look| Control::new(&ready.rig, ready.control, look, &bounds, settings));
+    let control = match made {
         Ok(control) => control,
         Err(why) => return fail(terminal, &why),
     };

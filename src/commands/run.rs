@@ -1,9 +1,9 @@
 //! `fric run`: compiles experiments, runs them, shows and writes what they did.
 
 use super::cross::{Crossed, cross};
-use super::{Done, End, compiled, done, load, sound};
+use super::{Done, End, compiled, done, has_experiment, load, sound};
 use crate::args::Run;
-use crate::compile::{self, Changes, Loaded, Options, Stages, Stopwatch};
+use crate::compile::{Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
@@ -37,15 +37,7 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
         return End::Failed;
     }
     let stages = watch.stop();
-    let changes = Changes {
-        set: args.set.iter().map(|(path, value)| format!("{path}={value}")).collect(),
-        method: args.solver,
-        step: args.step,
-        tol: args.tol,
-        duration: args.duration,
-        ..Changes::default()
-    };
-    let options = Options { changes, interpret: args.interpret };
+    let options = Options { changes: args.changed.changes(), interpret: args.interpret };
     let mut end = End::Fine;
     for name in &names {
         if experiment(args, &mut loaded, name, &options, &stages, terminal) != End::Fine {
@@ -64,19 +56,10 @@ fn refused(args: &Run, loaded: &Loaded, name: &str, diagnostics: &[Diagnostic], 
 /// The experiments to run: those named, else all.
 fn chosen(args: &Run, loaded: &Loaded) -> Result<Vec<String>, String> {
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    let file = args.file.display();
     if all.is_empty() {
-        return Err(format!("{file} has no experiment to run"));
+        return Err(format!("{} has no experiment to run", args.file.display()));
     }
-    for name in &args.experiments {
-        if !all.contains(name) {
-            let help = match compile::nearest(name, all.iter().map(String::as_str)) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all.join(", ")),
-            };
-            return Err(format!("{file} has no experiment `{name}`; {help}"));
-        }
-    }
+    args.experiments.iter().try_for_each(|name| has_experiment(&args.file, name, &all))?;
     Ok(if args.experiments.is_empty() { all } else { args.experiments.clone() })
 }
 
@@ -181,18 +164,7 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
     if first.experiment.plots.is_empty() {
         return None;
     }
-    let cases: Vec<figure::Recorded> = done
-        .cases
-        .iter()
-        .zip(&done.results)
-        .map(|(case, result)| {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
-            (case.label.as_str(), recording)
-        })
-        .collect();
+    let cases = figure::recorded(&done.cases, &done.results);
     let subtitle = format!("{}, {}", first.instance.description().name, results::solver(&first.experiment.solver));
     Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
 }
@@ -212,15 +184,11 @@ fn write(
             let png = path.extension().is_some_and(|extension| extension == "png");
             files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
         }
-        for (case, result) in done.cases.iter().zip(&done.results) {
-            let recording = match result {
-                Ok(outcome) => &outcome.recording,
-                Err(failure) => &failure.recording,
-            };
+        for (label, recording) in figure::recorded(&done.cases, &done.results) {
             let mut bytes = Vec::new();
             csv::write(recording, &mut bytes).expect("writing to memory does not fail");
             for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {
-                files.push((for_case(&path, &case.label), bytes.clone()));
+                files.push((for_case(&path, label), bytes.clone()));
             }
         }
     }

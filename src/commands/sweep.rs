@@ -4,7 +4,7 @@
 //! whole one, and shards written one behind the other are the whole. A neighbour of the file, `.NAME.unfinished`, holds
 //! what the sweep was asked for until it is complete: nobody goes on with another one.
 
-use super::{End, load, reported};
+use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
 use crate::compile::{self, Changes, Loaded, Options, Stopwatch, Varying};
 use crate::plot::{self, Axis, Curve, Figure, Panel};
@@ -33,12 +33,8 @@ const DEFAULT_RUNS: u64 = 100;
 pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let all: Vec<String> = loaded.experiments().into_iter().map(|experiment| experiment.name).collect();
-    if !all.contains(&args.experiment) {
-        let help = match compile::nearest(&args.experiment, all.iter().map(String::as_str)) {
-            Some(near) => format!("did you mean `{near}`?"),
-            None => format!("it has {}", all.join(", ")),
-        };
-        terminal.error(&format!("{} has no experiment `{}`; {help}", args.file.display(), args.experiment));
+    if let Err(message) = has_experiment(&args.file, &args.experiment, &all) {
+        terminal.error(&message);
         return End::Failed;
     }
     for (k, vary) in args.vary.iter().enumerate() {
@@ -66,17 +62,8 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
 
 /// The experiment with its parameters open; a parameter that follows from others, or has no value, is given one first.
 fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
-    let given: Vec<String> = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
     let mut options = Options {
-        changes: Changes {
-            set: given.clone(),
-            method: args.solver,
-            step: args.step,
-            tol: args.tol,
-            duration: args.duration,
-            vary: args.vary.iter().map(|vary| vary.path.clone()).collect(),
-            ..Changes::default()
-        },
+        changes: Changes { vary: args.vary.iter().map(|vary| vary.path.clone()).collect(), ..args.changed.changes() },
         interpret: args.interpret,
     };
     let name = &args.experiment;
@@ -402,8 +389,8 @@ impl Table {
         let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
         let solver = results::solver(&self.cases[0].experiment.solver);
         asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
-        for (path, value) in &args.set {
-            asked += &format!("--set {path}={value}\n");
+        for set in args.changed.stepped.set.texts() {
+            asked += &format!("--set {set}\n");
         }
         for vary in &self.vary {
             let how = match &vary.how {

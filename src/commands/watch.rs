@@ -1,9 +1,9 @@
 //! `fric watch`: runs an experiment again whenever its text is saved. States go on by name and unit.
 
-use super::End;
 use super::repl::{
     catch_interrupts, interrupted, run_figure, show_run, tell_fault, time_of, watch as stop_on_interrupt,
 };
+use super::{End, has_experiment};
 use crate::args::Watch;
 use crate::plot;
 use crate::repl::Session;
@@ -103,11 +103,7 @@ fn chosen(session: &Session, file: &str, name: &str) -> Result<String, String> {
         [] => Err(format!("{file} has no experiment to run")),
         [only] if name.is_empty() => Ok(only.clone()),
         _ if name.is_empty() => Err(format!("which one? {file} has {}", all.join(", "))),
-        _ if all.iter().any(|one| one == name) => Ok(name.into()),
-        _ => match crate::compile::nearest(name, all.iter().map(String::as_str)) {
-            Some(near) => Err(format!("{file} has no experiment `{name}`; did you mean `{near}`?")),
-            None => Err(format!("{file} has no experiment `{name}`; it has {}", all.join(", "))),
-        },
+        _ => has_experiment(Path::new(file), name, &all).map(|()| name.into()),
     }
 }
 

@@ -162,6 +162,23 @@ pub fn incomplete(text: &str) -> bool {
     depth > 0 || (depth == 0 && waits && !text.ends_with("\n\n"))
 }
 
+/// The inputs of a text of several lines, as a terminal hands over what is pasted: each goes as far as it must.
+pub fn inputs(text: &str) -> Vec<&str> {
+    let mut found = Vec::new();
+    let (mut begin, mut end) = (0, 0);
+    for line in text.split_inclusive('\n') {
+        end += line.len();
+        if !incomplete(&text[begin..end]) {
+            found.push(&text[begin..end]);
+            begin = end;
+        }
+    }
+    if begin < text.len() {
+        found.push(&text[begin..]);
+    }
+    found
+}
+
 /// Splits `… to FILE.svg` off the end of a command: what stands before, and the file.
 ///
 /// # Errors
@@ -207,6 +224,14 @@ mod tests {
         assert!(!incomplete("model M {\n  input v [m/s]\n}"));
         assert!(incomplete("f.F +"));
         assert!(!incomplete("f.F + 1 N") && !incomplete("f.F)"));
+    }
+
+    #[test]
+    fn what_is_pasted_is_taken_apart_where_an_input_ends() {
+        let text = "const m = 2 kg\nmodel M {\n  input v [m/s]\n}\n1 N +\n2 N\nf(";
+        assert_eq!(inputs(text), ["const m = 2 kg\n", "model M {\n  input v [m/s]\n}\n", "1 N +\n2 N\n", "f("]);
+        assert_eq!(inputs("1 N"), ["1 N"]);
+        assert_eq!(inputs(""), [""; 0]);
     }
 
     #[test]

@@ -194,6 +194,9 @@ fn wanted(session: &Session, line: &str, start: usize, cursor: usize) -> Option<
 /// What is shown in grey behind the cursor: how a command is used, or what a quantity is.
 pub fn hint(session: &Session, line: &str) -> Option<String> {
     let word = line.trim();
+    if word.is_empty() {
+        return None;
+    }
     if let Some((_, usage, _)) = COMMANDS.iter().find(|(name, ..)| *name == word) {
         let rest = usage.strip_prefix(word)?;
         let rest = if line.ends_with(' ') { rest.trim_start() } else { rest };

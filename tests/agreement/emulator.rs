@@ -3,7 +3,7 @@
 //! Compiler and emulator are taken from the system, else from Debian's packages, which are unpacked below `target/` and
 //! installed nowhere. Where neither is to be had, the test fails and says what to install.
 
-use std::fs;
+use crate::debian::{done, on_path, unpacked};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -51,7 +51,8 @@ fn harness() -> (Option<PathBuf>, PathBuf) {
         done(Command::new(compiler).args(flags).arg(&harness).arg(&source), "aarch64-linux-gnu-gcc");
         return (Some(emulator), harness);
     }
-    let usr = unpacked().join("usr");
+    let wanted = "code for 64-bit Arm cannot be tried: there is no qemu-aarch64 with aarch64-linux-gnu-gcc";
+    let usr = unpacked("aarch64-tools", &PACKAGES, wanted).join("usr");
     let (bin, target) = (usr.join("bin"), usr.join("aarch64-linux-gnu"));
     let mut across = Command::new(bin.join("aarch64-linux-gnu-gcc-12"));
     across.env("LD_LIBRARY_PATH", usr.join("lib/x86_64-linux-gnu"));
@@ -61,53 +62,4 @@ fn harness() -> (Option<PathBuf>, PathBuf) {
     across.arg("-isystem").arg(target.join("include"));
     done(&mut across, "the cross compiler");
     (Some(bin.join("qemu-aarch64-static")), harness)
-}
-
-/// The packages below `target/`, from an earlier run or fetched now.
-fn unpacked() -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("aarch64-tools");
-    if folder.is_dir() {
-        return folder;
-    }
-    // Under another name until it is whole.
-    let begun = folder.with_extension(format!("begun-{}", std::process::id()));
-    let archives = begun.join("archives");
-    fs::create_dir_all(archives.join("partial")).expect("target/ can be written");
-    let fetch = |own_lists: bool, what: &[&str]| {
-        let mut command = Command::new("apt-get");
-        command.current_dir(&archives).args(["-q", "-o", "APT::Sandbox::User=root"]);
-        if own_lists {
-            command.arg("-o").arg(format!("Dir::State::Lists={}", begun.join("lists").display()));
-            command.arg("-o").arg(format!("Dir::Cache={}", begun.join("cache").display()));
-        }
-        command.args(what).output().is_ok_and(|output| output.status.success())
-    };
-    let download: Vec<&str> = ["download"].into_iter().chain(PACKAGES).collect();
-    let fetched = fetch(false, &download) || fetch(true, &["update"]) && fetch(true, &download);
-    assert!(
-        fetched,
-        "code for 64-bit Arm cannot be tried: there is no qemu-aarch64 with aarch64-linux-gnu-gcc, and apt-get cannot \
-         download them.\nOn Debian: apt-get install qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross"
-    );
-    for archive in fs::read_dir(&archives).expect("it was just made").flatten() {
-        if archive.path().extension().is_some_and(|extension| extension == "deb") {
-            done(Command::new("dpkg-deb").arg("-x").arg(archive.path()).arg(&begun), "dpkg-deb");
-        }
-    }
-    fs::remove_dir_all(&archives).expect("target/ can be written");
-    // Another test may have been faster: what it unpacked is the same.
-    if fs::rename(&begun, &folder).is_err() {
-        fs::remove_dir_all(&begun).expect("target/ can be written");
-    }
-    folder
-}
-
-fn on_path(name: &str) -> Option<PathBuf> {
-    let path = std::env::var_os("PATH")?;
-    std::env::split_paths(&path).map(|folder| folder.join(name)).find(|file| file.is_file())
-}
-
-fn done(command: &mut Command, what: &str) {
-    let output = command.output().unwrap_or_else(|error| panic!("{what} does not start: {error}"));
-    assert!(output.status.success(), "{what}: {}", String::from_utf8_lossy(&output.stderr));
 }

@@ -5,6 +5,8 @@
 //! A plain run tries 2,000 programs of chance. `FRIC_PROGRAMS=1000000 cargo test --release --test agreement chance` goes on
 //! where an earlier run of the same command was interrupted: see docs/machine-code.md.
 
+#[path = "../support/debian.rs"]
+mod debian;
 mod emulator;
 #[path = "../support/mod.rs"]
 mod support;
@@ -66,7 +68,7 @@ impl Case {
     }
 
     fn image(&self, target: Target) -> Vec<u8> {
-        let image = blob::image(&self.functions, &self.description, &self.params, target);
+        let image = blob::image(&self.functions, &self.description, &self.params, target, &[]);
         image.unwrap_or_else(|why| panic!("{}: {why}", self.name)).to_bytes()
     }
 

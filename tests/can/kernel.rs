@@ -2,13 +2,18 @@
 //! with CAN and the right to make interfaces: `runner` sees to both.
 
 mod contract;
+mod rig;
 
 use contract::Pair;
 use runtime::can::socketcan::{self, SocketCan};
 use runtime::can::{Bus, Event, Frame, Options, Received, Refused, State};
 use runtime::clock::{Clock, Monotonic};
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicU32, Ordering};
+use runtime::hil::cycle::{End, Hil, Options as HilOptions};
+use runtime::safety::Cause;
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex};
 
 const RATE: u32 = 1_000_000;
 
@@ -194,4 +199,113 @@ fn prepared_frames_arrive() {
     let prepared = near.prepare(stop).expect("an interface can");
     assert!(std::thread::spawn(move || prepared.send()).join().expect("it ends"));
     assert!(matches!(far.receive(), Some(Received::Frame(frame, _)) if frame == stop));
+}
+
+/// What comes faster than it can be read: from another processor, through two cards. Whatever is missing has been told.
+#[test]
+fn a_flood_is_read_or_its_loss_is_told() {
+    if !guest() {
+        return;
+    }
+    let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    for name in ["can0", "can1"] {
+        socketcan::take_down(name).expect("we may");
+        socketcan::take_up(name, Some(RATE)).expect("the driver is loaded");
+    }
+    let (mut near, mut far) = (open("can0"), open("can1"));
+    let clock = Monotonic::new();
+    let sent = 20_000u32;
+    let flood = std::thread::spawn(move || {
+        for k in 0..sent {
+            while far.send(Frame::new(0x100, &k.to_le_bytes())).is_err() {
+                std::hint::spin_loop();
+            }
+        }
+        far
+    });
+    let (mut read, mut lost, mut last) = (0, 0, None);
+    while near.wait(clock.now_ns() + 2_000_000_000) {
+        while let Some(received) = near.receive() {
+            match received {
+                Received::Frame(frame, _) => {
+                    let k = u32::from_le_bytes(frame.data().try_into().expect("four bytes"));
+                    assert!(last < Some(k), "{k} after {last:?}");
+                    (read, last) = (read + 1, Some(k));
+                }
+                Received::Event(Event::Lost(frames), _) => lost += frames,
+                Received::Event(..) => {}
+            }
+        }
+    }
+    let _far = flood.join().expect("all was sent");
+    println!("flood: {read} of {sent} read, {lost} told as lost");
+    assert!(read > sent / 2 && (read == sent || lost > 0), "{read} read, {lost} told as lost");
+}
+
+/// The kernel's own gateway between two virtual buses, with rules.
+fn gateway(rules: &[&[&str]]) {
+    let tool = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/can/cache/root/usr/bin/cangw");
+    let run = |args: &[&str]| {
+        let output = Command::new(&tool).args(args).output().unwrap_or_else(|error| panic!("{tool:?}: {error}"));
+        assert!(output.status.success(), "cangw {args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    };
+    run(&["-F"]);
+    rules.iter().for_each(|rule| run(rule));
+}
+
+/// A rig of 50 Hz on one side of a gateway, its drives on the other, until it has been armed for a while; then the rules
+/// change. Why it stopped, and after how many cycles; no drive has torque then.
+fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
+    let (near, far) = (fresh(), fresh());
+    gateway(&[&["-A", "-s", &near, "-d", &far], &["-A", "-s", &far, "-d", &near]]);
+    let asked = rig::pulsed(20_000_000);
+    let over = Arc::new(AtomicBool::new(false));
+    let drives = {
+        let (rig, far, over) = (asked.rig.clone(), far.clone(), over.clone());
+        std::thread::spawn(move || rig::drives(&rig, &far, None, &over))
+    };
+    let mut options = HilOptions { arms_itself: true, duration_ns: Some(60_000_000_000), ..HilOptions::default() };
+    // A busy host may be late by itself.
+    (options.control.count_overruns, options.start.missed) = (true, 0.2);
+    let buses: Vec<Box<dyn Bus>> = vec![Box::new(open(&near))];
+    let made = Hil::new(&asked.rig, asked.program.clone(), Box::new(Monotonic::new()), buses, options, None);
+    let (mut hil, _operator) = made.expect("it can be started");
+    while hil.counts().cycles < 20 {
+        hil.cycle();
+        assert_eq!(hil.ended(), None, "before anything was changed");
+    }
+    changed(&near, &far);
+    let (since, mut noticed) = (hil.counts().all, None);
+    while hil.ended().is_none() {
+        hil.cycle();
+        let cause = hil.control().and_then(|control| control.supervisor().cause());
+        noticed = noticed.or(cause.map(|cause| (cause, hil.counts().all - since)));
+        assert!(hil.counts().all - since < 500, "it goes on");
+    }
+    assert!(matches!(hil.ended(), Some(End::Stopped(..))), "{:?}", hil.ended());
+    over.store(true, Ordering::Relaxed);
+    assert!(!drives.join().expect("the drives end"), "a drive still has torque");
+    noticed.expect("a stop has its cause")
+}
+
+/// Rows of the fault campaign on a kernel: frames that a rule drops, a data word that a rule rewrites, an interface that
+/// goes down.
+#[test]
+fn a_rig_stops_when_the_kernel_drops_or_rewrites_its_frames() {
+    if !guest() {
+        return;
+    }
+    let (cause, after) = through_a_gateway(|near, far| {
+        let all_but = ["-A", "-s", far, "-d", near, "-f", "183~7FF"];
+        gateway(&[&["-A", "-s", near, "-d", far], &all_but]);
+    });
+    assert!(matches!(cause, Cause::Lost(_)) && after <= 5, "dropped: {cause:?} after {after} cycles");
+    let (cause, after) = through_a_gateway(|near, far| {
+        let rewritten = ["-A", "-s", far, "-d", near, "-f", "183:7FF", "-m", "SET:D:183.8.0800000000000000"];
+        let others = ["-A", "-s", far, "-d", near, "-f", "183~7FF"];
+        gateway(&[&["-A", "-s", near, "-d", far], &rewritten, &others]);
+    });
+    assert!(matches!(cause, Cause::Drive(0)) && after <= 5, "rewritten: {cause:?} after {after} cycles");
+    let (cause, after) = through_a_gateway(|near, _| socketcan::take_down(near).expect("we may"));
+    assert!(matches!(cause, Cause::Bus(0)) && after <= 3, "down: {cause:?} after {after} cycles");
 }

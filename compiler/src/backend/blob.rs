@@ -3,23 +3,27 @@
 //! In: the functions of a model. Out: an [`Image`]: their code one behind the other, with nothing left to be resolved.
 //! The code reads its tables through the pointer to the pool that each call is given.
 
-use super::target::{Coder, Unsupported, of};
+use super::target::{Coder, Unsupported, with};
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
-use abi::image::{Image, Target};
+use abi::image::{Feature, Image, Target};
 use abi::{Description, Function};
 
-/// The image of a model: `params` are the defaults of its parameters, SI, as many as its layout has.
+/// The image of a model: `params` are the defaults of its parameters, SI, as many as its layout has. `more`: what its code
+/// uses besides what any code for the target needs.
 ///
 /// # Panics
-/// If a function is not sound or not expanded: a mistake of the passes before.
+/// If the target has no such features, or a function is not sound or not expanded: a mistake of the passes before.
 pub fn image(
     functions: &[(Function, Func)],
     description: &Description,
     params: &[f64],
     target: Target,
+    more: &[Feature],
 ) -> Result<Image, Unsupported> {
-    let mut coder = Coder::new(of(target));
+    assert!(more.iter().all(|feature| target.may_use().contains(feature)), "{more:?} on {}", target.name());
+    let isa = with(target, more);
+    let mut coder = Coder::new(&isa);
     let mut code: Vec<u8> = Vec::new();
     let mut entries = [None; Function::ALL.len()];
     for (function, func) in functions {
@@ -33,5 +37,8 @@ pub fn image(
         code.extend(bytes.code);
     }
     let (description, params) = (description.clone(), params.to_vec());
-    Ok(Image { target, features: target.needs().to_vec(), description, params, code, entries })
+    // In the order of their bits: what is read again is what was written.
+    let uses = |feature: &Feature| target.needs().contains(feature) || more.contains(feature);
+    let features = Feature::ALL.into_iter().filter(uses).collect();
+    Ok(Image { target, features, description, params, code, entries })
 }

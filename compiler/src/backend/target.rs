@@ -120,25 +120,37 @@ fn native(level: &str) -> Result<OwnedTargetIsa, Unsupported> {
 pub fn of(target: Target) -> &'static OwnedTargetIsa {
     static X86_64: OnceLock<OwnedTargetIsa> = OnceLock::new();
     static AARCH64: OnceLock<OwnedTargetIsa> = OnceLock::new();
-    let (isa, triple) = match target {
-        Target::X86_64 => (&X86_64, "x86_64-unknown-linux-gnu"),
-        Target::Aarch64 => (&AARCH64, "aarch64-unknown-linux-gnu"),
+    let isa = match target {
+        Target::X86_64 => &X86_64,
+        Target::Aarch64 => &AARCH64,
     };
-    isa.get_or_init(|| {
-        let mut isa = isa::lookup_by_name(triple).expect("the back end is compiled in");
-        for feature in target.needs() {
-            let flag = match feature {
-                Feature::Sse3 => "has_sse3",
-                Feature::Ssse3 => "has_ssse3",
-                Feature::Sse41 => "has_sse41",
-                Feature::Sse42 => "has_sse42",
-                Feature::Avx => "has_avx",
-                Feature::Fma => "has_fma",
-            };
-            isa.enable(flag).expect("a flag of this version");
-        }
-        isa.finish(flags("speed")).expect("flags that fit together")
-    })
+    isa.get_or_init(|| with(target, &[]))
+}
+
+/// A target with more than it needs.
+pub fn with(target: Target, more: &[Feature]) -> OwnedTargetIsa {
+    let triple = match target {
+        Target::X86_64 => "x86_64-unknown-linux-gnu",
+        Target::Aarch64 => "aarch64-unknown-linux-gnu",
+    };
+    let mut isa = isa::lookup_by_name(triple).expect("the back end is compiled in");
+    for feature in target.needs().iter().chain(more) {
+        let flag = match feature {
+            Feature::Sse3 => "has_sse3",
+            Feature::Ssse3 => "has_ssse3",
+            Feature::Sse41 => "has_sse41",
+            Feature::Sse42 => "has_sse42",
+            Feature::Avx => "has_avx",
+            Feature::Fma => "has_fma",
+            Feature::Avx2 => "has_avx2",
+            Feature::Bmi1 => "has_bmi1",
+            Feature::Bmi2 => "has_bmi2",
+            Feature::Lzcnt => "has_lzcnt",
+            Feature::Popcnt => "has_popcnt",
+        };
+        isa.enable(flag).expect("a flag of this version");
+    }
+    isa.finish(flags("speed")).expect("flags that fit together")
 }
 
 fn flags(level: &str) -> Flags {

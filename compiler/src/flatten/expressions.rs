@@ -504,14 +504,8 @@ impl<'a> Flattener<'a> {
                 None => Some(Dimension::NONE),
                 Some(unit) => self.unit(unit, env.rotary, env.instance).map(|unit| unit.dimension),
             };
-            let value = match dimension {
-                Some(dimension) => {
-                    let role = Role::Argument { function: function.name.text.clone(), name: arg.name.text.clone() };
-                    self.system.push(Node::Fits { value, dimension, role }, expr.span)
-                }
-                None => value,
-            };
-            locals.push((arg.name.text.clone(), value));
+            let role = Role::Argument { function: function.name.text.clone(), name: arg.name.text.clone() };
+            locals.push((arg.name.text.clone(), self.fitting(value, dimension, role, expr.span)));
         }
         if function.args.len() != args.len() {
             self.wrong_count(name, function.args.len(), args.len());
@@ -536,15 +530,19 @@ impl<'a> Flattener<'a> {
         let inner = Env { locals: Rc::new(locals), rotary: env.rotary, equation: env.equation, ..Env::file(item.file) };
         let body = self.expr(&function.body, &inner);
         self.functions.pop();
-        let result = match function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance)) {
-            Some(unit) => {
-                let role = Role::Result { function: function.name.text.clone() };
-                self.system.push(Node::Fits { value: body, dimension: unit.dimension, role }, span)
-            }
-            None => body,
-        };
+        let unit = function.unit.as_ref().and_then(|unit| self.unit(unit, env.rotary, env.instance));
+        let role = Role::Result { function: function.name.text.clone() };
+        let result = self.fitting(body, unit.map(|unit| unit.dimension), role, span);
         self.expansions.insert(key, result);
         result
+    }
+
+    /// The value, held to a dimension if there is one.
+    fn fitting(&mut self, value: ExprId, dimension: Option<Dimension>, role: Role, span: Span) -> ExprId {
+        match dimension {
+            Some(dimension) => self.system.push(Node::Fits { value, dimension, role }, span),
+            None => value,
+        }
     }
 
     pub(super) fn table(

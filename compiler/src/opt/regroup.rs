@@ -14,7 +14,7 @@
 use crate::ir::build::Build;
 use crate::ir::{Binary, Func, Op, Unary, Value};
 use abi::Slot;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 
 /// When a value is ready, in processor cycles after the beginning of an iteration; none: it is constant in the loop.
 type Ready = Option<u32>;
@@ -23,25 +23,15 @@ type Ready = Option<u32>;
 pub fn regroup(func: &Func) -> Func {
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let carried: HashSet<Slot> = func.loads().into_iter().filter(|slot| stored.contains(slot)).collect();
-    shortened(func, &carried, &carried, false)
-}
-
-/// Regroups a long function for the shortest chain from the slots that `vary` from one call to the next to its
-/// `results`; other slots count as constant. What is affine in a late value is split along all its paths, and its factor
-/// need only be early.
-pub fn between(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>) -> Func {
-    shortened(func, vary, results, true)
-}
-
-fn shortened(func: &Func, vary: &HashSet<Slot>, results: &HashSet<Slot>, early: bool) -> Func {
-    let after = after(func, results);
+    let after = after(func, &carried);
     // First everything, to learn how short the longest chain can be; then only what is needed for that.
-    let (_, shortest) = rebuilt(func, Pass::new(func, vary, early), results, &after, 0);
-    rebuilt(func, Pass::new(func, vary, early), results, &after, shortest).0
+    let (_, shortest) = rebuilt(func, Pass::new(func, &carried), &after, 0);
+    rebuilt(func, Pass::new(func, &carried), &after, shortest).0
 }
 
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(func: &Func, mut pass: Pass, results: &HashSet<Slot>, after: &[Option<u32>], enough: u32) -> (Func, u32) {
+fn rebuilt(func: &Func, mut pass: Pass, after: &[Option<u32>], enough: u32) -> (Func, u32) {
+    let handed_on = pass.carried;
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
@@ -54,7 +44,7 @@ fn rebuilt(func: &Func, mut pass: Pass, results: &HashSet<Slot>, after: &[Option
     for (slot, value) in &func.stores {
         let value = values[value.index()];
         build.store(*slot, value);
-        if results.contains(slot) {
+        if handed_on.contains(slot) {
             longest = longest.max(pass.ready[value.index()].unwrap_or(0));
         }
     }
@@ -130,8 +120,6 @@ struct Pass<'a> {
     /// Of every value of the builder.
     ready: Vec<Ready>,
     carried: &'a HashSet<Slot>,
-    /// Whether sums are split along all paths to a late value.
-    paths: bool,
 }
 
 /// A product of values over a product of values.
@@ -141,16 +129,9 @@ struct Product {
     below: Vec<Value>,
 }
 
-/// As an affine function of a late value: what it is without it, and its factor.
-#[derive(Clone, Copy)]
-struct Affine {
-    rest: Option<Value>,
-    factor: Option<Value>,
-}
-
 impl<'a> Pass<'a> {
-    fn new(func: &Func, carried: &'a HashSet<Slot>, paths: bool) -> Pass<'a> {
-        Pass { build: Build::new(&func.name), ready: Vec::new(), carried, paths }
+    fn new(func: &Func, carried: &'a HashSet<Slot>) -> Pass<'a> {
+        Pass { build: Build::new(&func.name), ready: Vec::new(), carried }
     }
 
     fn op(&mut self, op: Op) -> Value {
@@ -179,109 +160,12 @@ impl<'a> Pass<'a> {
 
     /// The value, or the same computed earlier.
     fn sooner(&mut self, plain: Value) -> Value {
-        let op = self.build.get(plain);
-        let mut best = plain;
-        let mut consider = |better: Value, ready: &[Ready]| {
-            if ready[better.index()] < ready[best.index()] {
-                best = better;
-            }
+        let other = match self.build.get(plain) {
+            Op::Mul(..) | Op::Div(..) => self.product(plain),
+            Op::Add(..) | Op::Sub(..) => self.split(plain),
+            _ => plain,
         };
-        if let Op::Mul(..) | Op::Div(..) = op {
-            let product = self.product(plain);
-            consider(product, &self.ready);
-            if self.paths {
-                consider(self.along_paths(product), &self.ready);
-            }
-        }
-        match op {
-            Op::Add(..) | Op::Sub(..) if self.paths => consider(self.along_paths(plain), &self.ready),
-            Op::Add(..) | Op::Sub(..) => consider(self.split(plain), &self.ready),
-            _ => {}
-        }
-        best
-    }
-
-    /// A value that is affine in a late one, as what it is without it, plus factor · late.
-    fn along_paths(&mut self, value: Value) -> Value {
-        // Down the operand that is ready last, to what is not affine in its operands.
-        let mut late = value;
-        for _ in 0..32 {
-            let later = |a: Value, b: Value| if self.at(a) > self.at(b) { a } else { b };
-            late = match self.build.get(late) {
-                Op::Neg(a) => a,
-                Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) => later(a, b),
-                _ => break,
-            };
-        }
-        if late == value || self.at(late).is_none() {
-            return value;
-        }
-        let mut known = HashMap::new();
-        let Some(Affine { rest: Some(rest), factor: Some(factor) }) = self.affine(value, late, &mut known) else {
-            return value;
-        };
-        let product = self.op(Op::Mul(factor, late));
-        self.op(Op::Add(rest, product))
-    }
-
-    /// None if it is not affine, or too large a formula.
-    fn affine(&mut self, value: Value, late: Value, known: &mut HashMap<Value, Option<Affine>>) -> Option<Affine> {
-        if value == late {
-            return Some(Affine { rest: None, factor: Some(self.op(Op::Real(1f64.to_bits()))) });
-        }
-        // What is ready no later cannot depend on it.
-        if self.at(value) <= self.at(late) {
-            return Some(Affine { rest: Some(value), factor: None });
-        }
-        if let Some(found) = known.get(&value) {
-            return *found;
-        }
-        if known.len() > 64 {
-            return None;
-        }
-        known.insert(value, None);
-        let found = self.affine_op(value, late, known);
-        known.insert(value, found);
-        found
-    }
-
-    fn affine_op(&mut self, value: Value, late: Value, known: &mut HashMap<Value, Option<Affine>>) -> Option<Affine> {
-        match self.build.get(value) {
-            Op::Neg(a) => {
-                let a = self.affine(a, late, known)?;
-                let minus = |pass: &mut Self, value: Value| pass.op(Op::Neg(value));
-                Some(Affine { rest: a.rest.map(|v| minus(self, v)), factor: a.factor.map(|v| minus(self, v)) })
-            }
-            op @ (Op::Add(a, b) | Op::Sub(a, b)) => {
-                let (a, b) = (self.affine(a, late, known)?, self.affine(b, late, known)?);
-                let negative = matches!(op, Op::Sub(..));
-                let mut join = |a: Option<Value>, b: Option<Value>| match (a, b) {
-                    (Some(a), Some(b)) => Some(self.op(if negative { Op::Sub(a, b) } else { Op::Add(a, b) })),
-                    (None, Some(b)) if negative => Some(self.op(Op::Neg(b))),
-                    (one, other) => one.or(other),
-                };
-                Some(Affine { rest: join(a.rest, b.rest), factor: join(a.factor, b.factor) })
-            }
-            Op::Mul(a, b) => {
-                let (a, b) = (self.affine(a, late, known)?, self.affine(b, late, known)?);
-                let (of, by) = match (a.factor, b.factor) {
-                    (_, None) => (a, b.rest?),
-                    (None, _) => (b, a.rest?),
-                    _ => return None,
-                };
-                let mut times = |value: Option<Value>| value.map(|value| self.op(Op::Mul(by, value)));
-                Some(Affine { rest: times(of.rest), factor: times(of.factor) })
-            }
-            // What is not affine must not depend on the late value.
-            op => {
-                let mut free = true;
-                op.each_operand(|operand| {
-                    let operand = self.affine(operand, late, known);
-                    free &= operand.is_some_and(|operand| operand.factor.is_none());
-                });
-                free.then_some(Affine { rest: Some(value), factor: None })
-            }
-        }
+        if self.at(other) < self.at(plain) { other } else { plain }
     }
 
     /// A product with its factors in the order in which they are ready.

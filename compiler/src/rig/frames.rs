@@ -8,7 +8,7 @@ use super::nodes::{Description, Read, Speaks, format_of};
 use abi::rig::{Field, Kind, Message, Rig, What};
 use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
-use grammar::span::Span;
+use grammar::span::{FileId, Span};
 
 /// How often a drive says that it lives, s.
 const DRIVE_HEARTBEAT: f64 = 20e-3;
@@ -141,6 +141,23 @@ pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnosti
         });
     }
     laid
+}
+
+/// The messages of a DBC file, for whoever wants to read frames by them.
+///
+/// # Errors
+/// What is wrong with the file, in words.
+pub fn of_dbc(text: &str) -> Result<Vec<Message>, String> {
+    let messages = dbc::read(FileId(0), text).map_err(|(why, span)| {
+        let line = text[..span.start as usize].lines().count().max(1);
+        format!("line {line}: {why}")
+    })?;
+    let mut found = Vec::new();
+    let laid = by_dbc(&messages, &|_| false, &mut found);
+    match found.first() {
+        Some(first) => Err(first.message.clone()),
+        None => Ok(laid.messages),
+    }
 }
 
 /// Whether all bits of a signal lie in the frame. A big-endian signal starts at its most significant bit and goes down

@@ -37,7 +37,7 @@ use statements::{Expressions, Statements};
 use std::sync::Arc;
 
 pub use advice::linear;
-pub use frames::load as bus_load;
+pub use frames::{load as bus_load, of_dbc as dbc_messages};
 pub use step::{Discrete, StepDerivative};
 
 /// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.

@@ -10,11 +10,16 @@ use crate::program::Program;
 use abi::Slot;
 use abi::series::Method;
 
+/// What stands for 0 in a state, SI: far from everything physical, and from what a step takes for 0.
+const AT_REST: f64 = 1e-20;
+
 /// One step of a program, ready to be differentiated at any point of its block.
 pub struct StepDerivative {
     func: Func,
     size: usize,
     states: Vec<Slot>,
+    /// How many of them are states of differential equations: the first.
+    continuous: usize,
     inputs: usize,
     outputs: usize,
     pool: std::sync::Arc<[f64]>,
@@ -60,6 +65,7 @@ impl StepDerivative {
             func: crate::math::expand(&build.finish()),
             size: layout.size(),
             states,
+            continuous: layout.states.len as usize,
             inputs: inputs.len(),
             outputs: outputs.len(),
             pool: program.description.pool.clone(),
@@ -70,6 +76,13 @@ impl StepDerivative {
     pub fn at(&self, block: &[f64], steps: u32) -> Discrete {
         let (n, m, p) = (self.states.len(), self.inputs, self.outputs);
         let mut block = block.to_vec();
+        // A step makes 0 of what has died away: at rest that would be the branch taken, and nothing would answer.
+        for slot in &self.states[..self.continuous] {
+            let value = &mut block[slot.index()];
+            if value.abs() < AT_REST {
+                *value = AT_REST;
+            }
+        }
         block.resize(self.size + (n + p) * (n + m), 0.0);
         run_once(&self.func, &mut block, &self.pool);
         let rows: Vec<&[f64]> = block[self.size..].chunks_exact((n + m).max(1)).collect();

@@ -376,11 +376,12 @@ fn make_raw(fd: RawFd) -> io::Result<()> {
     if unsafe { libc::tcgetattr(fd, &mut settings) } != 0 {
         return Err(io::Error::last_os_error());
     }
-    // SAFETY: both work on valid settings. The speed concerns only a real serial line.
+    // SAFETY: both work on valid settings. The speed concerns only a real serial line; it is written where Linux keeps it,
+    // since the function that does so has no name that a static program could be linked with.
     let set = unsafe {
         libc::cfmakeraw(&mut settings);
-        settings.c_cflag |= libc::CLOCAL | libc::CREAD;
-        libc::cfsetspeed(&mut settings, libc::B115200);
+        settings.c_cflag = (settings.c_cflag & !libc::CBAUD) | libc::B115200 | libc::CLOCAL | libc::CREAD;
+        (settings.c_ispeed, settings.c_ospeed) = (libc::B115200, libc::B115200);
         libc::tcsetattr(fd, libc::TCSANOW, &settings)
     };
     if set == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }

@@ -7,7 +7,9 @@ use super::frames;
 use super::hooks::{Effect, Hook, Start};
 use super::profiles;
 use super::simulated::{Behaviour, SimulatedDrive};
+use super::timing;
 use crate::can::Frame;
+use crate::chance::Chance;
 use abi::Instance;
 use abi::rig::{Kind, Message, Rig, Signal, What};
 
@@ -104,7 +106,7 @@ impl Bench {
         if let Some(plant) = &mut plant {
             status = plant.start(step_ns as f64 * 1e-9);
         }
-        let mut random = seed;
+        let mut chance = Chance(seed);
         let mut bodies = Vec::new();
         let mut compliance = vec![0.0; rig.nodes.len()];
         for (at, node) in rig.nodes.iter().enumerate() {
@@ -114,8 +116,10 @@ impl Bench {
                         .ok_or_else(|| format!("`{}`: no profile `{}`", node.name, config.profile))?;
                     compliance[at] = 1000.0 / config.rated_torque;
                     let inertia = rig.plant.inertia.filter(|_| plant.is_some()).unwrap_or(1.0 / compliance[at]);
-                    let offset = next(&mut random) as i32;
-                    let lags = (node.delay, node.lag);
+                    let offset = chance.number() as i32;
+                    // What a command has waited for before it reaches the drive is part of its delay.
+                    let passed = if config.at_sync { 0 } else { timing::transit_ns(rig, at) };
+                    let lags = ((node.delay - passed as f64 * 1e-9).max(0.0), node.lag);
                     let drive = SimulatedDrive::new(config, profile, behaviour(at), lags, inertia, offset);
                     Body::Drive(Box::new(drive))
                 }
@@ -403,13 +407,4 @@ impl SimulatedDevice {
             self.due_ns[message] = self.due_ns[message].min(now_ns);
         }
     }
-}
-
-/// splitmix64.
-fn next(state: &mut u64) -> u64 {
-    *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    let mut z = *state;
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
 }

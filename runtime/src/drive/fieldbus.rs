@@ -6,7 +6,6 @@
 
 use super::Send;
 use super::device::Device;
-use super::identify::{self, Identified, Steps};
 use super::master::{Drive, Limits, Setting, Status};
 use super::profiles::{self, Transport};
 use super::script::Watching;
@@ -34,8 +33,6 @@ pub struct Options {
     pub timeout_test: bool,
     /// The drives are simulated, whatever their transport.
     pub simulated: bool,
-    /// After the first motion, torque drives are measured.
-    pub identify: bool,
 }
 
 impl Default for Options {
@@ -47,7 +44,6 @@ impl Default for Options {
             sign_test: SignTest::Push,
             timeout_test: true,
             simulated: false,
-            identify: false,
         }
     }
 }
@@ -79,8 +75,6 @@ pub enum Step {
     Reenable,
     /// The first motion.
     SignTest,
-    /// Delay, lag and inertia are measured.
-    Identify,
     /// Waits for the operator's [`Request::Arm`].
     AwaitArm,
     /// Commands act.
@@ -89,6 +83,28 @@ pub enum Step {
     Stopped,
     /// Refused; only [`Request::Reset`] leads out.
     Refused,
+}
+
+impl Step {
+    /// All of them, in the order in which a start-up takes them.
+    pub const ALL: [Step; 16] = [
+        Step::Listen,
+        Step::Reset,
+        Step::Identity,
+        Step::Configure,
+        Step::Start,
+        Step::Sync,
+        Step::Mode,
+        Step::AwaitEnable,
+        Step::Enable,
+        Step::TimeoutTest,
+        Step::Reenable,
+        Step::SignTest,
+        Step::AwaitArm,
+        Step::Armed,
+        Step::Stopped,
+        Step::Refused,
+    ];
 }
 
 impl fmt::Display for Step {
@@ -106,7 +122,6 @@ impl fmt::Display for Step {
             Step::TimeoutTest => "testing the time-outs",
             Step::Reenable => "enabling again",
             Step::SignTest => "testing signs and scales",
-            Step::Identify => "measuring the drives",
             Step::AwaitArm => "waiting to be armed",
             Step::Armed => "armed",
             Step::Stopped => "stopped",
@@ -182,11 +197,7 @@ pub struct Fieldbus {
     answers: u32,
     /// The drive under test; the drive that turns it where it can't turn by itself.
     push: Option<(usize, Push, Option<usize>)>,
-    steps: Option<(usize, Steps)>,
-    identified: Vec<Option<Identified>>,
     /// When SYNC and commands went out last.
-    began_ns: u64,
-    sent_ns: u64,
     wanted: Vec<f64>,
     troubles: [Option<Trouble>; TROUBLES],
     lost_troubles: u64,
@@ -259,10 +270,6 @@ impl Fieldbus {
             refusal: None,
             answers: 0,
             push: None,
-            steps: None,
-            identified: vec![None; rig.nodes.len()],
-            began_ns: 0,
-            sent_ns: 0,
             troubles: [None; TROUBLES],
             lost_troubles: 0,
         };
@@ -481,7 +488,7 @@ impl Fieldbus {
         (self.step, self.since_ns, self.silent_since_ns) = (step, None, None);
         self.done.fill(false);
         self.wanted.fill(0.0);
-        (self.push, self.steps) = (None, None);
+        self.push = None;
     }
 
     fn aim(&mut self, goal: Goal, resets: bool) {
@@ -526,8 +533,7 @@ impl Fieldbus {
     }
 
     /// A tick begins: SYNC goes out, and everything known is a tick older.
-    pub fn begin(&mut self, now_ns: u64, send: Send) {
-        self.began_ns = now_ns;
+    pub fn begin(&mut self, send: Send) {
         for node in &mut self.nodes {
             match node {
                 Node::Drive(drive) => drive.begin(),
@@ -565,7 +571,6 @@ impl Fieldbus {
                 Node::Device(device) => device.send_commands(now_ns, &mut send),
             }
         }
-        self.sent_ns = now_ns;
         self.live(now_ns, send);
         self.start(now_ns, send);
     }
@@ -634,8 +639,9 @@ impl Fieldbus {
             Step::Listen if lasted_ns >= self.options.listen_ns => self.go(Step::Reset),
             Step::Listen => {}
             Step::Reset => {
-                // Once more after a second: a drive may have been booting.
-                let again = lasted_ns % 1_000_000_000 < self.period_ns;
+                // Once more after a second: a drive may have been booting. Never in the cycle after the first, which may come
+                // a little early: who has just booted would boot anew.
+                let again = first || (lasted_ns >= 1_000_000_000 && lasted_ns % 1_000_000_000 < self.period_ns);
                 let all = self.each(send, |drive, send| {
                     if first {
                         drive.forget();
@@ -688,7 +694,6 @@ impl Fieldbus {
             Step::Enable | Step::Reenable => self.enable(lasted_ns, send),
             Step::TimeoutTest => self.test_timeouts(now_ns, lasted_ns, send),
             Step::SignTest => self.test_signs(),
-            Step::Identify => self.identify(),
         }
     }
 
@@ -725,7 +730,6 @@ impl Fieldbus {
             }
             return self.go(match (again, self.options.timeout_test) {
                 (false, true) => Step::TimeoutTest,
-                _ if self.options.sign_test == SignTest::Skip && self.options.identify => Step::Identify,
                 _ if self.options.sign_test == SignTest::Skip => Step::AwaitArm,
                 _ => Step::SignTest,
             });
@@ -827,35 +831,7 @@ impl Fieldbus {
         for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
             drive.rest();
         }
-        let measured = self.step == Step::Identify || !self.options.identify;
-        self.go(if measured { Step::AwaitArm } else { Step::Identify });
-    }
-
-    /// One torque drive after the other.
-    fn identify(&mut self) {
-        let torque = |node: &Node| drive_of(node).is_some_and(|drive| drive.config().mode == Mode::Torque);
-        if self.steps.is_none() {
-            let next = (0..self.nodes.len()).find(|at| torque(&self.nodes[*at]) && !self.done[*at]);
-            let Some(at) = next else { return self.moved() };
-            let drive = drive_of(&self.nodes[at]).expect("found as one");
-            let (limits, most) = (drive.limits(), drive.most());
-            self.steps = Some((at, Steps::new(0.3 * most, 2.0, 0.3 * limits.speed)));
-        }
-        let Some((at, steps)) = &mut self.steps else { return };
-        let at = *at;
-        let drive = drive_of(&self.nodes[at]).expect("found as one");
-        match steps.tick(sample(drive), self.began_ns, self.sent_ns, self.period_ns as f64 * 1e-9) {
-            identify::Progress::Wants(command) => self.wanted[at] = command,
-            identify::Progress::Done(found) => {
-                (self.identified[at], self.done[at], self.wanted[at], self.steps) = (Some(found), true, 0.0, None);
-            }
-            identify::Progress::Wrong(why) => self.refuse(Some(at), why),
-        }
-    }
-
-    /// What was measured of a drive, if [`Options::identify`] asked for it.
-    pub fn identified(&self, node: usize) -> Option<Identified> {
-        self.identified[node]
+        self.go(Step::AwaitArm);
     }
 }
 

@@ -8,10 +8,10 @@ pub mod profiles;
 pub mod state;
 pub mod units;
 pub mod frames;
+pub mod timing;
 pub mod trouble;
 pub mod script;
 pub mod sign;
-pub mod identify;
 pub mod master;
 pub mod device;
 pub mod fieldbus;
@@ -19,12 +19,12 @@ pub mod hooks;
 pub mod simulated;
 pub mod bench;
 pub mod attend;
+pub mod serve;
 
 pub use attend::attend;
 pub use bench::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 pub use hooks::{Effect, Hook, Start};
-pub use identify::Identified;
 pub use master::{Limits, Status};
 pub use trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 

@@ -202,7 +202,7 @@ impl Table {
     pub fn tick(&mut self) {
         let start = self.now_ns;
         let mut ours = Vec::new();
-        self.fieldbus.begin(start, &mut |_, frame| ours.push(frame));
+        self.fieldbus.begin(&mut |_, frame| ours.push(frame));
         self.exchange(ours);
         self.run_to(start + self.period_ns / 2);
         for (signal, value) in &self.commands {

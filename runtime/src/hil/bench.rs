@@ -82,6 +82,40 @@ pub fn rig() -> (Rig, Instance) {
     (rig, model)
 }
 
+/// The pair with a load that is a bristle of 20 N·m/rad, which breaks away at 0.34 N·m: it holds 2.9 mJ. The servo swings
+/// as there.
+pub fn bristle() -> (Rig, Instance, Instance) {
+    let (rig, _, plant) = pair();
+    let control = Model::new("Bristle")
+        .param(0.4)
+        .param(20.0)
+        .param(0.34)
+        .inputs(2)
+        .state("z", "rad")
+        .output("servo", "N·m")
+        .output("load", "N·m")
+        .output("v", "rad/s")
+        .body(Function::Derivatives, |view| {
+            let v = view.u(0);
+            view.set_dx(0, v - view.p(1) * v.abs() * view.x(0) / view.p(2));
+        })
+        .body(Function::Outputs, |view| {
+            view.set_y(0, view.p(0) * (2.0 * std::f64::consts::PI * view.t()).sin());
+            view.set_y(1, -view.p(1) * view.x(0) - 0.02 * view.u(0));
+            view.set_y(2, view.u(0));
+        })
+        .build();
+    let layout = control.description().layout.clone();
+    let mut rig = rig;
+    for (k, input) in rig.inputs.iter_mut().enumerate() {
+        input.slot = layout.inputs.slot(k);
+    }
+    rig.outputs[0].slot = layout.outputs.slot(0);
+    rig.outputs[1].slot = layout.outputs.slot(1);
+    rig.record[0].slot = layout.outputs.slot(2);
+    (rig, control, plant)
+}
+
 /// Two drives on one shaft of 0.012 kg·m²: the servo swings it with 0.4 N·m at 1 Hz, the load brakes it like a damper of
 /// 0.05 N·m·s/rad; from the time of its third parameter on it gives no number. Rig, control program, plant program.
 pub fn pair() -> (Rig, Instance, Instance) {

@@ -4,6 +4,9 @@
 //! what the drives are told. Knows neither clock nor bus nor file, so that a replay of the same inputs gives the same
 //! bits. It allocates in [`Control::new`] only.
 
+use super::coupling::{Coupling, Verdict};
+use crate::drive::profiles;
+use crate::lookahead::Wired;
 use crate::safety::{Cause, DriveLimits, Order, OutputLimits, Patience, Refused, Seen, Supervisor};
 use abi::rig::{Kind, Mode, Overrun, Rig, Signal, What};
 use abi::{Function, Instance, Slot};
@@ -38,6 +41,8 @@ pub enum Source {
 pub struct Told<'a> {
     /// Ticks since the cycle before: 1, more after missed ones.
     pub ticks: u32,
+    /// How late after its tick this one began, ns: less than a period.
+    pub late_ns: u32,
     /// One reading for each of [`Control::signals`].
     pub readings: &'a [Reading],
     /// Who asks.
@@ -68,8 +73,22 @@ struct Watched {
 const ODD: u32 = 3;
 /// Ticks after which a drive's signal is lost where the rig names no time.
 const TIMEOUT: u32 = 3;
+/// How late a drive's speed may be behind its position at least, s.
+const SPEED_LATE: f64 = 2e-3;
 /// Torque that could act on a shaft beyond that of its drives, as a multiple of theirs.
 const SURPLUS: f64 = 4.0;
+
+/// Position and speed of one drive, of which each says what the other must be.
+struct Paired {
+    speed: usize,
+    position: usize,
+    /// Greatest credible difference between the speed told and that of the position, rad/s; infinite: not judged.
+    most: f64,
+    /// Position and lateness of the tick before, where both came.
+    before: Option<(f64, u32)>,
+    /// Ticks without a break in which they did not agree.
+    odd: u32,
+}
 
 /// What is not in the text of a rig.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -84,12 +103,17 @@ pub struct Options {
     pub blend_ns: u64,
     /// Missed ticks are counted only: for simulated drives.
     pub count_overruns: bool,
+    /// The loop is unstable unless it looks ahead: where it cannot, the rig stops.
+    pub needs_look: bool,
+    /// A contact that gives back more energy than it can hold stops the rig; otherwise that is counted.
+    pub energy_stops: bool,
 }
 
 impl Default for Options {
     fn default() -> Options {
         let (ramp_ns, clamped_ns, standstill_ns, blend_ns) = (100_000_000, 5_000_000_000, 1_000_000_000, 100_000_000);
-        Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns: false }
+        let (count_overruns, needs_look, energy_stops) = (false, false, false);
+        Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops }
     }
 }
 
@@ -111,6 +135,7 @@ pub struct Control {
     steps: u64,
     overrun: Overrun,
     supervisor: Supervisor,
+    coupling: Coupling,
     watched: Vec<Watched>,
     /// For each input: which signal, and the slot it goes to.
     inputs: Vec<(usize, Slot)>,
@@ -120,6 +145,7 @@ pub struct Control {
     /// For each drive: where its speed and position are among the signals.
     seen_at: Vec<(Option<usize>, Option<usize>)>,
     seen: Vec<Seen>,
+    paired: Vec<Paired>,
     requests: Vec<f64>,
     /// What a change of parameters left between the old and the new request, and the ticks it still lasts.
     offsets: Vec<f64>,
@@ -130,11 +156,22 @@ pub struct Control {
 }
 
 impl Control {
-    /// The control part of a rig. `bounds`: one entry a node, read from the drives where the rig leaves them out.
+    /// The control part of a rig. `look`: what its `predict` asks for; `bounds`: one entry a node, read from the drives
+    /// where the rig leaves them out.
     ///
     /// # Errors
     /// What refuses the start, in words.
-    pub fn new(rig: &Rig, model: Instance, bounds: &[Bounds], options: Options) -> Result<Control, String> {
+    ///
+    /// # Panics
+    /// If the rig asks for a look ahead and there is none.
+    pub fn new(
+        rig: &Rig,
+        model: Instance,
+        look: Option<Wired>,
+        bounds: &[Bounds],
+        options: Options,
+    ) -> Result<Control, String> {
+        assert_eq!(rig.predict, look.as_ref().map(|wired| wired.node), "the look ahead of rig {}", rig.name);
         let period = rig.period_ns as f64 * 1e-9;
         let ticks = |ns: u64| u32::try_from(ns.div_ceil(rig.period_ns)).unwrap_or(u32::MAX);
         let moving: Vec<usize> = (0..rig.nodes.len()).filter(|i| rig.nodes[*i].moves).collect();
@@ -154,8 +191,15 @@ impl Control {
         let supervisor = Supervisor::new(&outputs, &drives, patience, rig.period_ns)
             .map_err(|refused| refusal(rig, &moving, refused))?;
 
-        let torque: f64 = outputs.iter().filter(|o| o.torque).map(|o| o.low.abs().max(o.high.abs())).sum();
-        let acceleration = rig.plant.inertia.map_or(f64::INFINITY, |inertia| SURPLUS * torque / inertia);
+        // What a drive that holds speed or position gives for it is its own affair: all it has.
+        let strongest = |node: &usize| match outputs.iter().find(|o| o.torque && moving[o.drive.unwrap_or(0)] == *node)
+        {
+            Some(output) => output.low.abs().max(output.high.abs()),
+            None => bounds_of(rig, *node, bounds).torque.unwrap_or(f64::INFINITY),
+        };
+        let torque: f64 = moving.iter().map(strongest).sum();
+        let own_acceleration = rig.plant.inertia.map_or(f64::INFINITY, |inertia| torque / inertia);
+        let acceleration = SURPLUS * own_acceleration;
         let mut watched: Vec<Watched> = Vec::new();
         let mut watch = |signal: Signal, start: f64, needed: bool| {
             let at = watched.iter().position(|other| other.signal == signal);
@@ -192,18 +236,35 @@ impl Control {
         });
         let seen_at: Vec<_> = seen_at.collect();
         let regimes = model.description().layout.regimes;
+        let paired = moving.iter().zip(&seen_at).filter_map(|(node, at)| {
+            let ((Some(speed), Some(position)), Kind::Cia402(drive)) = (*at, &rig.nodes[*node].kind) else {
+                return None;
+            };
+            // What a drive tells on a grid of its own does not fit from tick to tick.
+            let profile = profiles::find(&drive.profile);
+            let refreshed = profile.is_some_and(|profile| profile.refresh_ns > 0);
+            let late = profile.map_or(0.0, |profile| 2.0 * profile.speed_lag).max(SPEED_LATE);
+            let most = own_acceleration * (period + late) + 4.0 * (drive.speed_unit + drive.count / period);
+            Some(Paired { speed, position, most, before: None, odd: 0 }).filter(|_| !refreshed)
+        });
+        let paired = paired.collect();
+        let signals: Vec<Signal> = watched.iter().map(|watched| watched.signal).collect();
+        let mut coupling = Coupling::new(rig, look, &signals, &model);
+        coupling.stops_for(options.needs_look, options.energy_stops);
         Ok(Control {
             shadow: model.clone(),
             step: period / f64::from(rig.steps.max(1)),
             steps: u64::from(rig.steps.max(1)),
             overrun: if options.count_overruns { Overrun::Hold(u32::MAX) } else { rig.overrun },
             supervisor,
+            coupling,
             watched,
             inputs,
             outputs: rig.outputs.iter().map(|output| output.slot).collect(),
             stops: rig.stops.iter().map(|stop| stop.slot).collect(),
             seen: vec![Seen::default(); seen_at.len()],
             seen_at,
+            paired,
             requests: rig.outputs.iter().map(|output| output.safe).collect(),
             offsets: vec![0.0; rig.outputs.len()],
             blend: (0, ticks(options.blend_ns).max(1)),
@@ -239,6 +300,11 @@ impl Control {
         &mut self.supervisor
     }
 
+    /// What stands between readings and model.
+    pub fn coupling(&self) -> &Coupling {
+        &self.coupling
+    }
+
     /// The model as it stands.
     pub fn model(&self) -> &Instance {
         &self.model
@@ -250,6 +316,7 @@ impl Control {
     }
 
     /// One cycle. Who asks for outputs must have armed the supervisor.
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn cycle(&mut self, told: &Told) -> Order {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;
@@ -260,6 +327,7 @@ impl Control {
         }
         told.causes.iter().for_each(|cause| self.supervisor.trip(*cause));
         self.read(told.readings, told.ticks, told.source);
+        self.compare(told);
         let missed = told.ticks.saturating_sub(1);
         let most = match self.overrun {
             Overrun::Stop => 0,
@@ -268,8 +336,9 @@ impl Control {
         if armed && missed > most {
             self.supervisor.trip(Cause::Overrun(missed));
         }
+        let computes = told.source == Source::Model && self.supervisor.is_armed();
         match told.source {
-            Source::Model if self.supervisor.is_armed() => self.advance(told),
+            Source::Model if computes => self.advance(told),
             Source::StartUp => self.requests.copy_from_slice(told.wanted),
             Source::Model | Source::Nobody => {}
         }
@@ -281,7 +350,11 @@ impl Control {
             };
             *seen = Seen { speed: last(speed), position: last(position) };
         }
-        self.supervisor.judge(&self.requests, &self.seen)
+        let order = self.supervisor.judge(&self.requests, &self.seen);
+        if computes {
+            self.coupling.sent(self.supervisor.permitted());
+        }
+        order
     }
 
     /// Takes what was read, as far as it is credible; trips on what has been missing or odd for too long.
@@ -315,10 +388,55 @@ impl Control {
         }
     }
 
+    /// Trips where position and speed of a drive have not agreed for too long: an encoder that stands still, or loses
+    /// counts as it goes.
+    fn compare(&mut self, told: &Told) {
+        for pair in &mut self.paired {
+            let [speed, position] = [pair.speed, pair.position].map(|at| &self.watched[at]);
+            let came = told.source == Source::Model && speed.since == Some(0) && position.since == Some(0);
+            let before = pair.before.take();
+            if !came {
+                continue;
+            }
+            pair.before = Some((position.last, told.late_ns));
+            let Some((from, late_ns)) = before else { continue };
+            // Drives read the shaft when SYNC comes, as late as the cycle.
+            let period = self.step * self.steps as f64;
+            let span = period * f64::from(told.ticks) + (f64::from(told.late_ns) - f64::from(late_ns)) * 1e-9;
+            let agrees = span < 0.5 * period || ((position.last - from) / span - speed.last).abs() <= pair.most;
+            pair.odd = if agrees { 0 } else { pair.odd + 1 };
+            if pair.odd >= ODD {
+                self.supervisor.trip(Cause::Implausible(pair.position));
+            }
+        }
+    }
+
     /// Brings the model to the end of this tick.
     fn advance(&mut self, told: &Told) {
         for (at, slot) in &self.inputs {
             self.model.set(*slot, self.watched[*at].last);
+        }
+        if !self.running {
+            self.coupling.restart(self.supervisor.permitted());
+        }
+        let watched = &self.watched;
+        let read = |at: usize| (watched[at].last, watched[at].since == Some(0));
+        let (ahead, verdict) = self.coupling.read(told.ticks, told.late_ns, read);
+        match verdict {
+            Verdict::Fine => {}
+            Verdict::Drives => self.supervisor.trip(Cause::Energy),
+            Verdict::Unpredictable => self.supervisor.trip(Cause::Unpredictable),
+        }
+        if let (Some(ahead), Some(node)) = (ahead, self.coupling.looks_ahead()) {
+            for (at, slot) in &self.inputs {
+                match self.watched[*at].signal {
+                    Signal { node: from, what: What::Speed } if from == node => self.model.set(*slot, ahead.speed),
+                    Signal { node: from, what: What::Position } if from == node => {
+                        self.model.set(*slot, ahead.position)
+                    }
+                    _ => {}
+                }
+            }
         }
         let begin = if self.running { 0 } else { self.start() };
         let steps = self.steps * u64::from(told.ticks.max(1));
@@ -396,7 +514,12 @@ impl Control {
             let since = watched.since.map_or(u64::MAX, u64::from);
             words.extend([watched.last.to_bits(), since, u64::from(watched.odd)]);
         }
+        for pair in &self.paired {
+            let (from, late_ns) = pair.before.unwrap_or_default();
+            words.extend([u64::from(pair.before.is_some()), from.to_bits(), late_ns.into(), pair.odd.into()]);
+        }
         self.supervisor.save(words);
+        self.coupling.save(words);
     }
 
     /// Takes over what [`Control::save`] gave. None if it does not fit this rig.
@@ -413,7 +536,14 @@ impl Control {
             watched.since = if since == u64::MAX { None } else { Some(u32::try_from(since).ok()?) };
             watched.odd = u32::try_from(words.next()?).ok()?;
         }
+        for pair in &mut self.paired {
+            let known = words.next()? != 0;
+            let before = (f64::from_bits(words.next()?), u32::try_from(words.next()?).ok()?);
+            pair.before = known.then_some(before);
+            pair.odd = u32::try_from(words.next()?).ok()?;
+        }
         self.supervisor.restore(&mut words)?;
+        self.coupling.restore(&mut words)?;
         words.next().is_none().then_some(())
     }
 }
@@ -516,7 +646,7 @@ mod tests {
             let (mut rig, model) = bench::rig();
             change(&mut rig);
             let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..Options::default() };
-            let mut control = Control::new(&rig, model, &[], options).unwrap();
+            let mut control = Control::new(&rig, model, None, &[], options).unwrap();
             assert!(control.supervisor_mut().arm());
             let readings = control.signals().map(|_| Reading { value: 0.0, age: FRESH }).collect();
             Way { control, readings }
@@ -527,9 +657,15 @@ mod tests {
             self.readings[at].value = value;
         }
 
+        /// One cycle; the shaft has turned as its speed says, as long as that comes.
         fn cycle(&mut self, ticks: u32, set: &[(Slot, f64)]) -> f64 {
+            let at = |what| self.control.signals().position(|signal| signal.what == what).unwrap();
+            let (speed, position) = (self.readings[at(What::Speed)], at(What::Position));
+            if speed.value.abs() < 100.0 {
+                self.readings[position].value += speed.value * 1e-3 * f64::from(ticks);
+            }
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
-            let told = Told { ticks, readings: &self.readings, source, wanted, causes, set };
+            let told = Told { ticks, late_ns: 0, readings: &self.readings, source, wanted, causes, set };
             self.control.cycle(&told);
             self.control.supervisor().permitted()[0]
         }
@@ -637,7 +773,7 @@ mod tests {
         let (mut rig, model) = bench::rig();
         let Kind::Cia402(drive) = &mut rig.nodes[0].kind else { unreachable!() };
         drive.max_speed = None;
-        let why = |bounds: &[Bounds]| Control::new(&rig, model.clone(), bounds, Options::default()).err();
+        let why = |bounds: &[Bounds]| Control::new(&rig, model.clone(), None, bounds, Options::default()).err();
         let missing =
             "drive `load`: no greatest speed is known: give `speed_max`; the drive does not say (object 6080)";
         assert_eq!(why(&[]).as_deref(), Some(missing));

@@ -10,15 +10,16 @@
 
 use super::control::{Bounds, Control, Reading, Source, Told};
 use super::trace::{self, Passed, Shape};
-use super::{control, emergency};
+use super::{control, coupling, emergency};
 use crate::can::{Bus, Event, Frame, Received};
 use crate::clock::Clock;
-use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind};
+use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
 use crate::histogram::Histogram;
+use crate::lookahead::Wired;
 use crate::queue::{Receiver, Sender, queue};
 use crate::record::log::{self, Log, Sections};
 use crate::safety::{Cause, Clamps, Order, Seen, Supervisor};
-use abi::rig::{Kind, Rig, Signal};
+use abi::rig::{Rig, Signal};
 use abi::{Instance, Slot};
 use std::io;
 use std::sync::Arc;
@@ -84,6 +85,16 @@ pub struct Options {
     pub collect_ns: Option<u64>,
     /// Time the model runs, ns; none: until somebody stops it.
     pub duration_ns: Option<u64>,
+    /// What `predict` of the rig asks for: [`look_ahead`].
+    pub look: Option<Wired>,
+}
+
+/// What the `predict` of a rig asks for, with the times of this loop. `plant`: the program of what was crossed out.
+///
+/// # Errors
+/// What is missing for it, in words.
+pub fn look_ahead(rig: &Rig, plant: &Instance) -> Result<Option<Wired>, String> {
+    Wired::of(rig, plant, |node| timing::transit_ns(rig, node))
 }
 
 /// How it ended.
@@ -122,6 +133,8 @@ pub struct Counts {
     pub log_dropped: u64,
     /// Sets of parameters that were refused.
     pub refused_sets: u64,
+    /// Looking ahead, and energy of the contacts; none: the rig has neither.
+    pub coupling: Option<coupling::Counts>,
     /// How late cycles began.
     pub late: Histogram,
     /// From the begin of a cycle to the last answer read.
@@ -283,13 +296,10 @@ impl Hil {
         assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
         let fieldbus = Fieldbus::new(rig, options.start)?;
         let (operator, commands) = queue(64);
-        let at_sync = |node: &abi::rig::Node| match &node.kind {
-            Kind::Cia402(drive) => !node.moves || drive.at_sync,
-            Kind::Frames(_) => true,
-        };
-        // All drives wait for the next SYNC: there is time. Otherwise the answers of some drives at 1 Mbit/s and 1 kHz.
-        let part = if rig.nodes.iter().all(at_sync) { 0.85 } else { 0.55 };
-        let collect_ns = options.collect_ns.unwrap_or((rig.period_ns as f64 * part) as u64);
+        if rig.predict.is_some() && options.look.is_none() {
+            return Err(format!("rig `{}` looks ahead, and nothing does it", rig.name));
+        }
+        let collect_ns = options.collect_ns.unwrap_or(timing::collect_ns(rig));
         let values = (0..rig.outputs.len() + rig.record.len()).map(|_| AtomicU64::new(0)).collect();
         let due_ns = clock.now_ns() + rig.period_ns;
         let empty = Shape { signals: 0, outputs: 0, drives: 0, recorded: 0 };
@@ -430,7 +440,7 @@ impl Hil {
         self.operate();
         self.wires.drain(&mut self.fieldbus);
         let Hil { fieldbus, wires, .. } = self;
-        fieldbus.begin(begin_ns, &mut |bus, frame| wires.send(bus, frame));
+        fieldbus.begin(&mut |bus, frame| wires.send(bus, frame));
         // A cycle that begins late still waits for its answers, as far as its period has room for them.
         let room_ns = self.due_ns + self.rig.period_ns / 10 * 9;
         let collect_ns = (begin_ns + self.collect_ns).min(room_ns).max(self.due_ns + self.collect_ns);
@@ -439,6 +449,7 @@ impl Hil {
         let read_ns = wires.clock.now_ns();
 
         self.gather();
+        self.cycle.late_ns = u32::try_from(late_ns).unwrap_or(u32::MAX);
         let order = self.compute(ticks);
         let computed_ns = self.wires.clock.now_ns();
         self.tell(order);
@@ -448,7 +459,6 @@ impl Hil {
 
         let short = |from: u64, to: u64| u32::try_from(to - from).unwrap_or(u32::MAX);
         self.cycle.due_ns = self.due_ns;
-        self.cycle.late_ns = u32::try_from(late_ns).unwrap_or(u32::MAX);
         self.cycle.phases_ns = [short(begin_ns, read_ns), short(read_ns, computed_ns), short(computed_ns, sent_ns)];
         self.count(ticks);
         self.leave_behind();
@@ -562,7 +572,7 @@ impl Hil {
             self.wires.causes.retain(|cause| *cause == Cause::Asked);
         }
         let source = match step {
-            Step::SignTest | Step::Identify | Step::AwaitArm => Source::StartUp,
+            Step::SignTest | Step::AwaitArm => Source::StartUp,
             Step::Armed => Source::Model,
             Step::Stopped => cycle.source,
             _ => Source::Nobody,
@@ -585,6 +595,7 @@ impl Hil {
         cycle.causes.extend_from_slice(&self.wires.causes);
         let order = control.cycle(&Told {
             ticks,
+            late_ns: trace::within_tick(cycle.late_ns, ticks, self.rig.period_ns),
             readings: &cycle.readings,
             source,
             wanted: &cycle.wanted,
@@ -615,7 +626,8 @@ impl Hil {
             self.misuse = true;
             return self.refuse(format!("{why}, and `{}` is none", self.rig.nodes[node].name));
         }
-        let control = match Control::new(&self.rig, self.model.clone(), &bounds, self.options.control) {
+        let look = self.options.look.clone();
+        let control = match Control::new(&self.rig, self.model.clone(), look, &bounds, self.options.control) {
             Ok(control) => control,
             Err(why) => return self.refuse(why),
         };
@@ -678,6 +690,7 @@ impl Hil {
         self.order = order;
     }
 
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     fn count(&mut self, ticks: u32) {
         let counts = &mut self.counts;
         counts.all += 1;
@@ -706,6 +719,7 @@ impl Hil {
                 }
             }
         }
+        counts.coupling = self.control.as_ref().and_then(|control| control.coupling().told());
         counts.refused_sets = self.control.as_ref().map_or(0, |control| u64::from(control.refused_sets()));
         let gauges = &self.gauges;
         gauges.now_ns.store(self.due_ns, Ordering::Relaxed);

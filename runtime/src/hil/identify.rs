@@ -48,7 +48,8 @@ pub struct Row {
 pub struct Found {
     /// Index into the rig's nodes.
     pub node: usize,
-    /// From the sending of a command to its first effect, s.
+    /// From the reading of the shaft, at SYNC, to the first effect of the command that answers it, s: the `delay` of the
+    /// rig's text.
     pub delay: f64,
     /// Time constant of the torque, s. Below about half a period hardly one value of the torque lies on its rise: then lag
     /// and delay are told apart only as far as the resolution of the torque allows.
@@ -115,7 +116,8 @@ impl Identification {
         let pulses = Pulses { layout, heights, pulse, each };
         let program = Instance::new(Arc::new(description), Code::Interpreted(Arc::new(pulses)), &[]);
         let duration_ns = each * drives.len() as u64 * rig.period_ns;
-        let rig = Rig { outputs, inputs: Vec::new(), stops: Vec::new(), record: Vec::new(), steps: 1, ..rig.clone() };
+        let (inputs, stops, record, predict) = (Vec::new(), Vec::new(), Vec::new(), None);
+        let rig = Rig { outputs, inputs, stops, record, predict, steps: 1, ..rig.clone() };
         Ok(Identification { rig, program, duration_ns, drives })
     }
 
@@ -124,8 +126,8 @@ impl Identification {
         &self.drives
     }
 
-    /// What the rows say of each drive. `sends`: from SYNC to the sending of a command, s.
-    pub fn evaluate(&self, rows: &[Row], sends: f64) -> Vec<Found> {
+    /// What the rows say of each drive.
+    pub fn evaluate(&self, rows: &[Row]) -> Vec<Found> {
         let period = self.rig.period_ns as f64 * 1e-9;
         let rest = (REST / period) as usize;
         // From the last cycle before its first pulse: whatever came before, it was told nothing by then.
@@ -139,7 +141,7 @@ impl Identification {
             let told: Vec<f64> = part(i).iter().map(|row| row.told[i]).collect();
             let torque: Vec<f64> = part(i).iter().map(|row| row.torque[i]).collect();
             let speed: Vec<f64> = part(i).iter().map(|row| row.speed[i]).collect();
-            let (delay, lag, residual) = dead_time_and_lag(&told, &torque, period, sends);
+            let (delay, lag, residual) = dead_time_and_lag(&told, &torque, period);
             Found { node: *node, delay, lag, residual, inertia: inertia(&torque, &speed, period) }
         };
         self.drives.iter().enumerate().map(one).collect()
@@ -166,10 +168,10 @@ fn misfit(told: &[f64], torque: &[f64], period: f64, delayed: f64, lag: f64) -> 
 }
 
 /// Dead time and lag that explain the torque best: a coarse grid, then a fine one around its best point.
-fn dead_time_and_lag(told: &[f64], torque: &[f64], period: f64, sends: f64) -> (f64, f64, f64) {
+fn dead_time_and_lag(told: &[f64], torque: &[f64], period: f64) -> (f64, f64, f64) {
     let best = |delays: &[f64], lags: &[f64]| {
         let pairs = delays.iter().flat_map(|delay| lags.iter().map(move |lag| (*delay, *lag)));
-        let rated = pairs.map(|(delay, lag)| (delay, lag, misfit(told, torque, period, sends + delay, lag)));
+        let rated = pairs.map(|(delay, lag)| (delay, lag, misfit(told, torque, period, delay, lag)));
         rated.min_by(|a, b| a.2.total_cmp(&b.2)).expect("a grid has points")
     };
     let coarse: Vec<f64> = (0..60).map(|i| 1e-4 * f64::from(i)).collect();
@@ -275,10 +277,9 @@ mod tests {
         let (mut hil, _) = Hil::new(&asked.rig, program, world.clock(), masters, options, None).unwrap();
         let rows = rows(&mut hil, &asked);
         assert_eq!(hil.ended(), Some(&End::Asked));
-        let found = asked.evaluate(&rows, 0.55e-3);
+        let found = asked.evaluate(&rows);
         for (found, (delay, lag)) in found.iter().zip([(0.8e-3, 0.6e-3), (1.5e-3, 0.5e-3)]) {
-            // A command is some 0.1 ms on its way.
-            assert!((found.delay - delay).abs() < 0.25e-3, "{found:?}");
+            assert!((found.delay - delay).abs() < 0.05e-3, "{found:?}");
             assert!((found.lag - lag).abs() < 0.1e-3, "{found:?}");
             let inertia = found.inertia.unwrap();
             assert!((inertia / 0.012 - 1.0).abs() < 0.03, "{found:?}");

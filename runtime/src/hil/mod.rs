@@ -3,6 +3,7 @@
 //! In: a rig, its compiled programs, buses, a clock. Out: commands to drives, a log, and why it stopped. Knows neither
 //! the language nor the terminal.
 
+pub mod coupling;
 pub mod control;
 pub mod trace;
 pub mod replay;

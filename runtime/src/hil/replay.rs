@@ -141,6 +141,7 @@ impl<'a> Replay<'a> {
         }
         let order = self.control.cycle(&Told {
             ticks: recorded.ticks,
+            late_ns: trace::within_tick(recorded.late_ns, recorded.ticks, self.rig.period_ns),
             readings: &recorded.readings,
             source: recorded.source,
             wanted: &recorded.wanted,

@@ -8,7 +8,7 @@ use crate::can::{Bus, Received};
 use crate::clock::Clock;
 use crate::drive::bench::Bench;
 use abi::Instance;
-use abi::rig::Rig;
+use abi::rig::{Kind, Mode, Node, Rig};
 use std::cell::{RefCell, RefMut};
 use std::rc::Rc;
 
@@ -111,4 +111,15 @@ impl Actor for Nodes {
         bench.advance(now_ns, &mut |bus, frame| _ = self.ports[bus].send(frame));
         bench.due_ns().max(now_ns + 1)
     }
+}
+
+/// Whether one drive holds speed or position while another gives torque: a simulated one would not let the other push the
+/// shaft.
+pub fn holds_and_pushes(rig: &Rig) -> bool {
+    let pushes = |node: &Node| match &node.kind {
+        Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),
+        Kind::Frames(_) => None,
+    };
+    let all = || rig.nodes.iter().filter_map(pushes);
+    all().any(|pushes| pushes) && all().any(|pushes| !pushes)
 }

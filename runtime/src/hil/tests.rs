@@ -2,11 +2,13 @@
 
 use super::bench;
 use super::control::Control;
-use super::cycle::{End, Hil, Options};
+use super::cycle::{End, Hil, Options, look_ahead};
 use super::replay::{Replay, Stopped};
 use super::simulated::{Pace, World};
 use super::trace;
 use crate::record::log::{Reader, Sections, Settings, Sink};
+use abi::Instance;
+use abi::rig::Rig;
 use std::path::Path;
 
 const SECOND_NS: u64 = 1_000_000_000;
@@ -15,25 +17,44 @@ fn options(seconds: f64) -> Options {
     Options { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..Options::default() }
 }
 
+type Made = (Rig, Instance, Instance);
+
+/// The pair of drives, the load looking ahead.
+fn looking_ahead() -> Made {
+    let (rig, control, plant) = bench::pair();
+    (Rig { predict: Some(0), ..rig }, control, plant)
+}
+
 /// Runs the pair of drives for a time; leaves a log.
 fn run(seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
-    let (rig, model, plant) = bench::pair();
+    run_of(bench::pair(), seconds, log)
+}
+
+fn run_of((rig, model, plant): Made, seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
+    let options = Options { look: look_ahead(&rig, &plant).unwrap(), ..options(seconds) };
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let masters = world.masters();
     let settings = log.map(|path| {
         let settings = Settings { sink: Sink::File(path.into()), cycles_per_block: 100, patient: true };
         (settings, Sections::default().with("rig", "pair"))
     });
-    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options(seconds), settings).unwrap();
+    let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options, settings).unwrap();
     let end = hil.run();
     (end, hil, world)
 }
 
 fn replay(path: &Path, change: impl Fn(&mut crate::record::log::Message)) -> Result<u64, Stopped> {
-    let (rig, model, _) = bench::pair();
+    replay_of(bench::pair(), path, change)
+}
+
+fn replay_of(
+    (rig, model, plant): Made,
+    path: &Path,
+    change: impl Fn(&mut crate::record::log::Message),
+) -> Result<u64, Stopped> {
     let mut reader = Reader::open(path).unwrap();
     let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
-    let control = Control::new(&rig, model, &bounds, options).unwrap();
+    let control = Control::new(&rig, model, look_ahead(&rig, &plant).unwrap(), &bounds, options).unwrap();
     let mut replay = Replay::new(&rig, control);
     while let Some(mut message) = reader.message().unwrap() {
         change(&mut message);
@@ -72,6 +93,36 @@ fn a_log_replays_to_the_bit_and_names_what_differs() {
     });
     let Err(Stopped::Differs(difference)) = flipped else { panic!("{flipped:?}") };
     assert!(difference.k == 2500, "{difference:?}");
+}
+
+#[test]
+fn a_rig_that_looks_ahead_replays_to_the_bit_from_any_state_of_its_log() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("ahead.friclog");
+    let (end, hil, _) = run_of(looking_ahead(), 3.0, Some(&path));
+    assert_eq!(end, End::Asked);
+    let coupling = hil.counts().coupling.unwrap();
+    assert_eq!(coupling.unpredicted, 0, "{coupling:?}");
+    // What it predicts is off by some counts of the encoder.
+    assert!(coupling.residual_max < 20.0 * 2.4e-5, "{coupling:?}");
+    hil.finish().unwrap();
+    let cycles = replay_of(looking_ahead(), &path, |_| ()).unwrap();
+    assert!(cycles > 3000, "{cycles}");
+    // The beginning is lost: it goes on from the next state, that of the observer included.
+    let (rig, model, plant) = looking_ahead();
+    let mut reader = Reader::open(&path).unwrap();
+    let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
+    let control = Control::new(&rig, model, look_ahead(&rig, &plant).unwrap(), &bounds, options).unwrap();
+    let mut late = Replay::new(&rig, control);
+    while let Some(message) = reader.message().unwrap() {
+        if message.kind != trace::CYCLE || message.words[0] > 1500 {
+            late.message(&message).unwrap();
+        }
+    }
+    assert!(late.found().cycles > 1000, "{:?}", late.found());
+    // Without the look ahead it is another rig.
+    let plain = replay(&path, |_| ());
+    assert!(plain.is_err(), "{plain:?}");
 }
 
 #[test]

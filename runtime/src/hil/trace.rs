@@ -139,6 +139,7 @@ impl Cycle {
     }
 
     /// As words, appended.
+    #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn write(&self, words: &mut Vec<u64>) {
         let [receive, compute, send] = self.phases_ns.map(u64::from);
         words.extend([self.k, self.due_ns, u64::from(self.late_ns) | u64::from(self.ticks) << 32]);
@@ -292,6 +293,12 @@ pub fn write_state(k: u64, control: &Control, words: &mut Vec<u64>) {
     words[start + 1] = hash(&words[start + 2..]);
 }
 
+/// How late after its own tick a cycle began: lateness counts from the first tick it missed.
+pub fn within_tick(late_ns: u32, ticks: u32, period_ns: u64) -> u32 {
+    let missed_ns = u64::from(ticks.saturating_sub(1)) * period_ns;
+    u64::from(late_ns).saturating_sub(missed_ns).min(period_ns - 1) as u32
+}
+
 /// A hash of words, the same on every machine: FNV-1a over them.
 pub fn hash(words: &[u64]) -> u64 {
     words.iter().fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0100_0000_01b3))
@@ -300,8 +307,9 @@ pub fn hash(words: &[u64]) -> u64 {
 /// What a replay needs of the drives and of the options, as bytes for the head of a log.
 pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
     let number = |value: Option<f64>| value.unwrap_or(f64::NAN).to_bits();
-    let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns } = *options;
-    let mut words = vec![ramp_ns, clamped_ns, standstill_ns, blend_ns, u64::from(count_overruns)];
+    let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops } = *options;
+    let flags = u64::from(count_overruns) | u64::from(needs_look) << 1 | u64::from(energy_stops) << 2;
+    let mut words = vec![ramp_ns, clamped_ns, standstill_ns, blend_ns, flags];
     words.extend(bounds.iter().flat_map(|bounds| [number(bounds.torque), number(bounds.speed)]));
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
@@ -310,7 +318,7 @@ pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
 pub fn settings_from_bytes(bytes: &[u8]) -> Option<(Vec<Bounds>, Options)> {
     let (words, rest) = bytes.as_chunks::<8>();
     let words: Vec<u64> = words.iter().map(|word| u64::from_le_bytes(*word)).collect();
-    let ([ramp_ns, clamped_ns, standstill_ns, blend_ns, count], bounds) = words.split_first_chunk::<5>()?;
+    let ([ramp_ns, clamped_ns, standstill_ns, blend_ns, flags], bounds) = words.split_first_chunk::<5>()?;
     let (bounds, odd) = bounds.as_chunks::<2>();
     let number = |word: u64| Some(f64::from_bits(word)).filter(|value| !value.is_nan());
     let bounds = bounds.iter().map(|[torque, speed]| Bounds { torque: number(*torque), speed: number(*speed) });
@@ -319,7 +327,9 @@ pub fn settings_from_bytes(bytes: &[u8]) -> Option<(Vec<Bounds>, Options)> {
         clamped_ns: *clamped_ns,
         standstill_ns: *standstill_ns,
         blend_ns: *blend_ns,
-        count_overruns: *count != 0,
+        count_overruns: flags & 1 != 0,
+        needs_look: flags & 2 != 0,
+        energy_stops: flags & 4 != 0,
     };
     (rest.is_empty() && odd.is_empty()).then(|| (bounds.collect(), options))
 }
@@ -383,7 +393,7 @@ mod tests {
     #[test]
     fn settings_come_back() {
         let bounds = [Bounds { torque: Some(4.0), speed: None }, Bounds::default()];
-        let options = Options { count_overruns: true, ramp_ns: 5, ..Options::default() };
+        let options = Options { count_overruns: true, energy_stops: true, ramp_ns: 5, ..Options::default() };
         let bytes = settings_to_bytes(&bounds, &options);
         assert_eq!(settings_from_bytes(&bytes), Some((bounds.to_vec(), options)));
         assert_eq!(settings_from_bytes(&bytes[1..]), None);

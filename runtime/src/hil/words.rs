@@ -67,37 +67,20 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
         Cause::Foreign(i, id) => format!("{}: somebody else sends frame 0x{id:03X}", bus(i)),
         Cause::Bus(i) => format!("{} does not carry: is the cable in, is anybody there?", bus(i)),
         Cause::Overload(_) => "frames were lost: the bus carries more than can be read".into(),
+        Cause::Unpredictable => {
+            "the shaft does not move as its inertia and torques say: commands cannot look ahead".into()
+        }
         Cause::Energy => "more energy came back than the friction can hold: the loop is not stable".into(),
         Cause::Watchdog => "no cycle ended in time: the watchdog stopped the drives".into(),
     }
 }
-
-const STEPS: [Step; 17] = [
-    Step::Listen,
-    Step::Reset,
-    Step::Identity,
-    Step::Configure,
-    Step::Start,
-    Step::Sync,
-    Step::Mode,
-    Step::AwaitEnable,
-    Step::Enable,
-    Step::TimeoutTest,
-    Step::Reenable,
-    Step::SignTest,
-    Step::Identify,
-    Step::AwaitArm,
-    Step::Armed,
-    Step::Stopped,
-    Step::Refused,
-];
 
 /// The stage that a gauge shows.
 pub fn stage(number: u64) -> String {
     match number {
         102 => "quick stop".into(),
         103 => "torque off".into(),
-        step => STEPS.iter().find(|known| **known as u64 == step).map_or("?".into(), Step::to_string),
+        step => Step::ALL.iter().find(|known| **known as u64 == step).map_or("?".into(), Step::to_string),
     }
 }
 
@@ -124,6 +107,13 @@ pub fn counts(counts: &Counts) -> String {
         out,
         "frames   {stale} readings held, {lost_frames} lost, {refused_frames} not taken, {bus_errors} bus errors"
     );
+    if let Some(coupling) = counts.coupling {
+        let _ = writeln!(
+            out,
+            "coupling  {} cycles did not look ahead; at most {:.2} of the stored energy came back, {} warnings",
+            coupling.unpredicted, coupling.returned_max, coupling.warnings
+        );
+    }
     let _ = writeln!(out, "log      {} messages dropped", counts.log_dropped);
     out
 }

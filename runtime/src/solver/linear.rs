@@ -74,10 +74,10 @@ pub(crate) fn spectral_radius(n: usize, a: &mut [f64], room: &mut [f64]) -> f64 
         }
         scale *= exact_root(largest, root);
         root *= 2.0;
+        a.iter_mut().for_each(|entry| *entry /= largest);
         for row in 0..n {
             for column in 0..n {
-                room[row * n + column] =
-                    (0..n).map(|k| (a[row * n + k] / largest) * (a[k * n + column] / largest)).sum();
+                room[row * n + column] = (0..n).map(|k| a[row * n + k] * a[k * n + column]).sum();
             }
         }
         a.copy_from_slice(room);

@@ -3,6 +3,7 @@
 //! In: a seed and what was planted. Out: what becomes of each frame. Knows nothing of the line.
 
 use super::super::Frame;
+use crate::chance::Chance;
 
 /// What goes wrong.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -99,38 +100,15 @@ impl Faults {
     }
 }
 
-/// A seeded generator: SplitMix64.
-pub(super) struct Chance(pub u64);
-
-impl Chance {
-    pub fn number(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ z >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ z >> 31
+/// The frame with one bit of its data turned over.
+pub(super) fn corrupted(chance: &mut Chance, frame: Frame) -> Frame {
+    if frame.data().is_empty() {
+        return frame;
     }
-
-    /// Uniform in [0, 1).
-    pub fn fraction(&mut self) -> f64 {
-        (self.number() >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    /// Uniform in 0..n.
-    pub fn below(&mut self, n: u64) -> u64 {
-        ((u128::from(self.number()) * u128::from(n)) >> 64) as u64
-    }
-
-    /// The frame with one bit of its data turned over.
-    pub fn corrupted(&mut self, frame: Frame) -> Frame {
-        if frame.data().is_empty() {
-            return frame;
-        }
-        let at = self.below(8 * frame.data().len() as u64);
-        let mut data = [0; 8];
-        data[..frame.data().len()].copy_from_slice(frame.data());
-        data[at as usize / 8] ^= 1 << (at % 8);
-        let data = &data[..frame.data().len()];
-        if frame.is_extended() { Frame::extended(frame.id(), data) } else { Frame::new(frame.id(), data) }
-    }
+    let at = chance.below(8 * frame.data().len() as u64);
+    let mut data = [0; 8];
+    data[..frame.data().len()].copy_from_slice(frame.data());
+    data[at as usize / 8] ^= 1 << (at % 8);
+    let data = &data[..frame.data().len()];
+    if frame.is_extended() { Frame::extended(frame.id(), data) } else { Frame::new(frame.id(), data) }
 }

@@ -4,7 +4,8 @@
 //! nanoseconds; nothing here waits, and nothing allocates after a node has joined. Source: ISO 11898-1:2015, 10.8, 12.
 
 use super::super::{Event, Filter, Frame, Health, Received, Refused, State, wire};
-use super::fault::{Chance, Fault, Faults, Kind};
+use super::fault::{Fault, Faults, Kind, corrupted};
+use crate::chance::Chance;
 use std::collections::VecDeque;
 
 /// Frames a node may have waiting for the line.
@@ -265,7 +266,7 @@ impl Line {
         let twice = struck(|kind| kind == Kind::Duplicate).is_some();
         let held_back = struck(|kind| kind == Kind::Reorder).is_some();
         let corrupt = struck(|kind| kind == Kind::Corrupt).is_some();
-        let frame = if corrupt { self.chance.corrupted(frame) } else { frame };
+        let frame = if corrupt { corrupted(&mut self.chance, frame) } else { frame };
         if held_back && node.held.is_none() {
             node.held = Some(frame);
             return Ok(());

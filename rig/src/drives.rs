@@ -1,0 +1,34 @@
+//! `fric-rig drives`: simulated drives and devices of a packed rig, on buses that other programs can reach.
+//!
+//! In: a package that has been verified, ways to the outside. Out: frames, and how the states change. The part of the
+//! system behind the drives is the package's own compiled plant.
+
+use crate::packed::Open;
+use crate::words;
+use runtime::drive::serve::{Doors, Refused, Served};
+use runtime::hil::emergency;
+
+/// Lets them live until Ctrl-C, or for so many s; gives the exit code.
+///
+/// # Errors
+/// Why they cannot.
+pub fn drives(open: &Open, doors: &Doors, duration: Option<f64>, quiet: bool) -> Result<u8, String> {
+    let rig = open.rig()?;
+    let served = match Served::open(&rig, Some(open.program("plant")?), doors) {
+        Ok(served) => served,
+        Err(Refused::Misused(why)) => {
+            words::error(&why);
+            return Ok(2);
+        }
+        Err(Refused::Failed(why)) => return Err(why),
+    };
+    emergency::guard();
+    words::report(&format!("{}\n", served.describe(&rig)));
+    let mut told = |line: &str| {
+        if !quiet {
+            words::print(&format!("{line}\n"));
+        }
+    };
+    served.serve(&rig, duration, &|| emergency::asked().is_some(), &mut told);
+    Ok(0)
+}

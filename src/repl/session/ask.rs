@@ -1,0 +1,276 @@
+//! What is asked of a session without running it: values, what there is, what a name stands for.
+//!
+//! In: expressions, names, paths. Out: values, trees, explanations. Nothing changes.
+
+use super::words::{Value, literal, model_of};
+use super::{Fault, Session, Setup, TEXT, Used, What, begin, found};
+use crate::compile::{self, Case, Changes, Explanation, Listed, Loaded, Lookup, SourceFile, Space};
+use crate::project;
+use abi::unit::{Dimension, Unit};
+use grammar::ast::{self, Item};
+use grammar::diagnostic::Diagnostic;
+use grammar::tokens::{TokenKind, tokens};
+use runtime::engine::{self, Continue};
+use std::sync::Arc;
+
+impl Session {
+    /// The value of an expression, now.
+    pub fn value(&mut self, text: &str) -> Result<Value, Fault> {
+        let text = self.with_answer(text)?;
+        let what = self.meant(&text).unwrap_or(What::Session);
+        let case = match self.now(&what, &[format!("plot {text}")], &text) {
+            Err(Fault::Found(files, errors)) if errors.iter().any(|error| error.code == "E0901") => {
+                return self.measured(&what, &text).unwrap_or(Err(Fault::Found(files, unplotted(errors))));
+            }
+            Err(Fault::Found(files, errors)) => return Err(Fault::Found(unplot(files, &text), unplotted(errors))),
+            other => other?,
+        };
+        let series = case.experiment.plots.last().and_then(|plot| plot.series.first());
+        let series = series.ok_or_else(|| Fault::Words("that is no expression".into()))?;
+        let si = case.instance.get(series.slot);
+        Ok(Value { si, unit: series.unit.clone(), boolean: series.boolean })
+    }
+
+    /// The first case of what is meant, where it is now.
+    pub(super) fn now(&self, what: &What, also: &[String], typed: &str) -> Result<Case, Fault> {
+        let (mut loaded, name) = self.loaded(what, "");
+        // One question needs no expectations, and no long run.
+        let setup = Setup { also: Vec::new(), duration: Some(1.0), ..self.setup(what).clone() };
+        let (cases, _) = self
+            .compiled_in(&mut loaded, &name, &setup, also, true)
+            .map_err(|errors| found(&loaded, &errors, typed, None))?;
+        let mut case = cases.into_iter().next().expect("there is a case");
+        begin(&mut case.instance, setup.live.as_ref(), 0.0);
+        Ok(case)
+    }
+
+    /// A measure over the last run, such as `max(fr.F)`.
+    pub(super) fn measured(&mut self, what: &What, text: &str) -> Option<Result<Value, Fault>> {
+        self.setup(what).duration.or_else(|| matches!(what, What::Experiment(..)).then_some(1.0))?;
+        let setup = Setup { also: vec![format!("expect {text} ~= 0 +- inf")], ..self.setup(what).clone() };
+        let (mut loaded, name) = self.loaded(what, "");
+        let cases = self.compiled_in(&mut loaded, &name, &setup, &[], false);
+        let (cases, _) = match cases {
+            Ok(cases) => cases,
+            Err(_) => return None,
+        };
+        let case = cases.into_iter().next()?;
+        let outcome = engine::run(case.instance, &case.experiment, &mut |_| Continue::Continue(()));
+        let outcome = match outcome {
+            Ok(outcome) => outcome,
+            Err(failure) => return Some(Err(Fault::Stopped(Box::new(failure)))),
+        };
+        let verdict = outcome.verdicts.last()?;
+        if let Some(problem) = &verdict.problem {
+            return Some(Err(Fault::Words(problem.clone())));
+        }
+        let value = match (&verdict.margin, verdict.readings.first()) {
+            (Some(margin), _) => (margin.value, margin.unit.clone()),
+            (None, Some(reading)) => (reading.value, reading.unit.clone()),
+            (None, None) => return None,
+        };
+        Some(Ok(Value { si: value.0, unit: value.1, boolean: false }))
+    }
+
+    /// Keeps a value for `ans`.
+    pub fn answer(&mut self, value: &Value) {
+        self.ans = Some(value.clone());
+    }
+
+    /// The text with the last value in place of `ans`.
+    pub(super) fn with_answer(&self, text: &str) -> Result<String, Fault> {
+        let mut out = String::new();
+        let mut after_dot = false;
+        for token in tokens(text) {
+            let word = token.text(text);
+            if token.kind == TokenKind::Word && word == "ans" && !after_dot {
+                let value = self.ans.as_ref().ok_or("there is no `ans` yet: it is the last value shown")?;
+                out += &literal(value);
+            } else {
+                out += word;
+            }
+            after_dot = word == ".";
+        }
+        Ok(out)
+    }
+
+    /// What kind of quantity fits in place of `?` in a line.
+    pub fn wanted(&self, line: &str) -> Option<Dimension> {
+        let what = self.meant(line).unwrap_or(What::Session);
+        let (mut loaded, name) = self.loaded(&what, "");
+        let setup = Setup { also: Vec::new(), duration: Some(1.0), ..self.setup(&what).clone() };
+        let errors = self.compiled_in(&mut loaded, &name, &setup, &[format!("plot {line}")], true).err()?;
+        let hole = errors.iter().find(|error| error.code == "E0112")?;
+        Unit::parse(&hole.labels.first()?.text).ok().map(|unit| unit.dimension)
+    }
+
+    /// What can stand where: quantities of the instances, then those of what was run last.
+    pub fn quantities(&self) -> impl Iterator<Item = &Listed> {
+        let staged = self.stage.as_ref().map_or(&[][..], |(_, setup)| &setup.known);
+        self.bench.known.iter().chain(staged)
+    }
+
+    /// Every quantity of what is meant; none if it cannot be compiled as it stands.
+    pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[Listed]> {
+        let (mut loaded, name) = self.loaded(what, "");
+        let changes = Changes { set: setup.set.clone(), duration: Some(1.0), ..Changes::default() };
+        compile::quantities(&mut loaded, &project::Disk, &name, &changes).unwrap_or_default().into()
+    }
+
+    /// What is known of the model behind a name or a path: its explanation, and the path within it; none for the whole.
+    pub fn explained(&mut self, name: &str) -> Result<(Explanation, Option<String>), Fault> {
+        let head = name.split(['.', '[']).next().unwrap_or(name);
+        if head.starts_with(|c: char| c.is_ascii_uppercase()) {
+            let own = compile::load(TEXT, &self.text("", "").0, &project::Disk);
+            let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
+            for loaded in texts.clone() {
+                if let Lookup::Found(item, Item::Model(_)) = loaded.find(loaded.root(), Space::Type, head) {
+                    let explanation = compile::explain_in(loaded, &project::Disk, head, item.file);
+                    return explanation
+                        .map(|explanation| (explanation, None))
+                        .map_err(|errors| found(loaded, &errors, name, None));
+                }
+            }
+            let visible = texts.flat_map(|loaded| loaded.visible(loaded.root(), Space::Type));
+            let help = match compile::nearest(head, visible) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => "`names` shows what there is".into(),
+            };
+            return Err(Fault::Words(format!("there is no model `{head}`; {help}")));
+        }
+        let what = self.meant(name).unwrap_or_else(|| self.current());
+        let known = self.setup(&what).known.clone();
+        let whole = self.parts.iter().any(|part| part.name == name);
+        if !whole && !known.iter().any(|q| q.path == name) {
+            let help = match compile::nearest(name, known.iter().map(|q| q.path.as_str())) {
+                Some(near) => format!("did you mean `{near}`?"),
+                None => "`names` shows what there is".into(),
+            };
+            return Err(Fault::Words(format!("there is no `{name}` here; {help}")));
+        }
+        let (mut loaded, experiment) = self.loaded(&what, "");
+        let changes = Changes { set: self.setup(&what).set.clone(), duration: Some(1.0), ..Changes::default() };
+        let mut explanation = compile::explain_run(&mut loaded, &project::Disk, &experiment, &changes)
+            .map_err(|errors| found(&loaded, &errors, name, None))?;
+        if whole {
+            let prefix = format!("{name}.");
+            explanation.model = name.to_string();
+            explanation.quantities.retain(|q| q.path.starts_with(&prefix));
+            explanation.equations.retain(|(left, _)| left.contains(&prefix));
+            explanation.states.retain(|state| state.path.starts_with(&prefix));
+            return Ok((explanation, Some(String::new())));
+        }
+        Ok((explanation, Some(name.to_string())))
+    }
+
+    /// The tree of a model that is visible, in the session or in a file in use.
+    pub fn model(&self, name: &str) -> Option<ast::Model> {
+        let name = self.parts.iter().find(|part| part.name == name).map_or(name, |part| &part.instance);
+        let name = &model_of(name);
+        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
+        texts.into_iter().find_map(|loaded| match loaded.find(loaded.root(), Space::Type, name) {
+            Lookup::Found(_, Item::Model(model)) => Some(model.clone()),
+            _ => None,
+        })
+    }
+
+    /// Models and interfaces that are visible.
+    pub fn models(&self) -> Vec<String> {
+        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        own.visible(own.root(), Space::Type).into_iter().map(str::to_string).collect()
+    }
+
+    /// Names of instances, each with what it is.
+    pub fn instances(&self) -> Vec<(String, String)> {
+        self.parts.iter().map(|part| (part.name.clone(), part.instance.clone())).collect()
+    }
+
+    /// Where an experiment of this name stands: among the session's own, or in the file used last that has it.
+    pub(super) fn experiment(&self, name: &str) -> Result<What, Fault> {
+        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        if own.experiments().iter().any(|experiment| experiment.name == name) {
+            return Ok(What::Experiment(None, name.into()));
+        }
+        let has = |used: &Used| used.loaded.experiments().iter().any(|experiment| experiment.name == name);
+        if let Some(file) = self.used.iter().rposition(has) {
+            return Ok(What::Experiment(Some(file), name.into()));
+        }
+        let experiments = self.experiments();
+        let known = experiments.iter().map(String::as_str).chain(self.parts.iter().map(|part| part.name.as_str()));
+        let help = match compile::nearest(name, known.clone()) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None if known.clone().next().is_none() => "`use \"FILE.fric\"` brings experiments".into(),
+            None => format!("there are {}", known.collect::<Vec<_>>().join(", ")),
+        };
+        Err(Fault::Words(format!("there is no experiment or instance `{name}`; {help}")))
+    }
+
+    /// Names of all experiments.
+    pub fn experiments(&self) -> Vec<String> {
+        let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
+        let of = |loaded: &Loaded| loaded.experiments().into_iter().map(|experiment| experiment.name);
+        of(&own).chain(self.used.iter().flatten_experiments()).collect()
+    }
+
+    /// Names of the experiments of a file in use.
+    pub fn experiments_of(&self, path: &str) -> Vec<String> {
+        self.used.iter().filter(|used| used.path == path).flatten_experiments()
+    }
+
+    /// Imports of the session as lines, and an instance as typed: for the battery.
+    pub fn origin(&self, model: &str) -> Option<String> {
+        let has = |used: &&Used| used.loaded.models().iter().any(|one| one.name.text == model);
+        self.used.iter().rev().find(has).map(|used| used.path.clone())
+    }
+
+    /// The files that a file in use consists of, on disk.
+    pub fn files_of(&self, path: &str) -> Vec<String> {
+        let used = self.used.iter().find(|used| used.path == path);
+        let files = used.map_or(Vec::new(), |used| used.loaded.files.0.clone());
+        files.into_iter().filter(|file| !file.library && !file.name.starts_with("--")).map(|file| file.name).collect()
+    }
+
+    /// The warnings of each file in use.
+    pub fn lints(&self) -> Vec<(Vec<SourceFile>, Vec<Diagnostic>)> {
+        let of = |used: &Used| {
+            let mut loaded = used.loaded.clone();
+            let found = compile::check(&mut loaded, &project::Disk);
+            (loaded.files.0, found)
+        };
+        let (text, ..) = self.text("", "");
+        let own = Used { path: TEXT.into(), loaded: compile::load(TEXT, &text, &project::Disk) };
+        self.used.iter().chain([&own]).map(of).filter(|(_, found)| !found.is_empty()).collect()
+    }
+}
+
+/// For [`Session::experiments`].
+trait Experiments {
+    fn flatten_experiments(self) -> Vec<String>;
+}
+
+impl<'a, I: Iterator<Item = &'a Used>> Experiments for I {
+    fn flatten_experiments(self) -> Vec<String> {
+        self.flat_map(|used| used.loaded.experiments().into_iter().map(|experiment| experiment.name)).collect()
+    }
+}
+
+/// An expression was handed over as `plot EXPR`: the report shows the expression alone.
+pub(super) fn unplot(mut files: Vec<SourceFile>, text: &str) -> Vec<SourceFile> {
+    for file in files.iter_mut().filter(|file| file.text.strip_prefix("plot ") == Some(text)) {
+        file.text = text.into();
+    }
+    files
+}
+
+/// Places in `plot EXPR` as places in the expression.
+pub(super) fn unplotted(errors: Vec<Diagnostic>) -> Vec<Diagnostic> {
+    let moved = |mut error: Diagnostic| {
+        for label in &mut error.labels {
+            label.span.start = label.span.start.saturating_sub(5);
+            label.span.end = label.span.end.saturating_sub(5);
+        }
+        error
+    };
+    errors.into_iter().map(moved).collect()
+}

@@ -1,0 +1,91 @@
+//! A session as a file that runs: what was run, what was set, what was expected.
+//!
+//! In: a session. Out: the text of an experiment, checked and laid out.
+
+use super::{Fault, MODEL, Session, What, found};
+use crate::compile::{self, Loaded};
+use crate::project;
+use grammar::ast::{self, Item};
+use grammar::diagnostic::Diagnostic;
+
+impl Session {
+    /// The session as a file: an experiment of this name that one can run and paste.
+    pub fn written(&self, name: &str) -> Result<String, Fault> {
+        let what = self.current();
+        let setup = self.setup(&what);
+        let mut text = String::new();
+        let mut lines = Vec::new();
+        match &what {
+            What::Session => {
+                if self.parts.is_empty() {
+                    return Err("there is nothing to save yet: make an instance, or run an experiment".into());
+                }
+                text += &self.text("", "").0;
+                lines.push(format!("run {MODEL}() for {}", seconds(setup.duration.unwrap_or(1.0))));
+            }
+            What::Typed(instance) => {
+                text += &(self.items.join("\n") + "\n");
+                lines.push(format!("run {instance} for {}", seconds(setup.duration.unwrap_or(1.0))));
+            }
+            What::Experiment(file, experiment) => {
+                match file {
+                    Some(file) => text += &format!("import \"{}\"\n", self.used[*file].path),
+                    None => text += &(self.items.join("\n") + "\n"),
+                }
+                let (loaded, _) = self.loaded(&what, "");
+                lines.extend(statements(&loaded, experiment, setup.duration));
+            }
+        }
+        // One value is a sweep of one.
+        lines.extend(setup.set.iter().map(|set| format!("sweep {}", set.trim())));
+        lines.extend(setup.also.iter().map(|also| also.trim().to_string()));
+        text += &format!("\nexperiment {name} {{\n");
+        for line in lines {
+            text += &format!("  {line}\n");
+        }
+        text += "}\n";
+        let mut loaded = compile::load(name, &text, &project::Disk);
+        let diagnostics = compile::check(&mut loaded, &project::Disk);
+        if diagnostics.iter().any(Diagnostic::is_error) {
+            return Err(Fault::Found(loaded.files.0, diagnostics));
+        }
+        grammar::format::format(&text, 120).map_err(|errors| found(&loaded, &errors, "", None))
+    }
+}
+
+/// Statements of an experiment as written, with another duration if there is one.
+pub(super) fn statements(loaded: &Loaded, name: &str, duration: Option<f64>) -> Vec<String> {
+    let file = loaded.files.get(loaded.root());
+    let found = file.ast.items.iter().find_map(|item| match item {
+        Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
+        _ => None,
+    });
+    let mut out = Vec::new();
+    for statement in found.map_or(&[][..], |experiment| &experiment.body) {
+        use ast::ExperimentStatement as S;
+        let span = match statement {
+            S::Run(run) => {
+                let instance = loaded.files.slice(run.instance.span);
+                let length = duration.map(seconds);
+                let written = || run.duration.as_ref().map(|expr| loaded.files.slice(expr.span).to_string());
+                out.push(match length.or_else(written) {
+                    Some(length) => format!("run {instance} for {length}"),
+                    None => format!("run {instance}"),
+                });
+                continue;
+            }
+            S::Solver(one) => one.span,
+            S::Sweep(one) => one.span,
+            S::Data(one) => one.span,
+            S::Plot(one) => one.span,
+            S::Expect(one) => one.span,
+            S::Allow(one) => one.span,
+        };
+        out.push(loaded.files.slice(span).trim().to_string());
+    }
+    out
+}
+
+pub(super) fn seconds(t: f64) -> String {
+    format!("{t} s")
+}
