@@ -151,7 +151,7 @@ impl<'a> Bench<'a> {
             let (low, high) = quantity.range;
             let mut values: Vec<f64> = Vec::new();
             for power in -6..=FAR {
-                let size = 10f64.powi(power);
+                let size = ten_to(power);
                 values.extend([size, -size].into_iter().filter(|x| (low..=high).contains(x)));
             }
             // Beyond what is usual only where a run ends on the way.
@@ -237,8 +237,7 @@ impl<'a> Bench<'a> {
             let (mut closed, mut farthest) = (scan.closed, 0.0_f64);
             for (at, setting) in settings.iter().enumerate() {
                 for value in &scan.values {
-                    let Some(left) = work.checked_sub(1) else { return None };
-                    work = left;
+                    work = work.checked_sub(1)?;
                     let block = self.at(setting, scan.slot, *value);
                     if self.ended(&block) {
                         closed = true;
@@ -526,14 +525,24 @@ fn radius(matrix: &[f64], n: usize, bound: f64) -> Option<(f64, Vec<f64>)> {
 /// A^(2^16): what is not normal in A is then felt by less than MARGIN.
 const SQUARINGS: u32 = 16;
 
+/// 10^power, exactly rounded.
+pub fn ten_to(power: i32) -> f64 {
+    format!("1e{power}").parse().expect("a number")
+}
+
+/// 2^−k
+fn half_to(k: i32) -> f64 {
+    (0..k).fold(1.0, |value, _| 0.5 * value)
+}
+
 /// e^(hA) by scaling and squaring.
 fn exponential(a: &[f64], n: usize, h: f64) -> Vec<f64> {
     let norm = (0..n).map(|i| (0..n).map(|j| (h * a[i * n + j]).abs()).sum::<f64>()).fold(0.0, f64::max);
     if !norm.is_finite() {
         return vec![f64::NAN; n * n];
     }
-    let squarings = (0..).find(|s| norm * 0.5_f64.powi(*s) < 0.25).unwrap_or(0);
-    let scaled: Vec<f64> = a.iter().map(|x| h * x * 0.5_f64.powi(squarings)).collect();
+    let squarings = (0..).find(|s| norm * half_to(*s) < 0.25).unwrap_or(0);
+    let scaled: Vec<f64> = a.iter().map(|x| h * x * half_to(squarings)).collect();
     let identity = |i: usize| f64::from(i / n == i % n);
     let mut sum: Vec<f64> = (0..n * n).map(identity).collect();
     // The series by Horner: twelve terms leave less than 1e-17.

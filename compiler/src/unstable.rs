@@ -7,7 +7,7 @@ use crate::explain::{Own, states};
 use crate::program::Program;
 use crate::remembered::Remembered;
 use crate::source::Files;
-use crate::stability::{Along, Bench, Chatter, Unstable};
+use crate::stability::{Along, Bench, Chatter, Unstable, ten_to};
 use crate::system::*;
 use crate::units::Types;
 use abi::Slot;
@@ -319,7 +319,7 @@ pub fn two_digits_time(t: f64) -> String {
 
 /// The round time below: 1, 2 or 5 of a power of ten.
 fn below(t: f64) -> String {
-    let round = (-9..=0).rev().flat_map(|power| [5.0, 2.0, 1.0].map(|digit| digit * 10f64.powi(power)));
+    let round = (-9..=0).rev().flat_map(|power| [5.0, 2.0, 1.0].map(|digit| digit * ten_to(power)));
     let mut round = round;
     two_digits_time(round.find(|x| *x <= t).unwrap_or(1e-9))
 }
