@@ -8,13 +8,15 @@ pub use abi::plan::Method;
 use compiler::backend::target::{self, Coder};
 use compiler::backend::wide::{self, Width};
 use compiler::backend::{blob, c, jit};
-pub use compiler::explain::{Explanation, Listed};
+pub use compiler::explain::{Explanation, Listed, StepCost};
 pub use compiler::friction::Verdict;
 pub use compiler::linearise::{Linear, Matrices, Ports};
 pub use compiler::names::nearest;
 use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
+pub use compiler::stability::LONGEST as LONGEST_STEP;
+pub use compiler::unstable::two_digits_time;
 pub use compiler::vary::{Alone, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,

@@ -93,24 +93,10 @@ fn derivative(of: &str, along: &str) -> String {
 fn tightness(expr: &Expr) -> u8 {
     match &expr.kind {
         ExprKind::If(..) => 0,
-        ExprKind::Binary(op, ..) => match op {
-            BinaryOp::Or => 1,
-            BinaryOp::And => 2,
-            BinaryOp::Less
-            | BinaryOp::LessEqual
-            | BinaryOp::Greater
-            | BinaryOp::GreaterEqual
-            | BinaryOp::Equal
-            | BinaryOp::NotEqual
-            | BinaryOp::Crosses
-            | BinaryOp::Rises
-            | BinaryOp::Falls => 4,
-            BinaryOp::Add | BinaryOp::Subtract => 5,
-            BinaryOp::Multiply | BinaryOp::Divide => 6,
-            BinaryOp::Power => 8,
-        },
-        ExprKind::Unary(UnaryOp::Not, _) => 3,
-        ExprKind::Unary(UnaryOp::Negate, _) => 6,
+        ExprKind::Binary(op, ..) => op.binds(),
+        // A product in print: a − (−b), a · (−b).
+        ExprKind::Unary(UnaryOp::Negate, _) => BinaryOp::Multiply.binds(),
+        ExprKind::Unary(UnaryOp::Not, _) => UnaryOp::Not.binds(),
         // `dz/dt` squared, or divided by, stands in parentheses.
         ExprKind::Derivative { .. } => 6,
         ExprKind::Number { unit: Some(_), .. } => 6,

@@ -166,6 +166,31 @@ fn models_share_axes_on_one_page() {
     assert!(page.contains("with the history") && page.matches("<svg").count() > 10);
 }
 
+/// Everything a command leaves behind, byte by byte, twice; a folder of its own for each time.
+#[test]
+fn two_runs_leave_the_same_bytes() {
+    let text = "import std.interfaces\nimport std.friction\nimport std.bench\nimport std.plant\n\
+        experiment slip {\n  run SpringBench(fr = LuGre()) for 10 s\n  plot x [m]\n  expect max(v) > 0 m/s\n}\n";
+    let both: Vec<Vec<Vec<u8>>> = ["bytes-a", "bytes-b"]
+        .map(|name| {
+            let folder = folder(name);
+            fs::write(folder.join("m.fric"), text).unwrap();
+            fric(&folder, &["run", "m.fric", "slip", "-q", "--csv", "r.csv", "--out", "run"]);
+            let json = fric(&folder, &["characterise", "KFM", "--json", "--out", "page"]);
+            fric(&folder, &["compare", "KFM", "Dahl", "--out", "side"]);
+            let threads = if name == "bytes-a" { "1" } else { "2" };
+            let vary = ["sweep", "m.fric", "slip", "--vary", "fr.Fs = 1.2 N .. 1.6 N by 0.2 N", "-q", "--out", "s.csv"];
+            fric(&folder, &[&vary[..], &["--threads", threads]].concat());
+            let files = ["r.csv", "page/report.html", "page/steady.csv", "side/compare.html", "s.csv"];
+            let mut bytes: Vec<Vec<u8>> = files.iter().map(|file| fs::read(folder.join(file)).unwrap()).collect();
+            bytes.push(json.into_bytes());
+            bytes
+        })
+        .into();
+    assert!(both[0].iter().all(|file| !file.is_empty()));
+    assert!(both[0] == both[1]);
+}
+
 #[test]
 fn the_page_of_the_library_is_up_to_date() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));

@@ -186,7 +186,54 @@ macro_rules! files {
     };
 }
 
-files! { units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
+files! { rigs steps units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
+
+/// Cases whose text makes several mistakes, each with a message of its own.
+const SEVERAL: &[&str] = &[
+    "a-mistake-does-not-hide-the-next-model",
+    "a-name-in-foreign-letters",
+    "a-name-that-the-instance-does-not-have",
+    "a-range-in-another-unit",
+    "a-straight-system-on-a-shaft",
+    "a-step-too-long-with-a-reason",
+    "a-step-too-long-without-an-end",
+    "a-torque-too-coarse",
+    "an-encoder-too-coarse",
+    "an-empty-window",
+    "an-expectation-in-another-unit",
+    "an-unknown-function",
+    "each-unknown-name-is-reported",
+    "inf-true-and-false-cannot-be-declared",
+    "mistakes-are-found-each-by-itself",
+    "next-in-a-regime",
+    "the-arcsine-of-what-can-be-larger-than-one",
+    "the-wrong-number-of-arguments",
+    "time-and-pi-cannot-be-declared",
+    "two-circles-are-two-messages",
+    "two-regimes-that-nothing-reaches",
+    "what-is-never-read",
+    // One mistake each, with two messages: where the second follows from the first is not seen yet.
+    "a-statement-outside-models",
+    "derivative-of-a-part-from-outside",
+];
+
+#[test]
+fn one_mistake_gets_one_message() {
+    let mut talkative: Vec<String> = Vec::new();
+    for (path, text) in support::texts_below(&root().join("tests/lang")) {
+        for case in cases(&text).1 {
+            let messages = case.expected.iter().filter(|line| !line.starts_with("fails "));
+            if messages.count() > 1 {
+                assert!(!talkative.contains(&case.name), "{}: two cases of this name", path.display());
+                talkative.push(case.name);
+            }
+        }
+    }
+    talkative.sort_unstable();
+    let mut several: Vec<String> = SEVERAL.iter().map(|name| name.to_string()).collect();
+    several.sort_unstable();
+    assert_eq!(talkative, several);
+}
 
 /// SplitMix64: chance with a seed that is printed.
 struct Chance(u64);

@@ -230,12 +230,11 @@ fn a_bristle_stays_in_bounds_at_ten_metres_a_second() {
     assert!(largest <= 15.0 * (1.0 + 2e-6), "{largest} um");
 }
 
-/// Stops after m/Fv · ln(1 + Fv v/Fc); breaks away when 0.2 N/s has wound up 1.5 N. To break away the model asks for
-/// v >= 0 besides: a speed of −1e-12 m/s, within the tolerance, has to be overcome first, which takes microseconds.
+/// Stops after m/Fv · ln(1 + Fv v/Fc); breaks away when 0.2 N/s has wound up 1.5 N.
 #[test]
 fn events_of_kfm_are_at_their_closed_forms() {
     let folder = Folder::new("events");
-    folder.near("kfm_go", "--tol 1e-11", 7.5, 1e-5);
+    folder.near("kfm_go", "--tol 1e-11", 7.5, 1e-9);
     let text = format!(
         "{MODELS}\nexperiment stop {{\n  run ForceBench(v_start = 1 m/s, fr = KFM()) for 2 s\n  expect first(fr.stick) > 0 s\n}}\n"
     );
@@ -250,6 +249,32 @@ fn a_sign_under_a_mass_is_reported_as_chatter_at_once() {
     let (_, err) = folder.run(&["run", "m.fric", "rings", "-q"], 1);
     assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
     assert!(err.contains("chatters at") && err.contains("sign(v)"), "{err}");
+}
+
+/// A relaxed sign turns ever faster, and so does a regime that asks when v passes zero: named within a second, however
+/// stiff.
+#[test]
+fn a_relaxed_sign_and_a_regime_that_races_it_are_chatter() {
+    let folder = Folder::new("race");
+    let contact = |name: &str, next: &str| {
+        format!("  mode {name} {{\n    df/dt = C * (sign(v) - f)\n    go {next} when v crosses 0\n  }}\n")
+    };
+    let modes = contact("a initial", "b") + &contact("b", "a");
+    let text = format!(
+        "model Race {{\n  param C = 1 1/s\n  state v [m/s] = 1 m/s\n  state f = 0\n{modes}  dv/dt = -1 m/s^2 * f\n}}\n\
+         model Alone {{\n  param C = 1 1/s\n  state v [m/s] = 1 m/s\n  state f = 0\n  df/dt = C * (sign(v) - f)\n\
+         \x20 dv/dt = -1 m/s^2 * f\n}}\n\
+         experiment race {{ run Race() for 3 s }}\nexperiment alone {{ run Alone() for 3 s }}\n"
+    );
+    fs::write(folder.0.join("m.fric"), text).unwrap();
+    for (experiment, named) in [("race", "`v crosses 0`"), ("alone", "`sign(v)`")] {
+        for rate in ["C=100 1/s", "C=1e4 1/s", "C=1e6 1/s", "C=1e9 1/s"] {
+            let begin = Instant::now();
+            let (_, err) = folder.run(&["run", "m.fric", experiment, "--set", rate, "-q"], 1);
+            assert!(begin.elapsed() < Duration::from_secs(5), "{rate}: {:?}", begin.elapsed());
+            assert!(err.contains("chatters at") && err.contains(named), "{experiment}, {rate}: {err}");
+        }
+    }
 }
 
 #[test]

@@ -22,13 +22,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let layout = &program.description.layout;
     let build = Shared::new(Build::new("step").with_pool(program.description.pool.clone()));
     let model = Model::new(program, &build);
-    let next = match method {
-        Method::Euler => model.euler(),
-        Method::Rk4 => model.rk4(),
-        Method::Expo => model.expo(),
-        Method::Implicit => model.implicit(),
-        Method::Adaptive => panic!("the adaptive method is no fixed step"),
-    };
+    let next = model.next(method);
 
     let mut env = Env::new();
     for (k, x) in next.into_iter().enumerate() {
@@ -71,6 +65,19 @@ pub fn step(program: &Program, method: Method) -> Func {
     if let Some(status) = status {
         build.status(status);
     }
+    build.finish()
+}
+
+/// What one fixed step makes of the continuous states, everything else frozen: no ticks, no transitions, no guards.
+///
+/// # Panics
+/// For the adaptive method, which is no fixed step.
+pub fn advance(program: &Program, method: Method) -> Func {
+    let states = program.description.layout.states;
+    let build = Shared::new(Build::new("advance").with_pool(program.description.pool.clone()));
+    let next: Vec<Value> = Model::new(program, &build).next(method).into_iter().map(|x| x.value).collect();
+    let mut build = build.into_inner();
+    next.into_iter().enumerate().for_each(|(k, value)| build.store(states.slot(k), value));
     build.finish()
 }
 
@@ -132,6 +139,17 @@ impl<'a> Model<'a> {
         let states = program.description.layout.states;
         let x = states.range().map(|slot| load(Slot(slot as u32))).collect();
         Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x }
+    }
+
+    /// The states after a step.
+    fn next(&self, method: Method) -> Vec<Real<'a>> {
+        match method {
+            Method::Euler => self.euler(),
+            Method::Rk4 => self.rk4(),
+            Method::Expo => self.expo(),
+            Method::Implicit => self.implicit(),
+            Method::Adaptive => panic!("the adaptive method is no fixed step"),
+        }
     }
 
     fn load(&self, slot: Slot) -> Real<'a> {

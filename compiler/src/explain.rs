@@ -13,6 +13,7 @@ use crate::lower::{Lowered, lower};
 use crate::opt::regroup::regroup;
 use crate::program::Program;
 use crate::source::Files;
+use crate::stability::Bench;
 use crate::system::*;
 use crate::units::{Types, three_digits};
 use crate::{derive, discretize};
@@ -59,6 +60,9 @@ pub struct StepCost {
     pub divisions: usize,
     /// Instructions of the machine code for this processor, and its bytes; none where there is none.
     pub code: Option<(usize, usize)>,
+    /// The largest stable step in s over the ranges, open ones up to [`OPEN`](crate::stability::OPEN); [`LONGEST`](crate::stability::LONGEST) for any.
+    /// None without continuous states, and with too many of them.
+    pub stable: Option<f64>,
 }
 
 /// One quantity.
@@ -107,6 +111,7 @@ const EXAMPLE_STEP: f64 = 1e-3;
 pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     let Lowered { mut program, .. } = lower(system, types, &[]);
     program.size_rings(EXAMPLE_STEP);
+    let bench = Bench::new(&program, &[]);
     let steps = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit].map(|method| {
         let step = discretize::step(&program, method);
         let expanded = crate::math::expand(&step);
@@ -117,6 +122,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
             operations: expanded.ops.len(),
             divisions,
             code: code_size(&crate::math::expand(&regroup(&step))),
+            stable: bench.as_ref().map(|bench| bench.largest_stable(method)),
         }
     });
     Explanation {
@@ -264,7 +270,8 @@ fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     out
 }
 
-fn states(system: &System, program: &Program) -> Vec<Stepped> {
+/// How each state is stepped.
+pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     let layout = &program.description.layout;
     let n = layout.states.len as usize;
     let slots: Vec<Slot> = (0..n).map(|k| layout.states.slot(k)).collect();

@@ -27,9 +27,12 @@ pub mod lower;
 pub mod checks;
 pub mod interval;
 pub mod domains;
+pub mod remembered;
 pub mod friction;
+pub mod stability;
 pub mod lints;
 pub mod explain;
+pub mod unstable;
 pub mod linearise;
 pub mod rig;
 pub mod experiment;
@@ -250,7 +253,13 @@ fn lowered_rig(
         return Err(once(diagnostics));
     };
     warnings.extend(diagnostics);
-    Ok(cut.lowered(warnings))
+    let lowered = cut.lowered(warnings);
+    let steps = cut.steps(&lowered, &loaded.files);
+    if steps.iter().any(Diagnostic::is_error) {
+        return Err(steps);
+    }
+    warnings.extend(steps);
+    Ok(lowered)
 }
 
 /// Code of the last case, and what it was made from.
@@ -554,7 +563,10 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                 let mut warnings = Vec::new();
                 let changes = Changes::default();
                 match experiment::read(loaded, sources, &experiment.name.text, &changes, &mut warnings, &mut |_| ()) {
-                    Ok(_) => all.extend(warnings),
+                    Ok(variants) => {
+                        all.extend(warnings);
+                        all.extend(steps(loaded, experiment, &variants));
+                    }
                     Err(errors) => all.extend(errors),
                 }
             }
@@ -583,6 +595,47 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
         all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
     }
     once(all)
+}
+
+/// Most combinations of an experiment whose steps are looked at.
+const MOST_STEPPED: usize = 4;
+
+/// What is to be said of the fixed steps of an experiment, once for all combinations of its sweeps.
+fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
+    use grammar::ast::ExperimentStatement as Statement;
+    let run = experiment.body.iter().find_map(|statement| match statement {
+        Statement::Run(run) => Some(run.instance.span),
+        _ => None,
+    });
+    let solver = experiment.body.iter().find_map(|statement| match statement {
+        Statement::Solver(solver) => Some(solver.method.span),
+        _ => None,
+    });
+    let (Some(run), Some(place)) = (run, solver) else { return Vec::new() };
+    let fixed = variants.iter().filter(|variant| {
+        variant.rig.is_none() && variant.experiment.solver.method != Method::Adaptive && !loaded.has_errors()
+    });
+    let said = fixed.take(MOST_STEPPED).flat_map(|variant| {
+        let abi::plan::Solver { method, step, .. } = variant.experiment.solver;
+        let (system, types, program) = (&variant.system, &variant.types, &variant.program);
+        let fixed = unstable::Fixed { system, types, program, method, step, place, run, ends: &[], rig: false };
+        let mut found = unstable::check(&fixed, &loaded.files);
+        lints::silence(system, &mut found);
+        found
+    });
+    let mut said: Vec<Diagnostic> = said.collect();
+    let allows = experiment.body.iter().filter_map(|statement| match statement {
+        Statement::Allow(allow) => Some(allow.lint.text.as_str()),
+        _ => None,
+    });
+    let allowed: Vec<&str> = allows.collect();
+    said.retain(|diagnostic| {
+        let lint = system::LINTS.iter().find(|(_, code)| *code == diagnostic.code);
+        diagnostic.is_error() || lint.is_none_or(|(name, _)| !allowed.contains(name))
+    });
+    let mut codes = std::collections::HashSet::new();
+    said.retain(|diagnostic| codes.insert(diagnostic.code));
+    said
 }
 
 /// Checks the models of a loaded text, each on its own, but for the physics of friction: what a run should know, in no

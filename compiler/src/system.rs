@@ -521,6 +521,15 @@ pub const LINTS: &[(&str, &str)] = &[
 ];
 
 impl System {
+    /// The quantity that an expression is, and nothing more.
+    pub fn alias(&self, id: ExprId) -> Option<VarId> {
+        match self.node(id) {
+            Node::Var(var) => Some(*var),
+            Node::Fits { value, .. } => self.alias(*value),
+            _ => None,
+        }
+    }
+
     /// Puts a node into the arena.
     pub fn push(&mut self, node: Node, span: Span) -> ExprId {
         self.nodes.push(node);

@@ -777,7 +777,37 @@ pub enum BinaryOp {
     Falls,
 }
 
+impl UnaryOp {
+    /// How tightly it binds, among [`BinaryOp::binds`].
+    pub fn binds(self) -> u8 {
+        match self {
+            UnaryOp::Not => 3,
+            UnaryOp::Negate => 7,
+        }
+    }
+}
+
 impl BinaryOp {
+    /// How tightly it binds, from 1 on; loosest first.
+    pub fn binds(self) -> u8 {
+        match self {
+            BinaryOp::Or => 1,
+            BinaryOp::And => 2,
+            BinaryOp::Less
+            | BinaryOp::LessEqual
+            | BinaryOp::Greater
+            | BinaryOp::GreaterEqual
+            | BinaryOp::Equal
+            | BinaryOp::NotEqual
+            | BinaryOp::Crosses
+            | BinaryOp::Rises
+            | BinaryOp::Falls => 4,
+            BinaryOp::Add | BinaryOp::Subtract => 5,
+            BinaryOp::Multiply | BinaryOp::Divide => 6,
+            BinaryOp::Power => 8,
+        }
+    }
+
     /// As written.
     pub fn text(self) -> &'static str {
         match self {

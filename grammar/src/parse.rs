@@ -1341,9 +1341,8 @@ impl<'t> Reader<'t> {
             Binary(BinaryOp, Span),
         }
         let strength = |pending: &Pending| match pending {
-            Pending::Unary(UnaryOp::Not, _) => 3,
-            Pending::Unary(UnaryOp::Negate, _) => 7,
-            Pending::Binary(operator, _) => binds(*operator),
+            Pending::Unary(operator, _) => operator.binds(),
+            Pending::Binary(operator, _) => operator.binds(),
         };
         let mut operands: Vec<Built> = Vec::new();
         let mut pending: Vec<Pending> = Vec::new();
@@ -1351,15 +1350,15 @@ impl<'t> Reader<'t> {
         loop {
             let item = items.next();
             let incoming = match &item {
-                Some(Flat::Binary(operator, _)) => binds(*operator),
+                Some(Flat::Binary(operator, _)) => operator.binds(),
                 None => 0,
-                Some(Flat::Operand(_) | Flat::Ratio(..) | Flat::Unary(..)) => usize::MAX,
+                Some(Flat::Operand(_) | Flat::Ratio(..) | Flat::Unary(..)) => u8::MAX,
             };
             // Powers are taken right to left, everything else left to right.
             let waits = |top: &Pending| {
-                strength(top) > incoming || strength(top) == incoming && incoming != binds(BinaryOp::Power)
+                strength(top) > incoming || strength(top) == incoming && incoming != BinaryOp::Power.binds()
             };
-            while incoming != usize::MAX && pending.last().is_some_and(waits) {
+            while incoming != u8::MAX && pending.last().is_some_and(waits) {
                 let top = pending.pop().expect("just looked at");
                 let right = operands.pop().expect("an operand stands behind every operator");
                 let built = match top {
@@ -1437,28 +1436,8 @@ impl<'t> Reader<'t> {
     }
 }
 
-/// How strongly an operator binds; loosest first.
-fn binds(operator: BinaryOp) -> usize {
-    match operator {
-        BinaryOp::Or => 1,
-        BinaryOp::And => 2,
-        BinaryOp::Less
-        | BinaryOp::LessEqual
-        | BinaryOp::Greater
-        | BinaryOp::GreaterEqual
-        | BinaryOp::Equal
-        | BinaryOp::NotEqual
-        | BinaryOp::Crosses
-        | BinaryOp::Rises
-        | BinaryOp::Falls => 4,
-        BinaryOp::Add | BinaryOp::Subtract => 5,
-        BinaryOp::Multiply | BinaryOp::Divide => 6,
-        BinaryOp::Power => 8,
-    }
-}
-
 fn compares(operator: BinaryOp) -> bool {
-    binds(operator) == binds(BinaryOp::Less)
+    operator.binds() == BinaryOp::Less.binds()
 }
 
 fn binary(text: &str) -> BinaryOp {

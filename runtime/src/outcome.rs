@@ -152,6 +152,8 @@ pub struct Chatter {
     pub regimes: Vec<String>,
     /// The conditions that turned, as written: `fr: v < 0`.
     pub conditions: Vec<String>,
+    /// How often at least.
+    pub times: usize,
     /// Over which time in s; 0 if at one instant.
     pub within: f64,
 }
@@ -193,8 +195,11 @@ impl fmt::Display for Chatter {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let conditions: Vec<String> = self.conditions.iter().map(|text| format!("`{text}`")).collect();
         let what = if conditions.is_empty() { "its regimes".into() } else { conditions.join(" and ") };
-        if self.within > 0.0 {
-            write!(f, "{what} turned more than 100 times within {}", show::time(self.within))?;
+        let within = show::time(self.within);
+        if self.within > 0.0 && self.times > 1 {
+            write!(f, "{what} turned more than {} times within {within}", self.times)?;
+        } else if self.within > 0.0 {
+            write!(f, "{what} turns again and again, in steps of {within}")?;
         } else {
             write!(f, "{what} turned more often than there are regimes, at one instant")?;
         }

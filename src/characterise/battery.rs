@@ -83,8 +83,9 @@ pub struct Entry {
     sweep: Option<String>,
     plots: Vec<String>,
     expects: Vec<String>,
-    /// Greatest fixed step in s of a model that chatters.
+    /// Greatest fixed step in s of a model that chatters, and how many steps are wanted.
     longest: f64,
+    fine: f64,
 }
 
 impl Entry {
@@ -99,7 +100,13 @@ impl Entry {
             plots: Vec::new(),
             expects: Vec::new(),
             longest: 1e-3,
+            fine: 1e5,
         }
+    }
+
+    /// Moved at one speed, so that nothing depends on the step but how far the contact goes in it.
+    fn steady(self) -> Entry {
+        Entry { longest: f64::INFINITY, fine: 5e4, ..self }
     }
 
     fn plot(mut self, plot: impl Into<String>) -> Entry {
@@ -117,13 +124,14 @@ impl Entry {
         self
     }
 
-    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it.
+    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps.
     pub fn step_fixed(&mut self) {
-        let wanted = (self.duration / 1e5).clamp(1e-5, self.longest);
-        let step = [1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5].into_iter().find(|step| *step <= wanted * 1.000001);
-        self.solver = Some(format!("expo step {} s", n(step.unwrap_or(1e-5))));
+        const STEPS: [f64; 15] =
+            [0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5];
+        let wanted = (self.duration / self.fine).clamp(1e-5, self.longest.max(self.duration / 3e5));
+        let step = STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5);
+        self.solver = Some(format!("expo step {} s", n(step)));
         // Whole steps.
-        let step = step.unwrap_or(1e-5);
         self.duration = (self.duration / step).ceil() * step;
     }
 
@@ -244,7 +252,9 @@ impl<'a> Layout<'a> {
     /// How hard the contact resists a fast speed: to know what size of force to push with.
     pub fn scale_sliding(&self) -> Entry {
         let run = format!("Sliding(speed = {} {})", n(0.1 * self.scales.v_max), self.units.speed);
-        Entry::new("scale_sliding", "The size of the force, from sliding fast.", run, 20.0).plot(self.show_force())
+        Entry::new("scale_sliding", "The size of the force, from sliding fast.", run, 20.0)
+            .plot(self.show_force())
+            .steady()
     }
 
     /// The force and the travel at which it lets go, for a ramp of `f_ref` a second.
@@ -272,7 +282,8 @@ impl<'a> Layout<'a> {
             let grid = if k == 0 { &GRID[..1] } else { &GRID[..] };
             let speeds = grid.iter().flat_map(|g| [g * low, -g * low]).map(|v| format!("{} {speed}", n(v)));
             let speeds: Vec<String> = speeds.collect();
-            let travel = (200.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
+            // e^−60 of the start is left of what settles along the path.
+            let travel = (60.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
             let mut entry = Entry::new(
                 format!("steady_{}", 7 - k),
                 format!("Steady friction from {} {speed} on, both directions.", n(low)),
@@ -280,7 +291,7 @@ impl<'a> Layout<'a> {
                 round(travel / low + 5.0),
             );
             entry.sweep = Some(format!("speed = {}", speeds.join(", ")));
-            entry.plot(self.show_force())
+            entry.plot(self.show_force()).steady()
         };
         (0..=6).rev().map(decade).collect()
     }

@@ -6,12 +6,13 @@
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::report;
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-/// An adaptive run is given up after 64 times as many tries of a step: twenty times what any test should need.
-const MOST_LOOKS: u32 = 1000;
+/// An adaptive run of a small model is given up after 64 times as many tries of a step: twenty times what any test should
+/// need. Of a model with more than eight states a step costs more, and there are fewer of them.
+const MOST_LOOKS: usize = 1000;
 
 /// What became of one case of an experiment.
 pub struct Ran {
@@ -55,23 +56,36 @@ pub fn load(name: &str, text: &str, sources: &(dyn compile::Sources + Sync)) -> 
     }
 }
 
-/// Compiles and runs experiments of a loaded text.
+/// Compiles and runs experiments of a loaded text. Where the first case of a sweep comes to no end the others are left out,
+/// for the experiment will be run otherwise.
 pub fn run(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + Sync)) -> Results {
     let compiled = compiled(loaded, names, sources);
-    let cases: Vec<&compile::Case> = compiled.iter().filter_map(|(_, cases)| cases.as_ref().ok()).flatten().collect();
-    let mut results = outcomes(&cases).into_iter();
+    let mut cases: Vec<(usize, &compile::Case)> = Vec::new();
+    for (i, (_, compiled)) in compiled.iter().enumerate() {
+        cases.extend(compiled.iter().flatten().map(|case| (i, case)));
+    }
+    let is_first = |k: &usize| *k == 0 || cases[k - 1].0 != cases[*k].0;
+    let (first, others): (Vec<usize>, Vec<usize>) = (0..cases.len()).partition(is_first);
+    let mut results: Vec<Option<Result<Outcome, Failure>>> = cases.iter().map(|_| None).collect();
+    let mut given_up = BTreeSet::new();
+    for mut wanted in [first, others] {
+        wanted.retain(|k| !given_up.contains(&cases[*k].0));
+        let picked: Vec<&compile::Case> = wanted.iter().map(|k| cases[*k].1).collect();
+        for (k, result) in wanted.into_iter().zip(outcomes(&picked)) {
+            if why(&result).is_some() {
+                given_up.insert(cases[k].0);
+            }
+            results[k] = Some(result);
+        }
+    }
+    let mut results = results.into_iter();
+    let mut ran = |case: compile::Case| {
+        let result = results.next().expect("a place for each case")?;
+        Some(Ran { label: case.label, result })
+    };
     compiled
         .into_iter()
-        .map(|(name, cases)| {
-            let ran = cases.map(|cases| {
-                let ran = |case: compile::Case| Ran {
-                    label: case.label,
-                    result: results.next().expect("a result for each case"),
-                };
-                cases.into_iter().map(ran).collect()
-            });
-            (name, ran)
-        })
+        .map(|(name, cases)| (name, cases.map(|cases| cases.into_iter().filter_map(&mut ran).collect())))
         .collect()
 }
 
@@ -82,10 +96,12 @@ fn outcomes(cases: &[&compile::Case]) -> Vec<Result<Outcome, Failure>> {
         let mut done = Vec::new();
         while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)).copied() {
             // Counted, not timed, so that what is given up does not depend on the machine.
+            let states = case.instance.description().layout.states.len as usize;
+            let most = (MOST_LOOKS * 8 / states.max(8)).max(50);
             let mut looks = 0;
             let mut watch = |_| {
                 looks += 1;
-                if looks > MOST_LOOKS { Continue::Break(()) } else { Continue::Continue(()) }
+                if looks > most { Continue::Break(()) } else { Continue::Continue(()) }
             };
             let index = cases.iter().position(|other| std::ptr::eq(*other, case)).expect("it is one of them");
             done.push((index, engine::run(case.instance.clone(), &case.experiment, &mut watch)));
@@ -112,12 +128,15 @@ pub enum Endless {
 
 /// Whether a case came to no such end, and why.
 pub fn endless(results: &Result<Vec<Ran>, String>) -> Option<Endless> {
-    let why = |ran: &Ran| match ran.result.as_ref().err()?.cause {
+    results.as_ref().ok()?.iter().find_map(|ran| why(&ran.result))
+}
+
+fn why(result: &Result<Outcome, Failure>) -> Option<Endless> {
+    match result.as_ref().err()?.cause {
         Cause::Chatter(_) => Some(Endless::Chatters),
         Cause::TooManySteps { .. } | Cause::StepTooShort { .. } | Cause::Stopped => Some(Endless::Slow),
         Cause::Guard { .. } | Cause::NotFinite { .. } | Cause::NoDerivatives | Cause::Rig { .. } => None,
-    };
-    results.as_ref().ok()?.iter().find_map(why)
+    }
 }
 
 type Compiled = (String, Result<Vec<compile::Case>, String>);

@@ -176,14 +176,17 @@ impl Look<'_> {
         let (Some(peak), Some(low), Some(points)) = (peak, low, Self::number(test, "stribeck_points")) else {
             return (Seen::NotApplicable, "not measured".into());
         };
-        match (Self::number(test, "stribeck_speed"), points.value >= 3.0 && peak.value > 1.01 * low.value) {
+        match (Self::number(test, "stribeck_speed"), peak.value > 1.01 * low.value) {
             (Some(speed), true) => {
                 when(true, format!("falls from {} to {}, 1/e at {}", peak.shown(), low.shown(), speed.shown()))
             }
-            (Some(speed), false) => {
-                when(false, format!("jumps from {} to {} near {}", peak.shown(), low.shown(), speed.shown()))
+            (None, true) if points.value >= 3.0 => {
+                when(false, format!("falls from {} to {}, within its own noise", peak.shown(), low.shown()))
             }
-            (None, _) => when(false, "the force of steady sliding never falls with speed".into()),
+            (None, true) if points.value > 0.0 => {
+                when(false, format!("jumps from {} to {}", peak.shown(), low.shown()))
+            }
+            (Some(_) | None, _) => when(false, "the force of steady sliding never falls with speed".into()),
         }
     }
 
@@ -350,7 +353,9 @@ impl Look<'_> {
         if let (Some(v), Some(force)) = (Self::number(test, "pushes_at"), Self::number(test, "pushes_with")) {
             return when(false, format!("can push: at v = {} with F = {}", v.shown(), force.shown()));
         }
-        if least.value < 0.0 {
+        // Less is what the sum over the steps of a run leaves.
+        let greatest = Self::number(test, "greatest_work").map_or(0.0, |number| number.value);
+        if least.value < -1e-9 * greatest {
             return when(false, format!("gives out {} on a closed path", least.shown()));
         }
         match Self::number(test, "dissipation_points") {

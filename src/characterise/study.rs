@@ -269,10 +269,13 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
         );
     }
     if let Some(chatter) = chatter {
+        let made_to_hold = match subject.states {
+            0 => format!(" `Sticking(law = {})` is the same law made to hold.", subject.instance),
+            _ => String::new(),
+        };
         notes.push(format!(
             "At rest it {chatter}. What comes to rest was therefore run with a fixed step; there the force jumps to and \
-             fro at every step, and what it carries is an average. `Sticking(law = {})` is the same law made to hold.",
-            subject.instance
+             fro at every step, and what it carries is an average.{made_to_hold}"
         ));
     }
     if subject.external == External::Absent && subject.states == 0 && subject.regimes.is_empty() {
@@ -357,6 +360,20 @@ fn break_away(rows: &[Vec<f64>], v_slip: f64) -> Option<(f64, f64)> {
     Some((best[1], best[2]))
 }
 
+/// The force at the end of a run at one speed; its mean over the last half where it goes on to change, and by how much it
+/// does.
+fn settled(rows: &[Vec<f64>]) -> (f64, f64) {
+    let Some(last) = rows.last() else { return (f64::NAN, 0.0) };
+    let half = rows.partition_point(|row| row[0] < 0.5 * last[0]);
+    let course = &rows[half.min(rows.len() - 1)..];
+    let spread = peak_to_peak(course, 1);
+    if spread <= 0.01 * last[1].abs() || course.len() < 3 {
+        return (last[1], 0.0);
+    }
+    let area: f64 = course.windows(2).map(|pair| 0.5 * (pair[0][1] + pair[1][1]) * (pair[1][0] - pair[0][0])).sum();
+    (area / (last[0] - course[0][0]), spread)
+}
+
 /// The steady curve.
 struct Steady {
     /// Speed and force, ascending in speed, for both directions.
@@ -375,6 +392,7 @@ struct Steady {
 impl Steady {
     fn of(results: &Results) -> Result<Steady, String> {
         let (mut forward, mut backward, mut failures) = (Vec::new(), Vec::new(), Vec::new());
+        let mut noise: f64 = 0.0;
         for (name, cases) in results.iter().filter(|(name, _)| name.starts_with("steady_")) {
             let cases = cases.as_ref().map_err(|why| why.clone())?;
             for ran in cases {
@@ -382,7 +400,8 @@ impl Steady {
                 let Some((speed, _)) = speed else { continue };
                 match ran.rows() {
                     Ok(rows) => {
-                        let force = rows.last().map_or(f64::NAN, |row| row[1]);
+                        let (force, spread) = settled(&rows);
+                        noise = noise.max(0.5 * spread);
                         if speed > 0.0 { forward.push((speed, force)) } else { backward.push((speed, force)) }
                     }
                     Err(why) => failures.push(format!("{name}, {}: {why}", ran.label)),
@@ -409,7 +428,9 @@ impl Steady {
             let level = f_c + (peak.1 - f_c) / std::f64::consts::E;
             let below = (top..=foot).find(|i| forward[*i].1 <= level).unwrap_or(foot);
             let (a, b) = (forward[below - 1], forward[below]);
-            v_s = Some(a.0 + (b.0 - a.0) * ((a.1 - level) / (a.1 - b.1)).clamp(0.0, 1.0));
+            // A jump, or the noise of a force that never settles, has no speed of its own.
+            v_s = (falls >= 3 && peak.1 - f_c > noise)
+                .then_some(a.0 + (b.0 - a.0) * ((a.1 - level) / (a.1 - b.1)).clamp(0.0, 1.0));
         }
         let asymmetry = forward.iter().zip(&backward).map(|(a, b)| (a.1 + b.1).abs()).fold(0.0, f64::max);
         Ok(Steady { forward, backward, f_c, v_s, peak, falls, viscous, asymmetry, failures })
@@ -975,11 +996,12 @@ impl Reader<'_> {
     }
 
     fn read_dissipation(&self, verdict: Option<Verdict>) -> Read {
-        let (mut least, mut lines) = (f64::INFINITY, Vec::new());
+        let (mut least, mut greatest, mut lines) = (f64::INFINITY, 0.0_f64, Vec::new());
         for i in 1..=6 {
             let name = format!("closed_path_{i}");
             let work = one(self.results, &name)?.reading(0).unwrap_or(f64::NAN);
             let rows = self.rows(&name)?;
+            greatest = greatest.max(work);
             if work < least {
                 least = work;
                 let second = rows.iter().filter(|row| row[0] >= 1.0);
@@ -995,7 +1017,10 @@ impl Reader<'_> {
             logarithmic: (false, false),
             lines,
         };
-        let mut numbers = vec![self.number("least_work", "least work of a round", least, "J")];
+        let mut numbers = vec![
+            self.number("least_work", "least work of a round", least, "J"),
+            self.number("greatest_work", "greatest work of a round", greatest, "J"),
+        ];
         match verdict {
             Some(Verdict::Holds(points)) => {
                 numbers.push(self.number(

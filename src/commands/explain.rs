@@ -103,6 +103,10 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
             step.divisions
         ));
     }
+    if let Some(stable) = stable_steps(explanation) {
+        terminal.line("\n  stable where states and inputs stay in their ranges, or below 10 in SI where those are open, with steps up to:");
+        terminal.line(&format!("    {stable}"));
+    }
     if !bounds.is_empty() {
         terminal.line(&format!("\n  a step on this machine, each of {CALLS} calls timed, other programs included:"));
         for bound in bounds {
@@ -132,6 +136,17 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
     terminal.line("");
 }
 
+/// `euler 20 us, rk4 28 us, expo any, implicit any`; none where nothing is stepped.
+fn stable_steps(explanation: &Explanation) -> Option<String> {
+    let one = |step: &compile::StepCost| {
+        let most = step.stable?;
+        let most = if most >= compile::LONGEST_STEP { "any".into() } else { compile::two_digits_time(most) };
+        Some(format!("{} {most}", step.method.name()))
+    };
+    let all: Option<Vec<String>> = explanation.steps.iter().map(one).collect();
+    all.map(|all| all.join(", "))
+}
+
 fn dissipation(verdict: &Verdict) -> String {
     match verdict {
         Verdict::Holds(points) => format!("holds at {points} samples"),
@@ -158,7 +173,7 @@ fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
         "steps": explanation.steps.iter().map(|step| json!({
             "method": step.method.name(), "operations": step.operations, "before_expansion": step.plain,
             "divisions": step.divisions, "instructions": step.code.map(|(instructions, _)| instructions),
-            "code_bytes": step.code.map(|(_, bytes)| bytes),
+            "code_bytes": step.code.map(|(_, bytes)| bytes), "largest_stable_s": step.stable,
         })).collect::<Vec<_>>(),
         "bounds": bounds.iter().map(|bound| json!({
             "method": bound.method.name(), "calls": CALLS, "median_ns": bound.median, "all_but_100_ns": bound.most,

@@ -120,6 +120,8 @@ impl<'a> Flattener<'a> {
                 }
             }
             (None, None) => match declaration.kind {
+                // The argument that was meant is reported where it is misspelt.
+                DeclarationKind::Param | DeclarationKind::Input if self.misspelt(id, &name.text) => Definition::Missing,
                 DeclarationKind::Param | DeclarationKind::Input if !self.tree(id).alone => {
                     let info = self.system.instance(id);
                     let model = self.tree(id).model;

@@ -608,6 +608,18 @@ impl<'a> Flattener<'a> {
         self.diagnostics.extend(errors);
     }
 
+    /// Whether an argument that the model does not have comes closest to this name.
+    pub(super) fn misspelt(&self, id: InstanceId, name: &str) -> bool {
+        let tree = self.tree(id);
+        let takes = || {
+            let own = declarations(tree.model);
+            own.filter(|d| matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input))
+                .map(|d| d.name.text.as_str())
+        };
+        let names = |text: &str| tree.names.contains_key(text);
+        tree.args.iter().any(|arg| !names(arg.name) && nearest(arg.name, takes()) == Some(name))
+    }
+
     pub(super) fn env(&self, id: InstanceId) -> Env {
         let tree = self.tree(id);
         Env {

@@ -59,7 +59,22 @@ pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &Places) -> 
     let mut found = Vec::new();
     emulation(rig, control, plant, places, &mut found);
     resolution(rig, control, places, &mut found);
+    unproven(rig, places, &mut found);
     found
+}
+
+/// Drives of frames described by hand or by a file: nothing in those says that they stop when the computer dies.
+fn unproven(rig: &Rig, places: &Places, found: &mut Vec<Diagnostic>) {
+    for (k, node) in rig.nodes.iter().enumerate() {
+        if node.moves && matches!(node.kind, Kind::Frames(_)) {
+            let warning = Diagnostic::warning(
+                "W0807",
+                format!("`{}` cannot show that it stops when the computer dies", node.name),
+            )
+            .label(places.nodes.get(k).copied().unwrap_or(places.name), "no heartbeat to watch, no time-out to test");
+            found.push(warning.help("see to it otherwise, by a relay or a time-out of the drive's own, and say so:\n`allow no-drive-timeout \"...\"`"));
+        }
+    }
 }
 
 /// How a command answers a signal near rest: stiffness K in N·m/rad and damping B in N·m·s/rad, both resisting.

@@ -70,6 +70,14 @@ pub fn by_hand(description: &Description, value: &dyn Fn(&str) -> f64, diagnosti
             laid.messages.len() - 1
         });
         let message = &mut laid.messages[at];
+        let bytes = |field: &Field| field.start_bit / 8..field.start_bit / 8 + field.bits / 8;
+        let mine = byte..byte + bits / 8;
+        let shared = message.fields.iter().find(|field| bytes(field).start < mine.end && mine.start < bytes(field).end);
+        if let Some(other) = shared.filter(|_| signal.send) {
+            let text = format!("`{name}` lies on top of `{}`", other.name);
+            let error = Diagnostic::error("E0802", text).label(signal.byte.span, format!("byte {byte} is taken"));
+            diagnostics.push(error.help("signals of one message stand side by side: give it a byte behind"));
+        }
         message.length = message.length.max((byte + bits / 8).min(8) as u8);
         let start = get("start");
         message.fields.push(Field {

@@ -160,6 +160,10 @@ pub struct Places {
     pub name: Span,
     /// The period.
     pub rate: Span,
+    /// What it runs.
+    pub run: Span,
+    /// The name of its method, or else the period.
+    pub solver: Span,
     /// Of each node its kind.
     pub nodes: Vec<Span>,
     /// Of each output its wire.
@@ -219,10 +223,22 @@ pub fn read<'a>(
             expressions: expressions.all.clone(),
         }),
     };
-    let flat = flatten(loaded, sources, &request);
+    let mut flat = flatten(loaded, sources, &request);
+    // Where the part is not there, neither are its inputs.
+    if let Some(hardware) = statements.hardware
+        && flat.diagnostics.iter().any(|d| d.span() == hardware.part.span)
+    {
+        flat.diagnostics.retain(|d| d.span() == hardware.part.span || !within(hardware.span, d.span()));
+    }
     reader.diagnostics.extend(flat.diagnostics);
     let framed = flat.framed?;
-    reader.cut(flat.system, flat.observed, framed, expressions, lists)
+    let cut = reader.cut(flat.system, flat.observed, framed, expressions, lists);
+    let allowed = |lint: &str| statements.allows.iter().any(|allow| allow.lint.text == lint);
+    diagnostics.retain(|said| {
+        let lint = LINTS.iter().find(|(_, code)| *code == said.code);
+        said.is_error() || !said.code.starts_with("W08") || !lint.is_some_and(|(name, _)| allowed(name))
+    });
+    cut
 }
 
 /// Whether a place lies in another.
@@ -456,6 +472,10 @@ impl<'a> Reader<'a, '_> {
                 _ => None,
             };
             let Some(found) = found else {
+                // A command in its place has been reported.
+                if self.hardware_is_wrong() {
+                    continue;
+                }
                 let error = Diagnostic::error("E0803", format!("nothing commands `{text}`"))
                     .label(path.span, "a safe value of no command");
                 self.report(
@@ -624,6 +644,22 @@ impl<'a> Reader<'a, '_> {
         };
         let number = |at: usize| constants_values[at];
         let plan = self.plan(&system, &framed, &lists, &number, &param)?;
+        for (send, output) in lists.sends.iter().zip(&plan.outputs) {
+            let value = evaluate(&system, &types, &[at(send.value)])[0];
+            let (rig::Kind::Frames(messages), What::Field(m, f)) = (&plan.nodes[send.node].kind, output.signal.what)
+            else {
+                continue;
+            };
+            // NaN of what is not known before it runs.
+            let (low, high) = frames::carries(&messages[m].fields[f]);
+            if value < low || value > high {
+                let shown = |value: f64| units::three_digits(send.unit.from_si(value));
+                let message = format!("`{}` cannot be {}", self.files.slice(send.path), shown(value));
+                let error = Diagnostic::error("E0802", message)
+                    .label(system.span(at(send.value)), format!("its field carries {} .. {}", shown(low), shown(high)));
+                self.report(error.help("send what fits, or describe the field with more bits or a coarser `scale`"));
+            }
+        }
         checks::whole_periods(
             &control,
             &control_types,
@@ -641,6 +677,12 @@ impl<'a> Reader<'a, '_> {
         let places = Places {
             name: self.rig.name.span,
             rate: self.statements.rate.map_or(self.rig.name.span, |(expr, _)| expr.span),
+            run: self.statements.run.map_or(self.rig.name.span, |run| run.instance.span),
+            solver: match (self.statements.solver, self.statements.rate) {
+                (Some(solver), _) => solver.method.span,
+                (None, Some((rate, _))) => rate.span,
+                (None, None) => self.rig.name.span,
+            },
             nodes: self.descriptions.iter().map(|node| node.statement.kind.span).collect(),
             wires: lists.sends.iter().map(|send| send.span).collect(),
             allows: self.statements.allows.iter().map(|allow| allow.lint.text.clone()).collect(),
@@ -668,6 +710,12 @@ impl<'a> Reader<'a, '_> {
             return None;
         }
         Some(cut)
+    }
+
+    /// Whether something is wrong with a wire of the part: then others may seem to be missing.
+    fn hardware_is_wrong(&self) -> bool {
+        let Some(hardware) = self.statements.hardware else { return false };
+        self.diagnostics.iter().any(|said| said.is_error() && within(hardware.span, said.span()))
     }
 
     fn errors(&self) -> usize {

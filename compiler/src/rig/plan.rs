@@ -564,6 +564,27 @@ impl Cut {
         found
     }
 
+    /// What is to be said of the steps of the control program, but for what the rig allows.
+    pub fn steps(&self, lowered: &super::Lowered, files: &Files) -> Vec<Diagnostic> {
+        let super::Lowered { rig, control, .. } = lowered;
+        let ends: Vec<(ExprId, Slot)> =
+            self.stops.iter().zip(&rig.stops).map(|(condition, stop)| (*condition, stop.slot)).collect();
+        let fixed = crate::unstable::Fixed {
+            system: &self.control,
+            types: &self.control_types,
+            program: control,
+            method: rig.method,
+            step: rig.period_ns as f64 * 1e-9 / f64::from(rig.steps),
+            place: self.places.solver,
+            run: self.places.run,
+            ends: &ends,
+            rig: true,
+        };
+        let mut found = crate::unstable::check(&fixed, files);
+        found.retain(|said| said.is_error() || !self.allowed(said));
+        found
+    }
+
     fn allowed(&self, warning: &Diagnostic) -> bool {
         LINTS.iter().any(|(name, code)| *code == warning.code && self.places.allows.iter().any(|allow| allow == name))
     }

@@ -104,7 +104,8 @@ impl Reader<'_, '_> {
                 }
             }
         }
-        for id in inputs {
+        let wrong = self.hardware_is_wrong();
+        for id in inputs.into_iter().filter(|_| !wrong) {
             let var = system.var(id);
             let silent = matches!(var.definition, Definition::Value(_, Origin::Default));
             if !silent && !sent.iter().any(|(known, _)| *known == id) {
@@ -118,13 +119,24 @@ impl Reader<'_, '_> {
             }
         }
         for (k, node) in self.descriptions.iter().enumerate().filter(|(_, node)| node.statement.moves) {
-            if !lists.sends.iter().any(|send| send.node == k) {
+            if !wrong && !lists.sends.iter().any(|send| send.node == k) {
                 let name = &node.name.text;
                 let error = Diagnostic::error("E0801", format!("nothing commands drive `{name}`"))
                     .label(node.name.span, "it would turn freely");
                 let help = "wire it in `hardware`; what only talks is a `device`";
                 self.diagnostics.push(error.help(help));
             }
+        }
+        for send in lists.sends.iter().filter(|send| send.inside && !self.descriptions[send.node].statement.moves) {
+            let node = &self.descriptions[send.node].statement;
+            let error = Diagnostic::error(
+                "E0801",
+                format!("`{}` moves the part, but is declared as a `device`", node.name.text),
+            )
+            .label(node.kind.span, "not supervised, and without a safe value")
+            .label(send.path, "takes the place of the part");
+            self.diagnostics
+                .push(error.help(format!("write `drive {} = …`, and give it a `safe` value", node.name.text)));
         }
         for send in lists.sends.iter().filter(|send| send.safe.is_none()) {
             if self.descriptions[send.node].statement.moves {
@@ -231,7 +243,7 @@ impl Reader<'_, '_> {
             let framing = framed.nodes.contains(&var.instance) || var.instance == framed.rig;
             !framing && !of_part(system, *id) && lives(&pruned, *id) && var.kind != VarKind::Param
         });
-        if let Some(foreign) = foreign
+        if let Some(foreign) = foreign.filter(|_| !self.hardware_is_wrong())
             && let Some(hardware) = self.statements.hardware
         {
             let message =
@@ -293,7 +305,7 @@ impl Reader<'_, '_> {
         part: InstanceId,
         of_part: &dyn Fn(&System, VarId) -> bool,
     ) {
-        let Some(hardware) = self.statements.hardware else { return };
+        let Some(hardware) = self.statements.hardware.filter(|_| !self.hardware_is_wrong()) else { return };
         for id in system.var_ids().filter(|id| of_part(system, *id) && given_kind(system.var(*id).kind)) {
             if lives(control, id) {
                 continue;

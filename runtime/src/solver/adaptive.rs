@@ -26,6 +26,16 @@ const MOST_ATTEMPTS: u64 = 5_000_000;
 /// More events than this within a millionth of the run are chatter.
 const MOST_EVENTS: usize = 100;
 
+/// And so are more surfaces than this, met by steps of whatever outcome, while no state moves by more than a thousand
+/// tolerances.
+const MOST_CROSSINGS: usize = 2000;
+
+/// More tries of a step than this within a millionth of the run lead nowhere.
+const MOST_IN_PLACE: u64 = 20_000;
+
+/// So often a step is made again to end before a surface without anything coming of it.
+const MOST_AIMS: u8 = 4;
+
 /// Steps are chosen this part of what the error would allow.
 const SAFETY: f64 = 0.9;
 
@@ -92,8 +102,10 @@ struct Adaptive<'a> {
     rejected: bool,
     /// The next step is no longer than this, for a surface is just ahead.
     creep: f64,
-    /// Steps for which none is made again to end at a condition: it may fall just short of it, and must not try for ever.
-    aimed: u8,
+    /// For each surface, how often of late a step has been made again to end before it, and nothing came of it.
+    aimed: Vec<u8>,
+    /// Length of the step that was made again: how long steps may be when the condition is behind.
+    usual: Option<f64>,
     /// States beside a crossing, and four slopes around it.
     beside: Vec<f64>,
     slopes: Vec<f64>,
@@ -102,6 +114,14 @@ struct Adaptive<'a> {
     fresh: bool,
     /// Time and a crossed surface of each of the last events.
     events: VecDeque<(f64, Option<usize>)>,
+    /// How many surfaces were met since when, and where the model was then; whether the last step tried was too long only
+    /// because of one.
+    crossings: usize,
+    crossings_since: f64,
+    crossings_at: Vec<f64>,
+    overran: bool,
+    /// Steps tried and time reached when it was looked last whether the run makes way.
+    place: (u64, f64),
     /// For each sampled block its period in s and the number of its next tick.
     ticks: Vec<(f64, u64)>,
     points: Points<'a>,
@@ -160,12 +180,18 @@ impl<'a> Adaptive<'a> {
             last: None,
             rejected: false,
             creep: f64::INFINITY,
-            aimed: 0,
+            aimed: vec![0; system.surfaces()],
+            usual: None,
             beside: vec![0.0; n],
             slopes: vec![0.0; 4 * n],
             surfaces: Surfaces::new(&system, 1e-12 * experiment.duration),
             fresh: true,
             events: VecDeque::new(),
+            crossings: 0,
+            crossings_since: 0.0,
+            crossings_at: system.instance.block()[system.states.clone()].to_vec(),
+            overran: false,
+            place: (0, 0.0),
             ticks,
             points,
             work: Work::default(),
@@ -208,6 +234,15 @@ impl<'a> Adaptive<'a> {
             }
             if self.attempts() - before >= MOST_ATTEMPTS {
                 return Err(self.stop(Cause::TooManySteps { steps: self.attempts(), path: self.worst() }));
+            }
+            if self.attempts() - self.place.0 > MOST_IN_PLACE {
+                if self.t - self.place.1 < 1e-6 * self.duration {
+                    return Err(self.in_place(before));
+                }
+                self.place = (self.attempts(), self.t);
+            }
+            if self.crossings > MOST_CROSSINGS {
+                return Err(self.chatter(MOST_CROSSINGS, self.t - self.crossings_since));
             }
             let left = stop - self.t;
             let wanted = self.h.min(self.longest);
@@ -265,7 +300,10 @@ impl<'a> Adaptive<'a> {
             let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(0.2) } else { 0.1 };
             self.h = part.min(0.9) * h;
             // Where the step ran over a surface, that may be all that is wrong with it.
-            if let Some(theta) = self.surfaces.guess(&mut self.system, &self.step) {
+            let ahead = self.surfaces.guess(&mut self.system, &self.step);
+            self.overran = ahead.is_some();
+            if let Some(theta) = ahead {
+                self.meet();
                 self.h = self.h.max(0.95 * theta.min(0.9) * h);
             }
             self.rejected = true;
@@ -416,23 +454,36 @@ impl<'a> Adaptive<'a> {
         self.kept = 0.0;
         let known = self.fused.as_ref().filter(|_| self.was_fused);
         self.surfaces.begin(&mut self.system, &self.step, self.fresh, known);
+        if self.ends_before_condition() {
+            return Ok(());
+        }
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
+            self.meet();
             let jump = self.jump(crossing);
             // A surface left at the very start needs no other step.
-            if from == 0.0 && crossing.near > 0.0 && (self.end_at(crossing) || self.shorten(crossing, jump)) {
+            if from == 0.0 && crossing.near > 0.0 && self.shorten(crossing, jump) {
                 self.surfaces.again();
                 return Ok(());
             }
             if self.acts(crossing, jump > 0.0)? {
-                (self.creep, self.aimed) = (f64::INFINITY, 0);
+                self.creep = f64::INFINITY;
+                self.aimed.fill(0);
                 return self.guard();
             }
             self.surfaces.pass(true);
             from = crossing.far;
         }
         self.fresh = false;
-        self.aimed = self.aimed.saturating_sub(1);
+        // Aims that came to nothing are forgotten when a whole step meets nothing: at rest the last bits of a speed pass
+        // zero at every step.
+        if from == 0.0 && self.usual.is_none() {
+            self.aimed.iter_mut().for_each(|aimed| *aimed = aimed.saturating_sub(1));
+        }
+        if self.creep.is_infinite() {
+            // The condition that a step was aimed at has moved on.
+            self.h = self.h.max(self.usual.take().unwrap_or(0.0));
+        }
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
         self.points.until(&mut self.system, &self.step, 1.0, reached)?;
@@ -452,22 +503,35 @@ impl<'a> Adaptive<'a> {
     }
 
     /// A condition is decided by the last bit of the states: where one may change, the step is made again so that it
-    /// ends there, and no stage has looked behind it.
-    fn end_at(&mut self, crossing: Crossing) -> bool {
-        let roots = &self.system.instance.description().roots;
-        let decides = self.surfaces.changed().any(|surface| roots[surface].decides);
-        let (h, width) = (self.step.h, (crossing.far - crossing.near) * self.step.h);
-        let shorter = crossing.far * h;
-        if self.aimed > 0 || !decides || shorter + 8.0 * width >= h || shorter < 64.0 * f64::EPSILON * self.t {
-            return false;
+    /// ends just before, and the next one is as short as the bracket. So no stage that looks behind the condition moves
+    /// a state by more than a rounding error: what is at rest is at rest when it breaks away.
+    fn ends_before_condition(&mut self) -> bool {
+        let mut from = 0.0;
+        let mut ends = false;
+        self.surfaces.only_conditions = true;
+        while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
+            let (h, width) = (self.step.h, (crossing.far - crossing.near) * self.step.h);
+            let shorter = crossing.near * h - 2.0 * width;
+            let aimed = self.surfaces.changed().map(|surface| self.aimed[surface]).min().unwrap_or(0);
+            if aimed < MOST_AIMS && shorter + 12.0 * width < h && shorter > 64.0 * f64::EPSILON * self.t {
+                (self.h, self.creep) = (shorter, 6.0 * width);
+                self.surfaces.changed().for_each(|surface| self.aimed[surface] += 1);
+                self.usual.get_or_insert(h);
+                self.retake();
+                ends = true;
+                break;
+            }
+            // One that is left at the very start, or is passed at the very end, needs no other step.
+            self.surfaces.pass(true);
+            from = crossing.far;
         }
-        (self.h, self.creep, self.aimed) = (shorter, f64::INFINITY, 2);
-        self.again();
-        true
+        self.surfaces.only_conditions = false;
+        self.surfaces.again();
+        ends
     }
 
     /// Takes a step back that is made again.
-    fn again(&mut self) {
+    fn retake(&mut self) {
         self.last = None;
         self.work.steps -= 1;
         self.work.stiff_steps -= u64::from(self.was_stiff);
@@ -498,7 +562,7 @@ impl<'a> Adaptive<'a> {
             return false;
         }
         (self.h, self.creep) = (shorter, creep);
-        self.again();
+        self.retake();
         true
     }
 
@@ -525,13 +589,14 @@ impl<'a> Adaptive<'a> {
         if self.events.len() > MOST_EVENTS {
             let (first, _) = self.events.pop_front().expect("there are more than a hundred");
             if time - first < 1e-6 * self.duration {
-                return Err(self.chatter(time - first));
+                return Err(self.chatter(MOST_EVENTS, time - first));
             }
         }
         self.keep_here()?;
         self.points.here(&mut self.system, self.t, &self.x)?;
         self.restart();
-        self.h = self.h.min(self.first_step());
+        let usual = self.usual.take().unwrap_or(self.h);
+        self.h = usual.min(self.first_step());
         Ok(true)
     }
 
@@ -597,7 +662,7 @@ impl<'a> Adaptive<'a> {
             }
             happened = true;
         }
-        Err(self.chatter(0.0))
+        Err(self.chatter(0, 0.0))
     }
 
     /// By how much derivatives jump at a crossing, as error tolerances of their states gathered per second; 0 where
@@ -752,23 +817,55 @@ impl<'a> Adaptive<'a> {
                 let value = if self.step.f0[i].is_finite() { self.step.x1[i] } else { self.step.f0[i] };
                 self.stop(Cause::NotFinite { path, value })
             }
+            // At a surface that is met again within the shortest step, the model turns faster than time can tell.
+            None if self.overran => self.chatter(1, h),
             None => self.stop(Cause::StepTooShort { step: h, path: self.worst() }),
         }
     }
 
-    fn chatter(&self, within: f64) -> Stop {
+    /// Counts a surface that was met; anew where the model has moved since.
+    fn meet(&mut self) {
+        self.crossings += 1;
+        let far = (1e3 * self.tol).min(1e-3);
+        let moved = |i: usize| (self.x[i] - self.crossings_at[i]).abs() > far * (self.x[i].abs() + self.scales[i]);
+        if (0..self.system.n).any(moved) {
+            (self.crossings, self.crossings_since) = (0, self.t);
+            self.crossings_at.copy_from_slice(&self.x);
+            self.surfaces.forget();
+        }
+    }
+
+    /// Why the run makes no way: a surface that was met just now turns all steps that are longer.
+    fn in_place(&mut self, before: u64) -> Stop {
+        let recent = self.t - 1e-3 * self.duration;
+        self.events.retain(|(time, _)| *time >= recent);
+        if self.events.is_empty() && self.surfaces.often().next().is_none() {
+            let steps = self.attempts() - before;
+            return self.stop(Cause::TooManySteps { steps, path: self.worst() });
+        }
+        self.chatter(1, self.h)
+    }
+
+    fn chatter(&self, times: usize, within: f64) -> Stop {
         let description = self.system.instance.description();
         let regime = |automaton: &abi::description::Automaton| {
             let name = &automaton.regimes[self.system.instance.get(automaton.slot) as usize];
             if automaton.path.is_empty() { name.clone() } else { format!("{}.{name}", automaton.path) }
         };
         let mut crossed: Vec<usize> = self.events.iter().filter_map(|(_, surface)| *surface).collect();
-        crossed.extend(self.surfaces.changed());
+        // Of many, those that turn all the time; the others were passed once.
+        let often = self.surfaces.often();
+        if times == MOST_EVENTS || times == 0 {
+            crossed.extend(self.surfaces.changed())
+        } else {
+            crossed.extend(often)
+        }
         crossed.sort();
         crossed.dedup();
         let chatter = Chatter {
             regimes: description.automata.iter().map(regime).collect(),
             conditions: crossed.into_iter().map(|i| description.roots[i].text.clone()).collect(),
+            times,
             within,
         };
         Stop { cause: Cause::Chatter(Box::new(chatter)), time: self.system.instance.get(Slot::TIME) }

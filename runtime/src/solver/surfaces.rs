@@ -21,6 +21,8 @@ pub(crate) struct Surfaces {
     sides: Vec<f64>,
     /// Whether a transition or an event depends on the surface: then leaving it, too, is a crossing.
     decides: Vec<bool>,
+    /// Whether only those are looked for.
+    pub(crate) only_conditions: bool,
     /// Values at the end of the last step, or where the search stands within this one.
     here: Vec<f64>,
     /// θ of the points to look at, ascending.
@@ -33,6 +35,8 @@ pub(crate) struct Surfaces {
     /// Values and sides at the start of the step.
     start: Vec<f64>,
     start_sides: Vec<f64>,
+    /// How often each has been met since `forget`.
+    met: Vec<u32>,
     x: Vec<f64>,
     /// Bracket width in s.
     width: f64,
@@ -45,6 +49,7 @@ impl Surfaces {
         Surfaces {
             sides: zeros(),
             decides: system.instance.description().roots.iter().map(|root| root.decides).collect(),
+            only_conditions: false,
             here: zeros(),
             nodes: Vec::new(),
             values: Vec::new(),
@@ -52,6 +57,7 @@ impl Surfaces {
             far: zeros(),
             start: zeros(),
             start_sides: zeros(),
+            met: vec![0; system.surfaces()],
             x: vec![0.0; system.n],
             width,
         }
@@ -74,8 +80,26 @@ impl Surfaces {
             return None;
         }
         system.roots(step.end, &step.x1, &mut self.trial);
-        let crossed = (0..self.sides.len()).filter(|&i| self.sides[i] * self.trial[i] < 0.0);
-        crossed.map(|i| self.here[i] / (self.here[i] - self.trial[i])).min_by(f64::total_cmp)
+        let mut first = None;
+        for i in 0..self.sides.len() {
+            if self.sides[i] * self.trial[i] < 0.0 {
+                self.met[i] += 1;
+                let theta = self.here[i] / (self.here[i] - self.trial[i]);
+                first = Some(first.map_or(theta, |first: f64| first.min(theta)));
+            }
+        }
+        first
+    }
+
+    /// The surfaces met most often since `forget`.
+    pub(crate) fn often(&self) -> impl Iterator<Item = usize> {
+        let most = self.met.iter().copied().max().unwrap_or(0);
+        (0..self.met.len()).filter(move |&i| self.met[i] > 0 && 4 * self.met[i] >= most)
+    }
+
+    /// Begins to count anew.
+    pub(crate) fn forget(&mut self) {
+        self.met.fill(0);
     }
 
     /// Goes back to the start of the step that was looked at last.
@@ -183,6 +207,9 @@ impl Surfaces {
 
     /// Whether surface i has been crossed where its value is g.
     fn crosses(&self, i: usize, g: f64) -> bool {
+        if self.only_conditions && !self.decides[i] {
+            return false;
+        }
         self.sides[i] * g < 0.0 || (self.decides[i] && self.sides[i] == 0.0 && g != 0.0 && !g.is_nan())
     }
 
@@ -211,6 +238,9 @@ impl Surfaces {
                 aim = 0.5;
             }
             slow = if far - near > 0.5 * before && slow < 2 { slow + 1 } else { 0 };
+        }
+        for i in 0..self.sides.len() {
+            self.met[i] += u32::from(self.crosses(i, self.far[i]));
         }
         Crossing { near, far }
     }
