@@ -40,7 +40,7 @@ enum Command {
     /// Run the current package, or the one named; nothing moves before `say enable`, `say arm`
     Run(Run),
     /// Run the current package in the background; fails if it does not get through its first second
-    Start(Store),
+    Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
     Drives(Drives),
     /// Tell the rig that runs: enable, arm, stop or reset
@@ -153,6 +153,15 @@ struct Install {
 }
 
 #[derive(clap::Args, Debug)]
+struct Start {
+    /// SHA-256 of the package that must be the current one: else the rig has gone back from it
+    #[arg(long)]
+    hash: Option<String>,
+    #[command(flatten)]
+    store: Store,
+}
+
+#[derive(clap::Args, Debug)]
 struct Status {
     /// Go on telling the state of the rig that runs until it ends, or Ctrl-C; that does not end the rig
     #[arg(long)]
@@ -232,7 +241,7 @@ fn main() -> ExitCode {
         Command::Check(check) => packed::open(&check.package, &check.trust.trusted).map(|open| open.describe()),
         Command::Run(run) => return ended(ran(run)),
         Command::Drives(drives) => return ended(served(drives)),
-        Command::Start(store) => run::start(&store.dir),
+        Command::Start(start) => run::start(&start.store.dir, start.hash.as_deref()),
         Command::Say(say) => run::say(&say.store.dir, &say.what),
         Command::Doctor => Ok(doctor::doctor()),
         Command::Install(install) => packed::open(&install.package, &install.trust.trusted)

@@ -377,19 +377,21 @@ const TELLS: Duration = Duration::from_secs(10);
 /// What the rig says when it goes back.
 const NOT_STARTED: &str = "the new package does not start: ";
 
-/// Starts the current package in a process of its own, which outlives this one.
+/// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be it.
 ///
 /// # Errors
 /// What the rig said if it ended within its first second, or runs another package than the current one.
-pub fn start(dir: &Path) -> Result<String, String> {
+pub fn start(dir: &Path, hash: Option<&str>) -> Result<String, String> {
     let store = Store::at(dir);
-    let Some(asked) = store.current_target() else {
+    let Some(current) = store.current_target() else {
         return Err(format!("nothing is installed in {}", dir.display()));
     };
+    // A rig that runs may have tried it and gone back before anybody asked.
+    let asked = hash.map_or_else(|| current.clone(), Store::target);
     let out = dir.join("log").join("rig.out");
     let about = |error: std::io::Error| format!("cannot start a rig in {}: {error}", dir.display());
     let mut child = None;
-    if UnixStream::connect(socket(dir)).is_err() {
+    if UnixStream::connect(socket(dir)).is_err() && current == asked {
         // That of a process that was killed.
         let _ = fs::remove_file(dir.join("state"));
         let file = fs::File::create(&out).map_err(about)?;

@@ -37,6 +37,12 @@ impl Store {
         Store { dir: dir.to_path_buf() }
     }
 
+    /// Where the link of a package points that has this SHA-256.
+    pub fn target(hash: &str) -> PathBuf {
+        let name: String = hash.chars().take(32).collect();
+        Path::new("packages").join(format!("{name}.{}", runtime::package::EXTENSION))
+    }
+
     /// Makes a verified package the current one.
     ///
     /// # Errors
@@ -47,15 +53,15 @@ impl Store {
         for folder in [&packages, &self.dir.join("log")] {
             fs::create_dir_all(folder).map_err(|error| about(folder, error))?;
         }
-        let name = format!("{}.{}", &hash(&open.bytes)[..32], runtime::package::EXTENSION);
-        let path = packages.join(&name);
+        let target = Store::target(&hash(&open.bytes));
+        let path = self.dir.join(&target);
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         whole(&path, &open.bytes).map_err(|error| about(&path, error))?;
         let signature = packages.join(format!("{name}.{SIGNATURE}"));
         // Where it has none, an older signature of the same bytes does no harm.
         if let Some(text) = &open.signature {
             whole(&signature, text.as_bytes()).map_err(|error| about(&signature, error))?;
         }
-        let target = Path::new("packages").join(&name);
         let before = fs::read_link(self.dir.join("current")).ok();
         if before.as_deref() == Some(&target) {
             return Ok(format!("{} is the current package already\n", open.package.rig));

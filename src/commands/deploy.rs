@@ -62,15 +62,16 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     let signed = format!("{arrived}.{SIGNATURE}");
     let _ = remote.run(&["rm", "-f", &arrived, &signed]);
     if args.start {
-        start(args, &remote, terminal)?;
+        start(args, &remote, &hash(&bytes), terminal)?;
     }
     Ok(())
 }
 
 /// Starts what has been installed, and tells its state; if it refuses, the computer itself goes back to what was there.
-fn start(args: &Deploy, remote: &Remote, terminal: &mut Terminal) -> Result<(), String> {
+fn start(args: &Deploy, remote: &Remote, hash: &str, terminal: &mut Terminal) -> Result<(), String> {
     let Host { host, rig, dir, .. } = &args.host;
-    let said = remote.run(&[rig, "start", "--dir", dir]).map_err(|why| format!("{host}: {}", why.words()))?;
+    let said =
+        remote.run(&[rig, "start", "--hash", hash, "--dir", dir]).map_err(|why| format!("{host}: {}", why.words()))?;
     terminal.print(&said);
     if args.follow || std::io::stdout().is_terminal() {
         // Whoever has seen enough presses Ctrl-C: what was asked for is done.
