@@ -87,7 +87,7 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
             // What runs instead is what ran before it; if that does not start either, nothing runs.
             Err(why) if wanted.package.is_none() && !fell_back && store.took_over() => {
                 words::error(&format!("{NOT_STARTED}{why}"));
-                words::error(&store.rollback()?);
+                words::error(&store.fall_back()?);
                 fell_back = true;
                 continue;
             }
@@ -458,7 +458,7 @@ fn said(out: &Path) -> String {
 fn back(store: &Store, asked: &Path) -> String {
     match store.current_target() {
         Some(current) if current != asked => format!("back to {}", current.display()),
-        _ => match store.rollback() {
+        _ => match store.fall_back() {
             Ok(said) => said.trim().to_string(),
             Err(why) => format!("and there is nothing to go back to: {why}"),
         },

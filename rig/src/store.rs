@@ -78,19 +78,33 @@ impl Store {
     /// # Errors
     /// If there is none, or why it cannot be done.
     pub fn rollback(&self) -> Result<String, String> {
-        let link = |name: &str| fs::read_link(self.dir.join(name)).ok();
-        let Some(previous) = link("previous") else {
+        let current = self.current_target();
+        let said = self.fall_back()?;
+        if let Some(current) = current {
+            self.link("previous", &current)?;
+        }
+        Ok(said)
+    }
+
+    /// As [`rollback`](Self::rollback), from a package that does not start: nothing goes back to that one by itself.
+    ///
+    /// # Errors
+    /// If there is none before it, or why it cannot be done.
+    pub fn fall_back(&self) -> Result<String, String> {
+        let Some(previous) = self.before() else {
             return Err(format!("there is no package before the current one in {}", self.dir.display()));
         };
         if !self.dir.join(&previous).is_file() {
             return Err(format!("{} is gone", previous.display()));
         }
-        let current = link("current");
         self.link("current", &previous)?;
-        if let Some(current) = current.filter(|current| *current != previous) {
-            self.link("previous", &current)?;
-        }
         Ok(format!("back to {}\n", previous.display()))
+    }
+
+    /// The package before the current one; none if that is the current one again.
+    fn before(&self) -> Option<PathBuf> {
+        let previous = fs::read_link(self.dir.join("previous")).ok();
+        previous.filter(|previous| Some(previous) != self.current_target().as_ref())
     }
 
     /// Keeps others from running a rig here, for as long as the file lives: the system lets go of it however the process
@@ -140,7 +154,7 @@ impl Store {
 
     /// Whether there is a package before the current one to go back to.
     pub fn took_over(&self) -> bool {
-        fs::read_link(self.dir.join("previous")).is_ok_and(|before| Some(before) != self.current_target())
+        self.before().is_some()
     }
 
     /// What is installed, and what runs.
@@ -149,8 +163,8 @@ impl Store {
     /// If nothing is.
     pub fn status(&self) -> Result<String, String> {
         let mut words = String::new();
-        for name in ["current", "previous"] {
-            if let Ok(target) = fs::read_link(self.dir.join(name)) {
+        for (name, target) in [("current", self.current_target()), ("previous", self.before())] {
+            if let Some(target) = target {
                 words += &format!("{name}: {}\n", target.display());
             }
         }
@@ -218,6 +232,11 @@ mod tests {
         store.rollback().unwrap();
         assert_eq!(current(dir.path()).rig, "two", "there and back");
         assert_eq!(store.status().unwrap().lines().count(), 2);
+        // What was left because it did not start is not gone back to.
+        store.fall_back().unwrap();
+        assert_eq!(current(dir.path()).rig, "one");
+        assert!(!store.took_over() && store.fall_back().is_err() && store.rollback().is_err());
+        assert_eq!(store.status().unwrap().lines().count(), 1);
     }
 
     #[test]
