@@ -171,16 +171,27 @@ const LETTER: f64 = 7.4;
 const ROW: f64 = 22.0;
 const GAP: f64 = 70.0;
 
-/// Boxes from left to right; wires that lead back run below them.
+/// Boxes from left to right; wires that lead back run below them. What comes from no part stands before its input.
 pub fn svg(model: &Model) -> String {
     let Diagram { blocks, wires } = diagram(model);
     let letters = |text: &str| text.chars().count() as f64 * LETTER;
+    let is_wired = |block: usize, row: usize| wires.iter().any(|wire| wire.to == (block, row));
+    let before = |k: usize, block: &Block| -> Vec<(usize, String)> {
+        let loose = block.inputs.iter().enumerate().filter(|(row, _)| !block.name.is_empty() && !is_wired(k, *row));
+        loose.map(|(row, (_, value))| (row, value.clone())).collect()
+    };
+    // A box has ports; what leaves the model is an equation.
+    let shown = |block: &Block, (name, value): &(String, String)| match block.name.is_empty() {
+        true => format!("{name} = {value}"),
+        false => name.clone(),
+    };
     let mut x = 20.0;
     let mut places = Vec::new();
     let mut deepest: f64 = 0.0;
-    for block in &blocks {
+    for (k, block) in blocks.iter().enumerate() {
+        x += before(k, block).iter().map(|(_, value)| letters(value)).fold(0.0, f64::max);
         let ports = |names: &mut dyn Iterator<Item = f64>| names.fold(0.0, f64::max);
-        let inputs = ports(&mut block.inputs.iter().map(|(name, _)| letters(name)));
+        let inputs = ports(&mut block.inputs.iter().map(|input| letters(&shown(block, input))));
         let outputs = ports(&mut block.outputs.iter().map(|name| letters(name)));
         let width = (inputs + outputs + 40.0).max(letters(&block.name).max(letters(&block.kind)) + 24.0);
         let rows = block.inputs.len().max(block.outputs.len()) as f64;
@@ -218,7 +229,7 @@ pub fn svg(model: &Model) -> String {
             x1, y1
         );
     }
-    for (block, (x, width, height)) in blocks.iter().zip(&places) {
+    for (k, (block, (x, width, height))) in blocks.iter().zip(&places).enumerate() {
         if !block.name.is_empty() {
             out += &format!(
                 "<rect x=\"{x:.1}\" y=\"{top}\" width=\"{width:.1}\" height=\"{height:.1}\" rx=\"4\" fill=\"#f5f7fa\" \
@@ -232,8 +243,19 @@ pub fn svg(model: &Model) -> String {
                 escaped(&block.kind)
             );
         }
-        for (row, (name, _)) in block.inputs.iter().enumerate() {
-            out += &format!("<text x=\"{:.1}\" y=\"{:.1}\">{}</text>\n", x + 6.0, port(row) + 4.0, escaped(name));
+        for (row, input) in block.inputs.iter().enumerate() {
+            let text = escaped(&shown(block, input));
+            out += &format!("<text x=\"{:.1}\" y=\"{:.1}\">{text}</text>\n", x + 6.0, port(row) + 4.0);
+        }
+        for (row, value) in before(k, block) {
+            let y = port(row);
+            out += &format!(
+                "<path d=\"M{x:.1} {y:.1} l-7 -3.5 v7 z\" fill=\"#666\"/>\n<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\" \
+                 fill=\"#666\">{}</text>\n",
+                x - 12.0,
+                y + 4.0,
+                escaped(&value)
+            );
         }
         for (row, name) in block.outputs.iter().enumerate() {
             let (x, y) = (x + width - 6.0, port(row) + 4.0);
@@ -290,6 +312,15 @@ Servo
   x = body.x
 ";
         assert_eq!(shown, expected, "\n{shown}");
+    }
+
+    #[test]
+    fn what_comes_from_no_part_stands_before_its_input() {
+        let picture = svg(&model(
+            "model Loop {\n  state v [m/s] = 0\n  part fr = LuGre(v = v)\n  dv/dt = (1 N - fr.F) / 1 kg\n}",
+        ));
+        assert_eq!(picture.matches(">v</text>").count(), 2, "{picture}");
+        assert!(picture.contains(">dv/dt = (1 N − fr.F) / (1 kg)</text>"), "{picture}");
     }
 
     #[test]
