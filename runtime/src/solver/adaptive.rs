@@ -459,8 +459,14 @@ impl<'a> Adaptive<'a> {
         }
         let mut from = 0.0;
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
-            self.meet();
             let jump = self.jump(crossing);
+            // What swings through a surface at which nothing jumps is no chatter.
+            let decides = self.surfaces.changed().any(|i| self.system.instance.description().roots[i].decides);
+            if jump > 0.0 || decides {
+                self.meet()
+            } else {
+                self.crossings = 0
+            }
             // A surface left at the very start needs no other step.
             if from == 0.0 && crossing.near > 0.0 && self.shorten(crossing, jump) {
                 self.surfaces.again();
