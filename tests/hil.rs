@@ -11,7 +11,7 @@ use runtime::hil::simulated::{Pace, World};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fs;
-use std::io::Write;
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -451,7 +451,11 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     let mut child = under_way(&folder, "log");
     let mut say = |line: &str| {
         std::thread::sleep(Duration::from_millis(700));
-        writeln!(child.stdin.as_mut().unwrap(), "{line}").unwrap();
+        if writeln!(child.stdin.as_mut().unwrap(), "{line}").is_err() {
+            let mut said = String::new();
+            child.stderr.as_mut().unwrap().read_to_string(&mut said).unwrap();
+            panic!("it ended before `{line}`: {said}");
+        }
     };
     say("");
     say("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");

@@ -313,6 +313,9 @@ static TURN: Mutex<()> = Mutex::new(());
 fn interfaces() {
     static INTERFACES: Once = Once::new();
     INTERFACES.call_once(|| {
+        // Large blocks are fresh pages each time: else a test could be given what an earlier one has touched.
+        // SAFETY: takes no pointers.
+        assert_eq!(unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, 128 << 10) }, 1);
         socketcan::make_virtual("vcan0").expect("the kernel has vcan");
         for card in ["can0", "can1"] {
             socketcan::take_up(card, Some(1_000_000)).expect("the guest has two cards");
