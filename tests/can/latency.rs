@@ -4,15 +4,11 @@
 //!
 //! Each gate is also seen red: with a lock, an allocation, a system call, or memory that was not locked.
 
-mod rig;
-
 use runtime::can::socketcan::{self, SocketCan};
 use runtime::can::{Bus, Filter, Frame, Options, Received};
 use runtime::clock::{Clock, Monotonic};
-use runtime::hil::cycle::{Hil, Options as HilOptions};
 use runtime::histogram::Histogram;
 use runtime::realtime::{self, Wishes};
-use runtime::record::log::{Sections, Settings, Sink};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::fs::File;
@@ -321,74 +317,6 @@ fn interfaces() {
             socketcan::take_up(card, Some(1_000_000)).expect("the guest has two cards");
         }
     });
-}
-
-/// The cycle of a whole rig, from its start-up on: model, safety, two drives with two answers each, a log.
-fn whole_rig(cycles: u64) -> Outcome {
-    let asked = rig::pulsed(1_000_000);
-    let clock = Monotonic::new();
-    let bus = SocketCan::open("can0", &Options::default(), clock).expect("it is up");
-    let fd = bus.descriptor().expect("a socket");
-    let options = HilOptions { arms_itself: true, duration_ns: Some(cycles * 1_000_000), ..HilOptions::default() };
-    let log = Settings { sink: Sink::BlackBox("/tmp/black".into(), 10), cycles_per_block: 100, patient: false };
-    let real_time = realtime::enter(&Wishes { priority: LOOP, ..Wishes::default() });
-    assert_eq!(real_time.refused(), [], "root of the guest may do all of it");
-    let log = Some((log, Sections::default()));
-    let made = Hil::new(&asked.rig, asked.program.clone(), Box::new(clock), vec![Box::new(bus)], options, log);
-    let (mut hil, _operator) = made.expect("it can be started");
-    let (warm, mut faults) = (100, 0);
-    while hil.ended().is_none() && hil.counts().cycles < cycles - 1 {
-        hil.cycle();
-        if hil.counts().cycles == warm && faults == 0 {
-            faults = realtime::suffered().page_faults;
-            watch_calls(fd);
-            FOREIGN.store(0, Ordering::Relaxed);
-            HEAP.with(|calls| calls.set(0));
-        }
-    }
-    let outcome = Outcome {
-        heap_calls: HEAP.with(Cell::get),
-        foreign_calls: FOREIGN.load(Ordering::Relaxed),
-        page_faults: realtime::suffered().page_faults - faults,
-        lateness: hil.counts().late.clone(),
-        answer: hil.counts().compute.clone(),
-        missed: hil.counts().missed + u64::from(hil.ended().is_some()) + hil.counts().stale,
-    };
-    if let Some(end) = hil.ended() {
-        println!("rig: ended early in cycle {}: {end:?}", hil.counts().cycles);
-    }
-    std::mem::forget((hil, real_time, _operator));
-    outcome
-}
-
-/// Two drives, five frames each way in a period, the model, the safety and the log: what `fric hil` does.
-#[test]
-fn a_whole_rig_at_1_khz() {
-    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-    interfaces();
-    // SAFETY: takes no pointers.
-    unsafe { libc::munlockall() };
-    let over = Arc::new(AtomicBool::new(false));
-    let drives = {
-        let over = over.clone();
-        std::thread::spawn(move || rig::drives(&rig::pulsed(1_000_000).rig, "can1", Some(DRIVE), &over))
-    };
-    let outcome = std::thread::spawn(|| whole_rig(10_000)).join().expect("the loop ends");
-    over.store(true, Ordering::Relaxed);
-    drives.join().expect("the drives end");
-    let us = |ns: u64| ns as f64 / 1000.0;
-    println!(
-        "rig: lateness µs p50 {} max {}, computing µs p50 {} max {}, missed {}, heap {}, faults {}, calls {}",
-        us(outcome.lateness.quantile_ns(0.5)),
-        us(outcome.lateness.max_ns()),
-        us(outcome.answer.quantile_ns(0.5)),
-        us(outcome.answer.max_ns()),
-        outcome.missed,
-        outcome.heap_calls,
-        outcome.page_faults,
-        outcome.foreign_calls,
-    );
-    assert_eq!(outcome.red(), [""; 0]);
 }
 
 fn gate(name: &str, plan: &Plan) -> Outcome {
