@@ -199,27 +199,31 @@ impl Loop {
             other.late[command].dead = dead;
             other.is_stable()
         };
-        if !stable(0.0) {
-            return Some(0.0);
-        }
-        let step = 0.125 * self.period;
-        let mut low = 0.0;
-        let mut high = loop {
-            let next = low + step;
-            if next > PERIODS * self.period {
-                return None;
-            }
-            if !stable(next) {
-                break next;
-            }
-            low = next;
-        };
-        for _ in 0..40 {
-            let middle = 0.5 * (low + high);
-            if stable(middle) { low = middle } else { high = middle }
-        }
-        Some(0.5 * (low + high))
+        first_unstable(self.period, 0.125, 40, stable)
     }
+}
+
+/// The least dead time, s, that is not stable: looked for in strides of so many periods, then by halving so often.
+fn first_unstable(period: f64, stride: f64, halvings: usize, stable: impl Fn(f64) -> bool) -> Option<f64> {
+    if !stable(0.0) {
+        return Some(0.0);
+    }
+    let mut low = 0.0;
+    let mut high = loop {
+        let next = low + stride * period;
+        if next > PERIODS * period {
+            return None;
+        }
+        if !stable(next) {
+            break next;
+        }
+        low = next;
+    };
+    for _ in 0..halvings {
+        let middle = 0.5 * (low + high);
+        if stable(middle) { low = middle } else { high = middle }
+    }
+    Some(0.5 * (low + high))
 }
 
 /// Periods in which the greatest deflection is looked for.
@@ -310,25 +314,7 @@ impl Ahead {
             (other.plain.late[0].dead, other.told.dead) = (dead, dead);
             other.radius() < 1.0
         };
-        if !stable(0.0) {
-            return Some(0.0);
-        }
-        let mut low = 0.0;
-        let mut high = loop {
-            let next = low + 2.0 * period;
-            if next > PERIODS * period {
-                return None;
-            }
-            if !stable(next) {
-                break next;
-            }
-            low = next;
-        };
-        for _ in 0..8 {
-            let middle = 0.5 * (low + high);
-            if stable(middle) { low = middle } else { high = middle }
-        }
-        Some(0.5 * (low + high))
+        first_unstable(period, 2.0, 8, stable)
     }
 }
 

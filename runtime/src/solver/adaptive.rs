@@ -461,8 +461,7 @@ impl<'a> Adaptive<'a> {
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
             // What swings through a surface at which nothing jumps is no chatter.
-            let decides = self.surfaces.changed().any(|i| self.system.instance.description().roots[i].decides);
-            if jump > 0.0 || decides {
+            if jump > 0.0 || self.surfaces.decided() {
                 self.meet()
             } else {
                 self.crossings = 0
@@ -512,6 +511,9 @@ impl<'a> Adaptive<'a> {
     /// ends just before, and the next one is as short as the bracket. So no stage that looks behind the condition moves
     /// a state by more than a rounding error: what is at rest is at rest when it breaks away.
     fn ends_before_condition(&mut self) -> bool {
+        if !self.surfaces.has_conditions() {
+            return false;
+        }
         let mut from = 0.0;
         let mut ends = false;
         self.surfaces.only_conditions = true;

@@ -191,6 +191,16 @@ impl Surfaces {
         (0..self.sides.len()).filter(|&i| self.crosses(i, self.far[i]))
     }
 
+    /// Whether a transition or an event depends on one of them.
+    pub(crate) fn decided(&self) -> bool {
+        self.changed().any(|i| self.decides[i])
+    }
+
+    /// Whether a transition or an event depends on any surface.
+    pub(crate) fn has_conditions(&self) -> bool {
+        self.decides.contains(&true)
+    }
+
     /// Goes on behind the last bracket, on the new sides.
     pub(crate) fn pass(&mut self, crossed: bool) {
         for (side, g) in self.sides.iter_mut().zip(&self.far) {
