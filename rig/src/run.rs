@@ -62,6 +62,8 @@ pub enum Ended {
     Asked,
     /// By safety or a condition: why.
     Stopped(String),
+    /// It had passed its start-up checks and waited for its operator, and what it waited with was lost: why.
+    Lost(String),
     /// Another package has been installed and may be taken over now.
     Replaced,
 }
@@ -99,6 +101,8 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
                 words::error(&format!("stopped: {why}"));
                 return Ok(3);
             }
+            // It did start: whether an older package shall take its place is for a person to say.
+            Ended::Lost(why) => return Err(format!("refused: {why}")),
             Ended::Replaced => {
                 fell_back = false;
                 words::print("another package is installed: taking it over\n");
@@ -165,7 +169,9 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     ));
     let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator));
     let end = hil.run();
-    let replaced = attendant.as_ref().is_some_and(|it| it.replaced.load(Ordering::Relaxed));
+    let seen =
+        |flag: fn(&Attendant) -> &AtomicBool| attendant.as_ref().is_some_and(|it| flag(it).load(Ordering::Relaxed));
+    let (replaced, waited) = (seen(|it| &it.replaced), seen(|it| &it.waited));
     drop(attendant);
     drop(real_time);
     drop(world);
@@ -183,6 +189,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     match end {
         End::Asked if replaced || goes_on => Ok(Ended::Replaced),
         End::Asked => Ok(Ended::Asked),
+        End::Refused(why) if waited => Ok(Ended::Lost(why)),
         End::Refused(why) => Err(format!("refused: {why}")),
         End::Stopped(_, why) => Ok(Ended::Stopped(why)),
     }
@@ -225,24 +232,28 @@ fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), 
 struct Attendant {
     over: Arc<AtomicBool>,
     replaced: Arc<AtomicBool>,
+    /// Whether the rig has been seen to wait for its operator.
+    waited: Arc<AtomicBool>,
     threads: Vec<std::thread::JoinHandle<()>>,
     dir: PathBuf,
 }
 
 impl Attendant {
     fn new(wanted: &Wanted, store: &Store, target: &Path, gauges: Arc<Gauges>, operator: Operator) -> Attendant {
-        let (over, replaced) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+        let [over, replaced, waited] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
         let operator = Arc::new(Mutex::new(operator));
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
-            let (over, replaced, dir, operator) = (over.clone(), replaced.clone(), dir.clone(), operator.clone());
+            let [over, replaced, waited] = [&over, &replaced, &waited].map(Arc::clone);
+            let (dir, operator) = (dir.clone(), operator.clone());
             let installed = wanted.package.is_none().then(|| store.clone());
             let target = target.to_path_buf();
             threads.push(std::thread::spawn(move || {
                 while !over.load(Ordering::Relaxed) {
                     tell(&dir, &target, &gauges);
                     let stage = gauges.stage.load(Ordering::Relaxed);
+                    waited.fetch_or(stage >= ENABLE, Ordering::Relaxed);
                     let idle = stage < ENABLE || stage == TORQUE_OFF;
                     let other =
                         installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
@@ -267,7 +278,7 @@ impl Attendant {
                 }
             }));
         }
-        Attendant { over, replaced, threads, dir }
+        Attendant { over, replaced, waited, threads, dir }
     }
 }
 

@@ -299,7 +299,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     let refused = there.over_ssh("deploy", &["bad.fric", "--start"]);
     let told = said(&refused);
     assert!(!refused.status.success() && told.contains("back to "), "{told}\n{}", there.out());
-    assert_eq!(there.current().as_ref(), Some(&second));
+    assert_eq!(there.current().as_ref(), Some(&second), "{told}\n{}", there.out());
     there.wait("back", |state| state.0 == name(&second) && state.1.contains("enable"));
     there.says("enable");
     there.wait("waiting to be armed", |state| state.1.contains("arm"));
