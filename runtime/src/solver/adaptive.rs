@@ -411,9 +411,13 @@ impl<'a> Adaptive<'a> {
         }
         self.know_jacobian();
         let n = self.system.n;
-        // The mean eigenvalue is cheap to know.
-        let trace: f64 = (0..n).map(|i| self.jacobian[i * n + i]).sum();
-        if self.stiff && self.step.h * trace.abs() > 0.5 * n as f64 {
+        // The means of the eigenvalues and of their squares are cheap to know, and no greater than the largest.
+        let entry = |row: usize, column: usize| self.jacobian[row * n + column];
+        let mean = (0..n).map(|i| entry(i, i)).sum::<f64>() / n as f64;
+        let product = |row: usize| (0..n).map(|column| entry(row, column) * entry(column, row)).sum::<f64>();
+        let square = (0..n).map(product).sum::<f64>() / n as f64;
+        let least = self.step.h * mean.abs().max(square.abs().sqrt());
+        if self.stiff && least > 0.5 {
             self.doubts = 0;
             return;
         }
