@@ -5,7 +5,8 @@ use super::jit::compile;
 use super::wide::{self, Width};
 use crate::ir::build::Build;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Func, Op, Unary, Value};
+use crate::math;
 use abi::lanes::Batch;
 use abi::{Code, Function, Layout, Slot};
 use std::sync::Arc;
@@ -171,6 +172,48 @@ fn lanes_agree_with_instances_alone() {
     }
     println!("{compared} lanes agree, {stopped} of them with a status; {refused} programs refused");
     assert!(widths.is_empty() || compared > 20_000 && stopped > 500);
+}
+
+/// e^x has instructions of its own in the widest lanes: the same bits from the least to the greatest argument.
+#[test]
+fn exponentials_in_lanes_agree_with_instances_alone() {
+    let layout = Layout::new([0, 0, 1, 0, 0, 2, 0, 0, 0, 0]);
+    let slot = layout.states.slot(0);
+    let mut build = Build::new("exponentials").with_pool(math::pool().into());
+    let x = build.load(slot);
+    let e = build.unary(Unary::Exp, x);
+    build.store(layout.outputs.slot(0), e);
+    let square = build.mul(x, x);
+    let less = build.neg(square);
+    let e = build.unary(Unary::Exp, less);
+    build.store(layout.outputs.slot(1), e);
+    let func = build.finish();
+    let alone = Interpreter::new(&[(Function::Step, math::expand(&func))], &layout, math::pool().len());
+    let mut random = Random(11);
+    let edges = REALS.iter().copied().chain((-1500..=1500).map(|half| 0.5 * f64::from(half)));
+    let spread = (0..40_000).map(|_| random.within(-760.0, 760.0));
+    let mut random = Random(12);
+    let any = (0..40_000).map(|_| random.real());
+    let arguments: Vec<f64> = edges.chain(spread).chain(any).collect();
+    for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
+        let lanes = wide::compile(&func, &layout, math::pool().len(), width, 2).expect("this processor can");
+        let mut batch = Batch::new(lanes);
+        for some in arguments.chunks(batch.width()) {
+            let start = |x: f64| {
+                let mut block = vec![0.0; layout.size()];
+                block[slot.index()] = x;
+                block
+            };
+            some.iter().enumerate().for_each(|(lane, x)| batch.load(lane, &start(*x)));
+            assert_eq!(batch.advance(math::pool(), 1), 1);
+            for (lane, x) in some.iter().enumerate() {
+                let (mut expected, mut found) = (start(*x), start(*x));
+                abi::table::Interpret::call(&alone, Function::Step, &mut expected, math::pool(), 1);
+                batch.save(lane, &mut found);
+                assert!(same(&found, &expected), "{width:?}, x = {x:e}: {found:?} instead of {expected:?}");
+            }
+        }
+    }
 }
 
 /// More states than registers can hold travel through the block.

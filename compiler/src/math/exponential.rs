@@ -8,13 +8,13 @@ use super::{polynomial, tables, two_sum};
 use crate::ir::expr::{Int, Real};
 
 /// (e^r − 1 − r)/r² on |r| ≤ ln2/128; error 2^-59.4 of e^r.
-const EXP: [f64; 4] = [0.49999999999948563, 0.16666666666654179, 0.04166672336772232, 0.008333343410773145];
+pub const EXP: [f64; 4] = [0.49999999999948563, 0.16666666666654179, 0.04166672336772232, 0.008333343410773145];
 /// The same with relative error 2^-62.2 of e^r − 1.
 const EXP_LONG: [f64; 5] = [0.5, 0.16666666666659316, 0.04166666666664381, 0.00833334143428054, 0.0013888902912655746];
 /// 64/ln2
-const STEPS: f64 = 92.33248261689366;
+pub const STEPS: f64 = 92.33248261689366;
 /// ln2/64: its first 38 bits, so that k times it taken from x is exact; and the rest.
-const STEP: (f64, f64) = (0.010830424696223417, 2.572804622327669e-14);
+pub const STEP: (f64, f64) = (0.010830424696223417, 2.572804622327669e-14);
 /// Added to a number below 2^51, it rounds it to a whole number, which the low bits then hold.
 pub const ROUND: f64 = 6755399441055744.0;
 

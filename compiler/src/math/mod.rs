@@ -7,7 +7,7 @@
 //! (Estrin), which is shorter in latency than Horner's chain. Coefficients and tables were computed with 60 digits.
 
 pub mod tables;
-mod exponential;
+pub mod exponential;
 mod logarithm;
 mod trigonometric;
 #[cfg(test)]
@@ -31,13 +31,18 @@ const fn two_to(n: i32) -> f64 {
 
 /// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
+    expand_but(func, &[])
+}
+
+/// The same, but for functions that a back end has instructions for: those must give the same bits.
+pub fn expand_but(func: &Func, kept: &[Unary]) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, live) in func.ops.iter().zip(func.live()) {
         let at = |operand: Value| Real::new(&build, values[operand.index()]);
         let value = match *op {
             _ if !live => Value(u32::MAX),
-            Op::Unary(function, x) => unary(function, at(x)).value,
+            Op::Unary(function, x) if !kept.contains(&function) => unary(function, at(x)).value,
             Op::Binary(function, x, y) => binary(function, at(x), at(y)).value,
             op => build.borrow_mut().op(op.map(|operand| values[operand.index()])),
         };

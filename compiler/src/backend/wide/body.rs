@@ -5,7 +5,7 @@
 //! instructions read one operand from there.
 
 use super::encode::{Assembler, Base, Instruction, Place, Width, instructions as i};
-use super::select::{Direction, Node, Nodes, What};
+use super::select::{Direction, Node, Nodes, Signs, What};
 use std::collections::HashMap;
 
 /// Where a node's vectors lie in memory: the `index`-th group of vectors behind `begin` bytes.
@@ -331,7 +331,7 @@ impl<'a> Body<'a> {
                 let to = self.result(node);
                 self.code.vector(instruction, to, 0, last, immediate);
             }
-            What::Fma { negated, a, b, c } => self.fma(node, negated, a, b, c),
+            What::Fma { signs, a, b, c } => self.fma(node, signs, a, b, c),
             What::Shift(direction, a, n) => {
                 let from = self.in_register(a);
                 let to = self.result(node);
@@ -360,6 +360,7 @@ impl<'a> Body<'a> {
                 let to = self.result(node);
                 self.code.vector(i::INT_COMPARE, to, first, last, Some(predicate));
             }
+            What::TestBits(a, b) => self.two(node, i::INT_TEST, true, a, b),
             What::CompareInt(predicate, a, b) => {
                 // a < b is b > a.
                 let first = self.in_register(b);
@@ -403,6 +404,14 @@ impl<'a> Body<'a> {
                     Width::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
                 }
             }
+            What::Permute(table, index) => {
+                let by = self.in_register(index);
+                let to = self.apart(node);
+                let [first, second] = table.rows().map(|row| self.code.row(row));
+                self.code.vector(i::LOAD, to, 0, first, None);
+                self.code.vector(i::PERMUTE_TWO, to, by, second, None);
+                self.release(index);
+            }
             What::Gather { base, index } => {
                 let from = self.in_register(index);
                 let mask = self.take(self.width == Width::Avx512);
@@ -430,7 +439,7 @@ impl<'a> Body<'a> {
     }
 
     /// One of three operands is overwritten, one may lie in memory.
-    fn fma(&mut self, node: Node, negated: bool, a: Node, b: Node, c: Node) {
+    fn fma(&mut self, node: Node, signs: Signs, a: Node, b: Node, c: Node) {
         let all = [a, b, c];
         let places = all.map(|operand| self.place(operand));
         let held = |k: usize| matches!(places[k], Place::Register(_));
@@ -463,9 +472,9 @@ impl<'a> Body<'a> {
         };
         let [Place::Register(_), _] = read else {
             let read = [read[1], read[0]];
-            return self.fused(node, negated, over, [others[1], others[0]], read, to, owned);
+            return self.fused(node, signs, over, [others[1], others[0]], read, to, owned);
         };
-        self.fused(node, negated, over, others, read, to, owned);
+        self.fused(node, signs, over, others, read, to, owned);
     }
 
     /// The first of `read` is a register.
@@ -473,7 +482,7 @@ impl<'a> Body<'a> {
     fn fused(
         &mut self,
         node: Node,
-        negated: bool,
+        signs: Signs,
         over: usize,
         others: [usize; 2],
         read: [Place; 2],
@@ -487,7 +496,7 @@ impl<'a> Body<'a> {
             (_, 2) => i::FMA_132,
             (_, _) => i::FMA_213,
         };
-        let form = if negated { Instruction(form.0, form.1, form.2, form.3 + 4) } else { form };
+        let form = Instruction(form.0, form.1, form.2, form.3 + signs as u8);
         self.code.vector(form, to, second, read[1], None);
         self.what(node).operands().for_each(|operand| self.release(operand));
         let copy = self.copy(node);

@@ -62,6 +62,8 @@ pub enum Place {
     Memory(Base, i32),
     /// A constant in every lane, by its bits.
     Constant(u64),
+    /// A vector of constants, by its number; see [`Assembler::row`].
+    Row(usize),
 }
 
 /// Instruction: mandatory prefix (0: none, 1: 66, 2: F3, 3: F2), map (1: 0F, 2: 0F 38, 3: 0F 3A), W of the EVEX form and
@@ -108,6 +110,12 @@ pub mod instructions {
     pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
     /// EVEX only.
     pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
+    /// v · 2^⌊rm⌋
+    pub const SCALE: Instruction = Instruction(1, 2, [1, 0], 0x2c);
+    /// From the two vectors d and rm, d first, by the low bits of v.
+    pub const PERMUTE_TWO: Instruction = Instruction(1, 2, [1, 0], 0x7f);
+    /// A mask: where v and rm have a bit in common.
+    pub const INT_TEST: Instruction = Instruction(1, 2, [1, 0], 0x27);
     pub const INT_MUL: Instruction = Instruction(1, 2, [1, 0], 0x40);
     pub const INT_MIN_UNSIGNED: Instruction = Instruction(1, 2, [1, 0], 0x3b);
     pub const INT_COMPARE: Instruction = Instruction(1, 3, [1, 0], 0x1f);
@@ -134,11 +142,22 @@ pub struct Assembler {
     constants: Vec<u64>,
     numbers: HashMap<u64, usize>,
     wanted: Vec<(usize, usize, usize)>,
+    /// The same of vectors of constants.
+    rows: Vec<[u64; 8]>,
+    wanted_rows: Vec<(usize, usize, usize)>,
 }
 
 impl Assembler {
     pub fn new(width: Width) -> Assembler {
-        Assembler { width, bytes: Vec::new(), constants: Vec::new(), numbers: HashMap::new(), wanted: Vec::new() }
+        Assembler {
+            width,
+            bytes: Vec::new(),
+            constants: Vec::new(),
+            numbers: HashMap::new(),
+            wanted: Vec::new(),
+            rows: Vec::new(),
+            wanted_rows: Vec::new(),
+        }
     }
 
     /// An instruction without a mask: `reg` and `second` as their operands stand in the manual.
@@ -194,6 +213,7 @@ impl Assembler {
             Place::Register(register) => (bit(register, 4), bit(register, 3), 0),
             Place::Memory(base, _) => (1, bit(base as u8, 3), 0),
             Place::Constant(_) => (1, 1, u8::from(opcode != instructions::BROADCAST.3)),
+            Place::Row(_) => (1, 1, 0),
         };
         let p0 = bit(reg, 3) << 7 | x << 6 | b << 5 | bit(reg, 4) << 4 | map;
         let p1 = w[0] << 7 | (!second & 15) << 3 | 1 << 2 | pp;
@@ -205,7 +225,7 @@ impl Assembler {
         let b = match last {
             Place::Register(register) => !register >> 3 & 1,
             Place::Memory(base, _) => !(base as u8) >> 3 & 1,
-            Place::Constant(_) => 1,
+            Place::Constant(_) | Place::Row(_) => 1,
         };
         let p0 = (!reg >> 3 & 1) << 7 | 1 << 6 | b << 5 | map;
         let p1 = w[1] << 7 | (!second & 15) << 3 | l << 2 | pp;
@@ -221,18 +241,36 @@ impl Assembler {
                 self.bytes.extend(offset.to_le_bytes());
             }
             Place::Constant(bits) => {
-                self.bytes.push(0x05 | reg);
                 let next = self.constants.len();
                 let number = *self.numbers.entry(bits).or_insert(next);
                 if number == next {
                     self.constants.push(bits);
                 }
-                let at = self.bytes.len();
-                self.bytes.extend([0; 4]);
+                let at = self.distance(reg);
                 self.wanted.push((at, at + 4 + usize::from(immediate.is_some()), number));
+            }
+            Place::Row(number) => {
+                let at = self.distance(reg);
+                self.wanted_rows.push((at, at + 4 + usize::from(immediate.is_some()), number));
             }
         }
         self.bytes.extend(immediate);
+    }
+
+    /// An operand behind the code; gives where its distance stands.
+    fn distance(&mut self, reg: u8) -> usize {
+        self.bytes.push(0x05 | reg);
+        self.bytes.extend([0; 4]);
+        self.bytes.len() - 4
+    }
+
+    /// A vector of eight constants behind the code.
+    pub fn row(&mut self, row: [u64; 8]) -> Place {
+        let known = self.rows.iter().position(|known| *known == row);
+        Place::Row(known.unwrap_or_else(|| {
+            self.rows.push(row);
+            self.rows.len() - 1
+        }))
     }
 
     /// Instructions without vectors, as bytes.
@@ -273,6 +311,13 @@ impl Assembler {
                 self.bytes.extend(bits.to_le_bytes());
             }
         }
+        self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
+        let begin = self.bytes.len();
+        for (at, end, number) in std::mem::take(&mut self.wanted_rows) {
+            let distance = i32::try_from(begin + 64 * number - end).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        }
+        self.bytes.extend(self.rows.iter().flatten().flat_map(|bits| bits.to_le_bytes()));
         self.bytes
     }
 }

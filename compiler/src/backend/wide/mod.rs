@@ -1,7 +1,7 @@
 //! The same program for many instances at once, in the widest vectors of x86-64: a straight line with a loop around it,
 //! and the bits of a single instance in every lane.
 //!
-//! In: an expanded step. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
+//! In: a step, expanded or not. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
 //! for itself. What no step changes is computed before the loop; what only the last step leaves behind (outputs) is
 //! computed in the last step. Two areas hold what one step hands to the next, in turn, so that a step at which a lane
 //! fails can be done again in full, with its status.
@@ -20,8 +20,9 @@ mod select;
 
 use super::jit::Executable;
 use super::target::Unsupported;
-use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
+use crate::ir::{Func, Op, Unary};
+use crate::math;
 use abi::lanes::{Lanes, LanesEntry};
 use abi::{Layout, Slot};
 use body::{Body, Home};
@@ -59,7 +60,7 @@ impl Width {
     pub fn vectors(self) -> usize {
         match self {
             Width::Avx2 => 3,
-            Width::Avx512 => 4,
+            Width::Avx512 => 3,
         }
     }
 
@@ -78,7 +79,7 @@ impl Width {
 /// If this processor does not have the width, or the width no instruction for an operation.
 ///
 /// # Panics
-/// If the function is not sound or not expanded: a mistake of the passes before.
+/// If the function is not sound: a mistake of the passes before.
 pub fn compile(
     func: &Func,
     layout: &Layout,
@@ -86,11 +87,18 @@ pub fn compile(
     width: Width,
     vectors: usize,
 ) -> Result<Lanes, Unsupported> {
-    verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+    verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
     if !width.is_here() {
         return Err(Unsupported(format!("this processor lacks {}", width.name())));
     }
-    let (code, scratch) = generate(func, layout, width, vectors)?;
+    let own: &[Unary] = match width {
+        Width::Avx512 => &[Unary::Exp],
+        Width::Avx2 => &[],
+    };
+    // Expanding works on the pool that every model begins with; what needs none may run with any.
+    let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
+    let expanded = elementary.then(|| math::expand_but(func, own));
+    let (code, scratch) = generate(expanded.as_ref().unwrap_or(func), layout, width, vectors)?;
     let executable = Executable::new(&code, 64)?;
     // SAFETY: `address` is the beginning of code with the signature of `LanesEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, LanesEntry>(executable.address()) };

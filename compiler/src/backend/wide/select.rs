@@ -1,12 +1,13 @@
 //! Operations of a function as vector instructions.
 //!
 //! In: an expanded function. Out: nodes that are each one instruction or a fixed few, in the order of the function. A
-//! comparison whose result a selection takes from becomes a minimum or maximum, a negated factor enters the fused
+//! comparison whose result a selection takes from becomes a minimum or maximum, what is negated enters the fused
 //! product, bits and numbers are one.
 
 use super::encode::{Instruction, Width, instructions as i};
 use crate::backend::target::Unsupported;
-use crate::ir::{Func, Op, Type, Value, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, verify};
+use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
 
@@ -20,6 +21,19 @@ impl Node {
     }
 }
 
+/// Signs of a fused product, by what they add to the opcode.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Signs {
+    /// a b + c
+    Plain = 0,
+    /// a b − c
+    Less = 2,
+    /// −a b + c
+    Negated = 4,
+    /// −a b − c
+    NegatedLess = 6,
+}
+
 /// What a node computes. A mask is a mask register, or without those a vector of all ones or zeros a lane.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum What {
@@ -31,9 +45,9 @@ pub enum What {
     Two(Instruction, bool, Node, Node),
     /// An instruction of one operand, with an immediate.
     One(Instruction, Option<u8>, Node),
-    /// ±a · b + c
+    /// ±a · b ± c
     Fma {
-        negated: bool,
+        signs: Signs,
         a: Node,
         b: Node,
         c: Node,
@@ -44,6 +58,8 @@ pub enum What {
     Compare(u8, Node, Node),
     /// Comparison of integers: equal (0) or less (1).
     CompareInt(u8, Node, Node),
+    /// A mask: whether two integers have a bit in common. AVX-512 only.
+    TestBits(Node, Node),
     /// A mask that is the same in every lane.
     Mask(bool),
     MaskAnd(Node, Node),
@@ -58,6 +74,32 @@ pub enum What {
         base: u32,
         index: Node,
     },
+    /// Entries of sixteen, by the low four bits of an integer. AVX-512 only.
+    Permute(Sixteen, Node),
+}
+
+/// A quarter of a table for exponentials: i begins with 16 times the number.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Sixteen {
+    /// 2^(i/64)
+    Power(u8),
+    /// What that is more than its rounded value, relative.
+    Tail(u8),
+}
+
+impl Sixteen {
+    /// Its two vectors, by the bits of their entries.
+    pub fn rows(self) -> [[u64; 8]; 2] {
+        let (Sixteen::Power(quarter) | Sixteen::Tail(quarter)) = self;
+        let entry = |place: usize| {
+            let i = 16 * usize::from(quarter) + place;
+            match self {
+                Sixteen::Power(_) => math::POOL[tables::EXP_SCALE as usize + i].to_bits() + ((i as u64) << 46),
+                Sixteen::Tail(_) => math::POOL[tables::EXP_TAIL as usize + i].to_bits(),
+            }
+        };
+        [0, 8].map(|row| std::array::from_fn(|place| entry(row + place)))
+    }
 }
 
 /// Of a shift.
@@ -73,12 +115,15 @@ impl What {
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
             What::Load(_) | What::Constant(_) | What::Mask(_) => [None; 3],
-            What::One(_, _, a) | What::Shift(_, a, _) | What::MaskNot(a) | What::Gather { index: a, .. } => {
-                [Some(a), None, None]
-            }
+            What::One(_, _, a)
+            | What::Shift(_, a, _)
+            | What::MaskNot(a)
+            | What::Gather { index: a, .. }
+            | What::Permute(_, a) => [Some(a), None, None],
             What::Two(_, _, a, b)
             | What::Compare(_, a, b)
             | What::CompareInt(_, a, b)
+            | What::TestBits(a, b)
             | What::MaskAnd(a, b)
             | What::MaskOr(a, b) => [Some(a), Some(b), None],
             What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) => {
@@ -92,7 +137,12 @@ impl What {
     pub fn is_mask(self, width: Width) -> bool {
         match self {
             What::Compare(..) | What::CompareInt(..) => width == Width::Avx512,
-            What::Mask(_) | What::MaskAnd(..) | What::MaskOr(..) | What::MaskNot(_) | What::MaskSelect(..) => true,
+            What::Mask(_)
+            | What::TestBits(..)
+            | What::MaskAnd(..)
+            | What::MaskOr(..)
+            | What::MaskNot(_)
+            | What::MaskSelect(..) => true,
             What::Load(_)
             | What::Constant(_)
             | What::Two(..)
@@ -100,7 +150,8 @@ impl What {
             | What::Fma { .. }
             | What::Shift(..)
             | What::Select(..)
-            | What::Gather { .. } => false,
+            | What::Gather { .. }
+            | What::Permute(..) => false,
         }
     }
 }
@@ -201,17 +252,27 @@ impl Selection {
             Op::Abs(a) => What::Two(i::AND, true, at(a), self.constant(!SIGN)),
             Op::Sqrt(a) => What::One(i::SQRT, None, at(a)),
             Op::Fma(a, b, c) => {
-                // (−a) b + c is one instruction, of the same rounding.
+                // (−a) b + c, a b − c and (−a) b − c are one instruction each, of the same rounding.
                 let plain = |value: Value| match func.op(value) {
                     Op::Neg(inner) => (true, at(inner)),
                     _ => (false, at(value)),
                 };
-                let ((first, a), (second, b)) = (plain(a), plain(b));
-                What::Fma { negated: first != second, a, b, c: at(c) }
+                let ((first, a), (second, b), (less, c)) = (plain(a), plain(b), plain(c));
+                let signs = match (first != second, less) {
+                    (false, false) => Signs::Plain,
+                    (false, true) => Signs::Less,
+                    (true, false) => Signs::Negated,
+                    (true, true) => Signs::NegatedLess,
+                };
+                What::Fma { signs, a, b, c }
             }
             // Without an exception for what is not exact.
             Op::Floor(a) => What::One(i::ROUND, Some(9), at(a)),
             Op::Nearest(a) => What::One(i::ROUND, Some(8), at(a)),
+            Op::Unary(Unary::Exp, x) => {
+                let falls = matches!(func.op(x), Op::Neg(square) if matches!(func.op(square), Op::Mul(a, b) if a == b));
+                return Ok(self.exp(at(x), falls));
+            }
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Less(a, b) => What::Compare(0x11, at(a), at(b)),
             Op::LessEqual(a, b) => What::Compare(0x12, at(a), at(b)),
@@ -263,6 +324,51 @@ impl Selection {
             Op::ToReal(_) => return Err(self.missing("conversion from integers")),
         };
         Ok(self.add(what))
+    }
+
+    /// e^x by the algorithm of [`exponential::exp`], to the bit, in fewer instructions: the power of two enters last, by one
+    /// that rounds once more where the result is too small for all digits, as the algorithm does, and knows overflow.
+    /// `falls`: x is not above 0. AVX-512 only.
+    fn exp(&mut self, x: Node, falls: bool) -> Node {
+        let number = |own: &mut Self, x: f64| own.constant(x.to_bits());
+        // Beyond these the result is 0 or infinite, and nothing on the way may be. Of NaN the second is taken.
+        let least = number(self, -746.0);
+        let mut x = self.add(What::Two(i::MAX, false, least, x));
+        if !falls {
+            let most = number(self, 746.0);
+            x = self.add(What::Two(i::MIN, false, most, x));
+        }
+        let fused = |own: &mut Self, signs: Signs, a: Node, b: Node, c: Node| own.add(What::Fma { signs, a, b, c });
+        let (steps, round) = (number(self, exponential::STEPS), number(self, exponential::ROUND));
+        let rounded = fused(self, Signs::Plain, x, steps, round);
+        let k = self.add(What::Two(i::SUB, false, rounded, round));
+        let [first, rest] = [exponential::STEP.0, exponential::STEP.1].map(|part| number(self, part));
+        let high = fused(self, Signs::Negated, k, first, x);
+        let r = fused(self, Signs::Negated, k, rest, high);
+        let scale = self.sixty_four(Sixteen::Power, rounded);
+        let tail = self.sixty_four(Sixteen::Tail, rounded);
+        let [c0, c1, c2, c3] = exponential::EXP.map(|c| number(self, c));
+        let (low, top) = (fused(self, Signs::Plain, r, c1, c0), fused(self, Signs::Plain, r, c3, c2));
+        let square = self.add(What::Two(i::MUL, true, r, r));
+        let q = fused(self, Signs::Plain, square, top, low);
+        let sum = self.add(What::Two(i::ADD, true, r, tail));
+        let p = fused(self, Signs::Plain, square, q, sum);
+        let mantissa = fused(self, Signs::Plain, scale, p, scale);
+        let part = number(self, 1.0 / f64::from(tables::EXP_LEN));
+        let exponent = self.add(What::Two(i::MUL, true, k, part));
+        self.add(What::Two(i::SCALE, false, mantissa, exponent))
+    }
+
+    /// Entries of a table of 64 by the low six bits of an integer.
+    fn sixty_four(&mut self, quarter: fn(u8) -> Sixteen, index: Node) -> Node {
+        let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| self.add(What::Permute(quarter(number), index)));
+        let [sixteen, thirty_two] = [16, 32].map(|bit| {
+            let bit = self.constant(bit);
+            self.add(What::TestBits(index, bit))
+        });
+        a = self.add(What::Select(sixteen, b, a));
+        c = self.add(What::Select(sixteen, d, c));
+        self.add(What::Select(thirty_two, c, a))
     }
 
     /// An index that lies inside a table: as it is, or the last where it is beyond.
