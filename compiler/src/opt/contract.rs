@@ -1,0 +1,130 @@
+//! Fuses products into the sums they are for: a · b + c with one rounding, in one instruction.
+//!
+//! In: a step, regrouped, before elementary functions are expanded. Out: the same with fewer operations and a shorter
+//! chain. This rounds differently (once instead of twice), so it is part of what a step *is*: it stands before every
+//! back end. Left alone is
+//!
+//! - a product that something else uses too: it would be computed twice, and what is compared with it would differ from
+//!   what it enters;
+//! - a sum or difference of two products: forces k·a and −k·a cancel, and fused they would leave what k·a was rounded by.
+//!
+//! Both rules look at one sum alone, so mirror images of a contact are fused alike.
+
+use crate::ir::build::Build;
+use crate::ir::{Func, Op, Value};
+
+/// Fuses what may be.
+pub fn contract(func: &Func) -> Func {
+    let uses = uses(func);
+    let mut build = Build::new(&func.name);
+    let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let at = |value: Value| values[value.index()];
+        // The factors of a product that only this operation uses.
+        let product = |value: Value| match func.op(value) {
+            Op::Mul(a, b) if uses[value.index()] == 1 => Some((at(a), at(b))),
+            _ => None,
+        };
+        let cancels = |other: Value| matches!(func.op(other), Op::Mul(..));
+        let fused = match *op {
+            Op::Add(x, y) => match (product(x), product(y)) {
+                (Some((a, b)), _) if !cancels(y) => Some(build.fma(a, b, at(y))),
+                (_, Some((a, b))) if !cancels(x) => Some(build.fma(a, b, at(x))),
+                _ => None,
+            },
+            Op::Sub(x, y) => match (product(x), product(y)) {
+                (Some((a, b)), _) if !cancels(y) => {
+                    let less = build.neg(at(y));
+                    Some(build.fma(a, b, less))
+                }
+                (_, Some((a, b))) if !cancels(x) => {
+                    let less = build.neg(a);
+                    Some(build.fma(less, b, at(x)))
+                }
+                _ => None,
+            },
+            _ => None,
+        };
+        let op = op.map(at);
+        values.push(fused.unwrap_or_else(|| build.op(op)));
+    }
+    for (slot, value) in &func.stores {
+        build.store(*slot, values[value.index()]);
+    }
+    for write in &func.writes {
+        build.write(write.map(|value| values[value.index()]));
+    }
+    if let Some(status) = func.status {
+        build.status(values[status.index()]);
+    }
+    build.finish()
+}
+
+/// How often each value is used, as an operand or a result.
+fn uses(func: &Func) -> Vec<u32> {
+    let mut uses = vec![0; func.ops.len()];
+    for op in &func.ops {
+        op.each_operand(|operand| uses[operand.index()] += 1);
+    }
+    for value in func.results() {
+        uses[value.index()] += 1;
+    }
+    uses
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use abi::Layout;
+
+    /// The operations of a function of four states whose first it changes to `f` of them.
+    fn contracted(f: impl Fn(&mut Build, [Value; 4]) -> Value) -> String {
+        let layout = Layout::new([0, 0, 4, 0, 0, 0, 0, 0, 0, 0]);
+        let mut build = Build::new("step");
+        let x: [Value; 4] = std::array::from_fn(|k| build.load(layout.states.slot(k)));
+        let y = f(&mut build, x);
+        build.store(layout.states.slot(0), y);
+        contract(&build.finish()).to_string()
+    }
+
+    fn count(listing: &str, operation: &str) -> usize {
+        listing.lines().filter(|line| line.contains(&format!(" {operation} "))).count()
+    }
+
+    #[test]
+    fn a_product_enters_its_sum_in_one_operation() {
+        let sum = contracted(|b, [x, y, z, _]| {
+            let product = b.mul(x, y);
+            b.add(z, product)
+        });
+        assert_eq!((count(&sum, "fma"), count(&sum, "mul"), count(&sum, "add")), (1, 0, 0), "{sum}");
+        let less = contracted(|b, [x, y, z, _]| {
+            let product = b.mul(x, y);
+            b.sub(z, product)
+        });
+        assert_eq!((count(&less, "fma"), count(&less, "mul"), count(&less, "sub")), (1, 0, 0), "{less}");
+    }
+
+    #[test]
+    fn what_cancels_still_does() {
+        for of_two in [Build::add, Build::sub] {
+            let forces = contracted(|b, [x, y, z, w]| {
+                let (one, other) = (b.mul(x, y), b.mul(z, w));
+                // One of them is wanted for itself, too.
+                let total = of_two(b, one, other);
+                let ratio = b.div(one, total);
+                b.add(ratio, total)
+            });
+            assert_eq!(count(&forces, "fma"), 0, "{forces}");
+        }
+        // A force that is both compared and applied.
+        let shared = contracted(|b, [x, y, z, w]| {
+            let force = b.mul(x, y);
+            let sticks = b.less(force, z);
+            let rest = b.sub(force, w);
+            let zero = b.real(0.0);
+            b.select(sticks, zero, rest)
+        });
+        assert_eq!(count(&shared, "fma"), 0, "{shared}");
+    }
+}
