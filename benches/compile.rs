@@ -13,9 +13,11 @@ mod compile {
 }
 
 use abi::plan::Method;
+use abi::{Function, Instance};
 use clock::processor_time;
-use compiler::{Changes, Options, Sources, check, load};
+use compiler::{Changes, NoSources, Options, Sources, check, load};
 use std::hint::black_box;
+use std::sync::Arc;
 
 const ROUNDS: usize = 60;
 
@@ -37,6 +39,7 @@ fn main() {
     library();
     lines();
     parts();
+    elements();
 }
 
 /// Milliseconds of each stage, in the order in which they ran.
@@ -73,52 +76,86 @@ fn stages() {
     println!("  {:<12} {sum:8.3} ms", "together");
 }
 
+/// The whole library as one text, by what is done with it.
 fn library() {
     let modules = project::Disk.modules();
     let texts: Vec<(String, String)> =
         modules.iter().filter_map(|module| project::Disk.library(module)).flatten().collect();
-    let mut times: Vec<f64> = (0..5)
-        .map(|_| {
-            let begin = processor_time();
-            for (name, text) in &texts {
-                let mut loaded = load(name, text, &project::Disk);
-                black_box(check(&mut loaded, &project::Disk));
+    let without_imports = |text: &str| -> String {
+        text.lines().filter(|line| !line.starts_with("import ")).map(|line| format!("{line}\n")).collect()
+    };
+    let whole: String = texts.iter().map(|(_, text)| without_imports(text)).collect();
+    let read = || load("library.fric", &whole, &NoSources);
+    let names: Vec<String> = read().models().iter().map(|model| model.name.text.clone()).collect();
+    println!("the library: {} texts of {} lines, {} models", texts.len(), whole.lines().count(), names.len());
+    let timed = |what: &str, rounds: usize, work: &dyn Fn()| {
+        let mut times: Vec<f64> = (0..rounds)
+            .map(|_| {
+                let begin = processor_time();
+                work();
+                1e3 * (processor_time() - begin)
+            })
+            .collect();
+        println!("  {what:<62} {:6.1} ms", median(&mut times));
+    };
+    let checked = |loaded: &compiler::Loaded| {
+        let found = compiler::check_models(loaded, &NoSources);
+        assert!(found.iter().all(|found| !found.is_error()), "{found:?}");
+    };
+    let built = |mut loaded: compiler::Loaded, work: &dyn Fn(&compiler::program::Program)| {
+        for model in &names {
+            let (changes, mut warnings) = (Changes::default(), Vec::new());
+            // A model with an open slot cannot be run on its own.
+            if let Ok(mut built) = compiler::build(&mut loaded, &NoSources, model, &changes, &mut warnings) {
+                built.program.size_rings(1e-3);
+                work(&built.program);
             }
-            1e3 * (processor_time() - begin)
-        })
-        .collect();
-    println!(
-        "checking each of the library's {} texts on its own, imports read anew: {:.0} ms",
-        texts.len(),
-        median(&mut times)
-    );
-    let mut models = 0;
-    let mut times: Vec<f64> = (0..5)
-        .map(|_| {
-            models = 0;
-            let begin = processor_time();
-            for (name, text) in &texts {
-                let mut loaded = load(name, text, &project::Disk);
-                let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
-                for model in names {
-                    let (changes, mut warnings) = (Changes::default(), Vec::new());
-                    let Ok(mut built) = compiler::build(&mut loaded, &project::Disk, &model, &changes, &mut warnings)
-                    else {
-                        continue;
-                    };
-                    built.program.size_rings(1e-3);
-                    let functions = compiler::functions(&built.program, Method::Expo);
-                    black_box(compiler::code(&functions, &built.program.description, false));
-                    models += 1;
-                }
-            }
-            1e3 * (processor_time() - begin)
-        })
-        .collect();
-    println!(
-        "compiling each of their {models} models on its own for `expo`, to machine code: {:.0} ms",
-        median(&mut times)
-    );
+        }
+    };
+    timed("read", 15, &|| {
+        black_box(read());
+    });
+    timed("read and checked, from the text to values", 15, &|| checked(&read()));
+    let first_step = |program: &compiler::program::Program| {
+        let (code, _) = compiler::code::late(program, Method::Expo, false);
+        let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+        instance.start(1e-3);
+        instance.advance(1);
+    };
+    timed("read, checked and compiled, to the first step by `expo`", 15, &|| {
+        let loaded = read();
+        checked(&loaded);
+        built(loaded, &first_step);
+    });
+    timed("the same, to machine code of that step", 5, &|| {
+        let loaded = read();
+        checked(&loaded);
+        built(loaded, &|program| {
+            let mut functions = compiler::functions(program, Method::Expo);
+            functions.retain(|(function, _)| *function == Function::Step);
+            black_box(compiler::code(&functions, &program.description, false));
+        });
+    });
+    timed("the same, to machine code of all functions", 5, &|| {
+        let loaded = read();
+        checked(&loaded);
+        built(loaded, &|program| {
+            let functions = compiler::functions(program, Method::Expo);
+            black_box(compiler::code(&functions, &program.description, false));
+        });
+    });
+    timed("checked text by text, each with what it imports read anew", 5, &|| {
+        for (name, text) in &texts {
+            let loaded = load(name, text, &project::Disk);
+            black_box(compiler::check_models(&loaded, &project::Disk));
+        }
+    });
+    timed("the same with experiments and the physics of friction", 5, &|| {
+        for (name, text) in &texts {
+            let mut loaded = load(name, text, &project::Disk);
+            black_box(check(&mut loaded, &project::Disk));
+        }
+    });
 }
 
 /// A text of 1,000 equations, from its first character to its last warning.
@@ -167,6 +204,38 @@ fn parts() {
             compiled.push(1e3 * (processor_time() - begin));
         }
         println!("  {n:>6}  {:9.2} ms  {:9.2} ms", median(&mut checked), median(&mut compiled));
+    }
+}
+
+/// A model of so many LuGre elements side by side: its machine code and its steps, each by the element.
+fn elements() {
+    println!("so many LuGre elements in one model: machine code of an `expo` step, a step of it");
+    for n in [1, 10, 100, 1_000] {
+        let text = format!(
+            "import std.friction\nmodel Surface {{\n  input  v [m/s] = 10 um/s\n  part   el[i in 1 .. {n}] = LuGre(v = v)\n\
+             \x20 output F [N] = sum(el.F)\n}}\n"
+        );
+        let mut loaded = load("surface.fric", &text, &project::Disk);
+        let (changes, mut warnings) = (Changes::default(), Vec::new());
+        let built = compiler::build(&mut loaded, &project::Disk, "Surface", &changes, &mut warnings);
+        let program = built.map_err(|found| format!("{found:?}")).expect("it compiles").program;
+        let mut functions = compiler::functions(&program, Method::Expo);
+        let step: Vec<_> = functions.extract_if(.., |(function, _)| *function == Function::Step).collect();
+        let (mut compiled, mut stepped) = (Vec::new(), Vec::new());
+        let rounds = if n < 1000 { 15 } else { 3 };
+        for _ in 0..rounds {
+            let begin = processor_time();
+            let (code, notes) = compiler::code(&step, &program.description, false);
+            compiled.push(1e6 * (processor_time() - begin) / f64::from(n));
+            assert!(notes.is_empty(), "{notes:?}");
+            let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+            instance.set(abi::Slot::STEP, 1e-3);
+            let steps = 200_000 / u64::from(n as u32);
+            let begin = processor_time();
+            assert_eq!(instance.advance(steps), 0);
+            stepped.push(1e9 * (processor_time() - begin) / (steps as f64 * f64::from(n)));
+        }
+        println!("  {n:>6}  {:9.1} us  {:9.2} ns an element", median(&mut compiled), median(&mut stepped));
     }
 }
 

@@ -49,3 +49,17 @@ void rk4(double *state, const Params *params, double h, uint64_t count) {
     }
     for (int i = 0; i < 5; i++) state[i] = x[i];
 }
+
+/* The contact alone, its speed prescribed: a sine of 10 mm/s and 1 Hz. States: bristle deflection, number of steps. */
+void contact(double *state, const Params *params, double h, uint64_t count) {
+    Params p = *params;
+    double z = state[0], first = state[1];
+    for (uint64_t n = 0; n < count; n++) {
+        double v = 0.01 * sin(6.283185307179586 * ((first + (double)n) * h));
+        double ratio = v / p.vs;
+        double g = p.Fc + (p.Fs - p.Fc) * exp(-(ratio * ratio));
+        z += h * (v - p.sigma0 * fabs(v) / g * z);
+    }
+    state[0] = z;
+    state[1] = first + (double)count;
+}

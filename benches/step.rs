@@ -14,6 +14,7 @@ use compiler::ir::Unary;
 use compiler::ir::build::Build;
 use compiler::ir::expr::{Real, Shared};
 use compiler::math::{POOL, expand};
+use compiler::opt::contract::contract;
 use compiler::opt::regroup::regroup;
 use compiler::program::Program;
 use std::path::Path;
@@ -81,7 +82,7 @@ fn main() {
         };
         let [as_written, plain, watched] = [(false, false), (true, false), (true, true)].map(|(regrouped, watched)| {
             let func = step(&servo(watched), method);
-            let func = if regrouped { regroup(&func) } else { func };
+            let func = if regrouped { contract(&regroup(&func)) } else { func };
             let funcs = [(Function::Step, expand(&func))];
             let begun = Instant::now();
             let (machine, stats) = compile(&funcs, &layout, POOL.len()).expect("this processor can");
@@ -119,6 +120,45 @@ fn main() {
         println!("  {name}: position at the end {x:.12} m, of gcc {:.12} m", state[0]);
         lanes(method, name, *hand);
     }
+    // SAFETY: as above.
+    contact(*unsafe { library.get::<Hand>(b"contact") }.expect("the function is in the source"));
+}
+
+/// The contact alone under a speed that is a function of time: only its state waits for itself.
+fn contact(hand: Hand) {
+    const TEXT: &str = "model Contact {
+  param sigma0 = 1e5 N/m  param Fc = 1 N  param Fs = 1.5 N  param vs = 1 mm/s
+  let   v = 10 mm/s * sin(6.283185307179586 1/s * t)
+  let   g = Fc + (Fs - Fc) * exp(-(v / vs)^2)
+  state z [um] = 0
+  dz/dt = v - sigma0 * abs(v) / g * z
+}";
+    let mut loaded = compiler::load("contact.fric", TEXT, &compiler::NoSources);
+    let changes = compiler::Changes::default();
+    let built = compiler::build(&mut loaded, &compiler::NoSources, "Contact", &changes, &mut Vec::new());
+    let program = built.map_err(|found| format!("{found:?}")).expect("it compiles").program;
+    let (code, notes) = compiler::code(&compiler::functions(&program, Method::Euler), &program.description, false);
+    assert!(notes.is_empty(), "{notes:?}");
+    let mut instance = abi::Instance::new(Arc::new(program.description.clone()), code, &program.params);
+    instance.start(H);
+    let mut state = [0.0; 2];
+    let (count, mut times) = (40_000, [const { Vec::new() }; 2]);
+    for _ in 0..301 {
+        let begun = Instant::now();
+        // SAFETY: two states and the servo's parameters, as the source declares.
+        unsafe { hand(state.as_mut_ptr(), PARAMS.as_ptr(), H, count) };
+        times[0].push(begun.elapsed().as_secs_f64() * 1e9 / count as f64);
+        let begun = Instant::now();
+        assert_eq!(instance.advance(count), 0);
+        times[1].push(begun.elapsed().as_secs_f64() * 1e9 / count as f64);
+    }
+    let [gcc, ours] = times.map(median);
+    println!(
+        "contact alone under a sine, euler: gcc {gcc:.1} ns a step; machine code {ours:.1} ns, ratio {:.3}",
+        ours / gcc
+    );
+    let z = instance.get(program.description.layout.states.slot(0));
+    println!("  deflection at the end {z:.12e} m, of gcc {:.12e} m", state[0]);
 }
 
 /// Many instances, each with its own parameters, on one core: the code for lanes against C that runs one after the other.
@@ -126,7 +166,7 @@ fn lanes(method: Method, name: &str, hand: Hand) {
     println!("{name}, many instances with their own parameters, on one core:");
     let program = servo(true);
     let layout = &program.description.layout;
-    let func = expand(&regroup(&step(&program, method)));
+    let func = contract(&regroup(&step(&program, method)));
     let mut codes = Vec::new();
     for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
         for vectors in [1, 2, 3, 4, 5, 6, 8] {
@@ -179,7 +219,7 @@ fn lanes(method: Method, name: &str, hand: Hand) {
 }
 
 fn build_c() -> libloading::Library {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../benches/servo.c");
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/servo.c");
     let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("servo.so");
     let built = Command::new("gcc")
         .args(["-O3", "-march=native", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic", "-o"])

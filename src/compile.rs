@@ -127,7 +127,10 @@ pub fn step_code(built: &Built, method: Method) -> StepCode {
     let bytes = jit::compile(&functions, layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
     let lanes = match Width::here() {
         None => Err("this processor has neither AVX2 nor AVX-512".to_string()),
-        Some(width) => wide::compile(func, layout, pool, width, width.vectors()).map_err(|why| why.to_string()),
+        Some(width) => {
+            let step = compiler::code::step(&built.program, method);
+            wide::compile(&step, layout, pool, width, width.vectors()).map_err(|why| why.to_string())
+        }
     };
     StepCode { operations: func.ops.len(), bytes, critical_path: regroup::critical_path(func), lanes }
 }

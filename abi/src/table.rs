@@ -61,7 +61,7 @@ impl Function {
 /// status, which it returns (0: none). `pool` is the description's pool of constants.
 pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
 
-/// Code that is interpreted, or written by hand in tests.
+/// Code that is interpreted, made late, or written by hand in tests.
 pub trait Interpret: Send + Sync {
     /// As [`Entry`], on a block of the description's size.
     fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64;
@@ -101,6 +101,16 @@ impl Machine {
     ) -> Machine {
         Machine { entries, size, pool_len, _memory: memory }
     }
+
+    /// As [`Code::call`].
+    pub fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+        assert!(block.len() >= self.size, "block of {} slots, {} needed", block.len(), self.size);
+        assert!(pool.len() >= self.pool_len, "pool of {} numbers, {} needed", pool.len(), self.pool_len);
+        let entry =
+            self.entries[function as usize].unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
+        // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
+        unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), count) }
+    }
 }
 
 impl Code {
@@ -118,14 +128,7 @@ impl Code {
     /// If the function is not there, or block or pool are shorter than the code needs: mistakes of the caller.
     pub fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
         match self {
-            Code::Machine(machine) => {
-                assert!(block.len() >= machine.size, "block of {} slots, {} needed", block.len(), machine.size);
-                assert!(pool.len() >= machine.pool_len, "pool of {} numbers, {} needed", pool.len(), machine.pool_len);
-                let entry = machine.entries[function as usize]
-                    .unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
-                // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
-                unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), count) }
-            }
+            Code::Machine(machine) => machine.call(function, block, pool, count),
             Code::Interpreted(code) => code.call(function, block, pool, count),
         }
     }

@@ -13,6 +13,7 @@ pub mod elimination;
 pub mod discretize;
 pub mod rosenbrock;
 pub mod backend;
+pub mod code;
 
 pub mod names;
 pub mod source;
@@ -38,6 +39,7 @@ pub mod rig;
 pub mod experiment;
 pub mod vary;
 
+pub use code::{code, functions};
 pub use experiment::Changes;
 pub use resolve::{ExperimentInfo, Loaded, load};
 pub use source::{Files, NoSources, SourceFile, Sources};
@@ -264,91 +266,47 @@ fn lowered_rig(
 
 /// Code of the last case, and what it was made from.
 struct Made {
-    functions: Vec<(Function, ir::Func)>,
-    layout: abi::description::Layout,
-    pool: Arc<[f64]>,
+    program: program::Program,
+    method: Method,
     code: Code,
     notes: Vec<String>,
 }
 
 impl Made {
-    /// Whether the code of a program with these functions is the same. Numbers are compared by their bits.
-    fn fits(&self, functions: &[(Function, ir::Func)], description: &abi::Description) -> bool {
-        let bits = |pool: &[f64]| pool.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
-        self.layout == description.layout
-            && bits(&self.pool) == bits(&description.pool)
-            && self.functions.len() == functions.len()
-            && self.functions.iter().zip(functions).all(|(a, b)| a == b)
+    /// Whether the code of a program is the same: it differs in the values of parameters at most.
+    fn fits(&self, program: &program::Program, method: Method) -> bool {
+        let program::Program { description, params: _, start, outputs, derivatives, tick, transitions, roots } =
+            program;
+        let made = &self.program;
+        self.method == method
+            && (&made.description, &made.start, &made.outputs) == (description, start, outputs)
+            && (&made.derivatives, &made.tick) == (derivatives, tick)
+            && (&made.transitions, &made.roots) == (transitions, roots)
     }
 }
 
 /// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
-    let program = &variant.program;
-    let method = variant.rig.as_ref().map_or(variant.experiment.solver.method, |(rig, _)| rig.method);
-    let functions = functions(program, method);
+    let experiment::Variant { label, program, mut experiment, rig, .. } = variant;
+    let method = rig.as_ref().map_or(experiment.solver.method, |(rig, _)| rig.method);
+    let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
     let (code, notes) = match made {
-        Some(made) if made.fits(&functions, &program.description) => (made.code.clone(), made.notes.clone()),
+        Some(made) if made.fits(&program, method) => (made.code.clone(), made.notes.clone()),
         _ => {
-            let (code, notes) = code(&functions, &program.description, interpret);
-            let (layout, pool) = (program.description.layout.clone(), program.description.pool.clone());
-            *made = Some(Made { functions, layout, pool, code: code.clone(), notes: notes.clone() });
+            let (code, notes) = code::late(&program, method, interpret);
+            *made = Some(Made { program, method, code: code.clone(), notes: notes.clone() });
             (code, notes)
         }
     };
-    let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    let mut experiment = variant.experiment;
-    experiment.bench =
-        variant.rig.map(|(rig, plant)| Box::new(bench(rig, &plant, experiment.solver.method, interpret)));
-    Case { label: variant.label, instance, experiment, notes }
+    let instance = Instance::new(description, code, &params);
+    experiment.bench = rig.map(|(rig, plant)| Box::new(bench(rig, &plant, experiment.solver.method, interpret)));
+    Case { label, instance, experiment, notes }
 }
 
 /// The surroundings of a dry run.
 fn bench(rig: abi::rig::Rig, plant: &program::Program, method: Method, interpret: bool) -> abi::rig::Bench {
-    let (code, _) = code(&self::functions(plant, method), &plant.description, interpret);
+    let (code, _) = code::late(plant, method, interpret);
     abi::rig::Bench { rig, plant: Instance::new(Arc::new(plant.description.clone()), code, &plant.params) }
-}
-
-/// The functions that a method needs, expanded to arithmetic.
-pub fn functions(program: &program::Program, method: Method) -> Vec<(Function, ir::Func)> {
-    let mut out = vec![(Function::Start, program.start.clone()), (Function::Outputs, program.outputs.clone())];
-    if let Some(transitions) = &program.transitions {
-        out.push((Function::Transitions, transitions.clone()));
-    }
-    match method {
-        Method::Adaptive => {
-            out.push((Function::Derivatives, program.derivatives.clone()));
-            if program.description.layout.jacobian.len > 0 {
-                out.push((Function::Jacobian, derive::jacobian(program)));
-            }
-            out.extend(rosenbrock::rosenbrock(program).map(|step| (Function::Rosenbrock, step)));
-            out.extend(program.tick.clone().map(|tick| (Function::Tick, tick)));
-            out.extend(program.roots.clone().map(|roots| (Function::Roots, roots)));
-        }
-        method => out.push((Function::Step, opt::regroup::regroup(&discretize::step(program, method)))),
-    }
-    let expanded = |(function, func): (Function, ir::Func)| match function {
-        Function::Rosenbrock => (function, rosenbrock::pooled(&math::expand(&func))),
-        _ => (function, math::expand(&func)),
-    };
-    out.into_iter().map(expanded).collect()
-}
-
-/// Machine code of functions, or the interpreter where there can be none, which is noted.
-pub fn code(
-    functions: &[(Function, ir::Func)],
-    description: &abi::Description,
-    interpret: bool,
-) -> (Code, Vec<String>) {
-    let (layout, pool) = (&description.layout, description.pool.len());
-    let interpreted = || Code::Interpreted(Arc::new(backend::interp::Interpreter::new(functions, layout, pool)));
-    if interpret {
-        return (interpreted(), Vec::new());
-    }
-    match backend::jit::compile(functions, layout, pool) {
-        Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
-        Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
-    }
 }
 
 /// Whether a friction model dissipates, with the parameters that the arguments of an instance give it. None for what

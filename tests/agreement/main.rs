@@ -1,6 +1,5 @@
 //! The reference interpreter, machine code in memory, images for x86-64 and 64-bit Arm, and C give the same bits, on the
-//! models of the library and on programs made of chance. All NaN are one value. (Lanes are held to the same in the compiler's
-//! own tests.)
+//! models of the library and on programs made of chance; so do lanes, where there is no delay. All NaN are one value.
 //!
 //! A plain run tries 2,000 programs of chance. `FRIC_PROGRAMS=1000000 cargo test --release --test agreement chance` goes on
 //! where an earlier run of the same command was interrupted: see docs/machine-code.md.
@@ -13,10 +12,12 @@ mod support;
 
 use abi::description::Layout;
 use abi::image::Target;
+use abi::lanes::Batch;
 use abi::plan::Method;
-use abi::table::Code;
+use abi::table::{Code, Interpret};
 use abi::{Description, Function};
 use compiler::backend::interp::Interpreter;
+use compiler::backend::wide::{self, Width};
 use compiler::backend::{blob, c, jit};
 use compiler::ir::random::{self, POOL_LEN, Random};
 use compiler::ir::{Func, Op};
@@ -36,6 +37,8 @@ struct Case {
     params: Vec<f64>,
     starts: Vec<Vec<f64>>,
     calls: Vec<(Function, u64)>,
+    /// The step as lanes take it: elementary functions not expanded.
+    step: Func,
 }
 
 /// The last status and the block after the calls.
@@ -56,6 +59,30 @@ impl Case {
             (status, block)
         };
         self.starts.iter().map(one).collect()
+    }
+
+    /// What each start leads to in the last lane of a batch of the same; none if there are no lanes.
+    fn in_lanes(&self, width: Width, vectors: usize) -> Option<Results> {
+        let pool = &self.description.pool;
+        let lanes = wide::compile(&self.step, self.layout(), pool.len(), width, vectors).ok()?;
+        let alone = Interpreter::new(&self.functions, self.layout(), pool.len());
+        let one = |start: &Vec<f64>| {
+            let mut block = start.clone();
+            let (mut status, mut batch) = (0, Batch::new(lanes.clone()));
+            for (function, count) in &self.calls {
+                if *function != Function::Step {
+                    status = alone.call(*function, &mut block, pool, *count);
+                    continue;
+                }
+                let last = batch.width() - 1;
+                (0..=last).for_each(|lane| batch.load(lane, &block));
+                batch.advance(pool, *count);
+                batch.save(last, &mut block);
+                status = batch.status(last);
+            }
+            (status, block)
+        };
+        Some(self.starts.iter().map(one).collect())
     }
 
     fn layout(&self) -> &Layout {
@@ -90,6 +117,21 @@ fn compare(cases: &[Case], level: &str) -> Vec<Results> {
         let model = unsafe { runtime::blob::load(&case.image(here)) };
         case.on(&model.unwrap_or_else(|why| panic!("{}: {why}", case.name)).code)
     };
+    for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
+        for (case, expected) in cases.iter().zip(&expected) {
+            let Some(results) = case.in_lanes(width, width.vectors()) else { continue };
+            for (expected, found) in expected.iter().zip(&results) {
+                let calls = &case.calls;
+                assert!(
+                    same(expected, found),
+                    "{}: a lane of {} differs\n{}\ncalls {calls:?}\nfound    {found:?}\nexpected {expected:?}",
+                    case.name,
+                    width.name(),
+                    case.step
+                );
+            }
+        }
+    }
     let found: [(&str, Vec<Results>); 4] = [
         ("machine code in memory", cases.iter().map(jit).collect()),
         ("an image for this processor", cases.iter().map(image).collect()),
@@ -212,6 +254,7 @@ fn of_chance(seed: u64) -> Case {
         Description { name: format!("Chance{seed}"), layout, pool: pool.into(), ..Description::default() };
     Case {
         name: format!("program of chance, seed {seed}"),
+        step: func.clone(),
         functions: vec![(Function::Step, func)],
         description,
         params,
@@ -251,6 +294,7 @@ fn of_experiment(name: &str, text: &str, experiment: &str, method: Method, steps
             params: program.params.clone(),
             starts: vec![start],
             calls,
+            step: compiler::code::step(&program, method),
             functions,
         }
     };

@@ -32,7 +32,7 @@ const TORQUE: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 /// asked for.
 pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
     let description = Arc::new(program.description.clone());
-    let functions = crate::functions(program, Method::Adaptive);
+    let functions = crate::code::functions(program, Method::Adaptive);
     let interpreter = Interpreter::new(&functions, &description.layout, description.pool.len());
     let mut instance = Instance::new(description.clone(), Code::Interpreted(Arc::new(interpreter)), &program.params);
     instance.start(0.0);
