@@ -222,7 +222,7 @@ fn elements() {
         let mut functions = compiler::functions(&program, Method::Expo);
         let step: Vec<_> = functions.extract_if(.., |(function, _)| *function == Function::Step).collect();
         let (mut compiled, mut stepped) = (Vec::new(), Vec::new());
-        let rounds = if n < 1000 { 15 } else { 3 };
+        let rounds = if n < 1000 { 9 } else { 1 };
         for _ in 0..rounds {
             let begin = processor_time();
             let (code, notes) = compiler::code(&step, &program.description, false);
