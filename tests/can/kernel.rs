@@ -260,7 +260,7 @@ fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
     let over = Arc::new(AtomicBool::new(false));
     let drives = {
         let (rig, far, over) = (asked.rig.clone(), far.clone(), over.clone());
-        std::thread::spawn(move || rig::drives(&rig, &far, &over))
+        std::thread::spawn(move || rig::drives(&rig, &far, None, &over))
     };
     let mut options = HilOptions { arms_itself: true, duration_ns: Some(60_000_000_000), ..HilOptions::default() };
     // A busy host may be late by itself.

@@ -562,7 +562,9 @@ impl Hil {
     /// Computes, once the drives have told their limits.
     fn compute(&mut self, ticks: u32) -> Order {
         let step = self.fieldbus.step();
-        if self.control.is_none() && step >= Step::AwaitEnable && step < Step::Stopped {
+        // This takes many periods, since memory is mapped and locked. So it is done before a drive waits for SYNC or for our
+        // life sign: the ticks that pass meanwhile are nobody's.
+        if self.control.is_none() && step >= Step::Configure && step < Step::Stopped {
             self.begin_control();
         }
         let Some(control) = &mut self.control else { return Order::Wait };
