@@ -13,6 +13,7 @@ use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
+use runtime::drive::profiles::Life;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::identify::{self, Identification};
@@ -368,7 +369,31 @@ fn run(
         let _ = view.join();
     }
     drop(real_time);
+    if hil.is_checked() {
+        checked(&rig, &hil, terminal);
+    }
     finish(args, hil, end, log_path, terminal)
+}
+
+/// What `--check` found of each drive, and that nothing was wrong.
+fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
+    for (at, node) in rig.nodes.iter().enumerate() {
+        let Some(status) = hil.fieldbus().status(at) else { continue };
+        let [vendor, product, ..] = status.identity.map(|word| word.map_or("-".into(), |word| format!("0x{word:08X}")));
+        let mut line = format!("  {}: vendor {vendor}, product {product}, mode {}", node.name, status.mode);
+        if let Some((ms, life)) = status.timeout {
+            let by = match life {
+                Life::Heartbeat => "our heartbeat",
+                Life::Guarding => "guarding",
+            };
+            line += &format!("; misses {by} after {ms} ms");
+            if let Some(ns) = status.timeout_measured_ns {
+                line += &format!(", stopped after {} ms", value::significant(ns as f64 * 1e-6, 3));
+            }
+        }
+        terminal.line(&line);
+    }
+    terminal.line("  checks passed: nothing was armed");
 }
 
 /// What the host refused, and the remedy.

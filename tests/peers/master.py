@@ -1,8 +1,8 @@
 """An independent CANopen master against the drives of `fric drives`.
 
-Argument: a link to its pseudo-terminal, or host:port of its TCP door. Boots node 3, reads its objects, maps its PDOs,
-leads it to OPERATION ENABLED in mode 10 and through SYNC cycles with a set-point; prints what it saw, one `name value`
-a line. Ends with code 0 only if all of it came as CiA 402 says.
+Argument: a link to its pseudo-terminal, host:port of its TCP door, or the name of an interface. Boots node 3, reads its
+objects, maps its PDOs, leads it to OPERATION ENABLED in mode 10 and through SYNC cycles with a set-point; prints what it
+saw, one `name value` a line. Ends with code 0 only if all of it came as CiA 402 says.
 """
 
 import struct
@@ -14,7 +14,9 @@ import canopen
 
 def connect(where):
     network = canopen.Network()
-    if ":" in where:
+    if where.startswith("vcan"):
+        network.connect(interface="socketcan", channel=where)
+    elif ":" in where:
         host, port = where.rsplit(":", 1)
         network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
     else:

@@ -277,6 +277,8 @@ pub struct Hil {
     resting_ns: Option<u64>,
     counts: Counts,
     misuse: bool,
+    /// The start-up is through, and nothing more was asked for.
+    checked: bool,
     end: Option<End>,
 }
 
@@ -339,6 +341,7 @@ impl Hil {
             resting_ns: None,
             counts: Counts::default(),
             misuse: false,
+            checked: false,
             end: None,
         };
         Ok((hil, operator))
@@ -397,6 +400,11 @@ impl Hil {
     /// How it ended, once it has.
     pub fn ended(&self) -> Option<&End> {
         self.end.as_ref()
+    }
+
+    /// Whether all checks of the start-up have passed, where nothing but them was asked for.
+    pub fn is_checked(&self) -> bool {
+        self.checked
     }
 
     /// Whether it was refused for what only simulated drives bear.
@@ -497,6 +505,7 @@ impl Hil {
             }
         }
         if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
+            self.checked = true;
             self.stop();
         }
         let arms_itself = self.options.arms_itself && self.end.is_none() && self.resting_ns.is_none();
