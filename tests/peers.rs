@@ -182,7 +182,11 @@ fn our_master_leads_a_foreign_drive_through_pseudo_terminals() {
 fn our_master_leads_a_foreign_drive_over_tcp() {
     let bus = Served::bus(&["--tcp", "0"]);
     let port = bus.port();
-    our_master_leads_a_foreign_drive(&format!("127.0.0.1:{port}"), &format!("socketcand:127.0.0.1:{port}/can0"), "tcp-log");
+    our_master_leads_a_foreign_drive(
+        &format!("127.0.0.1:{port}"),
+        &format!("socketcand:127.0.0.1:{port}/can0"),
+        "tcp-log",
+    );
 }
 
 /// Both roles over a virtual interface of the kernel: here where there is one, else in the guest that has one.

@@ -482,7 +482,11 @@ mod tests {
         });
         let judged: Vec<(bool, f64)> = judged.collect();
         let (both, limits) = (judged.iter().filter(|(both, _)| *both).count(), judged.iter().map(|(_, limit)| *limit));
-        println!("{} cases, {both} from both sides, dead times up to {} ms", judged.len(), 1e3 * limits.fold(0.0, f64::max));
+        println!(
+            "{} cases, {both} from both sides, dead times up to {} ms",
+            judged.len(),
+            1e3 * limits.fold(0.0, f64::max)
+        );
         assert!(both > 250, "{both} of {}", judged.len());
     }
 }

@@ -15,6 +15,7 @@ use runtime::can::{self, Bus};
 use runtime::clock::Clock;
 use runtime::drive::profiles::Life;
 use runtime::drive::sign::SignTest;
+use runtime::hil::control::PATIENT_NS;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::identify::{self, Identification};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
@@ -29,8 +30,6 @@ use std::time::Duration;
 
 /// Cycles whose loss a killed process may cost, as a time.
 const BLOCK_NS: u64 = 100_000_000;
-/// Without a cycle for so long even a run that only counts what it misses is over.
-const PATIENT_NS: u64 = 60_000_000_000;
 /// What a black box holds.
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
@@ -68,7 +67,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         return End::Misused;
     }
     if args.count_overruns {
-        // Neither the drives nor the watchdog stop what is only to be counted.
+        // Neither the drives nor the watchdog stop what is only to be counted, unless there is no cycle for so long.
         ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(PATIENT_NS);
     }
     let root = loaded.files.get(loaded.root());
