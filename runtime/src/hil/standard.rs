@@ -1,13 +1,14 @@
 //! A standard set of motions for a contact that a drive plays: the contact by itself beside the one that is read in steps,
 //! computed once a period and applied late.
 //!
-//! In: a rig, its control program, the program of what was crossed out. Out: figures of each contact. The shaft is rigid,
-//! and what pulls it is exact and told to nobody, so that the figures are those of the contact alone.
+//! In: a rig, its control program, the program of what was crossed out. Out: figures of each contact. The shaft is rigid.
+//! What pulls it is exact, so that the figures are those of the contact alone; a look ahead is told of it where the rig has
+//! another drive that pulls.
 
 use super::coupling::{Contact, contacts};
 use crate::lag::Lag;
 use crate::lookahead::{self, Lookahead, Torque};
-use abi::rig::{Kind, Rig, Signal, What};
+use abi::rig::{Kind, Rig, What};
 use abi::{Instance, Slot};
 
 /// Fine steps in a period.
@@ -29,18 +30,18 @@ pub struct Figures {
     pub node: usize,
     /// The torque at which a slow turn breaks it away, N·m: the measure of the errors below.
     pub holds: f64,
-    /// Torque of a slow ramp, 1 s to `holds`, at which it breaks away, N·m.
+    /// Torque of a slow ramp at which it has slid ten times as far as it gives before it breaks away, N·m.
     pub break_away: Pair,
     /// Ripple of the speed, peak to peak, under half of `holds`, rad/s: what the rig has and the contact has not is a limit
     /// cycle of the rig's.
     pub ripple: Pair,
     /// Area of the loop of torque over angle under 0.8 `holds`, 1 Hz, J.
     pub loop_area: Pair,
-    /// Times it slips within 10 s, pulled by a spring that winds up to `holds` in 2 s.
+    /// Times it slips within 20 s, pulled by a spring that winds up to `holds` in 5 s.
     pub slips: Pair,
     /// Error of the torque meanwhile, rms, as part of `holds`.
     pub stick_slip_error: f64,
-    /// Greatest error of F(v) while it is turned to and fro in 2 s, as part of `holds`.
+    /// Greatest error of F(v) while it is turned to and fro in 2 s, above half of the greatest speed, as part of `holds`.
     pub curve_error: f64,
 }
 
@@ -81,9 +82,8 @@ impl Stand<'_> {
     fn figures(&self) -> Option<Figures> {
         let Contact { output, most: holds, stiffness } = self.contact;
         let turn = 2.0 * std::f64::consts::PI;
-        // The angle at which it breaks away is reached within a second below: only what slides is much faster.
+        // About the angle at which it breaks away.
         let angle = holds / stiffness;
-        let slides = 10.0 * angle;
         let both =
             |seconds: f64, motion: &Motion| Some([self.run(false, seconds, motion)?, self.run(true, seconds, motion)?]);
         let pair = |runs: &[Vec<Row>; 2], of: &dyn Fn(&[Row]) -> f64| Pair { own: of(&runs[0]), played: of(&runs[1]) };
@@ -92,7 +92,7 @@ impl Stand<'_> {
         let runs = both(1.2, &Motion::Pulled(&ramp))?;
         let period = self.rig.period_ns as f64 * 1e-9;
         let first = |rows: &[Row]| {
-            let at = rows.iter().position(|row| row.v.abs() > slides);
+            let at = rows.iter().position(|row| row.x.abs() > 10.0 * angle);
             at.map_or(f64::INFINITY, |k| ramp(period * (k + 1) as f64, 0.0))
         };
         let break_away = pair(&runs, &first);
@@ -115,8 +115,8 @@ impl Stand<'_> {
 
         // A spring that makes a slip take two seconds.
         let spring = self.inertia * (0.25 * turn).powi(2);
-        let pace = holds / (2.0 * spring);
-        let runs = both(10.0, &Motion::Pulled(&|t, x| spring * (pace * t - x)))?;
+        let pace = holds / (5.0 * spring);
+        let runs = both(20.0, &Motion::Pulled(&|t, x| spring * (pace * t - x)))?;
         let slips = pair(&runs, &|rows| {
             let (mut count, mut fast) = (0.0, false);
             for row in rows {
@@ -132,7 +132,7 @@ impl Stand<'_> {
 
         let fast = 100.0 * angle;
         let runs = both(4.0, &Motion::Turned(&|t| fast * (0.5 * turn * t).sin()))?;
-        let sliding = runs[0].iter().map(|row| row.v.abs() > 0.1 * fast);
+        let sliding = runs[0].iter().map(|row| row.v.abs() > 0.5 * fast);
         let worst = apart(&runs).into_iter().zip(sliding).filter(|(_, slides)| *slides).map(|(d, _)| d.abs());
         let curve_error = worst.fold(0.0, f64::max) / holds;
         let node = self.rig.outputs[output].signal.node;
@@ -161,8 +161,12 @@ impl Stand<'_> {
         (model.start(if played { period / steps as f64 } else { fine }) == 0).then_some(())?;
         let mut applied = Lag::new(node.lag);
         let looks = played && rig.predict == Some(output.signal.node);
-        let mut look =
-            looks.then(|| Lookahead::new(*inertia, rig.period_ns, drive.count, vec![Torque::new(dead_ns, node.lag)]));
+        let other = |other: &abi::rig::Output| other.signal.what == What::Torque && other.signal != output.signal;
+        let told = rig.outputs.iter().any(other);
+        let mut look = looks.then(|| {
+            let torques = vec![Torque::new(dead_ns, node.lag), Torque::new(0, 0.0)];
+            Lookahead::new(*inertia, rig.period_ns, drive.count, torques)
+        });
         let (mut x, mut v) = (0.0, 0.0);
         let mut give = |v: f64, x: f64, steps: u64| {
             speeds.iter().for_each(|slot| model.set(*slot, v));
@@ -174,14 +178,16 @@ impl Stand<'_> {
             let now_ns = tick * rig.period_ns;
             if played {
                 let counted = (x / drive.count).floor() * drive.count;
-                let told = (v / drive.speed_unit).round() * drive.speed_unit;
                 let (v, x) = match &mut look {
                     Some(look) => {
                         look.observe(now_ns, counted);
+                        if let (Motion::Pulled(pull), true) = (motion, told) {
+                            look.sent(1, pull(tick as f64 * period, x));
+                        }
                         let ahead = look.ahead();
                         (ahead.speed, ahead.position)
                     }
-                    None => (told, counted),
+                    None => ((v / drive.speed_unit).round() * drive.speed_unit, counted),
                 };
                 let step = 1e-3 * drive.rated_torque;
                 let heard = (give(v, x, steps)?.clamp(output.low, output.high) / step).round() * step;
