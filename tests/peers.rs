@@ -7,9 +7,12 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock};
 
 const PACKAGES: [&str; 3] = ["python-can==4.6.1", "canopen==2.4.1", "pyserial==3.5"];
+
+/// Tests take turns: programs in Python have little time to answer, and a guest takes a processor for itself.
+static TURN: Mutex<()> = Mutex::new(());
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -115,6 +118,7 @@ fn master_saw(said: &str) {
 
 #[test]
 fn a_foreign_master_leads_our_drives_through_a_pseudo_terminal() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let door = link("can0");
     let _drives = Served::drives(&["--pty", &door]);
     master_saw(&script("master.py", &door));
@@ -122,6 +126,7 @@ fn a_foreign_master_leads_our_drives_through_a_pseudo_terminal() {
 
 #[test]
 fn a_foreign_master_leads_our_drives_over_tcp() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let drives = Served::drives(&["--tcp", "0"]);
     master_saw(&script("master.py", &format!("127.0.0.1:{}", drives.port())));
 }
@@ -173,6 +178,7 @@ fn our_master_leads_a_foreign_drive(theirs: &str, ours: &str, name: &str) {
 
 #[test]
 fn our_master_leads_a_foreign_drive_through_pseudo_terminals() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let [near, far] = ["near", "far"].map(link);
     let _bus = Served::bus(&["--pty", &near, "--pty", &far]);
     our_master_leads_a_foreign_drive(&far, &format!("slcan:{near}@1000000"), "slcan-log");
@@ -180,6 +186,7 @@ fn our_master_leads_a_foreign_drive_through_pseudo_terminals() {
 
 #[test]
 fn our_master_leads_a_foreign_drive_over_tcp() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let bus = Served::bus(&["--tcp", "0"]);
     let port = bus.port();
     our_master_leads_a_foreign_drive(
@@ -192,6 +199,7 @@ fn our_master_leads_a_foreign_drive_over_tcp() {
 /// Both roles over a virtual interface of the kernel: here where there is one, else in the guest that has one.
 #[test]
 fn both_roles_over_an_interface_of_the_kernel() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let here = "ip link add dev probe0 type vcan";
     let probe = Command::new("unshare").args(["-Urn", "sh", "-c", here]).output();
     let mut command = if probe.is_ok_and(|output| output.status.success()) {

@@ -42,6 +42,7 @@ pub struct Figures {
     /// Error of the torque meanwhile, rms, as part of `holds`.
     pub stick_slip_error: f64,
     /// Greatest error of F(v) while it is turned to and fro in 2 s, above half of the greatest speed, as part of `holds`.
+    /// Nothing looks ahead then: a shaft that is held is not free.
     pub curve_error: f64,
 }
 
@@ -160,7 +161,9 @@ impl Stand<'_> {
         let fine = period / FINE as f64;
         (model.start(if played { period / steps as f64 } else { fine }) == 0).then_some(())?;
         let mut applied = Lag::new(node.lag);
-        let looks = played && rig.predict == Some(output.signal.node);
+        // A shaft whose speed is held is not free: there is nothing to look ahead for.
+        let free = matches!(motion, Motion::Pulled(_));
+        let looks = played && free && rig.predict == Some(output.signal.node);
         let other = |other: &abi::rig::Output| other.signal.what == What::Torque && other.signal != output.signal;
         let told = rig.outputs.iter().any(other);
         let mut look = looks.then(|| {
