@@ -51,7 +51,7 @@ struct Served {
 
 impl Served {
     fn start(command: &mut Command, begin: &str) -> Served {
-        let command = command.args(["--for", "120s", "--quiet"]).stderr(Stdio::piped()).stdout(Stdio::null());
+        let command = command.args(["--for", "900s", "--quiet"]).stderr(Stdio::piped()).stdout(Stdio::null());
         let mut child = command.spawn().expect("fric starts");
         let mut told = String::new();
         // Its first line comes once its doors are open.

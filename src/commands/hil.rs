@@ -182,7 +182,8 @@ fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     options.start.missed = match (simulated, args.count_overruns) {
         (_, true) => 1.0,
         (true, false) => 0.05,
-        (false, false) if args.accept_jitter => 0.05,
+        // Where a host gives no real time, drives that are programs on it answer when they can.
+        (false, false) if args.accept_jitter => 0.9,
         (false, false) => 0.0,
     };
     options.start.timeout_test = !args.count_overruns;
