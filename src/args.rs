@@ -232,7 +232,7 @@ pub struct Sweep {
     /// From which all that is random follows
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
-    /// The table to write: .csv
+    /// The table to write: .csv or .parquet
     #[arg(long, value_name = "FILE", default_value = "sweep.csv", value_hint = ValueHint::FilePath, value_parser = table)]
     pub out: PathBuf,
     /// Go on with a table that was not finished
@@ -438,6 +438,9 @@ pub struct Replay {
     /// Write its cycles as a table
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub csv: Option<PathBuf>,
+    /// Write the same table as Parquet
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    pub parquet: Option<PathBuf>,
     /// Write its frames as candump -L does; `replay:FILE` is a bus that reads it
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub candump: Option<PathBuf>,
@@ -559,7 +562,7 @@ pub struct Drives {
     #[arg(long, value_name = "FAULT")]
     pub inject: Vec<String>,
     /// Give a drive the further objects of a data sheet (EDS, DCF): `load=servo.eds`
-    #[arg(long, value_name = "DRIVE=FILE", value_parser = setting)]
+    #[arg(long, value_name = "DRIVE=FILE", value_parser = sheet)]
     pub eds: Vec<(String, String)>,
     /// What of the text is changed
     #[command(flatten)]
@@ -792,12 +795,19 @@ pub struct New {
 }
 
 fn setting(text: &str) -> Result<(String, String), String> {
-    let (path, value) = text.split_once('=').ok_or("write it as PATH=VALUE, for example fr.Fs=2N")?;
-    let (path, value) = (path.trim(), value.trim());
-    if path.is_empty() || value.is_empty() {
-        return Err("write it as PATH=VALUE, for example fr.Fs=2N".into());
-    }
-    Ok((path.into(), value.into()))
+    pair(text).ok_or("write it as PATH=VALUE, for example fr.Fs=2N".into())
+}
+
+/// A drive and its data sheet.
+fn sheet(text: &str) -> Result<(String, String), String> {
+    pair(text).ok_or("write it as DRIVE=FILE, for example load=servo.eds".into())
+}
+
+/// What stands on both sides of the first `=`.
+fn pair(text: &str) -> Option<(String, String)> {
+    let (left, right) = text.split_once('=')?;
+    let (left, right) = (left.trim(), right.trim());
+    (!left.is_empty() && !right.is_empty()).then(|| (left.into(), right.into()))
 }
 
 /// What begins with a dash would be an option of ssh.
@@ -892,9 +902,8 @@ fn shard(text: &str) -> Result<(u64, u64), String> {
 fn table(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|extension| extension.to_str()) {
-        Some("csv") => Ok(path),
-        Some("parquet") => Err("results are written as CSV; Parquet is not available yet".into()),
-        _ => Err("the name of a table ends in .csv".into()),
+        Some("csv" | "parquet") => Ok(path),
+        _ => Err("the name of a table ends in .csv or .parquet".into()),
     }
 }
 

@@ -14,6 +14,7 @@ mod equations;
 mod figure;
 mod kept;
 mod matrices;
+mod parquet;
 mod plot;
 mod project;
 mod remote;

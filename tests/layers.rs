@@ -106,6 +106,7 @@ fn outside_crates_have_one_home() {
         ("memmap2", "runtime/src/blob.rs"),
         ("::socketcan", "runtime/src/can/socketcan.rs"),
         ("miette", "src/report.rs"),
+        ("::parquet", "src/parquet.rs"),
         ("resvg", "src/plot/png.rs"),
         ("rustyline", "src/repl/line.rs"),
     ];

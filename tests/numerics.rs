@@ -396,8 +396,17 @@ fn each_run_is_checked_and_measured_with_its_own_values() {
     assert!(err.contains("`fr.Fs` is a force, it cannot be a length"), "{err}");
     let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fx = 1 N, 2 N"], 1);
     assert!(err.contains("Fx"), "{err}");
-    let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 N, 2 N", "--out", "a.parquet"], 2);
-    assert!(err.contains("Parquet is not available yet"), "{err}");
+    // The same table as Parquet: its rows lie beside it only until it is complete.
+    folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 N, 2 N", "--out", "a.parquet"], 0);
+    let bytes = fs::read(folder.0.join("a.parquet")).unwrap();
+    assert!(bytes.starts_with(b"PAR1") && bytes.ends_with(b"PAR1"), "{} bytes", bytes.len());
+    let left = fs::read_dir(&folder.0)
+        .unwrap()
+        .flatten()
+        .filter(|file| file.file_name().to_string_lossy().contains("a.parquet"));
+    assert_eq!(left.count(), 1, "the table alone");
+    let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 N, 2 N", "--out", "a.xlsx"], 2);
+    assert!(err.contains("ends in .csv or .parquet"), "{err}");
 }
 
 #[test]

@@ -4,12 +4,15 @@
 //! test fails and says so.
 
 use std::fs;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock};
 
 const PACKAGES: [&str; 3] = ["python-can==4.6.1", "canopen==2.4.1", "pyserial==3.5"];
+
+/// Tests take turns: programs in Python have little time to answer, and a guest takes a processor for itself.
+static TURN: Mutex<()> = Mutex::new(());
 
 fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -36,36 +39,54 @@ fn python() -> &'static Path {
     })
 }
 
-/// Simulated drives of the example rig, until dropped.
-struct Drives {
+fn fric() -> Command {
+    Command::new(env!("CARGO_BIN_EXE_fric"))
+}
+
+/// A program with open doors, until dropped.
+struct Served {
     child: Child,
     told: String,
 }
 
-impl Drives {
-    fn start(door: &[&str]) -> Drives {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_fric"))
-            .arg("drives")
-            .arg(root().join("examples/rtfs/rtfs.fric"))
-            .args(door)
-            .args(["--for", "60s", "--quiet"])
-            .stderr(Stdio::piped())
-            .stdout(Stdio::null())
-            .spawn()
-            .expect("fric starts");
+impl Served {
+    fn start(command: &mut Command, begin: &str) -> Served {
+        let command = command.args(["--for", "900s", "--quiet"]).stderr(Stdio::piped()).stdout(Stdio::null());
+        let mut child = command.spawn().expect("fric starts");
         let mut told = String::new();
         // Its first line comes once its doors are open.
         BufReader::new(child.stderr.take().expect("piped")).read_line(&mut told).expect("a line");
-        assert!(told.starts_with("simulated: load, servo"), "{told}");
-        Drives { child, told }
+        assert!(told.starts_with(begin), "{told}");
+        Served { child, told }
+    }
+
+    /// Simulated drives of the example rig.
+    fn drives(door: &[&str]) -> Served {
+        let example = root().join("examples/rtfs/rtfs.fric");
+        Served::start(fric().arg("drives").arg(example).args(door), "simulated: load, servo")
+    }
+
+    /// A bus with two doors.
+    fn bus(doors: &[&str]) -> Served {
+        Served::start(fric().args(["bus", "sim:between"]).args(doors), "joined: sim:between")
+    }
+
+    fn port(&self) -> &str {
+        self.told.trim().rsplit(' ').next().expect("a port")
     }
 }
 
-impl Drop for Drives {
+impl Drop for Served {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// A place for a link to a pseudo-terminal.
+fn link(name: &str) -> String {
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id()));
+    path.to_str().expect("a text").to_string()
 }
 
 /// What a script printed.
@@ -77,34 +98,125 @@ fn script(name: &str, argument: &str) -> String {
     out.into_owned()
 }
 
-fn master(where_: &str) {
-    let said = script("master.py", where_);
-    let value = |name: &str| {
-        let line = said.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
-        line.unwrap_or_else(|| panic!("no {name} in\n{said}"))
-    };
-    assert_eq!(value("name"), "fric simulated");
-    assert_eq!(value("rated"), "4000");
-    assert_eq!(value("abort"), "0x6010002");
-    assert_eq!(value("nmt"), "OPERATIONAL");
-    assert_eq!(value("answers"), "100 100");
-    assert_eq!(value("torque"), "100");
+/// A line `name value` among what a script said.
+fn value<'a>(said: &'a str, name: &str) -> &'a str {
+    let line = said.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+    line.unwrap_or_else(|| panic!("no {name} in\n{said}"))
+}
+
+fn master_saw(said: &str) {
+    assert_eq!(value(said, "name"), "fric simulated");
+    assert_eq!(value(said, "rated"), "4000");
+    assert_eq!(value(said, "abort"), "0x6010002");
+    assert_eq!(value(said, "nmt"), "OPERATIONAL");
+    assert_eq!(value(said, "answers"), "100 100");
+    assert_eq!(value(said, "torque"), "100");
     // 0.4 N·m on 0.012 kg·m² for the 0.2 s that 100 cycles take at least: 0.67 rad.
-    let turned: i64 = value("turned").parse().expect("a number");
+    let turned: i64 = value(said, "turned").parse().expect("a number");
     assert!(turned > 25_000, "{turned} counts");
 }
 
 #[test]
 fn a_foreign_master_leads_our_drives_through_a_pseudo_terminal() {
-    let link = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("can0-{}", std::process::id()));
-    let link = link.to_str().expect("a text");
-    let _drives = Drives::start(&["--pty", link]);
-    master(link);
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let door = link("can0");
+    let _drives = Served::drives(&["--pty", &door]);
+    master_saw(&script("master.py", &door));
 }
 
 #[test]
 fn a_foreign_master_leads_our_drives_over_tcp() {
-    let drives = Drives::start(&["--tcp", "0"]);
-    let port = drives.told.trim().rsplit(' ').next().expect("a port");
-    master(&format!("127.0.0.1:{port}"));
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let drives = Served::drives(&["--tcp", "0"]);
+    master_saw(&script("master.py", &format!("127.0.0.1:{}", drives.port())));
+}
+
+/// What the package's drive saw of a rig that began with the whole start-up and ended as asked.
+fn node_saw(said: &str, timeout_tested: bool) {
+    let states: Vec<&str> = value(said, "states").split(", ").collect();
+    let times = states.iter().filter(|state| **state == "enabled").count();
+    assert_eq!(times, if timeout_tested { 2 } else { 1 }, "{states:?}");
+    assert!(states.starts_with(&["switch on disabled", "ready", "switched on", "enabled"]), "{states:?}");
+    assert!(states.ends_with(&["enabled", "quick stop", "switch on disabled"]), "{states:?}");
+    assert_eq!(value(said, "timeouts"), if timeout_tested { "1" } else { "0" });
+    assert_eq!(value(said, "nmt"), "OPERATIONAL");
+    let number = |name: &str| value(said, name).parse::<u32>().expect("a number");
+    assert!(number("syncs") > 100 && number("commands") > 100, "{said}");
+    // The model asks for up to 0.4 N·m, the push of the first motion for less: 0.2 of what 2 N·m are 1000 of.
+    assert!((150..=300).contains(&number("torque")), "{said}");
+}
+
+/// Our master against the package's drive: the whole start-up, 4 s of a model, the stop, and a log that replays.
+fn our_master_leads_a_foreign_drive(theirs: &str, ours: &str, name: &str) {
+    let script = root().join("tests/peers/node.py");
+    let mut node = Command::new(python());
+    let node = node.arg(script).arg(theirs).stdin(Stdio::piped()).stdout(Stdio::piped());
+    let mut node = node.spawn().expect("python starts");
+    let mut out = BufReader::new(node.stdout.take().expect("piped"));
+    let mut said = String::new();
+    out.read_line(&mut said).expect("a line");
+    assert_eq!(said, "ready\n");
+    let log = link(name);
+    let run = |arguments: &[&str]| {
+        let output = fric().args(arguments).stdin(Stdio::null()).output().expect("fric starts");
+        let told = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
+        assert_eq!(output.status.code(), Some(0), "{arguments:?}\n{told}");
+        told
+    };
+    let rig = root().join("tests/peers/node.fric");
+    let rig = rig.to_str().expect("a text");
+    let bus = format!("can0={ours}");
+    run(&["hil", rig, "node", "--bus", &bus, "--arm", "--accept-jitter", "--for", "4s", "--quiet", "--log", &log]);
+    let told = run(&["replay", &log]);
+    assert!(told.contains("agree to the bit; it ended as asked"), "{told}");
+    // The end of its input asks it for what it saw.
+    drop(node.stdin.take());
+    out.read_to_string(&mut said).expect("text");
+    assert!(node.wait().expect("it ends").success(), "{said}");
+    node_saw(&said, true);
+}
+
+#[test]
+fn our_master_leads_a_foreign_drive_through_pseudo_terminals() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let [near, far] = ["near", "far"].map(link);
+    let _bus = Served::bus(&["--pty", &near, "--pty", &far]);
+    our_master_leads_a_foreign_drive(&far, &format!("slcan:{near}@1000000"), "slcan-log");
+}
+
+#[test]
+fn our_master_leads_a_foreign_drive_over_tcp() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let bus = Served::bus(&["--tcp", "0"]);
+    let port = bus.port();
+    our_master_leads_a_foreign_drive(
+        &format!("127.0.0.1:{port}"),
+        &format!("socketcand:127.0.0.1:{port}/can0"),
+        "tcp-log",
+    );
+}
+
+/// Both roles over a virtual interface of the kernel: here where there is one, else in the guest that has one.
+#[test]
+fn both_roles_over_an_interface_of_the_kernel() {
+    let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+    let here = "ip link add dev probe0 type vcan";
+    let probe = Command::new("unshare").args(["-Urn", "sh", "-c", here]).output();
+    let mut command = if probe.is_ok_and(|output| output.status.success()) {
+        let mut command = Command::new("unshare");
+        command.args(["-Urn", "bash"]);
+        command
+    } else {
+        let mut command = Command::new(root().join("tests/can/guest"));
+        command.args(["--limit", "550", "bash"]);
+        command
+    };
+    let command = command.arg(root().join("tests/peers/vcan.sh")).arg(env!("CARGO_BIN_EXE_fric")).arg(python());
+    let output = command.current_dir(root()).output().expect("it starts");
+    let said = [output.stdout, output.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
+    assert!(output.status.success(), "{said}");
+    master_saw(&said);
+    let node = said.find("ready\n").unwrap_or_else(|| panic!("no node in\n{said}"));
+    node_saw(&said[node..], false);
+    assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
 }

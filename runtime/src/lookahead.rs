@@ -146,7 +146,7 @@ impl Wired {
 }
 
 /// Which way a torque turns what a drive sees: one short step of the part tells.
-fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> f64 {
+pub(crate) fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> f64 {
     let speed = rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node, what: What::Speed });
     let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == torque);
     let (Some((_, speed)), Some((_, applied))) = (speed, applied) else { return 1.0 };

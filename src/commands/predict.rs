@@ -14,6 +14,7 @@ use abi::description::{Kind as QuantityKind, Quantity};
 use abi::rig::Kind;
 use grammar::ast::{ExperimentStatement, Item};
 use runtime::engine::{self, Continue};
+use runtime::hil::standard::{self, Figures, Pair};
 use runtime::modes::modes;
 use runtime::predict::Loop;
 use serde_json::{Value, json};
@@ -52,7 +53,7 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     words += &text;
     let (text, step) = step_time(&ready);
     words += &text;
-    let mut twin = Value::Null;
+    let (mut twin, mut figures) = (Value::Null, Value::Null);
     if let Some(experiment) = &args.experiment {
         match twins(&mut loaded, &ready, experiment, &set) {
             Ok((text, object)) => (words, twin) = (words + &text, object),
@@ -61,10 +62,13 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
                 return End::Failed;
             }
         }
+    } else {
+        let (text, object) = standard(&ready);
+        (words, figures) = (words + &text, object);
     }
     match args.json {
         true => {
-            let object = json!({"rig": name, "stable": stable, "contacts": all, "resolution": resolution, "step": step, "twin": twin});
+            let object = json!({"rig": name, "stable": stable, "contacts": all, "resolution": resolution, "step": step, "standard": figures, "twin": twin});
             terminal.line(&object.to_string());
         }
         false => terminal.print(&words),
@@ -317,6 +321,39 @@ fn step_time(ready: &Ready) -> (String, Value) {
         crate::value::duration(period)
     );
     (words, json!({"median": median, "greatest": greatest, "period": period}))
+}
+
+/// Each contact by itself beside the one that the rig plays, in a standard set of motions.
+fn standard(ready: &Ready) -> (String, Value) {
+    let (mut words, mut out) = (String::new(), Vec::new());
+    for found in standard::standard(&ready.rig, &ready.control, &ready.plant) {
+        let Figures { holds, break_away, ripple, loop_area, slips, stick_slip_error, curve_error, node } = found;
+        let drive = &ready.rig.nodes[node].name;
+        let pair = |pair: Pair, digits: usize| [pair.played, pair.own].map(|value| significant(value, digits));
+        let [breaks, own_breaks] = pair(break_away, 3);
+        let [ripples, own_ripples] = pair(ripple, 2);
+        let [slipped, own_slips] = pair(slips, 2);
+        let percent = |share: f64| significant(100.0 * share, 2);
+        words += &format!("standard    {drive}  breaks away at {breaks} N·m, the contact itself at {own_breaks}\n");
+        words += &format!(
+            "            sticks and slips: {slipped} slips for {own_slips}, torque within {} % rms of {} N·m\n",
+            percent(stick_slip_error),
+            significant(holds, 3)
+        );
+        words += &format!("            held at half of it: ripple {ripples} rad/s for {own_ripples}\n");
+        words += &format!(
+            "            F(v) within {} %, hysteresis {} % of its area\n",
+            percent(curve_error),
+            percent(loop_area.played / loop_area.own)
+        );
+        let both = |pair: Pair| json!({"played": pair.played, "own": pair.own});
+        out.push(json!({
+            "drive": drive, "holds": holds, "break_away": both(break_away), "ripple": both(ripple),
+            "loop_area": both(loop_area), "slips": both(slips), "stick_slip_error": stick_slip_error,
+            "curve_error": curve_error
+        }));
+    }
+    (words, Value::Array(out))
 }
 
 /// The dry run beside one whose drives act at once: how far what is drawn differs.

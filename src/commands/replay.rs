@@ -4,9 +4,10 @@ use super::{End, load_text};
 use crate::args::Replay as Args;
 use crate::compile::{self, Changes, Options, Stopwatch};
 use crate::kept::Kept;
+use crate::parquet::{self, Holds};
 use crate::terminal::Terminal;
 use crate::{project, report, value};
-use abi::rig::{Rig, Signal};
+use abi::rig::Rig;
 use runtime::hil::control::Control;
 use runtime::hil::cycle::look_ahead;
 use runtime::hil::replay::{Replay, Stopped, What};
@@ -15,6 +16,7 @@ use runtime::hil::words;
 use runtime::record::blocks::End as LogEnd;
 use runtime::record::log::{Message, Reader};
 use std::fmt::Write;
+use std::path::Path;
 
 pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     let name = args.log.display().to_string();
@@ -127,51 +129,63 @@ fn differing(rig: &Rig, what: What) -> String {
 /// Tables made of a log.
 struct Exports {
     rig: Rig,
-    signals: Vec<Signal>,
     shape: Shape,
-    csv: Option<String>,
+    columns: Vec<(String, Holds)>,
+    /// Its cycles, where a table of them is wanted.
+    cycles: Option<String>,
     candump: Option<String>,
 }
 
 impl Exports {
     fn new(args: &Args, rig: &Rig, control: &Control) -> Exports {
-        let signals: Vec<Signal> = control.signals().collect();
-        let shape = Shape::of(rig, control);
-        let csv = args.csv.as_ref().map(|_| {
-            let mut header = "k,t [s],late [s],ticks,order".to_string();
-            for signal in &signals {
-                let name = words::signal(rig, *signal);
-                let _ = write!(header, ",{name},{name} age");
-            }
-            for output in &rig.outputs {
-                let name = words::signal(rig, output.signal);
-                let _ = write!(header, ",{name} requested,{name} permitted,{name} clamped");
-            }
-            for series in &rig.record {
-                let unit = if series.unit.text.is_empty() { String::new() } else { format!(" [{}]", series.unit) };
-                let _ = write!(header, ",{}{unit}", series.label.replace(',', ";"));
-            }
-            header + "\n"
-        });
-        Exports { rig: rig.clone(), signals, shape, csv, candump: args.candump.as_ref().map(|_| String::new()) }
+        let mut columns = Vec::new();
+        let mut column = |name: String, holds| columns.push((name.replace(',', ";"), holds));
+        for (name, holds) in [
+            ("k", Holds::Integers),
+            ("t [s]", Holds::Numbers),
+            ("late [s]", Holds::Numbers),
+            ("ticks", Holds::Integers),
+            ("order", Holds::Words),
+        ] {
+            column(name.into(), holds);
+        }
+        for signal in control.signals() {
+            let name = words::signal(rig, signal);
+            column(name.clone(), Holds::Numbers);
+            column(format!("{name} age"), Holds::Integers);
+        }
+        for output in &rig.outputs {
+            let name = words::signal(rig, output.signal);
+            column(format!("{name} requested"), Holds::Numbers);
+            column(format!("{name} permitted"), Holds::Numbers);
+            column(format!("{name} clamped"), Holds::Integers);
+        }
+        for series in &rig.record {
+            let unit = if series.unit.text.is_empty() { String::new() } else { format!(" [{}]", series.unit) };
+            column(format!("{}{unit}", series.label), Holds::Numbers);
+        }
+        let names: Vec<&str> = columns.iter().map(|(name, _)| name.as_str()).collect();
+        let cycles = (args.csv.is_some() || args.parquet.is_some()).then(|| names.join(",") + "\n");
+        let candump = args.candump.as_ref().map(|_| String::new());
+        Exports { rig: rig.clone(), shape: Shape::of(rig, control), columns, cycles, candump }
     }
 
     fn add(&mut self, message: &Message) {
-        if let (Some(csv), trace::CYCLE) = (&mut self.csv, message.kind)
+        if let (Some(rows), trace::CYCLE) = (&mut self.cycles, message.kind)
             && let Some(cycle) = Cycle::read(self.shape, &message.words)
         {
             let Cycle { k, due_ns, late_ns, ticks, order, .. } = cycle;
-            let _ = write!(csv, "{k},{:?},{:?},{ticks},{order:?}", due_ns as f64 * 1e-9, f64::from(late_ns) * 1e-9);
-            for reading in cycle.readings.iter().take(self.signals.len()) {
-                let _ = write!(csv, ",{:?},{}", reading.value, reading.age);
+            let _ = write!(rows, "{k},{:?},{:?},{ticks},{order:?}", due_ns as f64 * 1e-9, f64::from(late_ns) * 1e-9);
+            for reading in &cycle.readings {
+                let _ = write!(rows, ",{:?},{}", reading.value, reading.age);
             }
             for i in 0..self.rig.outputs.len() {
-                let _ = write!(csv, ",{:?},{:?},{}", cycle.requests[i], cycle.permitted[i], cycle.clamps[i].0);
+                let _ = write!(rows, ",{:?},{:?},{}", cycle.requests[i], cycle.permitted[i], cycle.clamps[i].0);
             }
             for (series, si) in self.rig.record.iter().zip(&cycle.recorded) {
-                let _ = write!(csv, ",{:?}", series.unit.from_si(*si));
+                let _ = write!(rows, ",{:?}", series.unit.from_si(*si));
             }
-            csv.push('\n');
+            rows.push('\n');
         }
         if let (Some(candump), trace::FRAMES) = (&mut self.candump, message.kind) {
             for Passed { stamp_ns, bus, frame, .. } in Passed::read(&message.words).into_iter().flatten() {
@@ -183,11 +197,22 @@ impl Exports {
     }
 
     fn write(&self, args: &Args, terminal: &mut Terminal) -> Result<(), String> {
-        for (path, text) in [(&args.csv, &self.csv), (&args.candump, &self.candump)] {
-            let (Some(path), Some(text)) = (path, text) else { continue };
-            project::write(path, text.as_bytes())
-                .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        let mut save = |path: &Path, bytes: &[u8]| {
+            project::write(path, bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
             terminal.line(&format!("wrote {}", path.display()));
+            Ok::<(), String>(())
+        };
+        if let (Some(path), Some(rows)) = (&args.csv, &self.cycles) {
+            save(path, rows.as_bytes())?;
+        }
+        if let (Some(path), Some(rows)) = (&args.parquet, &self.cycles) {
+            let mut bytes = Vec::new();
+            parquet::from_csv(rows.as_bytes(), true, &self.columns, &mut bytes)
+                .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+            save(path, &bytes)?;
+        }
+        if let (Some(path), Some(frames)) = (&args.candump, &self.candump) {
+            save(path, frames.as_bytes())?;
         }
         Ok(())
     }

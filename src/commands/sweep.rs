@@ -7,6 +7,7 @@
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
 use crate::compile::{self, Changes, Loaded, Options, Stopwatch, Varying};
+use crate::parquet::{self, Holds};
 use crate::plot::{self, Axis, Curve, Figure, Panel};
 use crate::terminal::{Style, Terminal};
 use crate::value::{self, count, significant};
@@ -20,7 +21,7 @@ use runtime::sweep;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -86,6 +87,14 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
             reported(loaded, &diagnostics, terminal);
             None
         }
+    }
+}
+
+/// Where rows are appended: the table itself, or a neighbour of one that cannot grow row by row.
+fn rows_of(out: &Path) -> PathBuf {
+    match out.extension().is_some_and(|extension| extension == "parquet") {
+        true => out.with_file_name(format!(".{}.csv", name_of(out))),
+        false => out.to_path_buf(),
     }
 }
 
@@ -250,6 +259,7 @@ impl Table {
         let header = if shard == 1 { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() };
         let asked = self.asked(args, loaded, &range);
         let out = &args.out;
+        let rows = rows_of(out);
         let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", out.display());
         let marker = out.with_file_name(format!(".{}.unfinished", name_of(out)));
         let before = fs::read_to_string(&marker).ok();
@@ -262,11 +272,11 @@ impl Table {
                     indented(&asked)
                 ));
             }
-            (true, Some(_)) => kept(out, &header).map_err(|error| told("read", error))?,
+            (true, Some(_)) => kept(&rows, &header).map_err(|error| told("read", error))?,
             (true, None) if out.exists() => {
                 return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
             }
-            (false, Some(_)) if out.exists() => {
+            (false, Some(_)) if rows.exists() => {
                 return Err(format!(
                     "{} holds a sweep that is not finished; go on with --resume, or remove it",
                     out.display()
@@ -276,10 +286,10 @@ impl Table {
         };
         project::make_folder_of(out).map_err(|error| told("write", error))?;
         let mut file = if done > 0 {
-            OpenOptions::new().append(true).open(out).map_err(|error| told("write", error))?
+            OpenOptions::new().append(true).open(&rows).map_err(|error| told("write", error))?
         } else {
             fs::write(&marker, &asked).map_err(|error| told("write", error))?;
-            let mut file = File::create(out).map_err(|error| told("write", error))?;
+            let mut file = File::create(&rows).map_err(|error| told("write", error))?;
             file.write_all(&header).map_err(|error| told("write", error))?;
             file
         };
@@ -293,13 +303,16 @@ impl Table {
                 "stopped after {} of {} runs, which are kept in {}; go on with --resume\n",
                 count(reached - range.start),
                 count(range.end - range.start),
-                out.display()
+                rows.display()
             ));
             return Ok(End::Failed);
         }
         file.sync_all().map_err(|error| told("write", error))?;
+        let summary = self.summary(&rows, shard == 1).map_err(|error| told("read", error))?;
+        if rows != *out {
+            self.convert(&rows, shard == 1, out).map_err(|error| told("write", error))?;
+        }
         let _ = fs::remove_file(&marker);
-        let summary = self.summary(out, shard == 1).map_err(|error| told("read", error))?;
         if let Some(path) = &args.plot {
             let figure = self.figure(args, &summary)?;
             let png = path.extension().is_some_and(|extension| extension == "png");
@@ -402,6 +415,27 @@ impl Table {
             asked += &format!("--vary {} in {}: {how}\n", vary.path, vary.unit);
         }
         asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed, range.start, range.end, self.total())
+    }
+
+    /// The rows as a Parquet file; they themselves are no longer needed then.
+    fn convert(&self, rows: &Path, header: bool, out: &Path) -> io::Result<()> {
+        let holds = |column: &Column| match column.kind {
+            ColumnKind::Run => Holds::Integers,
+            ColumnKind::Case | ColumnKind::Status => Holds::Words,
+            ColumnKind::Varied | ColumnKind::Measure(..) => Holds::Numbers,
+            ColumnKind::Verdict(_) => Holds::Booleans,
+        };
+        let columns: Vec<(String, Holds)> =
+            self.columns.iter().map(|column| (column.title.clone(), holds(column))).collect();
+        let part = out.with_file_name(format!(".{}.part", name_of(out)));
+        let written = File::create(&part)
+            .and_then(|to| parquet::from_csv(File::open(rows)?, header, &columns, to))
+            .and_then(|()| fs::rename(&part, out))
+            .and_then(|()| fs::remove_file(rows));
+        if written.is_err() {
+            let _ = fs::remove_file(&part);
+        }
+        written
     }
 
     /// Reads the file once.

@@ -7,6 +7,7 @@ use runtime::can::{Bus, Options, Received};
 use runtime::clock::{Clock, Monotonic};
 use runtime::drive::Bench;
 use runtime::hil::identify::Identification;
+use runtime::realtime::{self, Wishes};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 fn drive(name: &str, node: u8, period_ns: u64) -> Node {
@@ -56,11 +57,14 @@ pub fn pulsed(period_ns: u64) -> Identification {
     Identification::new(&rig).expect("its drives take torques")
 }
 
-/// The drives of a rig on an interface, until it is over: whether any of them still has torque then.
-pub fn drives(rig: &Rig, interface: &str, over: &AtomicBool) -> bool {
+/// The drives of a rig on an interface, until it is over: whether any of them still has torque then. `priority`: of a
+/// thread in real time; none for an ordinary one.
+pub fn drives(rig: &Rig, interface: &str, priority: Option<i32>, over: &AtomicBool) -> bool {
     let clock = Monotonic::new();
     let mut bus = SocketCan::open(interface, &Options::default(), clock).expect("it is up");
     let mut bench = Bench::new(rig, None, 1).expect("servos are simulated");
+    let real_time = priority.map(|priority| realtime::enter(&Wishes { priority, ..Wishes::default() }));
+    assert!(real_time.as_ref().is_none_or(|granted| granted.refused().is_empty()), "{real_time:?}");
     while !over.load(Ordering::Relaxed) {
         bus.wait(bench.due_ns().max(clock.now_ns() + 50_000));
         let mut send = Vec::new();

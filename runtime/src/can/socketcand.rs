@@ -317,7 +317,13 @@ impl Connection {
             }
             (Some("echo"), _) => b"< echo >",
             (Some("send"), Stage::Opened | Stage::Raw(_)) => match decode_send(words) {
-                Some(frame) => return Some(Some(frame)),
+                Some(frame) => {
+                    // Who sends has read the greetings: what answers it may come at once.
+                    if let Stage::Raw(from_ns) = &mut self.stage {
+                        *from_ns = 0;
+                    }
+                    return Some(Some(frame));
+                }
                 None => b"< error could not send frame >",
             },
             _ => b"< error unknown command >",
@@ -490,6 +496,40 @@ mod tests {
         for text in ["123 2 aa", "123 9 1 2 3 4 5 6 7 8 9", "123 1 100", "800 0", "123 1 a b", "FFFFFFFF 0"] {
             assert_eq!(decode_send(text.split(' ')), None, "{text}");
         }
+    }
+
+    /// What answers the first frame of a client may come before the pause behind its greetings is over.
+    #[test]
+    fn who_sends_at_once_hears_the_answer() {
+        let clock = Monotonic::new();
+        let mut server = Server::listen(0, false, clock).expect("a port");
+        let mut tcp = TcpStream::connect(("127.0.0.1", server.port())).expect("it listens");
+        tcp.set_read_timeout(Some(Duration::from_secs(10))).expect("more than 0");
+        let mut connection = loop {
+            if let Some(connection) = server.accept() {
+                break connection;
+            }
+        };
+        let mut tell = tcp.try_clone().expect("a second handle");
+        let mut read = |length: usize| {
+            let mut bytes = vec![0; length];
+            tcp.read_exact(&mut bytes).expect("an answer");
+            String::from_utf8(bytes).expect("a text")
+        };
+        assert_eq!(read(6), "< hi >");
+        let mut hears = |text: &[u8]| {
+            tell.write_all(text).expect("written");
+            while !connection.wait(clock.now_ns() + 1_000_000_000) {}
+            connection.receive()
+        };
+        for message in [&b"< open can0 >"[..], b"< rawmode >"] {
+            assert_eq!(hears(message), None);
+            assert_eq!(read(6), "< ok >");
+        }
+        let asked = Frame::new(0x123, &[]);
+        assert!(matches!(hears(b"< send 123 0 >"), Some(Received::Frame(frame, _)) if frame == asked));
+        connection.send(Frame::new(0x222, &[1])).expect("it listens");
+        assert_eq!(read(11), "< frame 222");
     }
 
     #[test]

@@ -23,7 +23,7 @@ const ERROR: Object = Object(0x603F, 0);
 
 /// How often a drive tells its state.
 pub const HEARTBEAT_MS: u64 = 20;
-/// Time after which a heartbeat is missing.
+/// Least time after which a heartbeat is missing: two and a half of them. A rig whose `watchdog` is slower has its time.
 const HEARTBEAT_LATE_NS: u64 = 50_000_000;
 /// Longest wait for an answer to an SDO request.
 const SDO_NS: u64 = 500_000_000;
@@ -554,8 +554,9 @@ impl Drive {
 
     /// Notes what only time shows.
     pub(super) fn watch(&mut self, now_ns: u64, tell: &mut dyn FnMut(TroubleKind)) {
+        let late_ns = self.setting.watchdog_ns.max(HEARTBEAT_LATE_NS);
         if self.watching == Some(Watching::Heartbeat)
-            && self.heard_ns.is_some_and(|heard| now_ns.saturating_sub(heard) > HEARTBEAT_LATE_NS)
+            && self.heard_ns.is_some_and(|heard| now_ns.saturating_sub(heard) > late_ns)
         {
             self.heard_ns = None;
             tell(TroubleKind::HeartbeatLost);

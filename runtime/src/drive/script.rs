@@ -1,7 +1,7 @@
 //! What is read from a drive and written into it before it may move, as a list that an SDO client works through.
 
 use super::trouble::Why;
-use crate::canopen::sdo::{Client, Outcome};
+use crate::canopen::sdo::{Client, Failure, Outcome};
 use crate::canopen::{Object, Send, Type};
 
 /// One entry of a list.
@@ -84,12 +84,17 @@ pub enum Progress {
     Refused(Why),
 }
 
+/// How often a drive is asked that does not answer: one may be busy, or an answer be lost on the way.
+const TRIES: u32 = 3;
+
 /// A list and the place in it.
 #[derive(Clone, Debug)]
 pub struct Script {
     entries: Vec<Entry>,
     at: usize,
     asked: bool,
+    /// Times it was asked in vain.
+    unanswered: u32,
     /// Numbers that were read.
     pub kept: [Option<i64>; KEPT],
     /// The time-out that a drive has accepted, ms.
@@ -99,12 +104,12 @@ pub struct Script {
 impl Script {
     /// At the start of a list.
     pub fn new(entries: Vec<Entry>, timeout_ms: u32) -> Script {
-        Script { entries, at: 0, asked: false, kept: [None; KEPT], timeout_ms }
+        Script { entries, at: 0, asked: false, unanswered: 0, kept: [None; KEPT], timeout_ms }
     }
 
     /// To the start again.
     pub fn rewind(&mut self) {
-        (self.at, self.asked) = (0, false);
+        (self.at, self.asked, self.unanswered) = (0, false, 0);
     }
 
     /// A number that was read.
@@ -113,7 +118,7 @@ impl Script {
     }
 
     fn next(&mut self, further: usize) {
-        (self.at, self.asked) = (self.at + 1 + further, false);
+        (self.at, self.asked, self.unanswered) = (self.at + 1 + further, false, 0);
     }
 
     /// Asks the next thing, or takes the answer. Called once a tick.
@@ -154,7 +159,11 @@ impl Script {
             Outcome::Idle | Outcome::Busy => Progress::Busy,
             Outcome::Done => self.take(entry, client.data()),
             Outcome::Failed(failure) => {
-                let aborted = matches!(failure, crate::canopen::sdo::Failure::Aborted(_));
+                let aborted = matches!(failure, Failure::Aborted(_));
+                if failure == Failure::Silence && self.unanswered + 1 < TRIES {
+                    (self.asked, self.unanswered) = (false, self.unanswered + 1);
+                    return Progress::Busy;
+                }
                 match entry {
                     Entry::ReadIf(..) if aborted => self.next(0),
                     Entry::WriteOr(.., further) if aborted => self.next(further),

@@ -93,11 +93,16 @@ impl Served {
         for Sheet { drive, file, text } in &doors.sheets {
             let at = rig.nodes.iter().position(|node| node.name == *drive);
             let Some((at, Kind::Cia402(config))) = at.map(|at| (at, &rig.nodes[at].kind)) else {
-                return Err(misused(format!("the rig has no drive `{drive}`")));
+                let all = rig.nodes.iter().filter(|node| matches!(node.kind, Kind::Cia402(_)));
+                let all: Vec<&str> = all.map(|node| node.name.as_str()).collect();
+                return Err(misused(format!("the rig has no drive `{drive}`; it has {}", all.join(", "))));
             };
             let sheet = eds::read(text, config.node).map_err(|mistakes| {
-                let all: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
-                failed(format!("{file} is no data sheet: {}", all.join("; ")))
+                let mut first: Vec<String> = mistakes.iter().take(3).map(ToString::to_string).collect();
+                if mistakes.len() > first.len() {
+                    first.push(format!("and {} more", mistakes.len() - first.len()));
+                }
+                failed(format!("{file} is no data sheet: {}", first.join("; ")))
             })?;
             let objects = bench.drive(at).expect("it is a drive").objects();
             // What the drive simulates it knows better.

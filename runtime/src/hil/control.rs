@@ -73,6 +73,8 @@ struct Watched {
 const ODD: u32 = 3;
 /// Ticks after which a drive's signal is lost where the rig names no time.
 const TIMEOUT: u32 = 3;
+/// The least such time where what is late is only counted, ns.
+pub const PATIENT_NS: u64 = 60_000_000_000;
 /// How late a drive's speed may be behind its position at least, s.
 const SPEED_LATE: f64 = 2e-3;
 /// Torque that could act on a shaft beyond that of its drives, as a multiple of theirs.
@@ -200,6 +202,7 @@ impl Control {
         let torque: f64 = moving.iter().map(strongest).sum();
         let own_acceleration = rig.plant.inertia.map_or(f64::INFINITY, |inertia| torque / inertia);
         let acceleration = SURPLUS * own_acceleration;
+        let patient = ticks(PATIENT_NS);
         let mut watched: Vec<Watched> = Vec::new();
         let mut watch = |signal: Signal, start: f64, needed: bool| {
             let at = watched.iter().position(|other| other.signal == signal);
@@ -208,6 +211,8 @@ impl Control {
                 0 => node.moves.then_some(TIMEOUT),
                 ns => Some(u32::try_from(ns / rig.period_ns).unwrap_or(u32::MAX).max(1)),
             };
+            // What is late between this process and itself says nothing of the drives.
+            let timeout = timeout.map(|own| if options.count_overruns { own.max(patient) } else { own });
             let timeout = timeout.filter(|_| needed);
             if let Some(at) = at {
                 watched[at].timeout = watched[at].timeout.or(timeout);

@@ -36,8 +36,36 @@ pub enum Verdict {
     Unpredictable,
 }
 
-/// A contact that a drive plays.
-struct Contact {
+/// A contact that a drive plays, as a slow turn shows it.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Contact {
+    /// Its output: an index into the rig's.
+    pub output: usize,
+    /// The torque that it gives at most, N·m.
+    pub most: f64,
+    /// Its stiffness at rest, N·m/rad.
+    pub stiffness: f64,
+}
+
+/// The contacts that drives of a rig play: found by turning the shaft of the model slowly. Where a drive is to look ahead,
+/// only its own. `model`: the control program before its start.
+pub fn contacts(rig: &Rig, model: &Instance) -> Vec<Contact> {
+    let speeds: Vec<Slot> =
+        rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
+    let found = rig.outputs.iter().enumerate().filter_map(|(at, output)| {
+        let node = output.signal.node;
+        let Kind::Cia402(drive) = &rig.nodes[node].kind else { return None };
+        if drive.mode != Mode::Torque || rig.predict.is_some_and(|emulates| emulates != node) {
+            return None;
+        }
+        let (most, stiffness) = turned(rig, model, &speeds, output.slot)?;
+        Some(Contact { output: at, most, stiffness })
+    });
+    found.collect()
+}
+
+/// The energy of a contact, watched.
+struct Watched {
     energy: Energy,
     /// Torque and speed of its drive among the readings.
     torque: usize,
@@ -51,7 +79,7 @@ pub struct Coupling {
     look: Option<Wired>,
     /// Position of the shaft among the readings.
     position: usize,
-    contacts: Vec<Contact>,
+    contacts: Vec<Watched>,
     /// Torques of all drives among the readings.
     torques: Vec<usize>,
     /// Without looking ahead the loop is unstable.
@@ -68,16 +96,11 @@ impl Coupling {
         let at = |signal: Signal| watched.iter().position(|other| *other == signal);
         let torques: Vec<usize> =
             (0..rig.nodes.len()).filter_map(|node| at(Signal { node, what: What::Torque })).collect();
-        let contact = |output: &abi::rig::Output| {
-            let node = output.signal.node;
-            let Kind::Cia402(drive) = &rig.nodes[node].kind else { return None };
-            if drive.mode != Mode::Torque || rig.predict.is_some_and(|emulates| emulates != node) {
-                return None;
-            }
-            let speeds: Vec<Slot> =
-                rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
-            let store = store(rig, model, &speeds, output.slot)?;
-            Some(Contact {
+        let watch = |contact: Contact| {
+            let node = rig.outputs[contact.output].signal.node;
+            // The largest energy that it holds.
+            let store = 0.5 * contact.most * contact.most / contact.stiffness;
+            Some(Watched {
                 energy: Energy::new(store, rig.period_ns as f64 * 1e-9),
                 torque: at(Signal { node, what: What::Torque })?,
                 speed: at(Signal { node, what: What::Speed })?,
@@ -89,7 +112,7 @@ impl Coupling {
             now_ns: 0,
             look: look.filter(|_| position.is_some()),
             position: position.unwrap_or_default(),
-            contacts: rig.outputs.iter().filter_map(contact).collect(),
+            contacts: contacts(rig, model).into_iter().filter_map(watch).collect(),
             torques,
             needs_look: false,
             stops: false,
@@ -193,13 +216,12 @@ const TURN: u32 = 2000;
 /// Turns of growing length until the contact breaks away.
 const TURNS: u32 = 40;
 
-/// The largest energy that a contact holds, J: F²/(2 K) of its break-away torque and of its stiffness at rest. None if
-/// this output is no contact: at rest it gives no torque, a small turn either way is answered as by a spring, a long one
-/// by a torque that grows no more.
-fn store(rig: &Rig, model: &Instance, speeds: &[Slot], output: Slot) -> Option<f64> {
+/// The break-away torque of a contact and its stiffness at rest. None if this output is no contact: at rest it gives no
+/// torque, a small turn either way is answered as by a spring, a long one by a torque that grows no more.
+fn turned(rig: &Rig, model: &Instance, speeds: &[Slot], output: Slot) -> Option<(f64, f64)> {
     let (period, steps) = (rig.period_ns as f64 * 1e-9, u64::from(rig.steps.max(1)));
     // Greatest torque while it is turned, and the torques after the first step and after the last but one.
-    let turned = |speed: f64, n: u32| {
+    let turn = |speed: f64, n: u32| {
         let mut model = model.clone();
         speeds.iter().for_each(|slot| model.set(*slot, speed));
         let begun = model.start(period / steps as f64);
@@ -215,19 +237,19 @@ fn store(rig: &Rig, model: &Instance, speeds: &[Slot], output: Slot) -> Option<f
         (most.is_finite() && !last.is_nan()).then_some((most, first, last))
     };
     let small = 1e-9;
-    let (_, first, last) = turned(small, 11)?;
+    let (_, first, last) = turn(small, 11)?;
     let stiffness = ((last - first) / (10.0 * period * small)).abs();
-    let (at_rest, ..) = turned(0.0, 2)?;
+    let (at_rest, ..) = turn(0.0, 2)?;
     let springs = stiffness > 0.0 && stiffness.is_finite() && at_rest <= 1e-3 * stiffness * 1e-6;
-    let (_, back, _) = turned(-small, 11)?;
+    let (_, back, _) = turn(-small, 11)?;
     if !springs || back * first >= 0.0 {
         return None;
     }
     let mut angle = 1e-6;
     for _ in 0..TURNS {
-        let (most, ..) = turned(angle / (f64::from(TURN) * period), TURN)?;
+        let (most, ..) = turn(angle / (f64::from(TURN) * period), TURN)?;
         if most < 0.3 * stiffness * angle {
-            return Some(0.5 * most * most / stiffness).filter(|store| *store > 0.0);
+            return (most > 0.0).then_some((most, stiffness));
         }
         angle *= 2.0;
     }

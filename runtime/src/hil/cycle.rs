@@ -277,6 +277,8 @@ pub struct Hil {
     resting_ns: Option<u64>,
     counts: Counts,
     misuse: bool,
+    /// The start-up is through, and nothing more was asked for.
+    checked: bool,
     end: Option<End>,
 }
 
@@ -339,6 +341,7 @@ impl Hil {
             resting_ns: None,
             counts: Counts::default(),
             misuse: false,
+            checked: false,
             end: None,
         };
         Ok((hil, operator))
@@ -397,6 +400,11 @@ impl Hil {
     /// How it ended, once it has.
     pub fn ended(&self) -> Option<&End> {
         self.end.as_ref()
+    }
+
+    /// Whether all checks of the start-up have passed, where nothing but them was asked for.
+    pub fn is_checked(&self) -> bool {
+        self.checked
     }
 
     /// Whether it was refused for what only simulated drives bear.
@@ -497,6 +505,7 @@ impl Hil {
             }
         }
         if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
+            self.checked = true;
             self.stop();
         }
         let arms_itself = self.options.arms_itself && self.end.is_none() && self.resting_ns.is_none();
@@ -562,7 +571,9 @@ impl Hil {
     /// Computes, once the drives have told their limits.
     fn compute(&mut self, ticks: u32) -> Order {
         let step = self.fieldbus.step();
-        if self.control.is_none() && step >= Step::AwaitEnable && step < Step::Stopped {
+        // This takes many periods, since memory is mapped and locked. So it is done before a drive waits for SYNC or for our
+        // life sign: the ticks that pass meanwhile are nobody's.
+        if self.control.is_none() && step >= Step::Configure && step < Step::Stopped {
             self.begin_control();
         }
         let Some(control) = &mut self.control else { return Order::Wait };

@@ -4,6 +4,7 @@
 //! the language nor the terminal.
 
 pub mod coupling;
+pub mod standard;
 pub mod control;
 pub mod trace;
 pub mod replay;

@@ -362,7 +362,8 @@ mod tests {
             set: vec![(Slot(17), 0.3)],
             recorded: vec![1e-300, 2.0, 3.0],
         };
-        let mut words = Vec::new();
+        // A cycle finds its place ready.
+        let mut words = Vec::with_capacity(1 << 14);
         cycle.write(&mut words);
         assert_eq!(Cycle::read(shape, &words), Some(cycle));
         for cut in 0..words.len() {

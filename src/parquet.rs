@@ -1,0 +1,168 @@
+//! Tables of text → Parquet files, for those who read with pandas, Polars or DuckDB.
+//!
+//! In: rows of comma-separated values and what each column holds. Out: a file. An empty cell becomes a null. The only home
+//! of the crate `parquet`.
+
+use ::parquet::basic::{self, LogicalType, Repetition};
+use ::parquet::data_type::{BoolType, ByteArray, ByteArrayType, DataType, DoubleType, Int64Type};
+use ::parquet::errors::ParquetError;
+use ::parquet::file::properties::WriterProperties;
+use ::parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
+use ::parquet::schema::types::Type;
+use std::io::{self, Read, Write};
+use std::sync::Arc;
+
+/// What the cells of a column are.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Holds {
+    Numbers,
+    Integers,
+    Booleans,
+    Words,
+}
+
+/// Rows that are held before they are written, as one row group.
+const GROUP: usize = 1 << 16;
+
+/// Writes the rows of `csv` as a table with these columns. The first row is left out where it is a header.
+///
+/// # Errors
+/// A row that is too short or a cell that is not what its column holds, with the number of its row; what the writer
+/// answers.
+pub fn from_csv(csv: impl Read, header: bool, columns: &[(String, Holds)], to: impl Write + Send) -> io::Result<()> {
+    let mut file = SerializedFileWriter::new(to, Arc::new(schema(columns)?), Arc::new(WriterProperties::default()))?;
+    let mut reader = ::csv::ReaderBuilder::new().has_headers(header).from_reader(csv);
+    let mut cells: Vec<Vec<String>> = vec![Vec::new(); columns.len()];
+    let (mut record, mut before) = (::csv::StringRecord::new(), 0);
+    loop {
+        let more = reader.read_record(&mut record)?;
+        if more {
+            // A row of another length is an error of the reader.
+            cells.iter_mut().zip(&record).for_each(|(column, cell)| column.push(cell.to_string()));
+        }
+        let rows = cells.first().map_or(0, Vec::len);
+        if rows == GROUP || !more {
+            let mut group = file.next_row_group()?;
+            for ((name, holds), cells) in columns.iter().zip(&mut cells) {
+                column(&mut group, *holds, cells).map_err(|(row, cell)| {
+                    let row = before + row + 1;
+                    io::Error::new(io::ErrorKind::InvalidData, format!("row {row}: {name} cannot be `{cell}`"))
+                })??;
+                cells.clear();
+            }
+            group.close()?;
+            before += rows;
+        }
+        if !more {
+            file.close()?;
+            return Ok(());
+        }
+    }
+}
+
+/// The columns as the format describes them.
+fn schema(columns: &[(String, Holds)]) -> Result<Type, ParquetError> {
+    let column = |(name, holds): &(String, Holds)| {
+        let (kind, logical) = match holds {
+            Holds::Numbers => (basic::Type::DOUBLE, None),
+            Holds::Integers => (basic::Type::INT64, None),
+            Holds::Booleans => (basic::Type::BOOLEAN, None),
+            Holds::Words => (basic::Type::BYTE_ARRAY, Some(LogicalType::String)),
+        };
+        let builder = Type::primitive_type_builder(name, kind);
+        builder.with_repetition(Repetition::OPTIONAL).with_logical_type(logical).build().map(Arc::new)
+    };
+    let fields = columns.iter().map(column).collect::<Result<Vec<_>, _>>()?;
+    Type::group_type_builder("table").with_fields(fields).build()
+}
+
+/// Cells of one column as one chunk. The outer error: a row, from 0, and its cell.
+fn column<W: Write + Send>(
+    group: &mut SerializedRowGroupWriter<'_, W>,
+    holds: Holds,
+    cells: &[String],
+) -> Result<Result<(), ParquetError>, (usize, String)> {
+    match holds {
+        Holds::Numbers => chunk::<DoubleType, W>(group, cells, |cell| cell.parse().ok()),
+        Holds::Integers => chunk::<Int64Type, W>(group, cells, |cell| cell.parse().ok()),
+        Holds::Booleans => chunk::<BoolType, W>(group, cells, |cell| cell.parse().ok()),
+        Holds::Words => chunk::<ByteArrayType, W>(group, cells, |cell| Some(ByteArray::from(cell))),
+    }
+}
+
+fn chunk<T: DataType, W: Write + Send>(
+    group: &mut SerializedRowGroupWriter<'_, W>,
+    cells: &[String],
+    read: impl Fn(&str) -> Option<T::T>,
+) -> Result<Result<(), ParquetError>, (usize, String)> {
+    let mut values = Vec::with_capacity(cells.len());
+    let mut present = Vec::with_capacity(cells.len());
+    for (row, cell) in cells.iter().enumerate() {
+        present.push(i16::from(!cell.is_empty()));
+        if !cell.is_empty() {
+            values.push(read(cell).ok_or_else(|| (row, cell.clone()))?);
+        }
+    }
+    let mut write = || {
+        let mut column = group.next_column()?.expect("one column of the schema is left");
+        column.typed::<T>().write_batch(&values, Some(&present), None)?;
+        column.close()
+    };
+    Ok(write())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ::parquet::file::reader::{FileReader, SerializedFileReader};
+    use std::fs::File;
+
+    fn columns() -> Vec<(String, Holds)> {
+        let named = |name: &str, holds| (name.to_string(), holds);
+        vec![
+            named("run", Holds::Integers),
+            named("fr.Fs [N]", Holds::Numbers),
+            named("holds", Holds::Booleans),
+            named("status", Holds::Words),
+        ]
+    }
+
+    /// The table of these rows, read again.
+    fn again(name: &str, csv: &str, header: bool) -> SerializedFileReader<File> {
+        let path = std::env::temp_dir().join(format!("fric-parquet-{name}-{}", std::process::id()));
+        from_csv(csv.as_bytes(), header, &columns(), File::create(&path).unwrap()).unwrap();
+        let file = File::open(&path).unwrap();
+        std::fs::remove_file(path).unwrap();
+        SerializedFileReader::new(file).unwrap()
+    }
+
+    #[test]
+    fn a_table_comes_back_with_its_kinds_and_gaps() {
+        let csv = "run,Fs,holds,status\n7,1e-5,true,ok\n8,,false,\"stopped: a, b\"\n9,NaN,,ok\n";
+        let file = again("kinds", csv, true);
+        let rows: Vec<String> = file.get_row_iter(None).unwrap().map(|row| row.unwrap().to_string()).collect();
+        assert_eq!(
+            rows,
+            [
+                "{run: 7, fr.Fs [N]: 0.00001, holds: true, status: \"ok\"}",
+                "{run: 8, fr.Fs [N]: null, holds: false, status: \"stopped: a, b\"}",
+                "{run: 9, fr.Fs [N]: NaN, holds: null, status: \"ok\"}",
+            ]
+        );
+    }
+
+    #[test]
+    fn what_does_not_fit_is_told_with_its_row() {
+        let refused = |csv: &str| from_csv(csv.as_bytes(), false, &columns(), Vec::new()).unwrap_err().to_string();
+        assert_eq!(refused("7,1,true,ok\n8,x,true,ok\n"), "row 2: fr.Fs [N] cannot be `x`");
+        assert!(refused("7,1,true,ok\n8\n").contains("found record with 1 fields"));
+    }
+
+    #[test]
+    fn many_rows_are_many_groups() {
+        let csv: String = (0..GROUP + 3).map(|k| format!("{k},0.5,true,ok\n")).collect();
+        let file = again("groups", &csv, false);
+        let metadata = file.metadata();
+        assert_eq!((metadata.num_row_groups(), metadata.file_metadata().num_rows()), (2, GROUP as i64 + 3));
+    }
+}
