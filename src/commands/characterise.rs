@@ -3,7 +3,7 @@
 use super::End;
 use crate::args::{Characterise, Compare};
 use crate::characterise::subject::{self, Origin, Subject, Written};
-use crate::characterise::{Extent, Seen, Study, page, study};
+use crate::characterise::{Extent, Seen, Study, page, shown, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
 use crate::{equations, project, report};
@@ -255,7 +255,6 @@ fn write(study: &Study, folder: &Path) -> Result<usize, String> {
 fn tell(study: &Study, terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &study.label));
     let scales = &study.scales;
-    let shown = |value: f64, unit: &str| crate::value::show(value, &crate::characterise::prefixed(unit, value).0, 4);
     terminal.line(&format!(
         "  lets go at {} after {}, slides with {}",
         shown(scales.f_b, study.units.force),
