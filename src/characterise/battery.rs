@@ -129,12 +129,19 @@ impl Entry {
         self
     }
 
-    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps.
-    pub fn step_fixed(&mut self) {
+    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps, unless
+    /// the model itself computes something oftener; `period` in s is how often, and a whole number of steps.
+    pub fn step_fixed(&mut self, period: Option<f64>) {
         const STEPS: [f64; 15] =
             [0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5];
         let wanted = (self.duration / self.fine).clamp(1e-5, self.longest.max(self.duration / 3e5));
-        let step = STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5);
+        let step = match period {
+            Some(period) => {
+                let parts = [1.0, 2.0, 4.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|parts| period / parts);
+                parts.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(period / 100.0)
+            }
+            None => STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5),
+        };
         self.solver = Some(format!("expo step {} s", n(step)));
         // Whole steps.
         self.duration = (self.duration / step).ceil() * step;

@@ -95,6 +95,9 @@ pub fn shown(value: f64, base: &str) -> String {
         "m" | "rad" | "m/s" | "rad/s" => 1e-12,
         _ => 0.0,
     };
+    if base.is_empty() {
+        return significant(value, 4);
+    }
     if value.abs() <= least {
         let small = if least > 0.0 { 1e-9 } else { 0.0 };
         return format!("0 {}", prefixed(base, small).0).trim_end().to_string();
@@ -360,8 +363,9 @@ impl Runner<'_> {
         let first = self.entries.len();
         self.entries.extend(entries(&layout));
         // What was slow once will be again.
-        let slow = self.slow;
-        self.entries[first..].iter_mut().filter(|entry| slow && entry.adaptive()).for_each(Entry::step_fixed);
+        let (slow, period) = (self.slow, self.subject.period);
+        let again = self.entries[first..].iter_mut().filter(|entry| slow && entry.adaptive());
+        again.for_each(|entry| entry.step_fixed(period));
         let mut names: Vec<String> = self.entries[first..].iter().map(|entry| entry.name.clone()).collect();
         for _ in 0..2 {
             let text = battery::text(&self.subject.imports, &layout.head(), &self.entries);
@@ -383,7 +387,7 @@ impl Runner<'_> {
                         _ => None,
                     });
                 }
-                entry.step_fixed();
+                entry.step_fixed(period);
             }
             if names.is_empty() {
                 break;
@@ -864,7 +868,10 @@ impl Reader<'_> {
             let last = points.iter().rev().find(|point| (point.1 - settled).abs() > 0.01 * size);
             last.map_or(0.0, |point| point.0)
         };
-        let far = (2.5 * moving(&forth).max(moving(&back))).max(1e-3 * turn);
+        let far = match moving(&forth).max(moving(&back)) {
+            0.0 => 0.1 * turn,
+            path => (2.5 * path).clamp(1e-3 * turn, turn),
+        };
         let cut = |points: Vec<(f64, f64)>| {
             let rows: Vec<Vec<f64>> = points.iter().map(|point| vec![point.0, point.1]).collect();
             let mut inside: Vec<(f64, f64)> = points.into_iter().filter(|point| point.0 <= far).collect();
@@ -1309,6 +1316,7 @@ mod tests {
             (22.68, "s", "22.68 s"),
             (123_456.0, "s", "123456 s"),
             (14.0, "", "14"),
+            (0.0, "", "0"),
         ];
         for (value, base, text) in cases {
             assert_eq!(shown(value, base), text, "{value:e} {base}");

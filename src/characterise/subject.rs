@@ -45,6 +45,8 @@ pub struct Subject {
     pub regimes: Vec<String>,
     /// Regimes of its own, not of its parts.
     pub own_regimes: Vec<String>,
+    /// How often its sampled code runs, in s: the shortest period.
+    pub period: Option<f64>,
 }
 
 /// The port `F_ext`.
@@ -292,6 +294,14 @@ pub fn params(model: &ast::Model, instance: &Instance) -> Vec<Param> {
         doc: quantity.doc.clone(),
     };
     of_kind.map(param).collect()
+}
+
+/// The shortest period in s of sampled code.
+pub fn period(instance: &Instance) -> Option<f64> {
+    let mut started = instance.clone();
+    started.start(1e-3);
+    let periods = started.description().ticks.iter().map(|tick| started.get(tick.period));
+    periods.filter(|period| *period > 0.0).min_by(f64::total_cmp)
 }
 
 #[cfg(test)]

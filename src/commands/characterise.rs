@@ -200,6 +200,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
             .filter(|automaton| automaton.path.is_empty())
             .flat_map(|automaton| automaton.regimes.clone())
             .collect(),
+        period: subject::period(instance),
         instance: written,
     })
 }
