@@ -244,7 +244,8 @@ pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
 /// The figure of one graph of a study, if it has it.
 pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
     let graphs = study.tests.iter().filter_map(|test| test.result.as_ref().ok()).flatten();
-    let graph = graphs.into_iter().find(|graph| graph.key == key)?;
+    // A force that jumps at every step is no picture of anything.
+    let graph = graphs.into_iter().find(|graph| graph.key == key && graph.alone.as_deref() != Some(JUMPS))?;
     // What did not move is no curve.
     let moved = graph.lines.iter().any(|line| line.points.iter().any(|point| point.0.abs() > 1e-12));
     moved.then(|| figure(&[(0, &study.label, graph)], 1))

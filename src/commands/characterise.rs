@@ -6,7 +6,7 @@ use crate::characterise::subject::{self, Origin, Subject, Written};
 use crate::characterise::{Extent, Seen, Study, page, shown, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
-use crate::{equations, project, report};
+use crate::{project, report};
 use serde_json::{Value, json};
 use std::path::{Component, Path, PathBuf};
 
@@ -188,7 +188,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
              // Run it with `fric run`, one experiment by its name; change what you like.\n{imports}"
         ),
         doc: model.doc.clone(),
-        equations: equations::equations(model),
+        equations: subject::equations(&loaded, model, &written),
         rotary,
         external: subject::external(model),
         params: subject::params(model, instance),
