@@ -4,7 +4,8 @@
 //! bars for `abs` only.
 
 use grammar::ast::{
-    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Statement, Target, UnaryOp,
+    BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Reset, Statement, Target,
+    UnaryOp,
 };
 
 /// The equations of a model, left and right side, in the order of the text; regimes have a heading of their own, which
@@ -32,20 +33,27 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
                 lines.push((format!("in {}:", mode.name.text), String::new()));
                 lines.extend(mode.equations.iter().map(sides));
                 for go in &mode.transitions {
-                    lines.push((format!("→ {}", go.target.text), format!("when {}", expression(&go.condition))));
+                    let resets = match &go.resets[..] {
+                        [] => String::new(),
+                        some => format!(", then {}", reset(some)),
+                    };
+                    let condition = expression(&go.condition);
+                    lines.push((format!("→ {}", go.target.text), format!("when {condition}{resets}")));
                 }
             }
             Statement::When(when) => {
-                let resets = when
-                    .resets
-                    .iter()
-                    .map(|reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value)));
-                lines.push((format!("when {}", expression(&when.condition)), resets.collect::<Vec<_>>().join(", ")));
+                lines.push((format!("when {}", expression(&when.condition)), reset(&when.resets)));
             }
             Statement::Require(_) | Statement::Storage(_) | Statement::Allow(_) => {}
         }
     }
     lines
+}
+
+/// What states are put on: `slip := 0, Ea := left`.
+fn reset(resets: &[Reset]) -> String {
+    let one = |reset: &Reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value));
+    resets.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
 /// One line for each equation, the equals signs below each other.
@@ -163,7 +171,14 @@ fn binary(op: BinaryOp, a: &Expr, b: &Expr) -> String {
         BinaryOp::Equal => joined(" = ", 5, 5),
         BinaryOp::NotEqual => joined(" ≠ ", 5, 5),
         BinaryOp::And => joined(" and ", 2, 3),
-        BinaryOp::Or => joined(" or ", 1, 2),
+        BinaryOp::Or => {
+            // It binds tighter, but who remembers.
+            let side = |x: &Expr, least: u8| match &x.kind {
+                ExprKind::Binary(BinaryOp::And, ..) => format!("({})", expression(x)),
+                _ => inside(x, least),
+            };
+            format!("{} or {}", side(a, 1), side(b, 2))
+        }
         BinaryOp::Crosses => joined(" crosses ", 5, 5),
         BinaryOp::Rises => joined(" rises through ", 5, 5),
         BinaryOp::Falls => joined(" falls through ", 5, 5),
@@ -271,6 +286,7 @@ mod tests {
         assert_eq!(shown("a / (b * c)"), "a / (b · c)");
         assert_eq!(shown("if abs(v) < Dv then 0 else 10 um/s"), "0 if |v| < Dv, else 10 µm/s");
         assert_eq!(shown("(a + b)^-1 * 3 N·s^2/m^2"), "(a + b)⁻¹ · (3 N·s²/m²)");
+        assert_eq!(shown("u > Fs and v >= 0 or v > vh"), "(u > Fs and v ≥ 0) or v > vh");
         assert_eq!(symbol("eps_f"), "ε_f");
         assert_eq!(symbol("Fc"), "Fc");
     }

@@ -91,6 +91,21 @@ fn the_table_of_phenomena_is_what_the_catalogue_says() {
     assert_eq!(verdicts(&answers("tustin", "Tustin"), &TABLE), "-++-.--.");
 }
 
+/// The models of the table that have presliding.
+#[test]
+fn the_table_of_phenomena_goes_on_with_bristles_and_elements() {
+    // Dahl's break-away force is the same at every rate: a mass that swings on the bristle has not broken away.
+    let dahl = answers("dahl", "Dahl");
+    assert_eq!(verdicts(&dahl, &TABLE), "+--+---+");
+    // And it does not stick again: without a peak the mass only touches rest.
+    assert_eq!(verdicts(&dahl, &["stick_slip", "hysteresis", "dissipative"]), "-++");
+    // Return-point memory is that of its elastic part, here the inner loop to a half and back.
+    assert_eq!(verdicts(&answers("elasto_plastic", "ElastoPlastic"), &TABLE), "+++++++-");
+    let gms = answers("gms", "GMS");
+    assert_eq!(verdicts(&gms, &TABLE), "+++++++-");
+    assert_eq!(verdicts(&gms, &["stick_slip", "no_drift", "symmetric"]), "+++");
+}
+
 #[test]
 fn rotary_twins_give_the_same_numbers() {
     let (straight, rotary) = (answers("straight", "LuGre"), answers("rotary", "rotary LuGre"));
@@ -121,6 +136,15 @@ model Spring {
 }
 "#;
 
+/// Nothing in a page is fetched.
+fn assert_self_contained(page: &str) {
+    // Names, and clips within the page itself.
+    let outside = page.replace("http://www.w3.org/2000/svg", "").replace("url(#", "");
+    for request in ["http:", "https:", "src=", "<script", "<link", "<iframe", "<object", "@import", "url(", "//cdn"] {
+        assert!(!outside.contains(request), "{request}");
+    }
+}
+
 #[test]
 fn a_users_model_gets_a_page_a_battery_and_tables() {
     let folder = folder("mine");
@@ -129,11 +153,7 @@ fn a_users_model_gets_a_page_a_battery_and_tables() {
     assert!(words.contains("Mine(Fc = 3N)") && words.contains("slides with 3 N"), "{words}");
     let page = fs::read_to_string(folder.join("report/report.html")).unwrap();
     assert!(page.contains("My first contact.") && page.contains("Coulomb friction"));
-    // Self-contained: nothing is fetched.
-    for request in ["http://", "https://", "src=", "<script", "<link", "@import", "url(h"] {
-        let outside = page.replace("http://www.w3.org/2000/svg", "");
-        assert!(!outside.contains(request), "{request}");
-    }
+    assert_self_contained(&page);
     assert!(fs::read_to_string(folder.join("report/steady.csv")).unwrap().starts_with("curve,|v| [m/s],|F| [N]\n"));
     // The battery is a text like any other.
     let again = fric(&folder, &["run", "report/battery.fric", "hold", "--quiet", "--out", "again"]);
@@ -141,6 +161,14 @@ fn a_users_model_gets_a_page_a_battery_and_tables() {
     // The same bytes once more.
     fric(&folder, &["characterise", "mine.fric", "--set", "Fc=3N", "--out", "report"]);
     assert_eq!(fs::read_to_string(folder.join("report/report.html")).unwrap(), page);
+}
+
+/// A model that computes once a millisecond is stepped so that its ticks fall on whole steps.
+#[test]
+fn a_sampled_model_is_stepped_by_its_period() {
+    let clip = answers("clip", "KFMClip");
+    assert_eq!(verdicts(&clip, &["holds", "no_drift", "stiction_peak", "stick_slip"]), "++++");
+    assert!((number(&clip, "break_away", "at 1 N/s") - 1.5).abs() < 2e-3);
 }
 
 #[test]
@@ -164,6 +192,24 @@ fn models_share_axes_on_one_page() {
     assert!(words.contains("1 KFM") && words.contains("2 BlimanSorine"), "{words}");
     let page = fs::read_to_string(folder.join("page/compare.html")).unwrap();
     assert!(page.contains("with the history") && page.matches("<svg").count() > 10);
+    assert_self_contained(&page);
+}
+
+/// What jumps to and fro at rest would hide the loops of the others.
+#[test]
+fn a_model_that_chatters_is_not_drawn_over_others() {
+    let folder = folder("chatters");
+    fric(&folder, &["compare", "Coulomb", "Dahl", "--out", "page"]);
+    let page = fs::read_to_string(folder.join("page/compare.html")).unwrap();
+    assert!(page.contains("Coulomb is not drawn over x: at rest its force jumps to and fro"));
+    assert_self_contained(&page);
+    // Numbers as people write them: no exponents among the verdicts and scales.
+    let head = page.split("<h2>Tests</h2>").next().unwrap().split("</style>").nth(1).unwrap();
+    let digit = |c: Option<char>| c.is_some_and(|c| c.is_ascii_digit());
+    let exponents = head
+        .match_indices("e-")
+        .filter(|(at, _)| digit(head[..*at].chars().next_back()) && digit(head[at + 2..].chars().next()));
+    assert_eq!(exponents.count(), 0, "{head}");
 }
 
 /// Everything a command leaves behind, byte by byte, twice; a folder of its own for each time.

@@ -12,11 +12,16 @@ mod compile {
 
 use compiler::{Options, load};
 
-/// Odd models of the library. GearEfficiency is not odd by design (the load drives), PositionDependent not by its ripple; the
-/// clipping of Gonthier rounds up and down alike, so it is odd but for its last bit (tests/stdlib/mirror.fric).
+/// Odd models of the library. GearEfficiency is not odd by design (the load drives), PositionDependent not by its ripple,
+/// Bristles not by its random places.
 const ODD: &str = "Coulomb(), CoulombViscous(), StribeckGauss(), StribeckLorentz(), Tustin(), KFM(), KFMSmooth(), \
-    Karnopp(), BlimanSorine(), LuGre(), LuGre(vd = 10 mm/s), Dahl(), ElastoPlastic(), MaxwellSlip(), GMS(), \
-    LeuvenModified(), BoucWen(), BrownMcPhee(), Makkar(), BengisuAkay(), Threlfall(), Ambrosio()";
+    KFMSmooth(soft = AtanSign()), KFMSmooth(soft = RootSign()), KFMSmooth(soft = ClampSign()), KFMDwell(), Karnopp(), BlimanSorine(), LuGre(), LuGre(vd = 10 mm/s), Dahl(), ElastoPlastic(), MaxwellSlip(), GMS(), \
+    LeuvenModified(), BoucWen(), BrownMcPhee(), Makkar(), BengisuAkay(), Threlfall(), Ambrosio(), Gonthier(), \
+    BoPavelescu(), Viscous(), ViscousPowers(), BreakAwayTanh(), Smoothed(), Sticking(), TableFriction(), \
+    PointsFriction(), LoadedStribeck(), LoadedLuGre(), LuGreCurve(), LuGreAsymmetric(), BlimanSorine1(), DahlPower(), \
+    ResetIntegrator(), Armstrong(), BristleMass(), RateState(), GearM1(), GearM2(), \
+    GearM3(F_m = 3 N), GearM4(F_m = 3 N), GearM5(F_m = 3 N), GearM6(F_m = 3 N), MaxwellElement(), Asymmetric(), \
+    BittencourtGunnarsson()";
 
 /// Moves every odd model to and fro, and the other way round: one program, its amplitude of the other sign.
 fn mirrored(solver: &str, h: f64, steps: u32) {

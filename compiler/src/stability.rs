@@ -64,6 +64,9 @@ pub struct Along {
     pub limit: f64,
     /// The farthest point that was looked at, SI.
     pub farthest: f64,
+    /// Whether it is the other way round: stable from `limit` on, unstable from there down to `farthest`, which is next to
+    /// nothing. So it is where friction is steepest at rest and the run starts in motion.
+    pub inward: bool,
     /// Whether the declared ranges, or what ends a run, go no farther.
     pub closed: bool,
 }
@@ -268,7 +271,9 @@ impl<'a> Bench<'a> {
                 .min_by(|a, b| a.abs().total_cmp(&b.abs()));
             let (mut high, start) = (first.unwrap_or(value), self.base[scan.slot.index()]);
             let below = scan.values.iter().filter(|x| same(x) && x.abs() < high.abs());
-            let mut low = below.copied().max_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(start);
+            let below = below.copied().max_by(|a, b| a.abs().total_cmp(&b.abs()));
+            let inward = below.is_none() && start.abs() > high.abs();
+            let (least, mut low) = (high, below.unwrap_or(start));
             for _ in 0..40 {
                 let middle = 0.5 * (low + high);
                 match self.grows(&stepper, &point(middle), h) {
@@ -277,9 +282,12 @@ impl<'a> Bench<'a> {
                 }
             }
             // What ends a run may lie between two powers of ten.
-            let edge = self.edge(setting, scan.slot, farthest.copysign(value), &scan);
+            let edge = match inward {
+                true => least,
+                false => self.edge(setting, scan.slot, farthest.copysign(value), &scan),
+            };
             let block = point(edge);
-            let along = Along { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), closed };
+            let along = Along { slot: scan.slot, limit: low.abs(), farthest: edge.abs(), inward, closed };
             let stable = self.largest(&stepper, &block, h);
             return Some(Unstable { state, rate: self.rate(&block, state), along: Some(along), stable });
         }

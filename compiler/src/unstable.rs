@@ -99,7 +99,7 @@ impl Fixed<'_> {
         };
         let mut out = if open { Diagnostic::warning("W0704", message) } else { Diagnostic::error("E0702", message) };
         let rate = match &scanned {
-            Some((along, (_, unit))) if stiff => {
+            Some((along, (_, unit))) if stiff && !along.inward => {
                 format!("a rate of {} 1/s per {}", two_digits(unstable.rate / along.farthest * unit.scale), unit.text)
             }
             _ if stiff => format!("a rate of {} 1/s", two_digits(unstable.rate)),
@@ -110,9 +110,18 @@ impl Fixed<'_> {
         out = out.label(place, format!("{about}{equation}{rate}"));
         let limit = match &scanned {
             Some((along, (name, unit))) => {
-                let text = format!("stable at {step} only for |{name}| <= {}", amount(along.limit, unit));
-                let far = || format!("; at {} it would need a step of {needed}", amount(along.farthest, unit));
-                if open { text + &far() } else { text }
+                let (limit, far) = (amount(along.limit, unit), amount(along.farthest, unit));
+                match (along.inward, open) {
+                    (true, _) => {
+                        format!("stable at {step} only for |{name}| >= {limit}; at rest it would need {needed}")
+                    }
+                    (false, true) => {
+                        format!(
+                            "stable at {step} only for |{name}| <= {limit}; at {far} it would need a step of {needed}"
+                        )
+                    }
+                    (false, false) => format!("stable at {step} only for |{name}| <= {limit}"),
+                }
             }
             None => format!("stable below a step of {needed} only"),
         };

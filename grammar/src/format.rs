@@ -307,6 +307,7 @@ impl<'s, 't> Layout<'s, 't> {
                     return !(index || self.source.word(at + 2) == "in");
                 }
                 ":" => return self.slot(at),
+                "-" if self.hyphen(at) => return false,
                 "/" if self.strokes.contains(&self.source.marks[at].token.start) => return false,
                 _ => {}
             }
@@ -315,7 +316,7 @@ impl<'s, 't> Layout<'s, 't> {
             match left {
                 "(" | "[" | "." | "^" => return false,
                 "/" if self.strokes.contains(&self.source.marks[before].token.start) => return false,
-                "-" if unary(before) => return false,
+                "-" if unary(before) || self.hyphen(before) => return false,
                 _ => {}
             }
         }
@@ -326,6 +327,12 @@ impl<'s, 't> Layout<'s, 't> {
     fn slot(&self, colon: usize) -> bool {
         let start = (0..=colon).rev().find(|&at| self.starts[at].is_some()).unwrap_or(0);
         self.source.is_word(start, "part")
+    }
+
+    /// Whether a minus sign is the hyphen in the name of a warning: `allow large-step`.
+    fn hyphen(&self, minus: usize) -> bool {
+        let start = (0..=minus).rev().find(|&at| self.starts[at].is_some()).unwrap_or(0);
+        self.source.is_word(start, "allow")
     }
 
     // ---- columns

@@ -82,6 +82,11 @@ fn blanks_and_units_become_canonical() {
         "model M { state z = 0 dz/dt = delta/depth*-a  }",
         "model M {\n  state  z = 0\n  dz/dt = delta / depth * -a\n}\n",
     );
+    // A hyphen in the name of a warning is no minus sign.
+    becomes(
+        "model M{allow not-dissipative   \"a - b\"\noutput y=1-2}",
+        "model M {\n  allow not-dissipative \"a - b\"\n  output y = 1 - 2\n}\n",
+    );
     becomes("\n\n// a\n\n\n// b\nimport   std.friction // c", "// a\n\n// b\nimport std.friction  // c\n");
     becomes(
         "table t(v [m/s])[N]=linear{0 m/s:1 N,1 m/s:2 N}",

@@ -106,7 +106,12 @@ impl Entry {
 
     /// Moved at one speed, so that nothing depends on the step but how far the contact goes in it.
     fn steady(self) -> Entry {
-        Entry { longest: f64::INFINITY, fine: 5e4, ..self }
+        Entry { longest: f64::INFINITY, fine: 2.5e4, ..self }
+    }
+
+    /// With as many steps as may be, if it must be run with fixed ones: what others are compared with.
+    fn finest(self) -> Entry {
+        Entry { fine: 3e5, ..self }
     }
 
     fn plot(mut self, plot: impl Into<String>) -> Entry {
@@ -124,15 +129,28 @@ impl Entry {
         self
     }
 
-    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps.
-    pub fn step_fixed(&mut self) {
+    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps, unless
+    /// the model itself computes something oftener; `period` in s is how often, and a whole number of steps.
+    pub fn step_fixed(&mut self, period: Option<f64>) {
         const STEPS: [f64; 15] =
             [0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5];
         let wanted = (self.duration / self.fine).clamp(1e-5, self.longest.max(self.duration / 3e5));
-        let step = STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5);
+        let step = match period {
+            Some(period) => {
+                let parts = [1.0, 2.0, 4.0, 5.0, 10.0, 20.0, 50.0, 100.0].map(|parts| period / parts);
+                parts.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(period / 100.0)
+            }
+            None => STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5),
+        };
         self.solver = Some(format!("expo step {} s", n(step)));
         // Whole steps.
         self.duration = (self.duration / step).ceil() * step;
+    }
+
+    /// The length of its steps in s, where that is fixed.
+    pub fn step(&self) -> Option<f64> {
+        let text = self.solver.as_ref()?.strip_prefix("expo step ")?;
+        text.strip_suffix(" s")?.parse().ok()
     }
 
     /// Whether it steps adaptively.
@@ -199,11 +217,13 @@ impl<'a> Layout<'a> {
         &self.subject.own_regimes
     }
 
-    /// What fills the slot of a bench that has no force of its own.
-    fn moved(&self) -> String {
+    /// What fills the slot of a bench that has no force of its own but moves the contact at a speed. A drive that does so
+    /// pushes as hard as it takes, so a contact that asks for the force is told of more than it can hold.
+    fn moved(&self, v: &str) -> String {
+        let push = format!("{} {} * sign({v})", n(100.0 * power_near(self.scales.f_ref)), self.units.force);
         match self.subject.external {
-            External::Required => self.subject.instance.with(&[("F_ext", "0")]),
-            External::Absent | External::Optional => self.subject.instance.to_string(),
+            External::Required | External::Optional => self.subject.instance.with(&[("F_ext", &push)]),
+            External::Absent => self.subject.instance.to_string(),
         }
     }
 
@@ -218,7 +238,7 @@ impl<'a> Layout<'a> {
     }
 
     fn speed_bench(&self, v: &str) -> String {
-        format!("{}SpeedBench(v = {v}, fr = {})", self.units.bench, self.moved())
+        format!("{}SpeedBench(v = {v}, fr = {})", self.units.bench, self.moved(v))
     }
 
     /// Models that the experiments share.
@@ -282,8 +302,8 @@ impl<'a> Layout<'a> {
             let grid = if k == 0 { &GRID[..1] } else { &GRID[..] };
             let speeds = grid.iter().flat_map(|g| [g * low, -g * low]).map(|v| format!("{} {speed}", n(v)));
             let speeds: Vec<String> = speeds.collect();
-            // e^−60 of the start is left of what settles along the path.
-            let travel = (60.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
+            // e^−30 of the start, 1e-13, is left of what settles along the path.
+            let travel = (30.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
             let mut entry = Entry::new(
                 format!("steady_{}", 7 - k),
                 format!("Steady friction from {} {speed} on, both directions.", n(low)),
@@ -542,7 +562,8 @@ impl<'a> Layout<'a> {
         let duration = round_up_to(f_b / (k * vp) * 2.0 + 5.0, 0.02);
         entries.push(motion(
             Entry::new("steps_reference", "The reference of the step-size sweep.", pulled.clone(), duration)
-                .solver("adaptive tol 1e-9"),
+                .solver("adaptive tol 1e-9")
+                .finest(),
         ));
         for (i, h) in self.steps().into_iter().enumerate() {
             entries.push(motion(

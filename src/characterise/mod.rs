@@ -17,4 +17,4 @@ mod study;
 pub mod page;
 
 pub use phenomena::Seen;
-pub use study::{Extent, Study, drawn, prefixed, study};
+pub use study::{Extent, Study, drawn, shown, study};

@@ -3,7 +3,7 @@
 //! In: one [`Study`] or several. Out: a page. Figures are SVG in the page, nothing is fetched, nothing is run.
 
 use super::phenomena::Seen;
-use super::study::{Graph, Study, Test, figure, prefixed};
+use super::study::{Graph, Study, Test, figure, shown};
 use crate::equations;
 use crate::plot;
 use crate::value::{show, significant};
@@ -67,7 +67,7 @@ pub fn report(study: &Study) -> String {
         }
     );
     for note in &study.notes {
-        let _ = writeln!(body, "<p class=\"note\">{}</p>", escaped(note));
+        let _ = writeln!(body, "<p class=\"note\">{}</p>", words(note));
     }
 
     body += "<div class=\"top\">\n<div>\n<h2>Phenomena</h2>\n<table>\n\
@@ -80,7 +80,7 @@ pub fn report(study: &Study) -> String {
             finding.name,
             mark(finding.seen),
             finding.seen.words(),
-            escaped(&finding.why)
+            words(&finding.why)
         );
     }
     body += "</table>\n</div>\n<div>\n<h2>Parameters</h2>\n";
@@ -117,7 +117,7 @@ pub fn comparison(studies: &[Study]) -> String {
     );
     for study in studies {
         for note in &study.notes {
-            let _ = writeln!(body, "<p class=\"note\">{}: {}</p>", escaped(&study.label), escaped(note));
+            let _ = writeln!(body, "<p class=\"note\">{}: {}</p>", escaped(&study.label), words(note));
         }
     }
     body += "<h2>Phenomena</h2>\n<table>\n<tr><th>phenomenon</th>";
@@ -135,7 +135,7 @@ pub fn comparison(studies: &[Study]) -> String {
                 class(finding.seen),
                 mark(finding.seen),
                 finding.seen.words(),
-                escaped(&finding.why)
+                words(&finding.why)
             );
         }
         body += "</tr>\n";
@@ -183,6 +183,16 @@ fn section(test: &Test, studies: &[&Study]) -> String {
         match &test.result {
             Ok(own) => {
                 for graph in own {
+                    if let Some(why) = graph.alone.as_ref().filter(|_| studies.len() > 1) {
+                        let _ = writeln!(
+                            reasons,
+                            "<p class=\"reason\">{} is not drawn over {}: {}</p>",
+                            escaped(&study.label),
+                            escaped(&graph.x.0),
+                            escaped(why)
+                        );
+                        continue;
+                    }
                     match graphs.iter_mut().find(|group| group[0].2.key == graph.key && group[0].2.x.1 == graph.x.1) {
                         Some(group) => group.push((number, &study.label, graph)),
                         None => graphs.push(vec![(number, &study.label, graph)]),
@@ -242,7 +252,6 @@ fn parameters(study: &Study) -> String {
 
 fn scale_rows(study: &Study) -> [(&'static str, String); 4] {
     let scales = &study.scales;
-    let shown = |value: f64, base: &str| show(value, &prefixed(base, value).0, 4);
     [
         ("break-away force of a slow ramp, F_b", shown(scales.f_b, study.units.force)),
         ("travel until then, x_b", shown(scales.x_b, study.units.length)),
@@ -275,24 +284,32 @@ fn prose(doc: &str) -> String {
     let mut out = String::new();
     for block in doc.trim_matches('\n').split("\n\n") {
         let set_in = |line: &str| line.starts_with("  ");
-        let (mut words, mut lines) = (String::new(), String::new());
+        let (mut text, mut lines) = (String::new(), String::new());
         for line in block.lines() {
             if set_in(line) {
                 lines += &format!("{}\n", escaped(line.trim_end()));
             } else {
-                words += &format!("{} ", escaped(line.trim()));
+                text += &format!("{} ", line.trim());
             }
         }
-        if !words.is_empty() {
-            let code = words.trim().split('`').enumerate();
-            let code = code.map(|(i, part)| if i % 2 == 1 { format!("<code>{part}</code>") } else { part.to_string() });
-            out += &format!("<p>{}</p>\n", code.collect::<String>());
+        if !text.is_empty() {
+            out += &format!("<p>{}</p>\n", words(text.trim()));
         }
         if !lines.is_empty() {
             out += &format!("<pre class=\"quiet\">{lines}</pre>\n");
         }
     }
     out
+}
+
+/// A line of words, with what stands between backticks as code.
+fn words(text: &str) -> String {
+    let parts = text.split('`').enumerate();
+    let part = |(i, part): (usize, &str)| match i % 2 {
+        1 => format!("<code>{}</code>", escaped(part)),
+        _ => escaped(part),
+    };
+    parts.map(part).collect()
 }
 
 fn class(seen: Seen) -> &'static str {

@@ -231,10 +231,7 @@ impl Look<'_> {
         }
         let area = self.test("presliding").ok().and_then(|test| Self::number(test, "loop_area"));
         let Some(area) = area else { return (Seen::NotApplicable, "not measured".into()) };
-        when(
-            area.value > 0.005,
-            format!("the loop fills {} % of its box", super::study::plain((1000.0 * area.value).round() / 10.0)),
-        )
+        when(area.value > 0.005, format!("the loop fills {} of its box", area.shown()))
     }
 
     fn memory(&self) -> Answer {
@@ -246,13 +243,7 @@ impl Look<'_> {
         }
         let error = self.test("presliding").ok().and_then(|test| Self::number(test, "memory_error"));
         let Some(error) = error else { return (Seen::NotApplicable, "not measured".into()) };
-        when(
-            error.value < 0.01,
-            format!(
-                "the inner loop misses its start by {} % of its width",
-                super::study::plain((1000.0 * error.value).round() / 10.0)
-            ),
-        )
+        when(error.value < 0.01, format!("the inner loop misses its start by {} of its width", error.shown()))
     }
 
     fn lag(&self) -> Answer {
@@ -263,7 +254,14 @@ impl Look<'_> {
         let widest = Self::all(test, "lag").into_iter().max_by(|a, b| a.value.abs().total_cmp(&b.value.abs()));
         let Some(widest) = widest else { return (Seen::NotApplicable, "not measured".into()) };
         let size = self.scales.f_c.max(self.scales.f_b);
-        when(widest.value > 0.005 * size, format!("loop up to {} wide", widest.shown()))
+        let wide = Number { value: widest.value.abs(), ..widest.clone() }.shown();
+        match widest.value > 0.005 * size {
+            true => when(true, format!("loop up to {wide} wide")),
+            false if widest.value < -0.005 * size => {
+                when(false, format!("F is higher while the speed falls, by up to {wide}"))
+            }
+            false => when(false, format!("F at rising and at falling speed differ by {wide} at most")),
+        }
     }
 
     fn varying(&self) -> Answer {
@@ -300,14 +298,7 @@ impl Look<'_> {
                 format!("with the history: the overshoot after a reversal is {ratio} times that from rest"),
             );
         }
-        when(
-            false,
-            format!(
-                "{} at every rate, within {} %",
-                slow.shown(),
-                super::study::plain((1000.0 * change.value).round() / 10.0)
-            ),
-        )
+        when(false, format!("{} at every rate, within {}", slow.shown(), change.shown()))
     }
 
     fn stick_slip(&self) -> Answer {
@@ -335,13 +326,7 @@ impl Look<'_> {
         let Some(part) = Self::number(test, "rate_difference_part") else {
             return (Seen::NotApplicable, "not measured".into());
         };
-        when(
-            part.value < 2e-3,
-            format!(
-                "differs by {} % from 0.1 to 10 times the speed",
-                super::study::plain((1e4 * part.value).round() / 100.0)
-            ),
-        )
+        when(part.value < 2e-3, format!("differs by {} from 0.1 to 10 times the speed", part.shown()))
     }
 
     fn dissipative(&self) -> Answer {

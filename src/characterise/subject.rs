@@ -3,7 +3,7 @@
 //! In: a model's name with arguments and where to look for it. Out: a [`Subject`], or why it cannot be tested.
 
 use crate::compile::{Loaded, Lookup, Space};
-use crate::equations::expression;
+use crate::equations::{self, expression};
 use abi::Instance;
 use abi::description::Kind;
 use abi::unit::{Dimension, Unit};
@@ -45,6 +45,8 @@ pub struct Subject {
     pub regimes: Vec<String>,
     /// Regimes of its own, not of its parts.
     pub own_regimes: Vec<String>,
+    /// How often its sampled code runs, in s: the shortest period.
+    pub period: Option<f64>,
 }
 
 /// The port `F_ext`.
@@ -168,6 +170,14 @@ impl Written {
         written.to_string()
     }
 
+    /// The model that was put into a slot.
+    fn slot(&self, part: &str) -> Option<&str> {
+        self.args.iter().find_map(|(name, argument)| match argument {
+            Argument::Model(model) if name == part => Some(model.model.as_str()),
+            _ => None,
+        })
+    }
+
     /// Short, for legends: without empty parentheses.
     pub fn label(&self) -> String {
         let text = self.to_string();
@@ -220,6 +230,28 @@ fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
 pub fn looks_like_friction(model: &ast::Model) -> bool {
     inputs(model).any(|(name, _)| name == "v")
         && declarations(model).any(|d| d.kind == DeclarationKind::Output && d.name.text == "F")
+}
+
+/// The equations of a model, and behind them those of its parts, each kind of part once.
+pub fn equations(loaded: &Loaded, found: &ast::Model, written: &Written) -> Vec<(String, String)> {
+    let mut lines = equations::equations(found);
+    let mut told: Vec<&str> = Vec::new();
+    for statement in &found.body {
+        let Statement::Part(part) = statement else { continue };
+        let (slot, own) = (equations::symbol(&part.name.text), &part.instance.model.text);
+        let name = written.slot(&part.name.text).unwrap_or(own);
+        // What was put into a slot stands there, not what the model has by itself.
+        if let Some((_, right)) = lines.iter_mut().find(|(left, right)| *left == slot && right == own) {
+            *right = name.to_string();
+        }
+        if let Some((_, part)) = model(loaded, name).filter(|_| !told.contains(&name)) {
+            told.push(name);
+            lines.push((String::new(), String::new()));
+            lines.push((format!("{name}:"), String::new()));
+            lines.extend(equations::equations(part));
+        }
+    }
+    lines
 }
 
 /// How a model treats the external force.
@@ -292,6 +324,14 @@ pub fn params(model: &ast::Model, instance: &Instance) -> Vec<Param> {
         doc: quantity.doc.clone(),
     };
     of_kind.map(param).collect()
+}
+
+/// The shortest period in s of sampled code.
+pub fn period(instance: &Instance) -> Option<f64> {
+    let mut started = instance.clone();
+    started.start(1e-3);
+    let periods = started.description().ticks.iter().map(|tick| started.get(tick.period));
+    periods.filter(|period| *period > 0.0).min_by(f64::total_cmp)
 }
 
 #[cfg(test)]

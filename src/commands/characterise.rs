@@ -3,10 +3,10 @@
 use super::End;
 use crate::args::{Characterise, Compare};
 use crate::characterise::subject::{self, Origin, Subject, Written};
-use crate::characterise::{Extent, Seen, Study, page, study};
+use crate::characterise::{Extent, Seen, Study, page, shown, study};
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::terminal::{Style, Terminal};
-use crate::{equations, project, report};
+use crate::{project, report};
 use serde_json::{Value, json};
 use std::path::{Component, Path, PathBuf};
 
@@ -188,7 +188,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
              // Run it with `fric run`, one experiment by its name; change what you like.\n{imports}"
         ),
         doc: model.doc.clone(),
-        equations: equations::equations(model),
+        equations: subject::equations(&loaded, model, &written),
         rotary,
         external: subject::external(model),
         params: subject::params(model, instance),
@@ -200,6 +200,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
             .filter(|automaton| automaton.path.is_empty())
             .flat_map(|automaton| automaton.regimes.clone())
             .collect(),
+        period: subject::period(instance),
         instance: written,
     })
 }
@@ -255,7 +256,6 @@ fn write(study: &Study, folder: &Path) -> Result<usize, String> {
 fn tell(study: &Study, terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &study.label));
     let scales = &study.scales;
-    let shown = |value: f64, unit: &str| crate::value::show(value, &crate::characterise::prefixed(unit, value).0, 4);
     terminal.line(&format!(
         "  lets go at {} after {}, slides with {}",
         shown(scales.f_b, study.units.force),

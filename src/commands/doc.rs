@@ -101,12 +101,17 @@ fn page(folder: &Path) -> String {
     }
     for (group, files) in &folders {
         let models = files.iter().flat_map(|(_, items)| items).filter_map(|item| match item {
-            Item::Model(model) => Some(format!("[{0}](#{1})", model.name.text, model.name.text.to_lowercase())),
+            Item::Model(model) => Some(format!(
+                "| [{0}](#{1}) | {2} |\n",
+                model.name.text,
+                model.name.text.to_lowercase(),
+                first_sentence(model.doc.as_deref().unwrap_or_default()).replace('|', "\\|")
+            )),
             _ => None,
         });
-        let models: Vec<String> = models.collect();
+        let models: String = models.collect();
         if !models.is_empty() {
-            out += &format!("**{group}**: {}\n\n", models.join(", "));
+            out += &format!("| {group} | |\n|---|---|\n{models}\n");
         }
     }
     for (group, files) in &folders {
@@ -125,6 +130,14 @@ fn page(folder: &Path) -> String {
     out.trim_end().to_string() + "\n"
 }
 
+/// What a doc comment says first.
+fn first_sentence(doc: &str) -> String {
+    let paragraph = doc.trim().split("\n\n").next().unwrap_or_default();
+    let words: Vec<&str> = paragraph.split_whitespace().collect();
+    let last = words.iter().position(|word| word.ends_with('.')).map_or(words.len(), |at| at + 1);
+    words[..last].join(" ").trim_end_matches('.').to_string()
+}
+
 /// A doc comment as Markdown: what is set in stays as it stands.
 fn prose(doc: Option<&String>) -> String {
     let Some(doc) = doc else { return String::new() };
@@ -132,6 +145,10 @@ fn prose(doc: Option<&String>) -> String {
     for line in doc.trim_matches('\n').lines() {
         let inside = line.starts_with("  ") || (set_in && line.trim().is_empty());
         if inside != set_in {
+            if !inside {
+                // The blank line behind what is set in stands outside.
+                out = out.trim_end().to_string() + "\n";
+            }
             out += if inside { "```text\n" } else { "```\n" };
             set_in = inside;
         }

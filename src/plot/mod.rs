@@ -10,6 +10,7 @@ mod svg;
 
 pub use braille::terminal;
 pub use png::png;
+pub use scale::raised;
 pub use svg::{inline, svg};
 
 use scale::Scale;
