@@ -580,6 +580,12 @@ fn variant(
             (system, types, flat.observed, ports.unwrap_or_default(), None)
         }
     };
+    // What rests on a declaration that could not be read has been reported with that.
+    let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
+    if lost && (cut.is_some() || nodes.is_empty() || system.nodes.iter().any(|node| matches!(node, Node::Error))) {
+        diagnostics.retain(Diagnostic::is_error);
+        return Err(diagnostics);
+    }
     // What is wrong with the experiment alone does not hide what else is wrong with it.
     if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
         || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")

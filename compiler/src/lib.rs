@@ -28,6 +28,7 @@ pub mod checks;
 pub mod interval;
 pub mod domains;
 pub mod remembered;
+pub mod proof;
 pub mod friction;
 pub mod stability;
 pub mod lints;
@@ -249,7 +250,9 @@ fn lowered_rig(
     let prepared = rig::prepare(loaded, sources, item);
     let changes = overrides.iter().map(|change| change.override_in(root)).collect();
     let cut = rig::read(loaded, sources, &prepared, changes, Vec::new(), Vec::new(), &mut diagnostics);
-    let Some(cut) = cut.filter(|_| !diagnostics.iter().any(Diagnostic::is_error)) else {
+    // What rests on a declaration that could not be read has been reported with that.
+    let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
+    let Some(cut) = cut.filter(|_| !lost && !diagnostics.iter().any(Diagnostic::is_error)) else {
         return Err(once(diagnostics));
     };
     warnings.extend(diagnostics);

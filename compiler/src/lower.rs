@@ -62,6 +62,16 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
 
     let mut description = std::mem::take(&mut plan.description);
     description.layout.roots.len = surfaces.len() as u32;
+    let (states, n) = (description.layout.states, description.layout.states.len as usize);
+    if (MOST_JACOBIAN + 1..=MOST_COUPLED).contains(&n) {
+        let slots = |segment: abi::description::Segment| segment.range().map(|slot| Slot(slot as u32)).collect();
+        let (rows, columns): (Vec<Slot>, Vec<Slot>) = (slots(description.layout.derivatives), slots(states));
+        let coupling = crate::derive::coupling(&derivatives, &rows, &columns, MOST_ENTRIES * n).unwrap_or_default();
+        if !coupling.is_empty() {
+            description.layout.jacobian.len = (coupling.len() + n) as u32;
+            description.coupling = coupling.into();
+        }
+    }
     // The segments behind the roots move up by their number.
     let lens = {
         let l = &description.layout;
@@ -768,6 +778,11 @@ impl<'a> Plan<'a> {
 
 /// Largest number of states with a dense Jacobian in the block.
 pub const MOST_JACOBIAN: usize = 200;
+
+/// Largest number of states of which it is known which depend on which, and how many others each may depend on, in the
+/// mean, to be worth it.
+pub const MOST_COUPLED: usize = 20_000;
+const MOST_ENTRIES: usize = 40;
 
 /// Largest number of states whose adaptive step is one function.
 const MOST_FUSED: u32 = 8;

@@ -290,10 +290,22 @@ impl<'s, 't> Layout<'s, 't> {
             && (self.starts[at].is_some() || at > 0 && self.source.ends_operand(at - 1))
     }
 
+    /// Whether this mark is a hyphen in the name of a lint: `allow large-step`.
+    fn in_lint(&self, at: usize) -> bool {
+        let mut word = at;
+        while word >= 2 && self.source.is_symbol(word, "-") && self.source.kind(word - 1) == Some(TokenKind::Word) {
+            word -= 2;
+        }
+        word < at && self.source.is_word(word, "allow") && self.starts[word].is_some()
+    }
+
     fn separates(&self, before: usize, at: usize) -> bool {
         let (left, right) = (self.source.word(before), self.source.word(at));
         let symbol = |mark: usize| self.source.kind(mark) == Some(TokenKind::Symbol);
         let unary = |mark: usize| symbol(mark) && self.source.word(mark) == "-" && (mark == 0 || !self.ends(mark - 1));
+        if self.in_lint(if symbol(at) { at } else { before }) {
+            return false;
+        }
         if symbol(at) {
             match right {
                 ")" | "]" | "," | "." | "^" => return false,

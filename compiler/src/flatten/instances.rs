@@ -36,6 +36,7 @@ impl<'a> Flattener<'a> {
                 self.report(error.help("name a model that fits it"));
             }
             Lookup::Ambiguous(a, b) => self.ambiguous(name, a, b),
+            Lookup::Missing if self.explained(name, file) => {}
             Lookup::Missing => {
                 let models = loaded.visible(file, Space::Type);
                 let near = nearest(&name.text, models.iter().copied().filter(|m| self.is_model(file, m)));
@@ -482,6 +483,7 @@ impl<'a> Flattener<'a> {
         match loaded.find(file, Space::Type, &slot.interface.text) {
             Lookup::Found(_, Item::Interface(interface)) => return Some(interface),
             Lookup::Ambiguous(a, b) => self.ambiguous(&slot.interface, a, b),
+            Lookup::Missing if self.explained(&slot.interface, file) => {}
             Lookup::Found(..) | Lookup::Missing => {
                 let mut error = Diagnostic::error("E0201", format!("there is no interface `{}`", slot.interface.text))
                     .label(slot.interface.span, "not declared and not imported");
