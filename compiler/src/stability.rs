@@ -31,7 +31,7 @@ const FINER: usize = 16;
 /// How many times farther than that it must go.
 const FARTHER: f64 = 10.0;
 /// Steps of a run that has to confirm a chatter, and how many of the last half of them must turn back.
-const CHATTER: (usize, usize) = (64, 16);
+const CHATTER: (usize, usize) = (256, 8);
 /// Steps, and their length in s, in which what is fast comes to where the rest lets it be.
 const RELAXING: (usize, f64) = (8, 2e-5);
 /// Greatest value in SI of a quantity whose range is open.

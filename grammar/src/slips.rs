@@ -120,7 +120,12 @@ fn is_name(word: &str) -> bool {
 
 /// A character that the language does not have.
 fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
-    let at = (piece.start..piece.end.min(stop.at + 1))
+    // A bracket with something strange in it does not fit as a whole.
+    let end = match source.is_symbol(stop.at, "[") {
+        true => (stop.at..piece.end).find(|&at| source.is_symbol(at, "]")).unwrap_or(stop.at),
+        false => stop.at,
+    };
+    let at = (piece.start..piece.end.min(end + 1))
         .rev()
         .find(|&at| matches!(source.kind(at), Some(TokenKind::Unknown | TokenKind::OpenText)))?;
     if source.kind(at) == Some(TokenKind::OpenText) {
@@ -131,6 +136,17 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         );
     }
     let found = source.word(at).chars().next()?;
+    // Signs as wide as Chinese letters.
+    if let '\u{ff01}'..='\u{ff5e}' = found {
+        let plain = char::from_u32(found as u32 - 0xff01 + 0x21).filter(|_| !found.is_alphanumeric());
+        if let Some(plain) = plain {
+            return Some(
+                Diagnostic::error("E0001", format!("`{found}` has no place here"))
+                    .label(source.span(at), "")
+                    .help(format!("write the narrow `{plain}`")),
+            );
+        }
+    }
     if found.is_alphabetic() {
         return Some(foreign(source, piece, at));
     }
@@ -147,6 +163,7 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         '·' => "between values write `*`; in a unit `·` has no blank around it",
         '÷' => "write `/`",
         '²' => "write `^2`",
+        '⁻' | '¹' => "powers are written `^2`, and what is divided by stands behind `/`: `m/s^2`",
         '³' => "write `^3`",
         '≤' => "write `<=`",
         '≥' => "write `>=`",

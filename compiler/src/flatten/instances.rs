@@ -435,7 +435,14 @@ impl<'a> Flattener<'a> {
         changes.retain(|change| !change.path.is_empty());
         let (instance, instance_env) = chosen;
         let (item, model) = self.model(instance_env.file, &instance.model)?;
-        if self.models.contains(&item) || self.models.len() >= DEEPEST {
+        if self.models.len() >= DEEPEST && !self.models.contains(&item) {
+            let error = Diagnostic::error("E0211", format!("parts are nested more than {DEEPEST} deep"))
+                .label(instance.model.span, "one too deep")
+                .help("make parts of the same model side by side, as an array or by name");
+            self.report(error);
+            return None;
+        }
+        if self.models.contains(&item) {
             let error = Diagnostic::error("E0211", format!("{} contains itself", model.name.text))
                 .label(instance.model.span, "here it is made again")
                 .help("a part cannot contain the model that it belongs to");

@@ -425,7 +425,7 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
         Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
     // Units that people have and SI has not: what one of them is.
     const OTHERS: [(&[&str], &str); 13] = [
-        (&["degC", "celsius", "Celsius", "C"], "temperatures are in K: 20 degC is `293.15 K`"),
+        (&["degC", "°C", "celsius", "Celsius", "C"], "temperatures are in K: 20 degC is `293.15 K`"),
         (&["bar"], "1 bar is `1e5 Pa`"),
         (&["psi"], "1 psi is `6894.76 Pa`"),
         (&["atm"], "1 atm is `101325 Pa`"),
