@@ -212,9 +212,6 @@ const SEVERAL: &[&str] = &[
     "two-circles-are-two-messages",
     "two-regimes-that-nothing-reaches",
     "what-is-never-read",
-    // One mistake each, with two messages: where the second follows from the first is not seen yet.
-    "a-statement-outside-models",
-    "derivative-of-a-part-from-outside",
 ];
 
 #[test]

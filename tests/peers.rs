@@ -1,4 +1,4 @@
-//! Programs that others have written, against ours: python-can and the Python package canopen.
+//! Programs that others have written, against ours: the Python packages python-can, canopen and cantools.
 //!
 //! They live in an environment of their own below `target/`, made at the first run with pip. Where that can't be had the
 //! test fails and says so.
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, OnceLock};
 
-const PACKAGES: [&str; 3] = ["python-can==4.6.1", "canopen==2.4.1", "pyserial==3.5"];
+const PACKAGES: [&str; 4] = ["python-can==4.6.1", "canopen==2.4.1", "pyserial==3.5", "cantools==45.1.0"];
 
 /// Tests take turns: programs in Python have little time to answer, and a guest takes a processor for itself.
 static TURN: Mutex<()> = Mutex::new(());
@@ -219,4 +219,85 @@ fn both_roles_over_an_interface_of_the_kernel() {
     let node = said.find("ready\n").unwrap_or_else(|| panic!("no node in\n{said}"));
     node_saw(&said[node..], false);
     assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
+}
+
+/// Bytes from hexadecimal digits, with zeros behind.
+fn bytes(hexadecimal: &str) -> [u8; 8] {
+    let mut out = [0; 8];
+    for (k, byte) in out.iter_mut().enumerate().take(hexadecimal.len() / 2) {
+        *byte = u8::from_str_radix(&hexadecimal[2 * k..2 * k + 2], 16).expect("hexadecimal digits");
+    }
+    out
+}
+
+/// A double from C's hexadecimal notation, as Python prints it.
+fn exactly(text: &str) -> f64 {
+    let (sign, text) = text.strip_prefix('-').map_or((1.0, text), |rest| (-1.0, rest));
+    let (mantissa, exponent) = text.strip_prefix("0x").and_then(|rest| rest.split_once('p')).expect("0x…p…");
+    let (whole, part) = mantissa.split_once('.').expect("a point");
+    let part = u64::from_str_radix(part, 16).expect("hexadecimal digits") as f64 / 16f64.powi(part.len() as i32);
+    let whole: f64 = whole.parse().expect("0 or 1");
+    sign * (whole + part) * 2f64.powi(exponent.parse().expect("an exponent"))
+}
+
+/// Big-endian and little-endian signals at odd places, floats, pages and pages of pages: the same values as cantools
+/// reads, and the same bytes as it writes.
+#[test]
+fn a_foreign_reader_of_dbc_files_finds_the_same_in_frames() {
+    use runtime::drive::frames;
+    let path = root().join("tests/peers/signals.dbc");
+    let messages = compiler::rig::dbc_messages(&fs::read_to_string(&path).expect("it is there")).expect("it is right");
+    // SI values of one unit of the file and of its zero.
+    let units = |signal: &str| match signal {
+        "Plain.wide" => (std::f64::consts::PI / 30.0, 0.0),
+        "Motorola.across" => (1.0, 273.15),
+        _ => (1.0, 0.0),
+    };
+    let (mut described, mut compared, mut absent, mut written) = (0, 0, 0, 0);
+    for line in script("dbc.py", path.to_str().expect("a text")).lines() {
+        let words: Vec<&str> = line.split(' ').collect();
+        let message = messages.iter().find(|message| message.name == words[1]).expect("a message that we know too");
+        if words[0] == "message" {
+            let ours = (message.id, message.extended, message.length, message.period_ns);
+            let number = |k: usize| words[k].parse::<u64>().expect("a number");
+            assert_eq!(ours, (number(2) as u32, number(3) == 1, number(4) as u8, number(5) * 1_000_000), "{line}");
+            described += 1;
+            continue;
+        }
+        let data = bytes(words[2]);
+        let data = &data[..message.length.into()];
+        if words[3] == "-" {
+            // A page that the file does not describe: whatever hangs on the switch is absent.
+            let switched = |field: &usize| message.fields[*field].multiplexed.is_some();
+            let found = (0..message.fields.len()).filter(switched);
+            assert!(found.clone().any(|field| frames::read(message, field, data).is_none()), "{line}");
+            continue;
+        }
+        let mut values = vec![0.0; message.fields.len()];
+        let mut precise = true;
+        for (k, field) in message.fields.iter().enumerate() {
+            let theirs = words[4..].iter().find_map(|word| word.strip_prefix(&field.name)?.strip_prefix('='));
+            let (scale, zero) = units(&format!("{}.{}", message.name, field.name));
+            let theirs = theirs.map(|text| exactly(text) * scale + zero);
+            let ours = frames::read(message, k, data);
+            let near = match (ours, theirs) {
+                (Some(ours), Some(theirs)) => (ours - theirs).abs() <= 4.0 * f64::EPSILON * theirs.abs(),
+                (ours, theirs) => ours == theirs,
+            };
+            assert!(near, "{} in {line}: {ours:?}, not {theirs:?}", field.name);
+            absent += usize::from(ours.is_none());
+            compared += usize::from(ours.is_some());
+            values[k] = ours.unwrap_or_default();
+            // More bits than a double has cannot come back.
+            precise &= field.bits <= 53;
+        }
+        if precise {
+            let mut again = [0; 8];
+            frames::fill(message, |field| values[field], &mut again);
+            assert_eq!(again, bytes(words[3]), "{line}");
+            written += 1;
+        }
+    }
+    println!("{described} messages, {compared} values, {absent} absent, {written} frames written");
+    assert!(described == 8 && compared > 1000 && absent > 200 && written > 300);
 }

@@ -68,7 +68,8 @@ pub struct Layout {
     pub derivatives: Segment,
     /// Switching surfaces, written by `Roots`.
     pub roots: Segment,
-    /// ∂f/∂x, row-major n × n, written by `Jacobian`; then ∂f/∂t, n entries.
+    /// ∂f/∂x, row-major n × n or the entries of the [coupling](Description::coupling), written by `Jacobian`; then ∂f/∂t,
+    /// n entries.
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
@@ -246,6 +247,9 @@ pub struct Description {
     pub guards: Vec<Guard>,
     /// Switching surfaces.
     pub roots: Vec<Root>,
+    /// Of a model with many states: the entries (row, column) of ∂f/∂x that are not always 0, by rows and then columns.
+    /// `Jacobian` then writes these one behind the other, and ∂f/∂t behind them. Empty where it writes all entries.
+    pub coupling: std::sync::Arc<[(u32, u32)]>,
     /// Constants that generated code reads by index: tables.
     pub pool: std::sync::Arc<[f64]>,
 }

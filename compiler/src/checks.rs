@@ -84,6 +84,18 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
             })
         };
         let (low, high) = (take(var.range.low), take(var.range.high));
+        if let (Some((least, _)), Some((most, _)), Some(range)) = (low, high, var.range_span)
+            && least > most
+        {
+            let error = Diagnostic::error("E0502", format!("nothing lies in the range of `{}`", var.name))
+                .label(range, "its lower bound is above its upper one");
+            let turned = files.slice(range).split_once("..");
+            diagnostics.push(match turned {
+                Some((low, high)) => error.help(format!("write `{} .. {}`", high.trim(), low.trim())),
+                None => error,
+            });
+            continue;
+        }
         let below = low.is_some_and(|(low, strict)| value < low || (strict && value == low));
         let above = high.is_some_and(|(high, strict)| value > high || (strict && value == high));
         if !below && !above {

@@ -23,6 +23,7 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
     let none = Value(u32::MAX);
     let mut values = vec![none; func.ops.len()];
     let mut gradients: Vec<Gradient> = vec![Gradient::new(); func.ops.len()];
+    let last = last_uses(func);
     for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
         if let Op::Load(slot) = op {
             values[i] = build.borrow_mut().read(*slot, env);
@@ -39,6 +40,12 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
             &gradients[operands[k].index()]
         };
         gradients[i] = gradient(build, op, values[i], &of);
+        // A sum over a thousand parts has half a million entries on its way.
+        func.ops[i].each_operand(|operand| {
+            if last[operand.index()] == i {
+                gradients[operand.index()] = Gradient::new();
+            }
+        });
     }
     let mut of_slots = HashMap::new();
     for (slot, value) in &func.stores {
@@ -48,20 +55,91 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
     of_slots
 }
 
-/// The function that writes ∂f/∂x and ∂f/∂t of dx/dt = f(t, x) into the segment `jacobian`.
+/// For each operation the last one that uses its value; the number of operations for what is stored.
+fn last_uses(func: &Func) -> Vec<usize> {
+    let mut last = vec![0; func.ops.len()];
+    for (i, op) in func.ops.iter().enumerate() {
+        op.each_operand(|operand| last[operand.index()] = i);
+    }
+    for (_, value) in &func.stores {
+        last[value.index()] = func.ops.len();
+    }
+    last
+}
+
+/// Which of what a function stores depends on which directions: (row, direction), where row r is the r-th of `rows`.
+/// None where there are more than `most`.
+pub fn coupling(func: &Func, rows: &[Slot], directions: &[Slot], most: usize) -> Option<Vec<(u32, u32)>> {
+    let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
+    let live = func.live();
+    let last = last_uses(func);
+    let mut depends: Vec<Vec<u32>> = vec![Vec::new(); func.ops.len()];
+    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+        let mut mine: Vec<u32> = Vec::new();
+        if let Op::Load(slot) = op {
+            mine.extend(direction.get(slot));
+        } else {
+            let mut operands = Vec::new();
+            op.each_operand(|operand| operands.push(operand.index()));
+            for operand in operands {
+                let taken = match last[operand] == i {
+                    true => std::mem::take(&mut depends[operand]),
+                    false => depends[operand].clone(),
+                };
+                mine = if mine.is_empty() { taken } else { union(&mine, &taken) };
+            }
+        }
+        depends[i] = mine;
+    }
+    let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
+    let mut entries = Vec::new();
+    for (row, slot) in rows.iter().enumerate() {
+        if let Some(value) = stored.get(slot) {
+            entries.extend(depends[value.index()].iter().map(|column| (row as u32, *column)));
+        }
+        if entries.len() > most {
+            return None;
+        }
+    }
+    Some(entries)
+}
+
+/// What is in either of two ascending lists, ascending.
+fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
+    let (mut i, mut j) = (0, 0);
+    let mut out = Vec::with_capacity(a.len() + b.len());
+    while i < a.len() && j < b.len() {
+        let (x, y) = (a[i], b[j]);
+        out.push(x.min(y));
+        i += usize::from(x <= y);
+        j += usize::from(y <= x);
+    }
+    out.extend_from_slice(&a[i..]);
+    out.extend_from_slice(&b[j..]);
+    out
+}
+
+/// The function that writes ∂f/∂x and ∂f/∂t of dx/dt = f(t, x) into the segment `jacobian`: all entries, or those of the
+/// coupling where the model has one.
 pub fn jacobian(program: &Program) -> Func {
     let layout = &program.description.layout;
+    let coupling = &program.description.coupling;
     let n = layout.states.len as usize;
-    assert_eq!(layout.jacobian.len as usize, n * n + n, "room for the Jacobian of {n} states");
+    let entries = if coupling.is_empty() { n * n } else { coupling.len() };
+    assert_eq!(layout.jacobian.len as usize, entries + n, "room for the Jacobian of {n} states");
     let delays = &program.description.delays;
     let states = (0..n).map(|j| layout.states.slot(j));
     let directions: Vec<Slot> = states.chain([Slot::TIME]).chain(delays.iter().map(|delay| delay.past)).collect();
     let build = Shared::new(Build::new("jacobian"));
     let of_slots = inline(&build, &program.derivatives, &mut Env::new(), &directions);
     let mut build = build.into_inner();
+    let mut next = 0;
     for i in 0..n {
         let gradient = of_slots.get(&layout.derivatives.slot(i));
-        for j in 0..=n {
+        let written = coupling[next.min(coupling.len())..].iter().take_while(|(row, _)| *row as usize == i);
+        let columns: Vec<usize> =
+            if coupling.is_empty() { (0..n).collect() } else { written.map(|(_, column)| *column as usize).collect() };
+        for j in columns.into_iter().chain([n]) {
             let entry = gradient.and_then(|gradient| entry(gradient, j as u32));
             let mut entry = entry.unwrap_or_else(|| build.real(0.0));
             // What was before moves along time too.
@@ -72,9 +150,12 @@ pub fn jacobian(program: &Program) -> Func {
                     entry = build.add(entry, part);
                 }
             }
-            build.store(layout.jacobian.slot(if j < n { i * n + j } else { n * n + i }), entry);
+            let at = if j < n { next } else { entries + i };
+            next += usize::from(j < n);
+            build.store(layout.jacobian.slot(at), entry);
         }
     }
+    assert_eq!(next, entries, "every entry is written");
     build.finish()
 }
 

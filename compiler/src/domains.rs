@@ -531,6 +531,18 @@ fn domain(
         .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{shown}`"))
 }
 
+/// `param Fc [N] = 1 N`: the declaration of a quantity as written, without what stands behind its value.
+fn declaration(system: &System, files: &Files, var: &Var) -> String {
+    let behind = &files.get(var.span.file).text[var.span.end as usize..];
+    let unit = behind.trim_start_matches(' ').strip_prefix('[').and_then(|rest| rest.split_once(']'));
+    let unit = unit.map_or(String::new(), |(unit, _)| format!(" [{unit}]"));
+    let value = match var.definition {
+        Definition::Value(value, Origin::Default) => format!(" = {}", files.slice(system.span(value))),
+        _ => String::new(),
+    };
+    format!("{} {}{unit}{value}", var.kind.word(), var.name)
+}
+
 /// E0601: names the parameter whose range would mend it, if one does.
 fn division(prover: &mut Prover, types: &Types, files: &Files, divisor: ExprId) -> Diagnostic {
     let system = prover.system;
@@ -569,17 +581,13 @@ fn division(prover: &mut Prover, types: &Types, files: &Files, divisor: ExprId) 
     match (system.node(divisor), free) {
         (Node::Var(id), _) if matches!(system.var(*id).kind, VarKind::Param | VarKind::Input) => {
             let var = system.var(*id);
-            error.label(var.span, "declared without a range").help(format!(
-                "declare its range: `{} {} … in > 0`",
-                var.kind.word(),
-                var.name
-            ))
+            error
+                .label(var.span, "declared without a range")
+                .help(format!("declare its range: `{} in > 0`", declaration(system, files, var)))
         }
-        (_, Some(var)) => error.label(var.span, format!("{} has no range", var.name)).help(format!(
-            "declare its range: `{} {} … in > 0`",
-            var.kind.word(),
-            var.name
-        )),
+        (_, Some(var)) => error
+            .label(var.span, format!("{} has no range", var.name))
+            .help(format!("declare its range: `{} in > 0`", declaration(system, files, var))),
         _ => error
             .help(format!("guard it: `if abs({text}) > … then … / {text} else …`, or keep it away from 0 with `max`")),
     }

@@ -5,7 +5,7 @@
 
 use crate::flatten::{Instance, Override, OverrideValue, Request, flatten};
 use crate::linearise::{Opened, PortSlots, Ports, open};
-use crate::lower::{Lowered, Wanted, evaluate, lower};
+use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
 use crate::resolve::Loaded;
 use crate::rig::{self, Prepared};
 use crate::source::Sources;
@@ -135,7 +135,10 @@ pub fn read(
         experiment.to_mut().body.extend(also);
     }
     let experiment = &*experiment;
-    let Some(mut parts) = parts(experiment, misread, &mut diagnostics) else { return Err(diagnostics) };
+    // A word that is reported once may be what its `run` lacks.
+    let Some(mut parts) = parts(experiment, misread || loaded.has_errors(), &mut diagnostics) else {
+        return Err(diagnostics);
+    };
     // What is said from outside counts: a value that is given, or varied there, is not swept here.
     let plain = |text: &str| text.split_whitespace().collect::<String>();
     let path = |path: &ast::Path| plain(loaded.files.slice(path.span));
@@ -580,6 +583,12 @@ fn variant(
             (system, types, flat.observed, ports.unwrap_or_default(), None)
         }
     };
+    // What rests on a declaration that could not be read has been reported with that.
+    let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
+    if lost && (cut.is_some() || nodes.is_empty() || system.nodes.iter().any(|node| matches!(node, Node::Error))) {
+        diagnostics.retain(Diagnostic::is_error);
+        return Err(diagnostics);
+    }
     // What is wrong with the experiment alone does not hide what else is wrong with it.
     if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
         || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
@@ -654,6 +663,16 @@ fn variant(
     warnings.extend(diagnostics);
     on_stage("lower");
     let lowered = lower(&system, &types, &wanted);
+    let description = &lowered.program.description;
+    let states = description.layout.states.len as usize;
+    if cut.is_none() && solver.method == Method::Adaptive && states > MOST_DENSE && description.coupling.is_empty() {
+        let message =
+            format!("{states} states, of which each depends on many others, are too many for an adaptive run");
+        let error = Diagnostic::error("E0902", message).label(parts.run.span, "with so many states");
+        return Err(vec![error.help(format!(
+            "fixed steps take any number, for example `solver expo step 0.1 ms`; up to {MOST_DENSE} go adaptively"
+        ))]);
+    }
     let mut rig = cut.map(|cut| cut.with_plant(&lowered, own));
     let Lowered { mut program, observed: slots } = lowered;
     match &mut rig {

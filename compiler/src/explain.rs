@@ -60,7 +60,7 @@ pub struct StepCost {
     pub divisions: usize,
     /// Instructions of the machine code for this processor, and its bytes; none where there is none.
     pub code: Option<(usize, usize)>,
-    /// The largest stable step in s over the ranges, open ones up to [`OPEN`](crate::stability::OPEN); [`LONGEST`](crate::stability::LONGEST) for any.
+    /// The largest stable step in s over the ranges, open ones up to [`OPEN`](crate::stability::OPEN); [`LONGEST`](crate::stability::LONGEST) for any, 0 for none.
     /// None without continuous states, and with too many of them.
     pub stable: Option<f64>,
 }

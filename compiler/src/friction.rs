@@ -1,14 +1,16 @@
 //! The physics of a model that fits `Friction`: does it jump at rest, does it hold, does it dissipate?
 //!
 //! In: a model on its own. Out: warnings, and a [`Verdict`] for those who ask. The model's own functions are evaluated
-//! by the reference interpreter on a fixed grid, so the work is bounded and the answer the same everywhere.
+//! by the reference interpreter on a fixed grid; where that finds nothing wrong with the dissipation, a proof by intervals
+//! is tried. The work is bounded and the answer the same everywhere.
 
 use crate::derive;
-use crate::ir::Func;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::Shared;
+use crate::ir::{Func, Op, Value};
 use crate::lower::{Lowered, Wanted, lower};
 use crate::program::Program;
+use crate::proof::{Claim, Range, prove};
 use crate::remembered::Remembered;
 use crate::system::*;
 use crate::units::{Types, three_digits};
@@ -20,6 +22,9 @@ use std::rc::Rc;
 /// What is known of the dissipation of a model.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Verdict {
+    /// Proven for all velocities from 1e-6 m/s to 10 m/s or to the ends of their range, all states within theirs, and all
+    /// external forces within theirs or up to 1e6 N.
+    Proved,
     /// No counterexample among so many points.
     Holds(usize),
     /// Power is given out at this point.
@@ -43,6 +48,11 @@ const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
 const FORCE: Dimension = Dimension::of([1, 1, -2, 0, 0]);
 /// Operations that may be interpreted for one verdict: less than a second.
 const WORK: usize = 100_000_000;
+/// Steps that a proof may take: as long again.
+const PROOF: usize = 8_000_000;
+/// Velocities, m/s, and external forces, N, of a model that declares no narrower range.
+const SPEEDS: (f64, f64) = (1e-6, 10.0);
+const LARGEST_LOAD: f64 = 1e6;
 /// A velocity at which every regularised sign is still next to nothing, m/s.
 const CRAWL: f64 = 1e-15;
 
@@ -77,6 +87,8 @@ struct Bench {
     force: Slot,
     /// Writes dV/dt into the first slot of the jacobian, if there is a `storage` and a state.
     flow: Option<Rc<Func>>,
+    /// Where the stored energy is.
+    energy: Option<Slot>,
     /// For each regime, whether it would be left: slots that are 1 where a level of a transition holds.
     exits: Vec<Vec<Slot>>,
     /// For each continuous state, whether force or storage depend on it.
@@ -126,7 +138,8 @@ impl Bench {
         let flow = flow.map(Rc::new);
         let mut block = vec![0.0; program.description.layout.size()];
         block[program.description.layout.params.range()].copy_from_slice(&program.params);
-        Some(Bench { program, outputs, start, v, external, force, flow, exits, matters, block })
+        let energy = energy.first().copied();
+        Some(Bench { program, outputs, start, v, external, force, flow, energy, exits, matters, block })
     }
 
     fn run(&mut self, func: &Func) {
@@ -237,7 +250,130 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
     let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
     let also = [contact.v.0, contact.force.0, contact.external.map_or(u32::MAX, |id| id.0), u32::from(energy)];
     let program = bench.program.clone();
-    KNOWN.answer(&program, &also.map(u64::from), || sampled(system, contact, bench))
+    KNOWN.answer(&program, &also.map(u64::from), || match sampled(system, contact, bench) {
+        Verdict::Holds(_) if proved(system, contact, bench) => Verdict::Proved,
+        verdict => verdict,
+    })
+}
+
+/// Whether intervals prove what samples did not refute: in every regime and for both directions.
+fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
+    let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
+    let layout = bench.program.description.layout.clone();
+    let description = bench.program.description.clone();
+    let range = |slot: Slot| description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
+    let (low, high) = range(bench.v).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
+    // Everything but velocity, load and the states that matter stays where it starts.
+    bench.force_at(SPEEDS.0, 0.0);
+    let mut work = PROOF;
+    for regime in 0..bench.exits.len().max(1) {
+        for sign in [1.0, -1.0] {
+            // |v| in its range of this sign; the function reads it in the slot of v.
+            let (least, most) = if sign > 0.0 { (low, high) } else { (-high, -low) };
+            let (least, most) = (least.max(SPEEDS.0), most.min(SPEEDS.1));
+            if least >= most {
+                continue;
+            }
+            let mut inputs = vec![(bench.v, Range { low: least, high: most })];
+            if let (Some(slot), Some(_)) = (bench.external, contact.external) {
+                let (low, high) = range(slot).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
+                inputs.push((slot, Range { low: low.max(-LARGEST_LOAD), high: high.min(LARGEST_LOAD) }));
+            }
+            for k in (0..layout.states.len as usize).filter(|k| bench.matters[*k]) {
+                let slot = layout.states.slot(k);
+                let Some((low, high)) = range(slot).filter(|(low, high)| low.is_finite() && high.is_finite()) else {
+                    return false;
+                };
+                inputs.push((slot, Range { low, high }));
+            }
+            let build = Shared::new(Build::new("dissipation").with_pool(description.pool.clone()));
+            let mut env = Env::new();
+            {
+                let mut build = build.borrow_mut();
+                let held = (0..layout.size()).filter(|slot| inputs.iter().all(|(input, _)| input.index() != *slot));
+                for slot in held {
+                    let mut value = bench.block[slot];
+                    if layout.regimes.range().next() == Some(slot) {
+                        value = regime as f64;
+                    }
+                    let value = build.real(value);
+                    env.insert(Slot(slot as u32), value);
+                }
+                if sign < 0.0 {
+                    let speed = build.load(bench.v);
+                    let v = build.neg(speed);
+                    env.insert(bench.v, v);
+                }
+            }
+            let states: Vec<Slot> = (0..layout.states.len as usize).map(|k| layout.states.slot(k)).collect();
+            let mut after = env.clone();
+            let gradients = derive::inline(&build, &bench.program.outputs, &mut after, &states);
+            let mut build = build.into_inner();
+            let mut rates = env.clone();
+            build.inline(&bench.program.derivatives, &mut rates);
+            let mut flow = build.real(0.0);
+            for k in 0..states.len() {
+                let slope = bench
+                    .energy
+                    .and_then(|energy| gradients.get(&energy))
+                    .and_then(|gradient| derive::entry(gradient, k as u32));
+                if let Some(slope) = slope.filter(|_| energy) {
+                    let rate = rates.get(&layout.derivatives.slot(k)).copied();
+                    let Some(rate) = rate else { return false };
+                    let term = build.mul(slope, rate);
+                    flow = build.add(flow, term);
+                }
+            }
+            let v = build.read(bench.v, &env);
+            let force = after[&bench.force];
+            let lost = |build: &mut Build, force| {
+                let power = build.mul(force, v);
+                build.sub(power, flow)
+            };
+            // F v ≥ min(0, F_ext v): one of both.
+            let mut any = vec![lost(&mut build, force)];
+            if let Some(slot) = bench.external {
+                let external = build.read(slot, &env);
+                let rest = build.sub(force, external);
+                any.push(lost(&mut build, rest));
+            }
+            let exits = bench.exits.get(regime).cloned().unwrap_or_default();
+            let (one, zero, half) = (build.real(1.0), build.real(0.0), build.real(0.5));
+            for slot in &exits {
+                let value = build.read(*slot, &after);
+                let left = build.less(half, value);
+                any.push(build.select(left, one, zero));
+            }
+            // Stored, so that all of it counts as used.
+            for (k, value) in any.iter().enumerate() {
+                build.store(Slot((layout.size() + k) as u32), *value);
+            }
+            let func = build.finish();
+            let stored = |k: usize| {
+                let slot = layout.size() + k;
+                func.stores.iter().find(|(at, _)| at.index() == slot).expect("it was just stored").1
+            };
+            let claims = any.len() - exits.len();
+            let claimed: Vec<Value> = (0..claims).map(stored).collect();
+            let mut unless = Vec::new();
+            let mut left = false;
+            for value in (claims..any.len()).map(stored) {
+                match func.ops[value.index()] {
+                    Op::Select(condition, ..) => unless.push(condition),
+                    // A regime that would be left at once is no regime; one that never is has nothing to leave out.
+                    Op::Real(bits) => left |= f64::from_bits(bits) > 0.5,
+                    _ => return false,
+                }
+            }
+            if left {
+                continue;
+            }
+            if !prove(&Claim { func: &func, any: &claimed, unless: &unless }, &inputs, &description.pool, &mut work) {
+                return false;
+            }
+        }
+    }
+    true
 }
 
 /// The verdict from samples.

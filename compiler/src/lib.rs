@@ -29,6 +29,7 @@ pub mod checks;
 pub mod interval;
 pub mod domains;
 pub mod remembered;
+pub mod proof;
 pub mod friction;
 pub mod stability;
 pub mod lints;
@@ -251,7 +252,9 @@ fn lowered_rig(
     let prepared = rig::prepare(loaded, sources, item);
     let changes = overrides.iter().map(|change| change.override_in(root)).collect();
     let cut = rig::read(loaded, sources, &prepared, changes, Vec::new(), Vec::new(), &mut diagnostics);
-    let Some(cut) = cut.filter(|_| !diagnostics.iter().any(Diagnostic::is_error)) else {
+    // What rests on a declaration that could not be read has been reported with that.
+    let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
+    let Some(cut) = cut.filter(|_| !lost && !diagnostics.iter().any(Diagnostic::is_error)) else {
         return Err(once(diagnostics));
     };
     warnings.extend(diagnostics);
@@ -514,6 +517,13 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let mut all = loaded.diagnostics.clone();
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
+    let inside = |d: &Diagnostic, item: grammar::span::Span| {
+        d.is_error() && d.span().file == root && item.start <= d.span().start && d.span().end <= item.end
+    };
+    let gaps = ast.items.iter().any(|item| match item {
+        Item::Model(model) => loaded.diagnostics.iter().any(|d| inside(d, model.span)),
+        _ => false,
+    });
     for item in &ast.items {
         match item {
             Item::Model(model) => all.extend(check_model(loaded, sources, model, true)),
@@ -525,9 +535,17 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                         all.extend(warnings);
                         all.extend(steps(loaded, experiment, &variants));
                     }
-                    Err(errors) => all.extend(errors),
+                    Err(errors) => {
+                        // What a statement that could not be read would have declared is missing in what is run, too.
+                        let missing = |d: &Diagnostic| {
+                            matches!(d.code, "E0106" | "E0203" | "E0204" | "E0205" | "E0206" | "E0303" | "E0501")
+                        };
+                        all.extend(errors.into_iter().filter(|d| !(gaps && missing(d))));
+                    }
                 }
             }
+            // What calls a function that grows beyond all bounds does so too, each time anew.
+            Item::Function(_) if all.iter().any(|d| d.message.ends_with(GROWS)) => {}
             Item::Function(_) | Item::Const(_) | Item::Table(_) => {
                 let flat = flatten::flatten_item(loaded, sources, root, item);
                 let mut diagnostics = flat.diagnostics;
@@ -630,6 +648,9 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     diagnostics
 }
 
+/// How the message about a program that grows without end ends.
+const GROWS: &str = " operations";
+
 /// One mistake, one message: in the order of the files, each code at each place once, warnings only without errors.
 pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     let errors = diagnostics.iter().any(Diagnostic::is_error);
@@ -640,7 +661,7 @@ pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
         // A circle is met from each of its members; the first is where it was entered. What grows without end does so
         // wherever it is used.
         let circle =
-            ["contains itself", "calls itself", "is defined by itself", " operations", " quantities and parts"]
+            ["contains itself", "calls itself", "is defined by itself", GROWS, " quantities and parts", " deep"]
                 .into_iter()
                 .find(|end| diagnostic.message.ends_with(end));
         let again = circle.is_some_and(|circle| !circles.insert(circle));

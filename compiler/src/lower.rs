@@ -62,6 +62,17 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
 
     let mut description = std::mem::take(&mut plan.description);
     description.layout.roots.len = surfaces.len() as u32;
+    let (states, n) = (description.layout.states, description.layout.states.len as usize);
+    if (LEAST_COUPLED..=MOST_COUPLED).contains(&n) {
+        let slots = |segment: abi::description::Segment| segment.range().map(|slot| Slot(slot as u32)).collect();
+        let (rows, columns): (Vec<Slot>, Vec<Slot>) = (slots(description.layout.derivatives), slots(states));
+        let coupling =
+            crate::derive::coupling(&derivatives, &rows, &columns, n * MOST_ENTRIES.min(n / 4)).unwrap_or_default();
+        if !coupling.is_empty() {
+            description.layout.jacobian.len = (coupling.len() + n) as u32;
+            description.coupling = coupling.into();
+        }
+    }
     // The segments behind the roots move up by their number.
     let lens = {
         let l = &description.layout;
@@ -768,6 +779,16 @@ impl<'a> Plan<'a> {
 
 /// Largest number of states with a dense Jacobian in the block.
 pub const MOST_JACOBIAN: usize = 200;
+
+/// Least and largest number of states of which it is known which depend on which, and how many others each may depend on,
+/// in the mean, to be worth it.
+const LEAST_COUPLED: usize = 40;
+const MOST_COUPLED: usize = 20_000;
+const MOST_ENTRIES: usize = 40;
+
+/// Largest number of states of an adaptive run of which each may depend on all others, or on nobody knows which: its matrices
+/// take some hundred megabytes.
+pub const MOST_DENSE: usize = 2000;
 
 /// Largest number of states whose adaptive step is one function.
 const MOST_FUSED: u32 = 8;

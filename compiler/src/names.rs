@@ -4,7 +4,9 @@
 /// listed first.
 pub fn nearest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let limit = match word.chars().count() {
-        0..=2 => 1,
+        // Every other letter would be near.
+        0..=1 => 0,
+        2 => 1,
         3..=5 => 2,
         _ => 3,
     };
@@ -31,5 +33,7 @@ mod tests {
         assert_eq!(nearest("simga1", names), Some("sigma1"));
         assert_eq!(nearest("fc", names), Some("Fc"));
         assert_eq!(nearest("temperature", names), None);
+        assert_eq!(nearest("V", names), Some("v"));
+        assert_eq!(nearest("x", names), None);
     }
 }

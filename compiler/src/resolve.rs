@@ -289,9 +289,14 @@ impl Loader<'_> {
                         vec![self.once(name, &text, false)]
                     }
                     Err(reason) => {
+                        let module = path.text.trim_end_matches(".fric");
+                        let library = self.sources.library(module).is_some_and(|files| !files.is_empty());
                         let error = Diagnostic::error("E0201", format!("cannot import \"{}\"", path.text))
                             .label(path.span, reason)
-                            .help("the path is relative to the importing file");
+                            .help(match library {
+                                true => format!("a module of the library stands without quotes: `import {module}`"),
+                                false => "the path is relative to the importing file".into(),
+                            });
                         self.loaded.diagnostics.push(error);
                         Vec::new()
                     }

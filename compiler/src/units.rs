@@ -200,7 +200,15 @@ impl Checker<'_> {
                 (None, VarKind::Param) if var.shown.is_some() => {
                     Kind::Real(Term::known(var.shown.as_ref().map_or(Dimension::NONE, |unit| unit.dimension)))
                 }
-                (None, VarKind::Input) => Kind::Real(Term::known(Dimension::NONE)),
+                (None, VarKind::Input) => {
+                    let error = Diagnostic::error("E0106", format!("input `{}` does not say its unit", var.name))
+                        .label(var.span, "a port states its unit, so that errors stay local");
+                    self.diagnostics.push(error.help(format!(
+                        "write `input {0} [m/s]`, with the unit that is meant; `input {0} [1]` for a pure number",
+                        var.name
+                    )));
+                    Kind::Unknown
+                }
                 (None, _) => Kind::Real(self.fresh()),
             };
             self.vars.push(kind);
@@ -384,6 +392,44 @@ impl Checker<'_> {
             ));
         }
         Some(format!("a coefficient in {unit} is missing; `{0}` is one: `{0} * {1}`", fitting.name, self.text(b)))
+    }
+
+    /// What a side of an equation may lack: the unit of a number in it, or a param that has the quotient as its unit.
+    fn factor(&self, value: ExprId, found: &Term, wanted: &Term, owner: InstanceId) -> Option<String> {
+        let (found, wanted) = (self.resolved(found), self.resolved(wanted));
+        if !found.unknowns.is_empty() || !wanted.unknowns.is_empty() {
+            return None;
+        }
+        let missing = wanted.base.over(found.base);
+        let (mut stack, mut sum) = (vec![(value, true)], false);
+        while let Some((id, above)) = stack.pop() {
+            match self.system.node(id) {
+                Node::Binary(BinaryOp::Multiply, a, b) => stack.extend([(*b, above), (*a, above)]),
+                Node::Binary(BinaryOp::Divide, a, b) => stack.extend([(*b, !above), (*a, above)]),
+                Node::Negate(a) if !self.is_bare(id) => stack.push((*a, above)),
+                Node::Binary(BinaryOp::Add | BinaryOp::Subtract, ..) | Node::If(..) => sum = true,
+                _ if self.is_bare(id) => {
+                    let unit = Unit::si(if above { missing } else { found.base.over(wanted.base) });
+                    return Some(format!("a number has a unit too: `{0} {unit}` in place of `{0}`", self.text(id)));
+                }
+                _ => {}
+            }
+        }
+        let text = if sum { format!("({})", self.text(value)) } else { self.text(value).to_string() };
+        if text.len() > 60 || text.contains('\n') {
+            return None;
+        }
+        let param = |dimension: Dimension| {
+            let fits = |var: &&Var| var.kind == VarKind::Param && self.unit_of(var) == Some(dimension);
+            self.system.vars.iter().filter(|var| var.instance == owner).find(fits)
+        };
+        if let Some(factor) = param(missing) {
+            let (name, unit) = (&factor.name, Unit::si(missing));
+            return Some(format!("a factor in {unit} is missing; `{name}` is one: `{name} * {text}`"));
+        }
+        let divisor = param(found.base.over(wanted.base))?;
+        let (name, unit) = (&divisor.name, Unit::si(found.base.over(wanted.base)));
+        Some(format!("divide by something in {unit}; `{name}` is one: `{text} / {name}`"))
     }
 
     /// The instance that some quantity of the expression belongs to.
@@ -803,6 +849,9 @@ impl Checker<'_> {
                     Some((_, span)) => error.label(*span, "declared here"),
                     None => error.label(var.span, format!("{} by its other uses", self.shown(&wanted))),
                 };
+                if let Some(help) = self.factor(value, &found, &wanted, var.instance) {
+                    error = error.help(help);
+                }
                 self.diagnostics.push(error);
             }
         }
@@ -831,9 +880,12 @@ impl Checker<'_> {
             return;
         }
         let message = format!("`{left}` is {}, but this is {}", self.described(&wanted), self.described(&found));
-        let error = Diagnostic::error("E0101", message)
+        let mut error = Diagnostic::error("E0101", message)
             .label(self.system.span(value), self.shown(&found))
             .label(*span, format!("needs {}", self.shown(&wanted)));
+        if let Some(help) = self.factor(value, &found, &wanted, var.instance) {
+            error = error.help(help);
+        }
         self.diagnostics.push(error);
     }
 
@@ -842,7 +894,11 @@ impl Checker<'_> {
             if let Some(term) = self.real(block.period)
                 && !self.unify(&term, &Term::known(TIME))
             {
+                let rate = self.unify(&term, &Term::known(RATE));
                 self.mismatch(block.period, &term, &Term::known(TIME));
+                if let Some(error) = self.diagnostics.last_mut().filter(|_| rate) {
+                    error.help = Some("a period is a time: `every 1 ms` for 1 kHz".into());
+                }
             }
         }
         for (_, energy) in &self.system.storages {

@@ -10,6 +10,9 @@ use crate::span::Span;
 pub struct File {
     /// The items in the order of the text. Items that could not be read are left out; they have been reported.
     pub items: Vec<Item>,
+    /// Names that are declared outside of all items, or by an item that could not be read. That has been reported;
+    /// whoever uses such a name makes no mistake of its own.
+    pub lost: Vec<String>,
 }
 
 /// A word that names something.

@@ -41,7 +41,8 @@ pub struct Parsed {
 pub fn parse(file: FileId, text: &str) -> Parsed {
     let mut reader = Reader::new(file, text);
     let items = reader.items();
-    Parsed { file: File { items }, diagnostics: reader.finish() }
+    let lost = std::mem::take(&mut reader.lost);
+    Parsed { file: File { items, lost }, diagnostics: reader.finish() }
 }
 
 /// For the formatter: where the strokes of derivatives stand, unlike those of divisions.
@@ -124,6 +125,8 @@ struct Reader<'t> {
     too_high: bool,
     /// Where the strokes of derivatives stand.
     derivatives: HashSet<usize>,
+    /// What is declared outside of all items, or by one that cannot be read.
+    lost: Vec<String>,
     diagnostics: Vec<Diagnostic>,
 }
 
@@ -183,6 +186,10 @@ impl<'t> Reader<'t> {
         let mut source = Source::new(file, text);
         let mut diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
+        // A brace that stands in a comment without end is missing because of that.
+        if source.block_comments.iter().any(|span| !text[span.range()].ends_with("*/")) {
+            diagnostics.clear();
+        }
         diagnostics.extend(slips::block_comment(&source));
         Reader {
             source,
@@ -192,6 +199,7 @@ impl<'t> Reader<'t> {
             semicolon: false,
             too_high: false,
             derivatives: HashSet::new(),
+            lost: Vec::new(),
             diagnostics,
         }
     }
@@ -201,6 +209,12 @@ impl<'t> Reader<'t> {
         // A name in foreign letters is read wherever it is used: said once.
         let mut names = HashSet::new();
         self.diagnostics.retain(|d| !d.message.ends_with(slips::NO_NAME) || names.insert(d.message.clone()));
+        // A word of the language as a name: said where it is declared, not where it is used.
+        let reserved = |d: &Diagnostic| d.message.strip_suffix(slips::RESERVED).map(str::to_string);
+        let words: HashSet<String> = self.diagnostics.iter().filter_map(reserved).collect();
+        let misfit = |d: &Diagnostic| d.message.strip_suffix(slips::MISFIT).is_some_and(|word| words.contains(word));
+        let mut seen = HashSet::new();
+        self.diagnostics.retain(|d| !misfit(d) && reserved(d).is_none_or(|word| seen.insert(word)));
         self.diagnostics.truncate(DIAGNOSTIC_LIMIT);
         self.diagnostics
     }
@@ -312,9 +326,19 @@ impl<'t> Reader<'t> {
         let mut stray = None;
         for piece in pieces {
             if begins_item(self.source.word(piece.start)) && self.source.kind(piece.start) == Some(TokenKind::Word) {
-                items.extend(self.item(piece));
+                match self.item(piece) {
+                    Some(item) => items.push(item),
+                    None => self.lost.push(self.source.word(piece.start + 1).to_string()),
+                }
                 stray = None;
-            } else if stray.is_none() {
+                continue;
+            }
+            for at in piece.start..piece.end {
+                if matches!(self.source.word(at), "param" | "input" | "output" | "state" | "let" | "part") {
+                    self.lost.push(self.source.word(at + 1).to_string());
+                }
+            }
+            if stray.is_none() {
                 stray = Some(piece);
                 self.stray(piece);
             }

@@ -17,8 +17,10 @@ pub(crate) struct Stop {
 
 /// What is wrong with `piece`.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
-    let finders =
-        [character, head, operator, condition, branch, unit, bare_unit, reserved, deeper, neighbours, model_name];
+    let finders = [
+        character, head, operator, condition, habit, branch, unit, bare_unit, reserved, deeper, missing, neighbours,
+        model_name,
+    ];
     finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
 }
 
@@ -111,9 +113,19 @@ pub(crate) fn is_unit(word: &str) -> bool {
         || word.strip_prefix(PREFIXES).is_some_and(|rest| known(rest) || rest == "Nm")
 }
 
+/// Whether a word could be a name: no sign of a unit in it.
+fn is_name(word: &str) -> bool {
+    word.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
+}
+
 /// A character that the language does not have.
 fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
-    let at = (piece.start..piece.end.min(stop.at + 1))
+    // A bracket with something strange in it does not fit as a whole.
+    let end = match source.is_symbol(stop.at, "[") {
+        true => (stop.at..piece.end).find(|&at| source.is_symbol(at, "]")).unwrap_or(stop.at),
+        false => stop.at,
+    };
+    let at = (piece.start..piece.end.min(end + 1))
         .rev()
         .find(|&at| matches!(source.kind(at), Some(TokenKind::Unknown | TokenKind::OpenText)))?;
     if source.kind(at) == Some(TokenKind::OpenText) {
@@ -124,8 +136,26 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         );
     }
     let found = source.word(at).chars().next()?;
+    // Signs as wide as Chinese letters.
+    if let '\u{ff01}'..='\u{ff5e}' = found {
+        let plain = char::from_u32(found as u32 - 0xff01 + 0x21).filter(|_| !found.is_alphanumeric());
+        if let Some(plain) = plain {
+            return Some(
+                Diagnostic::error("E0001", format!("`{found}` has no place here"))
+                    .label(source.span(at), "")
+                    .help(format!("write the narrow `{plain}`")),
+            );
+        }
+    }
     if found.is_alphabetic() {
         return Some(foreign(source, piece, at));
+    }
+    if found == '\'' && at == piece.start + 1 && source.glued(at) && source.kind(at - 1) == Some(TokenKind::Word) {
+        return Some(
+            Diagnostic::error("E0001", "a derivative is written as on paper")
+                .label(source.span(at - 1).to(source.span(at)), "")
+                .help(format!("write `d{}/dt`", source.word(at - 1))),
+        );
     }
     let instead = match found {
         '−' | '–' | '—' => "write `-`",
@@ -133,6 +163,7 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         '·' => "between values write `*`; in a unit `·` has no blank around it",
         '÷' => "write `/`",
         '²' => "write `^2`",
+        '⁻' | '¹' => "powers are written `^2`, and what is divided by stands behind `/`: `m/s^2`",
         '³' => "write `^3`",
         '≤' => "write `<=`",
         '≥' => "write `>=`",
@@ -143,6 +174,7 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         '\'' => "a derivative is written `dz/dt`, text in double quotes `\"`",
         '“' | '”' | '„' => "text stands in plain double quotes, `\"`",
         '#' => "a comment begins with `//`",
+        '%' if source.marks[at].first_on_line => "a comment begins with `//`",
         '\u{a0}' | '\u{2009}' | '\u{202f}' | '\u{200b}' => "write a plain space",
         _ => "remove it",
     };
@@ -328,6 +360,16 @@ fn head(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
             );
         }
     }
+    if source.is_symbol(first + 1, "/")
+        && let Some(of) = word.strip_prefix("d2").filter(|of| !of.is_empty())
+        && source.word(first + 2).starts_with("dt")
+    {
+        return Some(
+            Diagnostic::error("E0001", "an equation has a first derivative on its left")
+                .label(source.span(first).to(source.span(first + 2)), "a second derivative")
+                .help(format!("make it two states: `d{of}/dt = v` and `dv/dt = ...`")),
+        );
+    }
     spaced_derivative(source, piece).map(|(span, of, along)| {
         Diagnostic::error("E0003", "a derivative is written without spaces")
             .label(span, "reads as a division")
@@ -366,6 +408,90 @@ fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         _ => return None,
     };
     Some(Diagnostic::error("E0001", format!("`{here}` does not fit here")).label(source.span(at), "").help(instead))
+}
+
+/// What other languages have and this one says otherwise.
+fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let (first, at) = (piece.start, stop.at);
+    if at <= first || at >= piece.end {
+        return None;
+    }
+    let (begin, before, here) = (source.word(first), source.word(at - 1), source.word(at));
+    let error = |message: &str, from: usize, to: usize| {
+        Diagnostic::error("E0001", message).label(source.span(from).to(source.span(to)), "")
+    };
+    let word = |at: usize| source.kind(at) == Some(TokenKind::Word);
+    let number = |at: usize| source.kind(at) == Some(TokenKind::Number);
+    let declares = matches!(begin, "param" | "input" | "output" | "state" | "let" | "const");
+    if here == "," && number(at - 1) && number(at + 1) && source.glued(at) && source.glued(at + 1) {
+        let written = format!("{before}.{}", source.word(at + 1));
+        return Some(error("the decimal sign is a point", at - 1, at + 1).help(format!("write `{written}`")));
+    }
+    if declares && at == first + 2 && here == ":" {
+        let help = format!("write `{begin} {before} = ...`, or a unit: `{begin} {before} [m]`");
+        return Some(error("a value stands behind `=`", at, at).help(help));
+    }
+    if declares && at == first + 1 && here == "[" {
+        let close = (at..piece.end).find(|&mark| source.is_symbol(mark, "]"))?;
+        let name = if word(close + 1) { source.word(close + 1) } else { "name" };
+        let help = format!("write `{begin} {name} {}`", slice(source, at, close));
+        return Some(error("the unit stands behind the name", at, close).help(help));
+    }
+    if let Some(at) = [at - 1, at].into_iter().find(|&at| matches!(source.word(at), "elseif" | "elif" | "elsif")) {
+        let message = format!("`{}` is two words", source.word(at));
+        return Some(error(&message, at, at).help("write `else if`"));
+    }
+    if here == "?" {
+        let help = "write `if condition then a else b`";
+        return Some(error("a choice is written in words", at, at).help(help));
+    }
+    if matches!(here, "for" | "while" | "foreach" | "loop" | "repeat") && source.marks[at].first_on_line {
+        let help = "every equation holds at every instant; for several equal parts write\n`part el[i in 1 .. 4] = Model(k = i)` and `sum(el.f)`";
+        return Some(error("there are no loops", at, at).help(help));
+    }
+    if begin == "fn" && here == "{" {
+        let help = format!("write `{} = ...`; several steps are several functions", slice(source, first, at - 1));
+        return Some(error("a function is one expression", at, at).help(help));
+    }
+    if begin == "part" && before == "[" && number(at) {
+        let (name, last) = (source.word(first + 1), at);
+        return Some(
+            error("several parts have an index", at - 1, last).help(format!("write `{name}[i in 1 .. {here}]`")),
+        );
+    }
+    // An argument without its name: `LuGre(v)`.
+    let named = stop.expected.iter().any(|expected| expected == "`=`");
+    if named && matches!(here, "," | ")") && word(at - 1) && matches!(source.word(at - 2), "(" | ",") {
+        let help = format!("write `{before} = {before}`, the name of the model's input or param before its value");
+        return Some(error("an argument has a name", at - 1, at - 1).help(help));
+    }
+    let text = source.kind(at) == Some(TokenKind::Text);
+    if text && begin == "require" && stop.expected.iter().any(|expected| expected == "`,`") {
+        return Some(error("a comma stands before the message", at, at).help(format!("write `, {here}`")));
+    }
+    if begin == "table" && here == "," && stop.expected.iter().any(|expected| expected == "`:`") {
+        let help = "write each point as `x: y`, and commas between them";
+        return Some(error("a colon stands between the values of a point", at, at).help(help));
+    }
+    None
+}
+
+/// Something at the end that is always there.
+fn missing(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    let last = piece.end - 1;
+    if stop.at < piece.end || last <= piece.start {
+        return None;
+    }
+    let expects = |what: &str| stop.expected.iter().any(|expected| expected == what);
+    let (wanted, help) = match source.word(piece.start) {
+        "part" if expects("`(`") && source.kind(last) == Some(TokenKind::Word) => {
+            ("`(`", format!("write `{}()`, with arguments in the brackets", source.word(last)))
+        }
+        "sweep" if expects("`by`") => ("`by`", "add how far apart the values are: `by ...`".to_string()),
+        _ => return None,
+    };
+    let message = format!("expected {wanted} here");
+    Some(Diagnostic::error("E0001", message).label(source.span(last), "behind this").help(help))
 }
 
 /// A unit with blanks: `2 N m`, `[N m]`.
@@ -465,6 +591,10 @@ fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     )
 }
 
+/// How the message about a word of the language in the place of a name ends, and that about what does not fit.
+pub(crate) const RESERVED: &str = " is a word of the language";
+pub(crate) const MISFIT: &str = " does not fit here";
+
 /// A reserved word where a name should stand.
 fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
@@ -475,7 +605,7 @@ fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let named = stop.expected.iter().any(|expected| expected == "a name");
     let value = stop.expected.iter().any(|expected| expected == "a value");
     (named || value && !matches!(word, "then" | "else" | "in" | "and" | "or")).then(|| {
-        Diagnostic::error("E0001", format!("`{word}` is a word of the language"))
+        Diagnostic::error("E0001", format!("`{word}`{RESERVED}"))
             .label(source.span(at), if named { "expected a name" } else { "expected a value" })
             .help(format!("as a name write for example `{word}_`"))
     })
@@ -496,6 +626,15 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     if !begins || !source.ends_operand(at - 1) || source.kind(at - 1) == Some(TokenKind::Text) {
         return None;
     }
+    // `2 k x`: what reads as a unit is none.
+    let at = match source.kind(at - 1) {
+        Some(TokenKind::Unit)
+            if at - 1 > piece.start && !is_unit(source.word(at - 1)) && is_name(source.word(at - 1)) =>
+        {
+            at - 1
+        }
+        _ => at,
+    };
     let left = operand_before(source, piece, at);
     let right = match (source.word(at), source.is_symbol(at + 1, "(")) {
         ("(", _) => "(...)".to_string(),
@@ -584,7 +723,7 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     }
     let found = source.word(stop.at);
     let shown: String = found.chars().take(30).collect();
-    Diagnostic::error("E0001", format!("`{shown}` does not fit here")).label(source.span(stop.at), wanted)
+    Diagnostic::error("E0001", format!("`{shown}`{MISFIT}")).label(source.span(stop.at), wanted)
 }
 
 /// The operand that ends before `at`, if it is short enough to be shown.

@@ -189,6 +189,7 @@ impl Model {
             delays: Vec::new(),
             guards,
             roots: self.roots.iter().map(|text| Root { text: (*text).into(), decides: true }).collect(),
+            coupling: Arc::new([]),
             pool: Arc::new([]),
             layout,
         };

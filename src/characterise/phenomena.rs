@@ -343,6 +343,9 @@ impl Look<'_> {
         if least.value < -1e-9 * greatest {
             return when(false, format!("gives out {} on a closed path", least.shown()));
         }
+        if Self::number(test, "dissipation_proved").is_some() {
+            return when(true, format!("proved; least work of a round {}", least.shown()));
+        }
         match Self::number(test, "dissipation_points") {
             Some(points) => {
                 when(true, format!("holds at {} points; least work of a round {}", points.value, least.shown()))

@@ -1148,6 +1148,7 @@ impl Reader<'_> {
             self.number("greatest_work", "greatest work of a round", greatest, "J"),
         ];
         match verdict {
+            Some(Verdict::Proved) => numbers.push(self.number("dissipation_proved", "proved for all points", 1.0, "")),
             Some(Verdict::Holds(points)) => {
                 numbers.push(self.number(
                     "dissipation_points",

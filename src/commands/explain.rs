@@ -140,7 +140,11 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
 fn stable_steps(explanation: &Explanation) -> Option<String> {
     let one = |step: &compile::StepCost| {
         let most = step.stable?;
-        let most = if most >= compile::LONGEST_STEP { "any".into() } else { compile::two_digits_time(most) };
+        let most = match most {
+            0.0 => "none".into(),
+            most if most >= compile::LONGEST_STEP => "any".into(),
+            most => compile::two_digits_time(most),
+        };
         Some(format!("{} {most}", step.method.name()))
     };
     let all: Option<Vec<String>> = explanation.steps.iter().map(one).collect();
@@ -149,6 +153,7 @@ fn stable_steps(explanation: &Explanation) -> Option<String> {
 
 fn dissipation(verdict: &Verdict) -> String {
     match verdict {
+        Verdict::Proved => "proved".into(),
         Verdict::Holds(points) => format!("holds at {points} samples"),
         Verdict::Fails(point) => {
             format!("fails: at v = {:.3e} m/s it gives F = {:.3e} N and drives the motion", point.v, point.force)

@@ -139,7 +139,10 @@ impl<'a> Flattener<'a> {
                 DeclarationKind::State => {
                     let error = Diagnostic::error("E0303", format!("nothing says where `{}` starts", name.text))
                         .label(name.span, "a state needs an initial value")
-                        .help(format!("write `state {} = 0`", name.text));
+                        .help(match &declaration.unit {
+                            Some(unit) => format!("write `state {} [{}] = 0`", name.text, unit.text),
+                            None => format!("write `state {} = 0`", name.text),
+                        });
                     self.report(error);
                     let zero = self.system.push(zero(), name.span);
                     Definition::Continuous { initial: zero, rate: zero, path: None, span: name.span }

@@ -2,11 +2,20 @@
 
 use super::*;
 
+/// `an input`, `a param`
+fn kind_with_article(kind: DeclarationKind) -> String {
+    let word = kind.word();
+    format!("{} {word}", if word.starts_with(['i', 'o']) { "an" } else { "a" })
+}
+
 impl<'a> Flattener<'a> {
     /// E0204
     pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
         let tree = self.tree(id);
         let model = tree.model;
+        if self.explained(name, tree.file) {
+            return;
+        }
         let error = Diagnostic::error("E0204", format!("there is no `{}` in {}", name.text, model.name.text))
             .label(name.span, "not declared");
         let all = declarations(model).map(|d| d.name.text.as_str());
@@ -30,6 +39,88 @@ impl<'a> Flattener<'a> {
             None => error.help(format!("declare it, for example `param {} = …` or `let {} = …`", name.text, name.text)),
         };
         self.report(error);
+    }
+
+    /// Whether it has been said why this name is not known: its declaration could not be used, or it is the lower half
+    /// of what was read as a derivative.
+    pub(super) fn explained(&self, name: &Name, file: FileId) -> bool {
+        let lost = &self.loaded.files.get(file).ast.lost;
+        lost.contains(&name.text) || self.derivatives_read.contains(&name.span)
+    }
+
+    /// `fr.dz/dt`, where `z` is a quantity of the part: outside a division, and meant as a derivative.
+    fn derivative_of_part(&mut self, part: InstanceId, name: &Name) -> bool {
+        let state = name.text.strip_prefix('d').filter(|state| self.tree(part).names.contains_key(*state));
+        let (Some(state), Some((along, place))) = (state, self.below(name)) else { return false };
+        let model = &self.tree(part).model.name.text;
+        let derivative = format!("{}/{along}", name.text);
+        let error = Diagnostic::error("E0204", format!("`{derivative}` of {model} cannot be read from outside"))
+            .label(name.span.to(place), "a derivative of a part")
+            .help(format!("give {model} an output, `output rate_of_{state} = {derivative}`, and read that"));
+        self.derivatives_read.push(place);
+        self.report(error);
+        true
+    }
+
+    /// What stands below in `dv/dt`, if that is what begins with this name, and where.
+    fn below(&self, name: &Name) -> Option<(&'a str, Span)> {
+        let loaded: &'a Loaded = self.loaded;
+        let text = &loaded.files.get(name.span.file).text;
+        let below = text[name.span.end as usize..].strip_prefix('/').filter(|below| below.starts_with('d'))?;
+        let length = below.find(|c: char| !c.is_ascii_alphanumeric() && c != '_').unwrap_or(below.len());
+        let start = name.span.end as usize + 1;
+        Some((&below[..length], Span::new(name.span.file, start, start + length)))
+    }
+
+    /// `dv/dt`, where `v` is declared, but as no state.
+    fn derivative_of_no_state(&mut self, id: InstanceId, name: &Name) -> bool {
+        let Some(of) = name.text.strip_prefix('d') else { return false };
+        let Some(kind) = declarations(self.tree(id).model).find(|d| d.name.text == of).map(|d| d.kind) else {
+            return false;
+        };
+        let Some((along, place)) = self.below(name).filter(|(along, _)| *along == "dt") else { return false };
+        let error = Diagnostic::error("E0307", format!("`{of}` is {}, only a state has a derivative", kind_with_article(kind)))
+            .label(name.span.to(place), "no such derivative")
+            .help(match kind {
+                DeclarationKind::Input => format!(
+                    "let the model that knows it give it: `input rate_of_{of} [...]`, and there `output rate_of_{of} = d{of}/{along}`"
+                ),
+                _ => format!("write out how fast `{of}` changes, or declare a state for it"),
+            });
+        self.derivatives_read.push(place);
+        self.report(error);
+        true
+    }
+
+    /// `9.81 m / s^2`: what follows the blanks is read as a name.
+    fn spaced_unit(&mut self, name: &Name) -> bool {
+        let text = &self.loaded.files.get(name.span.file).text;
+        let (before, behind) = (&text[..name.span.start as usize], &text[name.span.end as usize..]);
+        let Some(front) = before.trim_end_matches(' ').strip_suffix(['/', '*']) else { return false };
+        let sign = if before.trim_end_matches(' ').ends_with('/') { '/' } else { '·' };
+        let front = front.trim_end_matches(' ');
+        let word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_');
+        let unit_start = front.rfind(|c: char| !word(c) && !matches!(c, '/' | '·' | '^')).map_or(0, |at| at + 1);
+        let (number, unit) = (&front[..unit_start], &front[unit_start..]);
+        let number = number.trim_end_matches(' ');
+        let number = &number[number.rfind(|c: char| !word(c)).map_or(0, |at| at + 1)..];
+        let power = behind
+            .strip_prefix('^')
+            .map_or("", |power| &behind[..1 + power.find(|c: char| !c.is_ascii_digit()).unwrap_or(power.len())]);
+        let whole = format!("{unit}{sign}{}{power}", name.text);
+        let spaced = number.parse::<f64>().is_ok() && Unit::parse(unit).is_ok() && Unit::parse(&whole).is_ok();
+        if !spaced {
+            return false;
+        }
+        let (start, end) = (unit_start, name.span.end as usize + power.len());
+        let error = Diagnostic::error("E0110", "a unit is written without spaces")
+            .label(
+                Span::new(name.span.file, start, end),
+                format!("reads as {number} {unit}, and then a name `{}`", name.text),
+            )
+            .help(format!("write `{number} {whole}`"));
+        self.report(error);
+        true
     }
 
     /// `param, N/m, line 4`
@@ -161,7 +252,10 @@ impl<'a> Flattener<'a> {
             return node;
         }
         match env.instance {
+            Some(id) if path.single().is_some() && self.derivative_of_no_state(id, &head.name) => {}
+            Some(_) | None if self.spaced_unit(&head.name) => {}
             Some(id) => self.unknown(id, &head.name),
+            None if self.explained(&head.name, env.file) => {}
             None => {
                 let visible = self.loaded.visible(env.file, Space::Const);
                 let error = Diagnostic::error("E0204", format!("there is no `{}` here", head.name.text))
@@ -259,7 +353,9 @@ impl<'a> Flattener<'a> {
             match self.tree(part).names.get(next.text.as_str()).cloned() {
                 Some(next) => (id, binding) = (part, next),
                 None => {
-                    self.unknown(part, next);
+                    if k + 2 < path.segments.len() || !self.derivative_of_part(part, next) {
+                        self.unknown(part, next);
+                    }
                     return self.error(path.span);
                 }
             }
@@ -404,6 +500,9 @@ impl<'a> Flattener<'a> {
     }
 
     pub(super) fn unknown_function(&mut self, function: &Name, env: &Env) {
+        if self.explained(function, env.file) {
+            return;
+        }
         let mut error = Diagnostic::error("E0204", format!("there is no function `{}`", function.text))
             .label(function.span, "not declared");
         let loaded = self.loaded;

@@ -36,6 +36,7 @@ impl<'a> Flattener<'a> {
                 self.report(error.help("name a model that fits it"));
             }
             Lookup::Ambiguous(a, b) => self.ambiguous(name, a, b),
+            Lookup::Missing if self.explained(name, file) => {}
             Lookup::Missing => {
                 let models = loaded.visible(file, Space::Type);
                 let near = nearest(&name.text, models.iter().copied().filter(|m| self.is_model(file, m)));
@@ -434,7 +435,14 @@ impl<'a> Flattener<'a> {
         changes.retain(|change| !change.path.is_empty());
         let (instance, instance_env) = chosen;
         let (item, model) = self.model(instance_env.file, &instance.model)?;
-        if self.models.contains(&item) || self.models.len() >= DEEPEST {
+        if self.models.len() >= DEEPEST && !self.models.contains(&item) {
+            let error = Diagnostic::error("E0211", format!("parts are nested more than {DEEPEST} deep"))
+                .label(instance.model.span, "one too deep")
+                .help("make parts of the same model side by side, as an array or by name");
+            self.report(error);
+            return None;
+        }
+        if self.models.contains(&item) {
             let error = Diagnostic::error("E0211", format!("{} contains itself", model.name.text))
                 .label(instance.model.span, "here it is made again")
                 .help("a part cannot contain the model that it belongs to");
@@ -482,6 +490,7 @@ impl<'a> Flattener<'a> {
         match loaded.find(file, Space::Type, &slot.interface.text) {
             Lookup::Found(_, Item::Interface(interface)) => return Some(interface),
             Lookup::Ambiguous(a, b) => self.ambiguous(&slot.interface, a, b),
+            Lookup::Missing if self.explained(&slot.interface, file) => {}
             Lookup::Found(..) | Lookup::Missing => {
                 let mut error = Diagnostic::error("E0201", format!("there is no interface `{}`", slot.interface.text))
                     .label(slot.interface.span, "not declared and not imported");

@@ -220,6 +220,8 @@ struct Flattener<'a> {
     models: Vec<ItemRef>,
     /// Unknown names reported so far: suggestions are made for the first of them only.
     unknowns: usize,
+    /// The lower halves of what was read as a derivative that there is not, which has been reported.
+    derivatives_read: Vec<Span>,
     /// Wiring of slots that the present model has no port for: another model may read it.
     dropped: Vec<Arg<'a>>,
     /// Most operations, and whether it has been reported that there are more.
@@ -338,6 +340,7 @@ impl<'a> Flattener<'a> {
             models: Vec::new(),
             refused: Vec::new(),
             unknowns: 0,
+            derivatives_read: Vec::new(),
             most_nodes: MOST_NODES,
             too_large: false,
             refused_parts: Vec::new(),
@@ -420,7 +423,28 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
     ];
     let error =
         Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
-    match nearest(part, known) {
+    // Units that people have and SI has not: what one of them is.
+    const OTHERS: [(&[&str], &str); 13] = [
+        (&["degC", "°C", "celsius", "Celsius", "C"], "temperatures are in K: 20 degC is `293.15 K`"),
+        (&["bar"], "1 bar is `1e5 Pa`"),
+        (&["psi"], "1 psi is `6894.76 Pa`"),
+        (&["atm"], "1 atm is `101325 Pa`"),
+        (&["in", "inch"], "1 inch is `25.4 mm`"),
+        (&["ft", "foot", "feet"], "1 foot is `304.8 mm`"),
+        (&["lb", "lbs"], "1 pound is `0.453592 kg`"),
+        (&["lbf"], "1 pound of force is `4.44822 N`"),
+        (&["kgf", "kp"], "1 kgf is `9.80665 N`"),
+        (&["hp", "PS"], "1 hp is `745.7 W`"),
+        (&["sec", "secs", "seconds"], "seconds are `s`"),
+        (&["meter", "meters", "metre", "metres"], "metres are `m`"),
+        (&["newton", "newtons", "Newton"], "newtons are `N`"),
+    ];
+    if let Some((_, what)) = OTHERS.iter().find(|(names, _)| names.contains(&part)) {
+        return error.help(*what);
+    }
+    // Of so short words only the nearest is near.
+    let near = |known: &&str| known.eq_ignore_ascii_case(part) || part.len() > 2 && known.len() > 1;
+    match nearest(part, known.into_iter().filter(near)).filter(|near| near.len() + 1 >= part.len()) {
         Some(near) => error.help(format!("did you mean `{near}`?")),
         None => error
             .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),

@@ -25,6 +25,8 @@ pub struct Message {
     pub period_ns: u64,
     /// What it carries.
     pub signals: Vec<Signal>,
+    /// Why we cannot tell which signals are in a frame, if we cannot: the signal, and words.
+    pub unclear: Option<(usize, String)>,
 }
 
 /// One signal of a message.
@@ -52,10 +54,8 @@ pub struct Signal {
     pub unit: Option<Unit>,
     /// What is added to a number in `unit`: 273.15 for degrees Celsius, shown in K.
     pub unit_offset: f64,
-    /// The switch of the message is this signal.
-    pub switch: bool,
-    /// Present only while the switch has this raw value.
-    pub present_at: Option<u64>,
+    /// Present only while the signal of this number, a switch, has this raw value.
+    pub present_at: Option<(usize, u64)>,
 }
 
 /// Reads a file whose text has this number.
@@ -105,12 +105,6 @@ pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
                 (_, ValueType::Unsigned) => Format::Unsigned,
             };
             let (unit, unit_offset) = known_unit(&signal.unit);
-            let (switch, present_at) = match signal.multiplexer_indicator {
-                MultiplexIndicator::Plain => (false, None),
-                MultiplexIndicator::Multiplexor => (true, None),
-                MultiplexIndicator::MultiplexedSignal(value) => (false, Some(value)),
-                MultiplexIndicator::MultiplexorAndMultiplexedSignal(value) => (true, Some(value)),
-            };
             Signal {
                 name: signal.name.clone(),
                 span: place_of_signal(file, text, block, &signal.name),
@@ -123,10 +117,17 @@ pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
                 unit_text: signal.unit.clone(),
                 unit,
                 unit_offset,
-                switch,
-                present_at,
+                present_at: None,
             }
         });
+        let mut signals: Vec<Signal> = signals.collect();
+        let unclear = match switched(&dbc, message) {
+            Ok(switched) => {
+                switched.into_iter().for_each(|(k, present_at)| signals[k].present_at = Some(present_at));
+                None
+            }
+            Err(unclear) => Some(unclear),
+        };
         messages.push(Message {
             name: message.name.clone(),
             span,
@@ -134,10 +135,63 @@ pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
             extended,
             length: message.size,
             period_ns: (period_ms.max(0.0) * 1e6).round() as u64,
-            signals: signals.collect(),
+            signals,
+            unclear,
         });
     }
     Ok(messages)
+}
+
+/// Which signals of a message are present only while which other has which raw value.
+///
+/// # Errors
+/// The signal of which the file does not say that, or more than we can do, and why.
+#[allow(clippy::type_complexity, reason = "a signal, its switch and the value of that")]
+fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize, u64))>, (usize, String)> {
+    let signals = &message.signals;
+    let is_switch = |signal: &can_dbc::Signal| {
+        let indicator = signal.multiplexer_indicator;
+        matches!(indicator, MultiplexIndicator::Multiplexor | MultiplexIndicator::MultiplexorAndMultiplexedSignal(_))
+    };
+    let switches: Vec<usize> = (0..signals.len()).filter(|k| is_switch(&signals[*k])).collect();
+    let mut out = Vec::new();
+    for (k, signal) in signals.iter().enumerate() {
+        let value = match signal.multiplexer_indicator {
+            MultiplexIndicator::Plain | MultiplexIndicator::Multiplexor => continue,
+            MultiplexIndicator::MultiplexedSignal(value)
+            | MultiplexIndicator::MultiplexorAndMultiplexedSignal(value) => value,
+        };
+        let name = &signal.name;
+        // Where there are several switches, a line of its own names the one.
+        let extended = dbc.extended_multiplex.iter().find(|e| e.message_id == message.id && e.signal_name == *name);
+        let (switch, value) = match extended {
+            Some(extended) => {
+                let [one] = &extended.mappings[..] else {
+                    return Err((k, format!("`{name}` is present at several values of its switch")));
+                };
+                if one.min_value != one.max_value {
+                    return Err((k, format!("`{name}` is present at several values of its switch")));
+                }
+                let wanted = &extended.multiplexor_signal_name;
+                let switch = signals.iter().position(|signal| signal.name == *wanted);
+                (switch.ok_or_else(|| (k, format!("the switch `{wanted}` of `{name}` is missing")))?, one.min_value)
+            }
+            None => match switches[..] {
+                [switch] if switch != k => (switch, value),
+                [] => return Err((k, format!("`{name}` is multiplexed, but its message has no switch"))),
+                _ => return Err((k, format!("`{name}` is multiplexed, but no SG_MUL_VAL_ says by which switch"))),
+            },
+        };
+        out.push((k, (switch, value)));
+    }
+    // A switch may hang on another one, but none on itself.
+    for &(k, _) in &out {
+        let above = |at: usize| out.iter().find(|(signal, _)| *signal == at).map(|(_, (switch, _))| *switch);
+        if std::iter::successors(Some(k), |at| above(*at)).take(signals.len() + 1).count() > signals.len() {
+            return Err((k, format!("the switch of `{}` is switched by itself", signals[k].name)));
+        }
+    }
+    Ok(out)
 }
 
 /// What people write for units in such files: the unit, and what is added to a number in it.

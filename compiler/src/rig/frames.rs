@@ -110,7 +110,6 @@ pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnosti
         if !message.extended && message.id > 0x7FF {
             refuse(message.span, format!("{} has the identifier {:#x}, more than 11 bits", message.name, message.id));
         }
-        let switch = message.signals.iter().position(|signal| signal.switch);
         let field = |signal: &dbc::Signal| {
             let unit = signal.unit.clone().unwrap_or_default();
             let offset = unit.scale * signal.offset + signal.unit_offset;
@@ -124,7 +123,7 @@ pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnosti
                 offset,
                 start: 0.0,
                 unit,
-                multiplexed: signal.present_at.zip(switch).map(|(value, switch)| (switch, value)),
+                multiplexed: signal.present_at,
             }
         };
         for signal in &message.signals {
@@ -151,15 +150,16 @@ pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnosti
     laid
 }
 
-/// The messages of a DBC file, for whoever wants to read frames by them.
+/// The messages of a DBC file that can be read, for whoever wants to read frames by them.
 ///
 /// # Errors
 /// What is wrong with the file, in words.
 pub fn of_dbc(text: &str) -> Result<Vec<Message>, String> {
-    let messages = dbc::read(FileId(0), text).map_err(|(why, span)| {
+    let mut messages = dbc::read(FileId(0), text).map_err(|(why, span)| {
         let line = text[..span.start as usize].lines().count().max(1);
         format!("line {line}: {why}")
     })?;
+    messages.retain(|message| message.unclear.is_none());
     let mut found = Vec::new();
     let laid = by_dbc(&messages, &|_| false, &mut found);
     match found.first() {

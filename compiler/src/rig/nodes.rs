@@ -32,9 +32,9 @@ model Cia402 {
   input torque [N·m]                           /// torque at the shaft
   input speed [rad/s]                          /// speed of the shaft
   input position [rad]                         /// counted from enabling
-  input enabled_bit                            /// follows commands
-  input fault_bit                              /// reports a fault
-  input limited_bit                            /// reports an internal limit
+  input enabled_bit [1]                        /// follows commands
+  input fault_bit [1]                          /// reports a fault
+  input limited_bit [1]                        /// reports an internal limit
   output enabled = enabled_bit > 0.5
   output fault   = fault_bit > 0.5
   output limited = limited_bit > 0.5
@@ -436,11 +436,12 @@ impl Describer<'_> {
         for name in names {
             match all.iter().find(|message| message.name == name.text) {
                 Some(message) => {
-                    let switches = message.signals.iter().filter(|signal| signal.switch).count();
-                    if switches > 1 {
-                        let why = format!("{} has {switches} switches: nested multiplexing is not read", name.text);
-                        let error = Diagnostic::error("E0807", why).label(name.span, "asked for here");
-                        self.diagnostics.push(error.label(message.span, "described here"));
+                    if let Some((signal, why)) = &message.unclear {
+                        let error = Diagnostic::error("E0807", format!("in {}, {why}", name.text))
+                            .label(name.span, "asked for here")
+                            .label(message.signals[*signal].span, "described here");
+                        self.diagnostics
+                            .push(error.help("one switch, or SG_MUL_VAL_ with one value for each signal, can be read"));
                     }
                     out.push(message.clone());
                 }
@@ -475,7 +476,7 @@ impl Describer<'_> {
     fn by_dbc(&mut self, messages: &[dbc::Message]) -> Vec<Declaration> {
         let one = |(_, _, signal): (usize, usize, &dbc::Signal)| {
             let unit = signal.unit.as_ref().map(|unit| unit.text.as_str()).filter(|unit| !unit.is_empty());
-            declared(DeclarationKind::Input, &signal.name, unit, None, signal.span)
+            declared(DeclarationKind::Input, &signal.name, unit.or(Some("1")), None, signal.span)
         };
         fields(messages).map(one).collect()
     }

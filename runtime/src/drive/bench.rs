@@ -390,11 +390,7 @@ impl SimulatedDevice {
             }
             self.due_ns[at] = now_ns + self.period_ns[at];
             let mut data = [0; 8];
-            for (field, value) in message.fields.iter().zip(&self.values[at]) {
-                if field.multiplexed.is_none() {
-                    frames::write(field, *value, &mut data);
-                }
-            }
+            frames::fill(message, |field| self.values[at][field], &mut data);
             let data = &data[..message.length.into()];
             send(if message.extended { Frame::extended(message.id, data) } else { Frame::new(message.id, data) });
         }

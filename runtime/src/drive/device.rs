@@ -131,9 +131,7 @@ impl Device {
     pub(super) fn send_commands(&mut self, now_ns: u64, send: Send) {
         for line in self.lines.iter_mut().filter(|line| line.message.send) {
             let mut data = [0; 8];
-            for (field, reading) in line.message.fields.iter().zip(&line.values) {
-                frames::write(field, reading.value, &mut data);
-            }
+            frames::fill(&line.message, |field| line.values[field].value, &mut data);
             if self.moves || data != line.sent || now_ns >= line.due_ns || !line.fresh {
                 let period = if line.message.period_ns > 0 { line.message.period_ns } else { PERIOD_NS };
                 (line.sent, line.due_ns, line.fresh) = (data, now_ns + period, true);
@@ -146,9 +144,7 @@ impl Device {
     pub(super) fn stop_frames(&self) -> impl Iterator<Item = Frame> + '_ {
         self.lines.iter().filter(|line| line.message.send).map(|line| {
             let mut data = [0; 8];
-            for (field, safe) in line.message.fields.iter().zip(&line.safe) {
-                frames::write(field, *safe, &mut data);
-            }
+            frames::fill(&line.message, |field| line.safe[field], &mut data);
             frame(&line.message, &data)
         })
     }

@@ -27,15 +27,27 @@ fn raw(field: &Field, data: &[u8]) -> Option<u64> {
     Some(raw)
 }
 
+/// Whether a field is in this frame: its switch, if it has one, is there and says so.
+fn present(message: &Message, field: usize, data: &[u8]) -> bool {
+    let mut at = field;
+    // A switch may hang on another one; no chain is longer than the message.
+    for _ in 0..=message.fields.len() {
+        let Some((switch, value)) = message.fields[at].multiplexed else { return true };
+        if raw(&message.fields[switch], data) != Some(value) {
+            return false;
+        }
+        at = switch;
+    }
+    false
+}
+
 /// The value of a field, SI; nothing if the frame is too short, if the field is not in it (multiplexing), or if what
 /// it holds is no number.
 pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
-    let field = &message.fields[field];
-    if let Some((selector, value)) = field.multiplexed
-        && raw(&message.fields[selector], data)? != value
-    {
+    if !present(message, field, data) {
         return None;
     }
+    let field = &message.fields[field];
     let raw = raw(field, data)?;
     let number = match field.format {
         Format::Unsigned => raw as f64,
@@ -65,6 +77,30 @@ pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
         let (byte, bit) = place(field, k);
         if let Some(byte) = data.get_mut(byte) {
             *byte = *byte & !(1 << bit) | ((raw >> k & 1) as u8) << bit;
+        }
+    }
+}
+
+/// Puts the values of all fields, SI, into the data of a frame: of those that share bits, the ones whose switch has their
+/// value. Bits of no field become 0.
+pub fn fill(message: &Message, value: impl Fn(usize) -> f64, data: &mut [u8; 8]) {
+    *data = [0; 8];
+    let switches = |field: usize| {
+        let above = |at: &usize| message.fields[*at].multiplexed.map(|(switch, _)| switch);
+        std::iter::successors(Some(field), above).take(message.fields.len() + 1).count()
+    };
+    // Switches before what they switch.
+    for depth in 1..=message.fields.len() {
+        let mut deeper = false;
+        for (k, field) in message.fields.iter().enumerate() {
+            let its = switches(k);
+            deeper |= its > depth;
+            if its == depth && present(message, k, data) {
+                write(field, value(k), data);
+            }
+        }
+        if !deeper {
+            break;
         }
     }
 }
@@ -143,6 +179,29 @@ mod tests {
         write(&field(0, 4, false, Format::Unsigned), f64::NAN, &mut data);
         write(&field(12, 4, false, Format::Unsigned), 99.0, &mut data);
         assert_eq!(data[..2], [0x00, 0xF8]);
+    }
+
+    #[test]
+    fn what_shares_bits_is_written_where_the_switch_says() {
+        let byte = |k: u16| field(8 * k, 8, false, Format::Unsigned);
+        let mut message = message(vec![byte(2), byte(1), byte(2), byte(0), byte(3)]);
+        // Field 3 switches 0 and 1; 1 switches 2 and 4.
+        message.fields[0].multiplexed = Some((3, 0));
+        message.fields[1].multiplexed = Some((3, 1));
+        message.fields[2].multiplexed = Some((1, 7));
+        message.fields[4].multiplexed = Some((1, 8));
+        let filled = |values: [f64; 5]| {
+            let mut data = [0xFF; 8];
+            fill(&message, |k| values[k], &mut data);
+            data
+        };
+        assert_eq!(filled([5.0, 7.0, 6.0, 0.0, 9.0]), [0, 0, 5, 0, 0, 0, 0, 0]);
+        assert_eq!(filled([5.0, 7.0, 6.0, 1.0, 9.0]), [1, 7, 6, 0, 0, 0, 0, 0]);
+        assert_eq!(filled([5.0, 8.0, 6.0, 1.0, 9.0]), [1, 8, 0, 9, 0, 0, 0, 0]);
+        assert_eq!(filled([5.0, 8.0, 6.0, 2.0, 9.0]), [2, 0, 0, 0, 0, 0, 0, 0]);
+        // What hangs on a switch that is not there is not there.
+        assert_eq!(read(&message, 2, &[0, 7, 6, 0]), None);
+        assert_eq!(read(&message, 2, &[1, 7, 6, 0]), Some(6.0));
     }
 
     #[test]

@@ -8,7 +8,7 @@
 
 use super::explicit::Explicit;
 use super::fused::{Fused, Judged};
-use super::linear;
+use super::jacobian::Entries;
 use super::points::Points;
 use super::rosenbrock::Rosenbrock;
 use super::step::{Step, System};
@@ -86,7 +86,7 @@ struct Adaptive<'a> {
     was_stiff: bool,
     jacobian_known: bool,
     jacobian: Vec<f64>,
-    room: Vec<f64>,
+    entries: Entries,
     rosenbrock: Rosenbrock,
     /// The same as one function of the model, if it has it; and whether the last step was made by it.
     fused: Option<Fused>,
@@ -154,6 +154,7 @@ impl<'a> Adaptive<'a> {
         let fused = Fused::new(instance, tol, &scales);
         let system = System::new(instance);
         let n = system.n;
+        let entries = Entries::new(n, &description.coupling);
         Adaptive {
             duration: experiment.duration,
             corners: experiment.corners.clone(),
@@ -168,9 +169,9 @@ impl<'a> Adaptive<'a> {
             end_slope: vec![0.0; n],
             was_stiff: true,
             jacobian_known: false,
-            jacobian: vec![0.0; n * n + n],
-            room: vec![0.0; 2 * n * n],
-            rosenbrock: Rosenbrock::new(n),
+            jacobian: vec![0.0; entries.len() + n],
+            rosenbrock: Rosenbrock::new(n, entries.coupled()),
+            entries,
             fused,
             was_fused: false,
             explicit: Explicit::new(n),
@@ -380,14 +381,7 @@ impl<'a> Adaptive<'a> {
     fn defect(&self) -> f64 {
         let n = self.system.n;
         let step = &self.step;
-        // Squares of frequencies: exact for a mass on a spring, and for what decays.
-        let entry = |row: usize, column: usize| self.jacobian[row * n + column];
-        let mut fastest = 1.0 / (step.h * step.h);
-        for row in 0..n {
-            for column in 0..=row {
-                fastest = f64::max(fastest, (entry(row, column) * entry(column, row)).abs());
-            }
-        }
+        let fastest = self.entries.fastest(&self.jacobian, 1.0 / (step.h * step.h));
         let time = 1.0 / fastest.sqrt();
         let part = |i: usize| {
             let slope = (step.x1[i] - step.x0[i] - step.k1[i] - step.k2[i] - step.k3[i]) / step.h;
@@ -411,23 +405,13 @@ impl<'a> Adaptive<'a> {
         }
         self.know_jacobian();
         let n = self.system.n;
-        // The means of the eigenvalues and of their squares are cheap to know, and no greater than the largest.
-        let entry = |row: usize, column: usize| self.jacobian[row * n + column];
-        let mean = (0..n).map(|i| entry(i, i)).sum::<f64>() / n as f64;
-        let product = |row: usize| (0..n).map(|column| entry(row, column) * entry(column, row)).sum::<f64>();
-        let square = (0..n).map(product).sum::<f64>() / n as f64;
-        let least = self.step.h * mean.abs().max(square.abs().sqrt());
-        if self.stiff && least > 0.5 {
+        // The mean eigenvalue is cheap to know.
+        let trace = self.entries.trace(&self.jacobian);
+        if self.stiff && self.step.h * trace.abs() > 0.5 * n as f64 {
             self.doubts = 0;
             return;
         }
-        let (matrix, room) = self.room.split_at_mut(n * n);
-        for row in 0..n {
-            for column in 0..n {
-                matrix[row * n + column] = self.jacobian[row * n + column] * self.scales[column] / self.scales[row];
-            }
-        }
-        let size = self.step.h * linear::spectral_radius(n, matrix, room);
+        let size = self.step.h * self.entries.spectral_radius(&self.jacobian, &self.scales);
         let doubt = if self.stiff { size < 0.5 } else { size > 1.5 };
         self.doubts = if doubt { self.doubts + 1 } else { 0 };
         if self.doubts >= if self.stiff { self.patience } else { 2 } {

@@ -9,6 +9,7 @@
 //! eq. IV.7.25. The tests check the order conditions of the coefficients as they stand here.
 
 use super::linear;
+use super::sparse::Sparse;
 use super::step::{Step, System};
 use abi::rodas5p::{A, C, D, GAMMA, H, STAGES, W};
 
@@ -19,13 +20,16 @@ pub(crate) struct Rosenbrock {
     /// Factors of I/(γh) − J.
     matrix: Vec<f64>,
     rows: Vec<usize>,
+    /// Instead, of a model that knows its coupling.
+    sparse: Option<Sparse>,
     x: Vec<f64>,
     f: Vec<f64>,
     attempt: fn(&mut Rosenbrock, &mut System, &mut Step, &[f64]) -> bool,
 }
 
 impl Rosenbrock {
-    pub(crate) fn new(n: usize) -> Rosenbrock {
+    /// Of n states; `coupled`: where the Jacobian has entries, if these are not all.
+    pub(crate) fn new(n: usize, coupled: Option<&[(u32, u32)]>) -> Rosenbrock {
         let attempt = match n {
             1 => Rosenbrock::stages::<1>,
             2 => Rosenbrock::stages::<2>,
@@ -40,8 +44,9 @@ impl Rosenbrock {
         let zeros = || vec![0.0; n];
         Rosenbrock {
             u: vec![0.0; STAGES * n],
-            matrix: vec![0.0; n * n],
+            matrix: vec![0.0; if coupled.is_some() { 0 } else { n * n }],
             rows: vec![0; n],
+            sparse: coupled.map(|coupled| Sparse::new(n, coupled)),
             x: zeros(),
             f: zeros(),
             attempt,
@@ -58,15 +63,22 @@ impl Rosenbrock {
     fn stages<const N: usize>(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
         let n = if N == 0 { system.n } else { N };
         let h = step.h;
-        let (matrix, rows) = (&mut self.matrix[..n * n], &mut self.rows[..n]);
-        let (df_dx, df_dt) = jacobian[..n * n + n].split_at(n * n);
-        for (entry, j) in matrix.iter_mut().zip(df_dx) {
-            *entry = -j;
-        }
-        for i in 0..n {
-            matrix[i * n + i] += 1.0 / (GAMMA * h);
-        }
-        if !linear::factor::<N>(n, matrix, rows) {
+        let (df_dx, df_dt) =
+            if N == 0 { jacobian.split_at(jacobian.len() - n) } else { jacobian[..n * n + n].split_at(n * n) };
+        let regular = match &mut self.sparse {
+            Some(sparse) if N == 0 => sparse.factor(1.0 / (GAMMA * h), df_dx),
+            _ => {
+                let (matrix, rows) = (&mut self.matrix[..n * n], &mut self.rows[..n]);
+                for (entry, j) in matrix.iter_mut().zip(df_dx) {
+                    *entry = -j;
+                }
+                for i in 0..n {
+                    matrix[i * n + i] += 1.0 / (GAMMA * h);
+                }
+                linear::factor::<N>(n, matrix, rows)
+            }
+        };
+        if !regular {
             return false;
         }
         self.stage::<N, 0>(system, step, df_dt);
@@ -111,7 +123,10 @@ impl Rosenbrock {
         for i in 0..n {
             u[i] = f[i] + per_step * combine::<S>(&W[S], done, n, i) + step.h * D[S] * df_dt[i];
         }
-        linear::solve::<N>(n, &self.matrix, &self.rows, u);
+        match &mut self.sparse {
+            Some(sparse) if N == 0 => sparse.solve(u),
+            _ => linear::solve::<N>(n, &self.matrix, &self.rows, u),
+        }
     }
 }
 
@@ -207,7 +222,7 @@ mod tests {
             })
             .build();
         let mut system = System::new(&mut instance);
-        let (mut method, mut step) = (Rosenbrock::new(1), Step::new(1));
+        let (mut method, mut step) = (Rosenbrock::new(1, None), Step::new(1));
         let exact = |t: f64| 1.0 / (1.0 + t.sin());
         let h = 2.0 / f64::from(steps);
         let (mut x, mut dense, mut j) = (1.0, 0.0f64, [0.0; 2]);

@@ -1,0 +1,677 @@
+//! Proves that a value of a function is nowhere negative, whatever its inputs are within a box.
+//!
+//! In: a function before its elementary functions are expanded, what it reads as intervals, and the work it may cost. Out:
+//! whether there is a proof. Boxes are halved until each is proven: a value is written as a sum of products of what is
+//! opaque (inputs, functions, quotients, branches that are not decided), so that what cancels on paper cancels here, and
+//! then bounded by intervals. Comparisons that are the same all over a box are decided; one of an input with a number
+//! halves the box just there. Bounds are rounded outwards; a sum that is negative by no more than 1e-12 of its
+//! terms counts as zero, for coefficients of the same product may differ in their last digit.
+
+use crate::ir::{Binary, Func, Op, Unary, Value};
+use abi::Slot;
+use std::collections::{BTreeMap, HashMap};
+use std::rc::Rc;
+
+/// Closed, never empty.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Range {
+    /// Least value; may be infinite.
+    pub low: f64,
+    /// Greatest value; may be infinite.
+    pub high: f64,
+}
+
+/// One thing to prove, of a function: that one of these values is nowhere negative where none of these conditions holds.
+pub struct Claim<'a> {
+    /// The function.
+    pub func: &'a Func,
+    /// Any one of them suffices, in each box another one.
+    pub any: &'a [Value],
+    /// Where one of these holds, nothing is claimed.
+    pub unless: &'a [Value],
+}
+
+/// Most terms of a sum of products; one with more is opaque.
+const MOST_TERMS: usize = 48;
+/// Parts of a sum that count as nothing.
+const NOTHING: f64 = 1e-12;
+/// Most halvings one inside the other.
+const DEEPEST: u32 = 60;
+
+/// Proves a claim for all inputs in `inputs`; false where there is no proof within `work` steps, of which each is some
+/// operations. What is left of the work stays in it.
+pub fn prove(claim: &Claim, inputs: &[(Slot, Range)], pool: &[f64], work: &mut usize) -> bool {
+    let live = claim.func.live();
+    let mut stack = vec![Cell { inputs: inputs.to_vec(), facts: Vec::new(), depth: 0 }];
+    while let Some(cell) = stack.pop() {
+        let cost = claim.func.ops.len() + 1;
+        let Some(rest) = work.checked_sub(cost) else { return false };
+        *work = rest;
+        let mut bounds = Bounds::new(claim.func, &live, &cell, pool, work);
+        if claim.unless.iter().any(|condition| bounds.truth(*condition) == Some(true)) {
+            continue;
+        }
+        if claim.any.iter().any(|value| bounds.not_negative(*value)) {
+            continue;
+        }
+        if cell.depth >= DEEPEST {
+            return false;
+        }
+        let Some(halves) = bounds.halves(claim) else { return false };
+        stack.extend(halves);
+    }
+    true
+}
+
+/// A box, with comparisons that are known in it.
+#[derive(Clone)]
+struct Cell {
+    inputs: Vec<(Slot, Range)>,
+    facts: Vec<(Value, bool)>,
+    depth: u32,
+}
+
+/// What is opaque, by its value, and its power.
+type Product = Vec<(u32, i32)>;
+
+/// A sum of products with their coefficients; each with the sum of magnitudes that it was added from.
+#[derive(Clone, Default)]
+struct Sum(BTreeMap<Product, (f64, f64)>);
+
+impl Sum {
+    fn number(x: f64) -> Sum {
+        Sum([(Product::new(), (x, x.abs()))].into_iter().filter(|(_, (x, _))| *x != 0.0).collect())
+    }
+
+    fn opaque(value: Value) -> Sum {
+        Sum([(vec![(value.0, 1)], (1.0, 1.0))].into())
+    }
+
+    fn add(mut self, other: &Sum, sign: f64) -> Sum {
+        for (product, (x, size)) in &other.0 {
+            let entry = self.0.entry(product.clone()).or_default();
+            entry.0 += sign * x;
+            entry.1 += size;
+        }
+        self.0.retain(|_, (x, size)| x.abs() > NOTHING * *size);
+        self
+    }
+
+    fn times(&self, other: &Sum) -> Sum {
+        let mut out = Sum::default();
+        for (a, (x, size)) in &self.0 {
+            for (b, (y, other)) in &other.0 {
+                let mut product: BTreeMap<u32, i32> = a.iter().copied().collect();
+                for (opaque, power) in b {
+                    *product.entry(*opaque).or_default() += power;
+                }
+                let product: Product = product.into_iter().filter(|(_, power)| *power != 0).collect();
+                let entry = out.0.entry(product).or_default();
+                entry.0 += x * y;
+                entry.1 += size * other;
+            }
+        }
+        out.0.retain(|_, (x, size)| x.abs() > NOTHING * *size);
+        out
+    }
+
+    /// The one product that it is, with its coefficient.
+    fn single(&self) -> Option<(&Product, f64)> {
+        match self.0.len() {
+            1 => self.0.iter().next().map(|(product, (x, _))| (product, *x)),
+            _ => None,
+        }
+    }
+}
+
+/// What is known of the values of a function in a box.
+struct Bounds<'a> {
+    func: &'a Func,
+    cell: &'a Cell,
+    ranges: Vec<Range>,
+    truths: Vec<Option<bool>>,
+    sums: Vec<Option<Rc<Sum>>>,
+    /// Opaque values that stand for the inverse of a sum, by its value.
+    inverse: HashMap<u32, Range>,
+    work: &'a mut usize,
+}
+
+const ALL: Range = Range { low: f64::NEG_INFINITY, high: f64::INFINITY };
+
+impl Range {
+    /// From the least to the greatest of these, rounded outwards; everything if one is no number.
+    fn around(values: &[f64]) -> Range {
+        if values.iter().any(|x| x.is_nan()) {
+            return ALL;
+        }
+        let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), x| (l.min(*x), h.max(*x)));
+        Range { low: low.next_down(), high: high.next_up() }
+    }
+
+    fn point(x: f64) -> Range {
+        if x.is_nan() { ALL } else { Range { low: x, high: x } }
+    }
+
+    fn add(self, other: Range) -> Range {
+        Range::around(&[self.low + other.low, self.high + other.high])
+    }
+
+    fn negate(self) -> Range {
+        Range { low: -self.high, high: -self.low }
+    }
+
+    fn multiply(self, other: Range) -> Range {
+        // 0 · inf is 0: an infinite end is never reached.
+        let product = |a: f64, b: f64| if a == 0.0 || b == 0.0 { 0.0 } else { a * b };
+        let ends = [
+            product(self.low, other.low),
+            product(self.low, other.high),
+            product(self.high, other.low),
+            product(self.high, other.high),
+        ];
+        let mut out = Range::around(&ends);
+        // What is exact stays so: a zero is the most common end.
+        for (end, exact) in [(&mut out.low, f64::min as fn(f64, f64) -> f64), (&mut out.high, f64::max)] {
+            let bound = ends.into_iter().reduce(exact).expect("there are four");
+            if bound == 0.0 {
+                *end = 0.0;
+            }
+        }
+        out
+    }
+
+    fn inverse(self) -> Range {
+        if self.low > 0.0 || self.high < 0.0 { Range::around(&[1.0 / self.low, 1.0 / self.high]) } else { ALL }
+    }
+
+    fn power(self, power: i32) -> Range {
+        let base = if power < 0 { self.inverse() } else { self };
+        let n = power.unsigned_abs();
+        let size = |x: f64| (0..n).fold(1.0_f64, |product, _| product * x.abs());
+        let (low, high) = (size(base.low), size(base.high));
+        if n % 2 == 1 {
+            return Range::around(&[low.copysign(base.low), high.copysign(base.high)]).keep_zero(base);
+        }
+        let out = Range::around(&[low, high]);
+        Range { low: if base.low <= 0.0 && base.high >= 0.0 { 0.0 } else { out.low.max(0.0) }, high: out.high }
+    }
+
+    /// An end that was exactly zero is zero.
+    fn keep_zero(self, base: Range) -> Range {
+        Range {
+            low: if base.low == 0.0 { 0.0 } else { self.low },
+            high: if base.high == 0.0 { 0.0 } else { self.high },
+        }
+    }
+
+    fn hull(self, other: Range) -> Range {
+        Range { low: self.low.min(other.low), high: self.high.max(other.high) }
+    }
+
+    fn size(self) -> f64 {
+        self.low.abs().max(self.high.abs())
+    }
+
+    /// Under a function that rises, whose values are right to some last digits, within `limits`.
+    fn rising(self, f: impl Fn(f64) -> f64, limits: (f64, f64)) -> Range {
+        let off = |x: f64| 8.0 * f64::EPSILON * x.abs();
+        let (low, high) = (f(self.low), f(self.high));
+        if low.is_nan() || high.is_nan() {
+            return Range { low: limits.0, high: limits.1 };
+        }
+        Range { low: (low - off(low)).max(limits.0), high: (high + off(high)).min(limits.1) }
+            .keep_zero(Range { low, high })
+    }
+}
+
+#[expect(clippy::disallowed_methods, reason = "bounds of intervals with room for errors, not values of a run")]
+fn elementary(function: Unary, x: Range) -> Range {
+    let (all, unit) = ((f64::NEG_INFINITY, f64::INFINITY), Range { low: -1.0, high: 1.0 });
+    match function {
+        Unary::Exp => x.rising(f64::exp, (0.0, f64::INFINITY)),
+        Unary::Expm1 => x.rising(f64::exp_m1, (-1.0, f64::INFINITY)),
+        Unary::Log if x.low > 0.0 => x.rising(f64::ln, all),
+        Unary::Log1p if x.low > -1.0 => x.rising(f64::ln_1p, all),
+        Unary::Sin | Unary::Cos => unit,
+        Unary::Tanh => x.rising(f64::tanh, (-1.0, 1.0)),
+        Unary::Atan => x.rising(f64::atan, (-1.6, 1.6)),
+        Unary::Sinh => x.rising(f64::sinh, all),
+        Unary::Asin => Range { low: -1.6, high: 1.6 },
+        Unary::Acos => Range { low: 0.0, high: 3.2 },
+        Unary::Cosh => Range { low: 1.0, high: f64::INFINITY },
+        Unary::Log | Unary::Log1p | Unary::Tan => ALL,
+    }
+}
+
+#[expect(clippy::disallowed_methods, reason = "bounds of intervals with room for errors, not values of a run")]
+fn of_two(function: Binary, a: Range, b: Range) -> Range {
+    match function {
+        Binary::Pow if a.low >= 0.0 && b.low == b.high => {
+            let n = b.low;
+            let off = |x: f64| 16.0 * f64::EPSILON * x.abs();
+            let (p, q) = (a.low.powf(n), a.high.powf(n));
+            let out = Range::around(&[p - off(p), p + off(p), q - off(q), q + off(q)]);
+            Range { low: out.low.max(0.0), high: out.high }
+        }
+        Binary::Pow if a.low >= 0.0 => Range { low: 0.0, high: f64::INFINITY },
+        Binary::Hypot => Range { low: 0.0, high: f64::INFINITY },
+        Binary::Atan2 => Range { low: -3.2, high: 3.2 },
+        Binary::Pow => ALL,
+    }
+}
+
+impl<'a> Bounds<'a> {
+    fn new(func: &'a Func, live: &[bool], cell: &'a Cell, pool: &[f64], work: &'a mut usize) -> Bounds<'a> {
+        let n = func.ops.len();
+        let mut ranges = vec![ALL; n];
+        let mut truths: Vec<Option<bool>> = vec![None; n];
+        for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+            let r = |value: Value| ranges[value.index()];
+            let known = cell.facts.iter().find(|(value, _)| value.index() == i).map(|(_, truth)| *truth);
+            let mut truth = None;
+            let range = match *op {
+                Op::Real(bits) => Range::point(f64::from_bits(bits)),
+                Op::Load(slot) => cell.inputs.iter().find(|(at, _)| *at == slot).map_or(ALL, |(_, range)| *range),
+                Op::Pool { base, len, .. } => {
+                    let entries = &pool[base as usize..(base + len) as usize];
+                    entries.iter().fold(Range::point(entries[0]), |all, x| all.hull(Range::point(*x)))
+                }
+                Op::Add(a, b) => r(a).add(r(b)),
+                Op::Sub(a, b) => r(a).add(r(b).negate()),
+                Op::Mul(a, b) if a == b => r(a).power(2),
+                Op::Mul(a, b) => r(a).multiply(r(b)),
+                Op::Fma(a, b, c) => r(a).multiply(r(b)).add(r(c)),
+                Op::Div(a, b) => r(a).multiply(r(b).inverse()),
+                Op::Neg(a) => r(a).negate(),
+                Op::Abs(a) if r(a).low >= 0.0 => r(a),
+                Op::Abs(a) if r(a).high <= 0.0 => r(a).negate(),
+                Op::Abs(a) => Range { low: 0.0, high: r(a).size() },
+                Op::Sqrt(a) if r(a).low >= 0.0 => r(a).rising(f64::sqrt, (0.0, f64::INFINITY)),
+                Op::Unary(function, a) => elementary(function, r(a)),
+                Op::Binary(function, a, b) => of_two(function, r(a), r(b)),
+                Op::Bool(b) => {
+                    truth = Some(b);
+                    ALL
+                }
+                Op::Less(a, b) => {
+                    truth = (r(a).high < r(b).low).then_some(true).or((r(a).low >= r(b).high).then_some(false));
+                    ALL
+                }
+                Op::LessEqual(a, b) => {
+                    truth = (r(a).high <= r(b).low).then_some(true).or((r(a).low > r(b).high).then_some(false));
+                    ALL
+                }
+                Op::Equal(a, b) => {
+                    let (a, b) = (r(a), r(b));
+                    truth = (a.low == a.high && a == b).then_some(true);
+                    truth = truth.or((a.high < b.low || b.high < a.low).then_some(false));
+                    ALL
+                }
+                Op::And(a, b) => {
+                    truth = match (truths[a.index()], truths[b.index()]) {
+                        (Some(false), _) | (_, Some(false)) => Some(false),
+                        (Some(true), Some(true)) => Some(true),
+                        _ => None,
+                    };
+                    ALL
+                }
+                Op::Or(a, b) => {
+                    truth = match (truths[a.index()], truths[b.index()]) {
+                        (Some(true), _) | (_, Some(true)) => Some(true),
+                        (Some(false), Some(false)) => Some(false),
+                        _ => None,
+                    };
+                    ALL
+                }
+                Op::Not(a) => {
+                    truth = truths[a.index()].map(|truth| !truth);
+                    ALL
+                }
+                Op::Select(condition, a, b) => match truths[condition.index()] {
+                    Some(yes) => {
+                        let chosen = if yes { a } else { b };
+                        truth = truths[chosen.index()];
+                        r(chosen)
+                    }
+                    None => {
+                        truth = truths[a.index()].filter(|truth| truths[b.index()] == Some(*truth));
+                        smaller_or_larger(func, condition, a, b, r(a), r(b)).unwrap_or(r(a).hull(r(b)))
+                    }
+                },
+                Op::Ring { .. }
+                | Op::Sqrt(_)
+                | Op::Floor(_)
+                | Op::Nearest(_)
+                | Op::Int(_)
+                | Op::IntAdd(..)
+                | Op::IntSub(..)
+                | Op::IntMul(..)
+                | Op::IntAnd(..)
+                | Op::IntOr(..)
+                | Op::IntXor(..)
+                | Op::ShiftLeft(..)
+                | Op::ShiftRight(..)
+                | Op::ShiftRightSigned(..)
+                | Op::IntLess(..)
+                | Op::IntEqual(..)
+                | Op::ToBits(_)
+                | Op::FromBits(_)
+                | Op::ToInt(_)
+                | Op::ToReal(_) => ALL,
+            };
+            truths[i] = known.or(truth);
+            ranges[i] = range;
+        }
+        Bounds { func, cell, ranges, truths, sums: vec![None; n], inverse: HashMap::new(), work }
+    }
+
+    fn truth(&self, condition: Value) -> Option<bool> {
+        self.truths[condition.index()]
+    }
+
+    /// The value as a sum of products.
+    fn sum(&mut self, value: Value) -> Rc<Sum> {
+        if let Some(known) = &self.sums[value.index()] {
+            return known.clone();
+        }
+        let sum = Rc::new(self.expanded(value));
+        self.sums[value.index()] = Some(sum.clone());
+        sum
+    }
+
+    fn expanded(&mut self, value: Value) -> Sum {
+        let opaque = || Sum::opaque(value);
+        let out = match self.func.ops[value.index()] {
+            Op::Real(bits) => Sum::number(f64::from_bits(bits)),
+            Op::Add(a, b) => (*self.sum(a)).clone().add(&self.sum(b), 1.0),
+            Op::Sub(a, b) => (*self.sum(a)).clone().add(&self.sum(b), -1.0),
+            Op::Neg(a) => Sum::default().add(&self.sum(a), -1.0),
+            Op::Mul(a, b) => self.product(a, b).unwrap_or_else(opaque),
+            Op::Fma(a, b, c) => match self.product(a, b) {
+                Some(product) => product.add(&self.sum(c), 1.0),
+                None => opaque(),
+            },
+            Op::Div(a, b) => {
+                let (above, below) = (self.sum(a), self.sum(b));
+                let range = self.ranges[b.index()];
+                let safe = range.low > 0.0 || range.high < 0.0;
+                let inverse = match below.single() {
+                    Some((product, x)) if safe => {
+                        let turned: Product = product.iter().map(|(opaque, power)| (*opaque, -power)).collect();
+                        Sum([(turned, (1.0 / x, (1.0 / x).abs()))].into())
+                    }
+                    _ => {
+                        // The divisor is opaque as a whole: under its own number, with the sign bit of none other.
+                        let key = b.0 | 1 << 31;
+                        self.inverse.insert(key, if safe { range.inverse() } else { ALL });
+                        Sum([(vec![(key, 1)], (1.0, 1.0))].into())
+                    }
+                };
+                above.times(&inverse)
+            }
+            Op::Abs(a) if self.ranges[a.index()].low >= 0.0 => (*self.sum(a)).clone(),
+            Op::Abs(a) if self.ranges[a.index()].high <= 0.0 => Sum::default().add(&self.sum(a), -1.0),
+            Op::Select(condition, a, b) => match self.truth(condition) {
+                Some(yes) => (*self.sum(if yes { a } else { b })).clone(),
+                None => opaque(),
+            },
+            _ => opaque(),
+        };
+        if out.0.len() > MOST_TERMS { opaque() } else { out }
+    }
+
+    fn product(&mut self, a: Value, b: Value) -> Option<Sum> {
+        let (a, b) = (self.sum(a), self.sum(b));
+        let terms = a.0.len() * b.0.len();
+        *self.work = self.work.saturating_sub(4 * terms);
+        (terms <= MOST_TERMS).then(|| a.times(&b))
+    }
+
+    fn opaque(&self, key: u32) -> Range {
+        self.inverse.get(&key).copied().unwrap_or_else(|| self.ranges[key as usize])
+    }
+
+    /// Whether the value is nowhere negative in the box.
+    fn not_negative(&mut self, value: Value) -> bool {
+        if self.ranges[value.index()].low >= 0.0 {
+            return true;
+        }
+        let sum = self.sum(value);
+        *self.work = self.work.saturating_sub(4 * sum.0.len());
+        if sum.0.is_empty() {
+            return true;
+        }
+        // What all products have in common and is positive says nothing of the sign.
+        let mut common: BTreeMap<u32, i32> = sum.0.keys().next().expect("there is one").iter().copied().collect();
+        for product in sum.0.keys() {
+            common.retain(|opaque, power| match product.iter().find(|(other, _)| other == opaque) {
+                Some((_, other)) if (*power > 0) == (*other > 0) => {
+                    *power = if *power > 0 { (*power).min(*other) } else { (*power).max(*other) };
+                    true
+                }
+                _ => false,
+            });
+        }
+        common.retain(|opaque, power| *power % 2 == 0 || self.opaque(*opaque).low > 0.0);
+        let mut total = Range::point(0.0);
+        let mut size = 0.0;
+        for (product, (x, _)) in &sum.0 {
+            let mut range = Range::point(*x);
+            for (opaque, power) in product {
+                let power = power - common.get(opaque).copied().unwrap_or(0);
+                if power != 0 {
+                    range = range.multiply(self.opaque(*opaque).power(power));
+                }
+            }
+            total = total.add(range);
+            size += range.size();
+        }
+        total.low >= -NOTHING * size && size.is_finite() || total.low >= 0.0
+    }
+
+    /// The box in two: at the number with which a comparison that is open compares an input, else where an input that
+    /// matters is widest, by ratio where it has one sign.
+    fn halves(&self, claim: &Claim) -> Option<[Cell; 2]> {
+        let mut matters = vec![false; self.func.ops.len()];
+        claim.any.iter().chain(claim.unless).for_each(|value| matters[value.index()] = true);
+        let mut inputs: Vec<Slot> = Vec::new();
+        for i in (0..self.func.ops.len()).rev() {
+            if !matters[i] {
+                continue;
+            }
+            let op = &self.func.ops[i];
+            match op {
+                Op::Select(condition, a, b) => match self.truth(*condition) {
+                    Some(yes) => matters[if yes { a } else { b }.index()] = true,
+                    None => [condition, a, b].into_iter().for_each(|value| matters[value.index()] = true),
+                },
+                Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) if self.truths[i].is_some() => {}
+                Op::Load(slot) => inputs.push(*slot),
+                op => op.each_operand(|operand| matters[operand.index()] = true),
+            }
+        }
+        for (i, op) in self.func.ops.iter().enumerate().filter(|(i, _)| matters[*i] && self.truths[*i].is_none()) {
+            let (Op::Less(a, b) | Op::LessEqual(a, b)) = *op else { continue };
+            let load = |value: Value| match self.func.ops[value.index()] {
+                Op::Load(slot) => Some(slot),
+                _ => None,
+            };
+            let number = |value: Value| {
+                let range = self.ranges[value.index()];
+                (range.low == range.high).then_some(range.low)
+            };
+            let (slot, at, below) = match (load(a), number(b), load(b), number(a)) {
+                (Some(slot), Some(at), ..) => (slot, at, true),
+                (.., Some(slot), Some(at)) => (slot, at, false),
+                _ => continue,
+            };
+            let half = |low: bool| {
+                let mut cell = self.cell.clone();
+                let (_, range) = cell.inputs.iter_mut().find(|(input, _)| *input == slot)?;
+                if low {
+                    range.high = range.high.min(at);
+                } else {
+                    range.low = range.low.max(at);
+                }
+                cell.depth += 1;
+                cell.facts.push((Value(i as u32), low == below));
+                Some(cell)
+            };
+            return Some([half(true)?, half(false)?]);
+        }
+        let width = |range: &Range| match (range.low, range.high) {
+            (low, high) if low > 0.0 => (high / low).min(1e300) - 1.0,
+            (low, high) if high < 0.0 => (low / high).min(1e300) - 1.0,
+            // Across zero a ratio says nothing.
+            (low, high) => {
+                if low == high {
+                    0.0
+                } else {
+                    1.0
+                }
+            }
+        };
+        let (at, range) = self
+            .cell
+            .inputs
+            .iter()
+            .enumerate()
+            .filter(|(_, (slot, _))| inputs.contains(slot))
+            .map(|(k, (_, range))| (k, *range))
+            .max_by(|a, b| width(&a.1).total_cmp(&width(&b.1)).then(b.0.cmp(&a.0)))?;
+        let middle = match (range.low, range.high) {
+            (low, high) if low > 0.0 && high > 2.0 * low => (low.sqrt() * high.min(1e300).sqrt()).clamp(low, high),
+            (low, high) if high < 0.0 && low < 2.0 * high => -(low.max(-1e300).abs().sqrt() * high.abs().sqrt()),
+            (low, high) if low < 0.0 && high > 0.0 => 0.0,
+            (low, high) => 0.5 * low.max(-1e300) + 0.5 * high.min(1e300),
+        };
+        let inside = range.low < middle && middle < range.high;
+        inside.then(|| {
+            [Range { high: middle, ..range }, Range { low: middle, ..range }].map(|range| {
+                let mut cell = self.cell.clone();
+                cell.inputs[at].1 = range;
+                cell.depth += 1;
+                cell
+            })
+        })
+    }
+}
+
+/// `if a < b then a else b` is at most both, and `if b < a then a else b` at least both.
+fn smaller_or_larger(func: &Func, condition: Value, a: Value, b: Value, x: Range, y: Range) -> Option<Range> {
+    match func.ops[condition.index()] {
+        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (a, b) => {
+            Some(Range { low: x.low.min(y.low), high: x.high.min(y.high) })
+        }
+        Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (b, a) => {
+            Some(Range { low: x.low.max(y.low), high: x.high.max(y.high) })
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::build::Build;
+
+    const X: Slot = Slot(0);
+    const Y: Slot = Slot(1);
+
+    /// Whether it is proven that what `f` makes of x in −1..1 and y in 0.001..10 is nowhere negative.
+    fn proven(f: impl Fn(&mut Build, Value, Value) -> Value) -> bool {
+        let mut build = Build::new("claim");
+        let (x, y) = (build.load(X), build.load(Y));
+        let value = f(&mut build, x, y);
+        let func = build.finish();
+        let inputs = [(X, Range { low: -1.0, high: 1.0 }), (Y, Range { low: 1e-3, high: 10.0 })];
+        let claim = Claim { func: &func, any: &[value], unless: &[] };
+        let mut work = 1_000_000;
+        prove(&claim, &inputs, &[], &mut work)
+    }
+
+    #[test]
+    fn what_cancels_on_paper_cancels() {
+        // (x + y)² − x² − 2xy = y²
+        assert!(proven(|b, x, y| {
+            let sum = b.add(x, y);
+            let square = b.mul(sum, sum);
+            let (xx, xy) = (b.mul(x, x), b.mul(x, y));
+            let two = b.add(xy, xy);
+            let rest = b.sub(square, xx);
+            b.sub(rest, two)
+        }));
+        // x y − x (y − y x / 2) = y x²/2: a bristle gives out no more than it took.
+        assert!(proven(|b, x, y| {
+            let half = b.real(0.5);
+            let part = b.mul(y, x);
+            let slip = b.mul(part, half);
+            let rate = b.sub(y, slip);
+            let (took, kept) = (b.mul(x, y), b.mul(x, rate));
+            b.sub(took, kept)
+        }));
+    }
+
+    #[test]
+    fn boxes_are_halved_where_it_is_needed() {
+        // x² − x + 0.3 has its least value, 0.05, at 0.5; with 0.2 it is negative there.
+        let parabola = |c: f64| {
+            move |b: &mut Build, x: Value, _: Value| {
+                let (square, c) = (b.mul(x, x), b.real(c));
+                let rest = b.sub(square, x);
+                b.add(rest, c)
+            }
+        };
+        assert!(proven(parabola(0.3)) && !proven(parabola(0.2)));
+        // y / (1 + x²) − 0.0004
+        let quotient = |c: f64| {
+            move |b: &mut Build, x: Value, y: Value| {
+                let (square, one, c) = (b.mul(x, x), b.real(1.0), b.real(c));
+                let below = b.add(one, square);
+                let q = b.div(y, below);
+                b.sub(q, c)
+            }
+        };
+        assert!(proven(quotient(0.0004)) && !proven(quotient(0.0006)));
+    }
+
+    #[test]
+    fn a_branch_is_taken_where_its_condition_holds() {
+        // min(x, 0.25) − x ≤ 0, and exactly 0 below.
+        let clipped = |sign: f64| {
+            move |b: &mut Build, x: Value, _: Value| {
+                let (quarter, sign) = (b.real(0.25), b.real(sign));
+                let min = b.min(x, quarter);
+                let rest = b.sub(min, x);
+                b.mul(sign, rest)
+            }
+        };
+        assert!(proven(clipped(-1.0)) && !proven(clipped(1.0)));
+        // A jump: 1 up to 0.5 and −1 beyond.
+        assert!(!proven(|b, x, _| {
+            let (half, one, less) = (b.real(0.5), b.real(1.0), b.real(-1.0));
+            let beyond = b.less(half, x);
+            b.select(beyond, less, one)
+        }));
+        // exp(−x²) − 0.36 > 0 for |x| ≤ 1
+        assert!(proven(|b, x, _| {
+            let (square, c) = (b.mul(x, x), b.real(0.36));
+            let minus = b.neg(square);
+            let bell = b.unary(Unary::Exp, minus);
+            b.sub(bell, c)
+        }));
+    }
+
+    #[test]
+    fn where_a_condition_holds_nothing_is_claimed() {
+        let mut build = Build::new("claim");
+        let (x, zero) = (build.load(X), build.real(0.0));
+        let negative = build.less(x, zero);
+        let func = build.finish();
+        let inputs = [(X, Range { low: -1.0, high: 1.0 })];
+        for (unless, wanted) in [(vec![negative], true), (vec![], false)] {
+            let claim = Claim { func: &func, any: &[x], unless: &unless };
+            assert_eq!(prove(&claim, &inputs, &[], &mut 10_000), wanted);
+        }
+    }
+}
