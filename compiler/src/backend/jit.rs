@@ -35,6 +35,9 @@ pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> 
     Ok((machine, stats))
 }
 
+/// Operations from which on code is kept in their order: else the time to find registers grows with the square of them.
+const LONG: usize = 2000;
+
 type Entries = [Option<Entry>; Function::ALL.len()];
 
 fn generate(
@@ -50,7 +53,8 @@ fn generate(
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
-        let coder = if *function == Function::Rosenbrock { &mut keeping } else { &mut coder };
+        let long = *function == Function::Rosenbrock || func.ops.len() > LONG;
+        let coder = if long { &mut keeping } else { &mut coder };
         let bytes = coder.function(func)?;
         let failed = |error| Unsupported(format!("no memory for the code of `{}`: {error}", func.name));
         let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
