@@ -231,6 +231,7 @@ fn bytes(hexadecimal: &str) -> [u8; 8] {
 }
 
 /// A double from C's hexadecimal notation, as Python prints it.
+#[expect(clippy::disallowed_methods, reason = "powers of two are exact everywhere")]
 fn exactly(text: &str) -> f64 {
     let (sign, text) = text.strip_prefix('-').map_or((1.0, text), |rest| (-1.0, rest));
     let (mantissa, exponent) = text.strip_prefix("0x").and_then(|rest| rest.split_once('p')).expect("0x…p…");

@@ -583,7 +583,9 @@ mod tests {
         let mut build = Build::new("claim");
         let (x, y) = (build.load(X), build.load(Y));
         let value = f(&mut build, x, y);
+        build.store(Slot(2), value);
         let func = build.finish();
+        let value = func.stores[0].1;
         let inputs = [(X, Range { low: -1.0, high: 1.0 }), (Y, Range { low: 1e-3, high: 10.0 })];
         let claim = Claim { func: &func, any: &[value], unless: &[] };
         let mut work = 1_000_000;
@@ -666,8 +668,14 @@ mod tests {
     fn where_a_condition_holds_nothing_is_claimed() {
         let mut build = Build::new("claim");
         let (x, zero) = (build.load(X), build.real(0.0));
-        let negative = build.less(x, zero);
+        let (negative, one) = (build.less(x, zero), build.real(1.0));
+        let chosen = build.select(negative, one, zero);
+        build.store(Slot(2), chosen);
+        build.store(Slot(3), x);
         let func = build.finish();
+        let stored = |slot: Slot| func.stores.iter().find(|(at, _)| *at == slot).expect("it is stored").1;
+        let x = stored(Slot(3));
+        let Op::Select(negative, ..) = func.ops[stored(Slot(2)).index()] else { panic!("a choice") };
         let inputs = [(X, Range { low: -1.0, high: 1.0 })];
         for (unless, wanted) in [(vec![negative], true), (vec![], false)] {
             let claim = Claim { func: &func, any: &[x], unless: &unless };

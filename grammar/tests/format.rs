@@ -40,6 +40,16 @@ fn becomes(text: &str, wanted: &str) {
     keeps_its_tree(text, 100);
 }
 
+#[test]
+fn the_names_of_lints_keep_their_hyphens() {
+    let model = "model M {\n  allow no-drive-timeout \"x\"\n}\n";
+    becomes(model, model);
+    becomes(
+        "experiment e {\n  run M() for 1 s\n  allow   large-step \"slow\"\n}\n",
+        "experiment e {\n  run    M() for 1 s\n  allow  large-step \"slow\"\n}\n",
+    );
+}
+
 /// The tree without places, with canonical units.
 fn shape(text: &str) -> String {
     let parsed = parse(FileId(0), text);
