@@ -141,10 +141,10 @@ impl Interpret for Late {
         let made = &self.made[which as usize];
         let compiled = || self.make(which, |funcs, layout, pool| jit::compile(funcs, layout, pool).ok().map(|it| it.0));
         let pays = || made.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > PAYS;
-        if made.machine.get().is_some() || pays() {
-            if let Some(machine) = made.machine.get_or_init(compiled) {
-                return machine.call(which, block, pool, count);
-            }
+        if (made.machine.get().is_some() || pays())
+            && let Some(machine) = made.machine.get_or_init(compiled)
+        {
+            return machine.call(which, block, pool, count);
         }
         made.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
     }

@@ -94,13 +94,7 @@ pub fn pooled(func: &Func) -> Func {
             None => build.op(op.map(|operand| values[operand.index()])),
         });
     }
-    for (slot, value) in &func.stores {
-        build.store(*slot, values[value.index()]);
-    }
-    if let Some(status) = func.status {
-        build.status(values[status.index()]);
-    }
-    build.finish()
+    build.finish_as(func, &values)
 }
 
 struct Step<'a> {

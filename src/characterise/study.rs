@@ -1328,6 +1328,7 @@ mod tests {
     }
 
     #[test]
+    #[allow(clippy::disallowed_methods, reason = "its last bits decide nothing")]
     fn a_mass_that_only_touches_rest_does_not_stick() {
         // 0.1 m/s (1 − cos t), and the same with half a second of rest in each period.
         let swing = |t: f64| vec![t, 0.0, 0.1 * (t - t.sin()), 0.1 * (1.0 - t.cos())];

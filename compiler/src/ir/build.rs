@@ -329,6 +329,17 @@ impl Build {
         func.status.map(|status| values[status.index()])
     }
 
+    /// The function with the results of another, whose values have become `values`.
+    pub fn finish_as(mut self, func: &Func, values: &[Value]) -> Func {
+        let at = |value: Value| values[value.index()];
+        func.stores.iter().for_each(|(slot, value)| self.store(*slot, at(*value)));
+        func.writes.iter().for_each(|write| self.write(write.map(at)));
+        if let Some(status) = func.status {
+            self.status(at(status));
+        }
+        self.finish()
+    }
+
     /// The function: stores in the order of their slots, no operation that nothing needs, and no store that writes
     /// back what it read.
     pub fn finish(self) -> Func {

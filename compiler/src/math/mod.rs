@@ -48,17 +48,7 @@ pub fn expand_but(func: &Func, kept: &[Unary]) -> Func {
         };
         values.push(value);
     }
-    let mut build = build.into_inner();
-    for (slot, value) in &func.stores {
-        build.store(*slot, values[value.index()]);
-    }
-    for write in &func.writes {
-        build.write(write.map(|value| values[value.index()]));
-    }
-    if let Some(status) = func.status {
-        build.status(values[status.index()]);
-    }
-    build.finish()
+    build.into_inner().finish_as(func, &values)
 }
 
 fn unary(function: Unary, x: Real) -> Real {

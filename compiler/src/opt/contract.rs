@@ -48,16 +48,7 @@ pub fn contract(func: &Func) -> Func {
         let op = op.map(at);
         values.push(fused.unwrap_or_else(|| build.op(op)));
     }
-    for (slot, value) in &func.stores {
-        build.store(*slot, values[value.index()]);
-    }
-    for write in &func.writes {
-        build.write(write.map(|value| values[value.index()]));
-    }
-    if let Some(status) = func.status {
-        build.status(values[status.index()]);
-    }
-    build.finish()
+    build.finish_as(func, &values)
 }
 
 /// How often each value is used, as an operand or a result.

@@ -31,7 +31,6 @@ pub fn regroup(func: &Func) -> Func {
 
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
 fn rebuilt(func: &Func, mut pass: Pass, after: &[Option<u32>], enough: u32) -> (Func, u32) {
-    let handed_on = pass.carried;
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
@@ -39,22 +38,9 @@ fn rebuilt(func: &Func, mut pass: Pass, after: &[Option<u32>], enough: u32) -> (
         let long = after.zip(pass.at(plain)).is_some_and(|(after, ready)| ready + after > enough);
         values.push(if long { pass.sooner(plain) } else { plain });
     }
-    let mut build = pass.build;
-    let mut longest = 0;
-    for (slot, value) in &func.stores {
-        let value = values[value.index()];
-        build.store(*slot, value);
-        if handed_on.contains(slot) {
-            longest = longest.max(pass.ready[value.index()].unwrap_or(0));
-        }
-    }
-    for write in &func.writes {
-        build.write(write.map(|value| values[value.index()]));
-    }
-    if let Some(status) = func.status {
-        build.status(values[status.index()]);
-    }
-    (build.finish(), longest)
+    let handed = func.stores.iter().filter(|(slot, _)| pass.carried.contains(slot));
+    let longest = handed.filter_map(|(_, value)| pass.at(values[value.index()])).max().unwrap_or(0);
+    (pass.build.finish_as(func, &values), longest)
 }
 
 /// For each operation, the cycles from its value to a result; none if no result needs it.
