@@ -94,7 +94,7 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
 }
 
 /// Operations of a program, before elementary functions are expanded, that surely become machine code.
-const LARGE: usize = 20_000;
+const LARGE: usize = 5_000;
 
 /// Runs of a function that cost about as much as to compile it: an operation is interpreted in some 10 ns and compiled
 /// in some 2 µs.

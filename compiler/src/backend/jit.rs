@@ -38,6 +38,9 @@ pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> 
 /// Operations from which on code is kept in their order: else the time to find registers grows with the square of them.
 const LONG: usize = 2000;
 
+/// Operations of which code is still made within seconds; to find registers for more takes minutes.
+const MOST: usize = 50_000;
+
 type Entries = [Option<Entry>; Function::ALL.len()];
 
 fn generate(
@@ -53,6 +56,13 @@ fn generate(
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
+        if func.ops.len() > MOST {
+            let many = func.ops.len();
+            return Err(Unsupported(format!(
+                "`{}` has {many} operations, and of more than {MOST} code is no gain",
+                func.name
+            )));
+        }
         let long = *function == Function::Rosenbrock || func.ops.len() > LONG;
         let coder = if long { &mut keeping } else { &mut coder };
         let bytes = coder.function(func)?;

@@ -13,6 +13,7 @@ use crate::can::socketcand::Server;
 use crate::can::{self};
 use crate::canopen::eds;
 use crate::clock::Clock;
+use crate::realtime::{self, Wishes};
 use abi::Instance;
 use abi::rig::{Kind, Rig};
 use std::path::PathBuf;
@@ -58,6 +59,9 @@ pub enum Refused {
     /// The world failed: a bus, a port.
     Failed(String),
 }
+
+/// Priority under SCHED_FIFO; a rig's loop has 80.
+const PRIORITY: i32 = 79;
 
 /// A simulated bus for each of a rig, joined with ways to the outside, and the drives on them.
 pub struct Served {
@@ -161,6 +165,8 @@ impl Served {
     /// Lets them live for so many s, or until `over`; tells how their states change.
     pub fn serve(self, rig: &Rig, duration: Option<f64>, over: &dyn Fn() -> bool, told: &mut dyn FnMut(&str)) {
         let Served { world, buses, mut hubs, mut server, bench, .. } = self;
+        // A drive keeps its time however busy a computer is: where it may, this one stands just below a loop beside it.
+        let _real_time = realtime::enter(&Wishes { priority: PRIORITY, core: None, memory: false, awake: false });
         let bench = attend(&world, &buses, rig, bench);
         let until_ns = duration.map_or(u64::MAX, |seconds| world.now_ns().saturating_add((seconds * 1e9) as u64));
         let also: Vec<i32> = server.iter().map(Server::descriptor).collect();
