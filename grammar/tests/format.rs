@@ -45,8 +45,8 @@ fn the_names_of_lints_keep_their_hyphens() {
     let model = "model M {\n  allow no-drive-timeout \"x\"\n}\n";
     becomes(model, model);
     becomes(
-        "experiment e {\n  run M() for 1 s\n  allow   large-step \"slow\"\n}\n",
-        "experiment e {\n  run    M() for 1 s\n  allow  large-step \"slow\"\n}\n",
+        "experiment e {\n  run M() for 1 s\n  allow large-step \"slow\"\n}\n",
+        "experiment e {\n  run   M() for 1 s\n  allow large-step \"slow\"\n}\n",
     );
 }
 

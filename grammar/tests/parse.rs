@@ -322,7 +322,10 @@ fn common_slips_get_an_answer_to_paste() {
     );
     model_says("input v m/s", &["E0001 `m/s` the unit of a declaration stands in brackets () | write `input v [m/s]`"]);
     model_says("let a = k +", &["E0001 `+` expected a value here (behind this)"]);
-    model_says("part fr = lugre", &["E0001 `lugre` expected `(` here (behind this)"]);
+    model_says(
+        "part fr = lugre",
+        &["E0001 `lugre` expected `(` here (behind this) | write `lugre()`, with arguments in the brackets"],
+    );
     model_says(
         "let a = 1e999",
         &["E0001 `1e999` this number is too large (more than 1.8e308) | without a bound write `inf`"],
