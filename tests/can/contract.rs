@@ -95,6 +95,22 @@ fn every_frame_is_carried_whole(kind: &str, mut pair: Pair) {
     }
 }
 
+/// How many frames came or are counted as lost.
+fn counted(got: &[Received], near: &dyn Bus) -> u64 {
+    frames(got).len() as u64 + near.health().lost
+}
+
+/// Waits until so many frames that the far end sent have come or are counted as lost.
+fn gather(pair: &mut Pair, got: &mut Vec<Received>, count: u64) {
+    let until_ns = (pair.now_ns)() + PATIENCE_NS;
+    while counted(got, &*pair.near) < count && (pair.now_ns)() < until_ns {
+        // What the far end still has in hand goes out when it is asked.
+        drain(&mut *pair.far);
+        pair.near.wait((pair.now_ns)() + 10_000_000);
+        got.extend(drain(&mut *pair.near));
+    }
+}
+
 /// With a reader that comes when it is called, nothing is lost; but a virtual interface never says that it is full, and
 /// then its losses are counted.
 fn a_burst_arrives_whole(kind: &str, mut pair: Pair) {
@@ -104,11 +120,11 @@ fn a_burst_arrives_whole(kind: &str, mut pair: Pair) {
             assert_eq!(refused, Refused::Full, "{kind}");
             let until_ns = (pair.now_ns)() + PATIENCE_NS;
             assert!(pair.near.wait(until_ns), "{kind}: full, and nothing comes");
-            got.extend(frames(&drain(&mut *pair.near)));
+            got.extend(drain(&mut *pair.near));
         }
     }
-    let missing = 2000 - got.len();
-    got.extend(expect(&mut *pair.near, &pair.now_ns, missing));
+    gather(&mut pair, &mut got, 2000);
+    let got = frames(&got);
     let lost = 2000 - got.len();
     assert_eq!(lost as u64, pair.near.health().lost, "{kind}: {} of 2000", got.len());
     let mut all = (0..2000).map(numbered);
@@ -127,14 +143,7 @@ fn what_is_taken_arrives_or_is_counted(kind: &str, mut pair: Pair) {
         }
     }
     let mut got = drain(&mut *pair.near);
-    let counted = |got: &[Received], near: &dyn Bus| frames(got).len() as u64 + near.health().lost;
-    let until_ns = (pair.now_ns)() + PATIENCE_NS;
-    while counted(&got, &*pair.near) < taken && (pair.now_ns)() < until_ns {
-        // What the far end still has in hand goes out when it is asked.
-        drain(&mut *pair.far);
-        pair.near.wait((pair.now_ns)() + 10_000_000);
-        got.extend(drain(&mut *pair.near));
-    }
+    gather(&mut pair, &mut got, taken);
     assert_eq!(counted(&got, &*pair.near), taken, "{kind}");
     let told: u64 =
         got.iter().map(|got| if let Received::Event(Event::Lost(lost), _) = got { u64::from(*lost) } else { 0 }).sum();
