@@ -1,6 +1,8 @@
 //! Time of one step of the PID servo with LuGre friction, at 10 µs: generated code, the interpreter, and C written by
 //! hand with `gcc -O3 -march=native`, side by side in one run. Ratios are medians over interleaved rounds.
 
+mod gcc;
+
 use abi::description::Guard;
 use abi::lanes::Batch;
 use abi::plan::Method;
@@ -17,8 +19,6 @@ use compiler::math::{POOL, expand};
 use compiler::opt::contract::contract;
 use compiler::opt::regroup::regroup;
 use compiler::program::Program;
-use std::path::Path;
-use std::process::Command;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -68,7 +68,7 @@ fn servo(watched: bool) -> Program {
 type Hand = unsafe extern "C" fn(state: *mut f64, params: *const f64, h: f64, count: u64);
 
 fn main() {
-    let library = build_c();
+    let library = gcc::built("servo.c");
     println!("PID servo with LuGre, {} µs, one instance; below 1 is faster than gcc -O3 -march=native", H * 1e6);
     for (method, name) in [(Method::Euler, "euler"), (Method::Rk4, "rk4")] {
         // SAFETY: the library was just built from a source with functions of this name and type.
@@ -168,7 +168,7 @@ fn lanes(method: Method, name: &str, hand: Hand) {
     let layout = &program.description.layout;
     let func = contract(&regroup(&step(&program, method)));
     let mut codes = Vec::new();
-    for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
+    for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
         for vectors in [1, 2, 3, 4, 5, 6, 8] {
             let begun = Instant::now();
             let lanes = wide::compile(&func, layout, POOL.len(), width, vectors).expect("this processor can");
@@ -216,20 +216,6 @@ fn lanes(method: Method, name: &str, hand: Hand) {
     }
     let x = (batches[0].get(layout.states.slot(0), 1), states[1][0]);
     println!("  position of the second instance {:.12} m, of gcc {:.12} m", x.0, x.1);
-}
-
-fn build_c() -> libloading::Library {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/servo.c");
-    let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join("servo.so");
-    let built = Command::new("gcc")
-        .args(["-O3", "-march=native", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic", "-o"])
-        .arg(&library)
-        .arg(&source)
-        .arg("-lm")
-        .status();
-    assert!(built.expect("gcc runs").success(), "{} builds", source.display());
-    // SAFETY: the library runs no code when it is loaded.
-    unsafe { libloading::Library::new(&library) }.expect("the library loads")
 }
 
 fn median(mut times: Vec<f64>) -> f64 {

@@ -3,24 +3,29 @@
 //! Stick-slip to 20 s and hunting to 100 s. For each program the loosest tolerance is taken whose largest error of
 //! position at 201 instants stays below 1e-6 or 1e-8 m; the times are the least of many, of the processor and not of the
 //! wall, taken in turn in one run, and their ratios are what counts. Needs gcc, and CVODE of SUNDIALS to compare with
-//! that; what is missing is said.
+//! that; what is missing is said. Then the same runs by hundreds, each with another force at rest, with nothing but their
+//! last position wanted: in lanes on one core, against the program in C that makes one after the other.
 
 #[path = "../clock.rs"]
 mod clock;
 
 use abi::Slot;
-use abi::plan::Experiment;
+use abi::lanes::Lanes;
+use abi::plan::{Experiment, Method};
 use clock::processor_time;
+use compiler::backend::wide::Width;
 use compiler::{Case, Changes, NoSources, Options};
-use runtime::engine::{self, Continue};
+use runtime::engine::{self, Continue, Failure, Outcome};
+use runtime::lanes::{self, Next};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const TEXT: &str = r#"
 model Bristle {
   input  v [m/s]
+  param  rise = 0.5 N
   state  z [um] = 0
-  let    g = 1 N + 0.5 N * exp(-(v / 1 mm/s)^2)
+  let    g = 1 N + rise * exp(-(v / 1 mm/s)^2)
   dz/dt = v - 1e5 N/m * abs(v) / g * z
   output F [N] = 1e5 N/m * z + 316.22776601683796 N·s/m * dz/dt + 0.4 N·s/m * v
 }
@@ -41,18 +46,24 @@ model Pid {
   dx/dt = v
   dv/dt = (u - fr.F) / 1 kg
 }
-experiment stick_slip { run Pull() for 20 s }
-experiment hunting { run Pid() for 100 s }
+experiment stick_slip { run Pull() for 20 s  expect final(x) > 0 m }
+experiment hunting { run Pid() for 100 s  expect final(x) > 0 m }
 "#;
 
 const INSTANTS: usize = 200;
 const ROUNDS: usize = 15;
+/// Of a sweep.
+const RUNS: usize = 512;
 
 /// Seconds of a run, and positions.
 type Timed = (f64, Vec<f64>);
 
 fn main() {
     println!("processor seconds a run at equal error; ratios below 1: faster than C (gcc -O3 -march=native)");
+    let diffsol = diffsol();
+    if let Err(why) = &diffsol {
+        println!("SKIPPED: diffsol: {why}");
+    }
     let sundials = sundials();
     if let Err(why) = &sundials {
         println!("SKIPPED: CVODE: {why}");
@@ -68,10 +79,7 @@ fn main() {
         });
         let case = compiled(name);
         let run = |program: &Path, tol: f64, rounds: usize| -> Timed {
-            let output = Command::new(program).args([tol.to_string(), rounds.to_string()]).output();
-            let text = String::from_utf8(output.expect("it was just built").stdout).expect("it prints numbers");
-            let numbers: Vec<f64> = text.lines().map(|line| line.parse().expect("it prints numbers")).collect();
-            (numbers[0], numbers[1..].to_vec())
+            timed(Command::new(program).args([tol.to_string(), rounds.to_string()]))
         };
         let c = |tol: f64, rounds: usize| run(&rosenbrock, tol, rounds);
         let ours = |tol: f64, rounds: usize| -> Timed {
@@ -96,8 +104,10 @@ fn main() {
         };
         let (reference, other) = (c(1e-13, 1).1, ours(1e-13, 1).1);
         println!("{name}: both at tol 1e-13 differ by {:.1e} m", distance(&reference, &other));
+        let mut tolerances = Vec::new();
         for error in [1e-6, 1e-8] {
             let (tol_ours, tol_c) = (loosest(&ours, &other, error), loosest(&c, &other, error));
+            tolerances.push((tol_ours, tol_c));
             let tol_cvode =
                 cvode.as_ref().map(|program| loosest(&|tol, rounds| run(program, tol, rounds), &other, error));
             let [mut best_ours, mut best_c, mut best_cvode] = [f64::INFINITY; 3];
@@ -118,9 +128,121 @@ fn main() {
             if let Some(tol) = tol_cvode {
                 println!("    CVODE {:.2} ms (tol {tol:.1e}), ratio {:.3}", 1e3 * best_cvode, best_ours / best_cvode);
             }
+            if let Ok(program) = &diffsol {
+                against_diffsol(name, program, &other, error, best_ours);
+            }
+        }
+        sweep(name, &rosenbrock, [tolerances[0], tolerances[1]]);
+    }
+}
+
+/// Runs of diffsol at equal error: its best method counts.
+fn against_diffsol(name: &str, program: &Path, reference: &[f64], error: f64, ours: f64) {
+    let mut best: Option<(f64, &str, f64)> = None;
+    for method in ["bdf", "tr_bdf2", "esdirk34"] {
+        let run = |tol: f64, rounds: usize| {
+            let rounds = rounds.to_string();
+            timed(Command::new(program).args([name, method, &tol.to_string(), &rounds]))
+        };
+        let Some(tol) = loosest_of(&run, reference, error) else {
+            println!("    diffsol, {method}: no tolerance keeps the error");
+            continue;
+        };
+        let seconds = (0..3).map(|_| run(tol, 1).0).fold(f64::INFINITY, f64::min);
+        if best.is_none_or(|(least, ..)| seconds < least) {
+            best = Some((seconds, method, tol));
         }
     }
-    println!("SKIPPED: diffsol is not compared yet");
+    if let Some((seconds, method, tol)) = best {
+        println!("    diffsol, {method}: {:.2} ms (tol {tol:.1e}), ratio {:.3}", 1e3 * seconds, ours / seconds);
+    }
+}
+
+/// What one of the programs beside prints: seconds of a run, then positions.
+fn timed(program: &mut Command) -> Timed {
+    let text = String::from_utf8(program.output().expect("it was just built").stdout).expect("it prints numbers");
+    let numbers: Vec<f64> = text.lines().map(|line| line.parse().expect("it prints numbers")).collect();
+    (numbers[0], numbers[1..].to_vec())
+}
+
+/// Builds the program beside that uses diffsol: a crate of its own with a hundred others, so only if it is asked for.
+fn diffsol() -> Result<PathBuf, String> {
+    if std::env::var_os("FRIC_DIFFSOL").is_none() {
+        return Err("set FRIC_DIFFSOL=1 to build it and the hundred crates that it needs".into());
+    }
+    let manifest = format!("{}/benches/adaptive/diffsol/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
+    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("diffsol");
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(["build", "--release", "--quiet", "--manifest-path", &manifest, "--target-dir"]).arg(&target);
+    cargo.env("RUSTFLAGS", "-C target-cpu=native");
+    match cargo.status() {
+        Ok(status) if status.success() => Ok(target.join("release/fric-bench-diffsol")),
+        _ => Err(format!("{manifest} is not built")),
+    }
+}
+
+/// Many runs in lanes, each with another force at rest; in C one after the other.
+fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
+    let mut loaded = compiler::load("bench", TEXT, &NoSources);
+    let changes = Changes { vary: vec!["fr.rise".into()], ..Changes::default() };
+    let options = Options { changes, ..Options::default() };
+    let varying = compiler::varying(&mut loaded, &NoSources, name, &options, &mut Vec::new());
+    let varying = varying.unwrap_or_else(|found| panic!("{found:?}")).remove(0);
+    let slot = varying.param("fr.rise").expect("it is a parameter").slot;
+    let changes = Changes { vary: vec!["fr.rise".into()], ..Changes::default() };
+    let built = compiler::build(&mut loaded, &NoSources, name, &changes, &mut Vec::new());
+    let program = built.unwrap_or_else(|found| panic!("{found:?}")).program;
+    let widths = Width::ALL.into_iter().filter(|width| width.is_here());
+    let kinds = widths.flat_map(|width| [1, 2, 3].map(|vectors| (width, vectors)));
+    let codes: Vec<Lanes> = kinds
+        .filter_map(|(width, vectors)| compiler::code::lanes_of(&program, Method::Adaptive, width, vectors))
+        .collect();
+    for (tol_ours, tol_c) in tolerances {
+        let run = |k: usize| {
+            let rise = 0.5 * (0.9 + 0.2 * k as f64 / RUNS as f64);
+            let fitted = varying.fit(&[(slot, rise)]).expect("any rise will do");
+            let mut experiment = fitted.experiment;
+            experiment.solver.tol = tol_ours;
+            (fitted.instance, experiment)
+        };
+        let in_lanes = |code: &Lanes| {
+            let mut last = vec![f64::NAN; RUNS];
+            let mut runs = 0..RUNS;
+            let begin = processor_time();
+            let mut next = |_| runs.next().map_or(Next::Nothing, |k| Next::Run(k, Box::new(run(k))));
+            let mut give = |k: usize, outcome: Result<Outcome, Failure>| {
+                last[k] = outcome.expect("it runs to its end").verdicts[0].readings[0].value;
+            };
+            lanes::run(code, &mut next, &mut give, &mut |_| Continue::Continue(()));
+            ((processor_time() - begin) / RUNS as f64, last)
+        };
+        let in_c = || timed(Command::new(rosenbrock).args([&tol_c.to_string(), &RUNS.to_string(), "sweep"]));
+        let alone = {
+            let (instance, experiment) = run(7);
+            let outcome = engine::run(instance, &experiment, &mut |_| Continue::Continue(())).expect("it runs");
+            outcome.verdicts[0].readings[0].value
+        };
+        let (mut best, mut best_c) = (vec![f64::INFINITY; codes.len()], f64::INFINITY);
+        let mut off = 0.0;
+        for _ in 0..5 {
+            let c = in_c();
+            best_c = best_c.min(c.0);
+            for (code, best) in codes.iter().zip(&mut best) {
+                let ours = in_lanes(code);
+                assert_eq!(ours.1[7].to_bits(), alone.to_bits(), "a run in a lane is that alone");
+                *best = best.min(ours.0);
+                off = distance(&ours.1, &c.1);
+            }
+        }
+        println!(
+            "{name}, {RUNS} runs on one core, tol {tol_ours:.1e}, in C {tol_c:.1e}: last positions differ by {off:.1e} m; C \
+             {:.4} ms a run",
+            1e3 * best_c
+        );
+        for (code, best) in codes.iter().zip(&best) {
+            println!("    in lanes, {}: {:.4} ms a run, ratio {:.3}", code.name(), 1e3 * best, best / best_c);
+        }
+    }
 }
 
 /// Builds one of the C programs beside; gives where it is.
@@ -168,20 +290,27 @@ fn compiled(name: &str) -> Case {
 
 fn distance(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
-    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    // What is not a number is as far off as can be.
+    let off = |(a, b): (&f64, &f64)| Some((a - b).abs()).filter(|off| !off.is_nan()).unwrap_or(f64::INFINITY);
+    a.iter().zip(b).map(off).fold(0.0, f64::max)
 }
 
 /// The loosest tolerance of 1e-3, 1e-3.1, … that keeps the error, and so does the next one.
 fn loosest(run: &dyn Fn(f64, usize) -> Timed, reference: &[f64], error: f64) -> f64 {
+    loosest_of(run, reference, error).unwrap_or_else(|| panic!("no tolerance keeps an error of {error}"))
+}
+
+/// As `loosest`, if there is one.
+fn loosest_of(run: &dyn Fn(f64, usize) -> Timed, reference: &[f64], error: f64) -> Option<f64> {
     let mut tol = 1e-3;
     let mut before = false;
     while tol > 1e-13 {
         let good = distance(&run(tol, 1).1, reference) <= error;
         if good && before {
-            return tol / 0.794_328_234_724_281_5;
+            return Some(tol / 0.794_328_234_724_281_5);
         }
         before = good;
         tol *= 0.794_328_234_724_281_5;
     }
-    panic!("no tolerance keeps an error of {error}")
+    None
 }

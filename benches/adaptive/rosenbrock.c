@@ -71,9 +71,9 @@ static void solve(const double *a, const int *rows, double *b) {
     }
 }
 
-static void run(double tol, double *positions) {
+static double run(double tol, double *positions) {
     double x[N] = {0}, f0[N] = {0}, j[N * N] = {0}, ft[N] = {0}, m[N * N], u[8][N], y[N], f[N], t = 0, h = 1e-4, last_h = 0, last_error = 0;
-    int rows[N], next = 0, known = 0, rejected = 0;
+    int rows[N], next = positions ? 0 : INSTANTS + 1, known = 0, rejected = 0;
     while (t < end) {
         int hits = h > 0.999 * (end - t);
         if (hits) h = end - t;
@@ -127,4 +127,5 @@ static void run(double tol, double *positions) {
         h *= fmin(6, fmax(0.2, part));
         h = fmin(h, end / 50);
     }
+    return x[0];
 }
