@@ -285,13 +285,16 @@ pub struct Linearise {
     /// Outputs, or other quantities [default: the outputs of the whole]
     #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
     pub outputs: Vec<String>,
+    /// Parameters: P and Q then say how rates and outputs depend on them
+    #[arg(long, value_name = "PATH,…", value_delimiter = ',')]
+    pub params: Vec<String>,
     /// What of the text is changed
     #[command(flatten)]
     pub set: Set,
     /// Print a JSON object
     #[arg(long)]
     pub json: bool,
-    /// Write A, B, C, D to a file: .npz, .mat or .json
+    /// Write A, B, C, D, and P and Q if there are any, to a file: .npz, .mat or .json
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath, value_parser = matrices)]
     pub out: Option<PathBuf>,
 }

@@ -1,12 +1,13 @@
 //! From a text to cases that run: the only place that calls the compiler.
 
-use abi::Function;
 use abi::encode::Encode;
 use abi::image::{Feature, Target};
 use abi::lanes::Lanes;
 pub use abi::plan::Method;
+use abi::unit::Unit;
+use abi::{Description, Function, Slot};
 use compiler::backend::target::{self, Coder};
-use compiler::backend::wide::{self, Width};
+use compiler::backend::wide;
 use compiler::backend::{blob, c, jit};
 pub use compiler::explain::{Explanation, Listed, StepCost};
 pub use compiler::friction::Verdict;
@@ -17,7 +18,7 @@ pub use compiler::resolve::{Lookup, Space};
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::stability::LONGEST as LONGEST_STEP;
 pub use compiler::unstable::two_digits_time;
-pub use compiler::vary::{Alone, Varying};
+pub use compiler::vary::{Alone, Fitted, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
     dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
@@ -52,13 +53,16 @@ pub fn emit(
     made_for: Option<Target>,
     features: &[Feature],
 ) -> Result<Vec<u8>, String> {
-    let method = built.solver.map(|solver| solver.method).or(solver).unwrap_or(Method::Expo);
+    let method = method(built, solver);
     let functions = compiler::functions(&built.program, method);
     let description = &built.program.description;
     let told = |error: target::Unsupported| error.to_string();
     let text = match emit {
         Emit::C => c::source(&functions, description, &built.program.params),
-        Emit::Ir => functions.iter().map(|(_, func)| func.to_string()).collect::<Vec<_>>().join("\n"),
+        Emit::Ir => {
+            let listings: Vec<String> = functions.iter().map(|(_, func)| func.to_string()).collect();
+            format!("{}\n{}", places(description, method, 1), listings.join("\n"))
+        }
         Emit::Clif | Emit::Asm => {
             let chosen = match (made_for, Target::here()) {
                 (Some(made_for), _) => Some(made_for),
@@ -73,10 +77,13 @@ pub fn emit(
                 None => target::here().map_err(told)?,
             };
             let mut coder = Coder::new(isa);
-            let mut listings = Vec::new();
+            let mut listings = vec![places(description, method, size_of::<f64>())];
+            if emit == Emit::Asm {
+                listings[0] += "; As Cranelift has it before it joins blocks and places constants.\n";
+            }
             for (function, func) in &functions {
-                let listing = if emit == Emit::Clif { coder.clif(func) } else { coder.assembly(func).map_err(told)? };
-                listings.push(format!("; {}\n{listing}", function.name()));
+                let listing = if emit == Emit::Clif { coder.clif(func) } else { coder.assembly(func) };
+                listings.push(format!("; {}\n{}", function.name(), listing.map_err(told)?));
             }
             listings.join("\n")
         }
@@ -90,6 +97,42 @@ pub fn emit(
         }
     };
     Ok(text.into_bytes())
+}
+
+/// How what was built is stepped.
+fn method(built: &Built, solver: Option<Method>) -> Method {
+    built.solver.map(|solver| solver.method).or(solver).unwrap_or(Method::Expo)
+}
+
+/// Whether it keeps something of the past, but for no step, though it is stepped by fixed ones.
+pub fn unsized_delays(built: &Built, solver: Option<Method>) -> bool {
+    let delays = &built.program.description.delays;
+    method(built, solver) != Method::Adaptive && delays.iter().any(|delay| delay.ring.len == 0)
+}
+
+/// What a listing is of, and what its places of the block mean: each by its number times `unit`.
+fn places(description: &Description, method: Method, unit: usize) -> String {
+    let counted = if unit == 1 { "by number" } else { "by bytes from its beginning" };
+    let mut out = format!("; {}, by {}. The block, {counted}:\n", description.name, method.name());
+    let fixed = [(Slot::TIME, "t, time in s"), (Slot::STEP, "h, step in s"), (Slot::COUNT, "steps since the start")];
+    let fixed = fixed.into_iter().map(|(slot, what)| (slot, what.to_string()));
+    let named = description.quantities.iter().map(|quantity| {
+        let unit = Unit::si(quantity.unit.dimension).text;
+        let unit = if quantity.boolean || unit.is_empty() { String::new() } else { format!(" [{unit}]") };
+        (quantity.slot, format!("{}{unit}", quantity.path.replace('\n', " ")))
+    });
+    let regimes = description.automata.iter().map(|automaton| {
+        let owner = if automaton.path.is_empty() { String::new() } else { format!("{}: ", automaton.path) };
+        (automaton.slot, format!("{owner}regime, {}", automaton.regimes.join(" ")))
+    });
+    let mut told: std::collections::BTreeMap<Slot, Vec<String>> = Default::default();
+    for (slot, what) in fixed.chain(named).chain(regimes) {
+        told.entry(slot).or_default().push(what);
+    }
+    for (slot, what) in told {
+        out += &format!(";   {:<5} {}\n", slot.index() * unit, what.join(", "));
+    }
+    out
 }
 
 /// Features, if code for a target may use them.
@@ -121,18 +164,12 @@ pub struct StepCode {
 pub fn step_code(built: &Built, method: Method) -> StepCode {
     let description = &built.program.description;
     let (layout, pool) = (&description.layout, description.pool.len());
-    let mut functions = compiler::functions(&built.program, method);
-    functions.retain(|(function, _)| *function == Function::Step);
-    let func = &functions[0].1;
-    let bytes = jit::compile(&functions, layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
-    let lanes = match Width::here() {
-        None => Err("this processor has neither AVX2 nor AVX-512".to_string()),
-        Some(width) => {
-            let step = compiler::code::step(&built.program, method);
-            wide::compile(&step, layout, pool, width, width.vectors()).map_err(|why| why.to_string())
-        }
-    };
-    StepCode { operations: func.ops.len(), bytes, critical_path: regroup::critical_path(func), lanes }
+    let step = compiler::code::step(&built.program, method);
+    let func = compiler::math::expand(&step);
+    let (operations, critical_path) = (func.ops.len(), regroup::critical_path(&func));
+    let bytes = jit::compile(&[(Function::Step, func)], layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
+    let lanes = wide::widest(&step, layout, pool).map_err(|why| why.to_string());
+    StepCode { operations, bytes, critical_path, lanes }
 }
 
 /// How long each stage took, in the order in which they ran.

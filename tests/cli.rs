@@ -340,16 +340,89 @@ fn a_model_can_be_taken_away() {
         folder.check(&["build", "pull.fric", "Pull", "--emit", "blob", "--target", target, "-o", &out], 0, "wrote");
         assert!(fs::read(folder.0.join(out)).unwrap().starts_with(b"FRICCODE"));
     }
-    for emit in ["ir", "clif", "asm"] {
-        let (out, _) = folder.check(&["build", "pull.fric", "Pull", "--emit", emit, "--target", "aarch64"], 0, "");
-        assert!(out.contains("step") && out.lines().count() > 40, "{out}");
-    }
     folder.check(&["build", "pull.fric", "--emit", "c"], 2, "Name one of Contact, Pull, holds, breaks, silent");
     folder.check(&["build", "pull.fric", "Contakt", "--emit", "c"], 1, "did you mean `Contact`?");
     folder.check(&["build", "pull.fric", "Pull", "--emit", "blob"], 2, "--out");
     folder.check(&["build", "pull.fric", "Pull", "--emit", "c", "--set", "fr.Fz=2N"], 1, "Fz");
     folder.check(&["build", "pull.fric", "Pull", "--emit", "blob", "--target", "z80", "-o", "x"], 2, "x86_64, aarch64");
     assert!(!folder.0.join("x").exists());
+}
+
+/// Listings name the places of the block, hold one function after the other, and show the code that runs: expanded, fused,
+/// without a call.
+#[test]
+fn what_is_made_on_the_way_can_be_read() {
+    let folder = Folder::new("listings").with("pull.fric", PULL);
+    for (name, method, functions) in [
+        ("Pull", "expo", &["start", "outputs", "step"][..]),
+        ("holds", "rk4", &["start", "outputs", "step"]),
+        ("Pull", "adaptive", &["start", "outputs", "derivatives", "jacobian", "rosenbrock"]),
+    ] {
+        let listing = |emit: &str, more: &[&str]| {
+            let all = ["build", "pull.fric", name, "--emit", emit, "--solver", method];
+            folder.check(&[&all[..], more].concat(), 0, "").0
+        };
+        // The place of the state x, as the heading tells it.
+        let place = |text: &str, what: &str| -> usize {
+            let line = text.lines().find(|line| line.starts_with(';') && line.ends_with(what));
+            let line = line.unwrap_or_else(|| panic!("no place of {what}: {text}"));
+            line.split_whitespace().nth(1).and_then(|word| word.parse().ok()).expect("a number")
+        };
+
+        let ir = listing("ir", &[]);
+        assert!(ir.starts_with("; Pull") && ir.contains(&format!(", by {method}.")), "{ir}");
+        let titles: Vec<&str> =
+            ir.lines().filter_map(|line| line.strip_suffix(':')).filter(|title| !title.starts_with(';')).collect();
+        assert_eq!(titles, functions);
+        let mut next = 0;
+        for line in ir.lines() {
+            let Some((value, op)) = line.strip_prefix("  v").and_then(|line| line.split_once(" = ")) else {
+                next = if line.starts_with("  ") { next } else { 0 };
+                continue;
+            };
+            assert_eq!(value.parse(), Ok(next), "values are counted: {line}");
+            let operands = op.split([' ', '[', ']']).filter_map(|word| word.strip_prefix('v')?.parse::<usize>().ok());
+            operands.for_each(|operand| assert!(operand < next, "an operand of a later line: {line}"));
+            assert!(!op.starts_with("tanh") && !op.starts_with("exp"), "elementary functions are arithmetic: {line}");
+            next += 1;
+        }
+        assert!(ir.contains(" = fma v"), "{ir}");
+        let x = place(&ir, "x [m]");
+        assert!(ir.contains(&format!("  store {x} = v")), "something gives x its value: {ir}");
+
+        for (target, fused, store) in [("x86_64", "vfmadd", "(%rdi)"), ("aarch64", "fmadd d", "[x0, #")] {
+            let clif = listing("clif", &["--target", target]);
+            let titles: Vec<&str> =
+                clif.lines().filter_map(|line| line.strip_prefix("; ")).filter(|it| !it.contains(' ')).collect();
+            assert_eq!(titles, functions);
+            assert_eq!(clif.matches("(i64, i64, i64) -> i64").count(), functions.len(), "{clif}");
+            assert!(!clif.contains("call ") && clif.contains(" = fma "), "{clif}");
+            assert_eq!(place(&clif, "x [m]"), 8 * x);
+            assert!(clif.lines().any(|line| line.contains("store") && line.contains(&format!("+{}", 8 * x))), "{clif}");
+
+            let asm = listing("asm", &["--target", target]);
+            let titles: Vec<&str> =
+                asm.lines().filter_map(|line| line.strip_prefix("; ")).filter(|it| !it.contains(' ')).collect();
+            assert_eq!(titles, functions);
+            assert_eq!(place(&asm, "x [m]"), 8 * x);
+            assert!(asm.contains(fused), "{target} fuses products and sums: {asm}");
+            assert!(asm.lines().any(|line| line.contains(store)), "it writes the block: {asm}");
+            let calls = |line: &str| matches!(line.split_whitespace().next(), Some("call" | "callq" | "bl" | "blr"));
+            assert!(!asm.lines().any(calls), "it calls nothing: {asm}");
+            let returns = asm.lines().filter(|line| matches!(line.trim(), "ret" | "retq")).count();
+            assert!(returns >= functions.len(), "each function ends: {asm}");
+        }
+    }
+    // What reads the past is kept in steps.
+    let late = "model Late {\n  input  u [N]\n  output y [N] = delay(u, 5 ms)\n}\n";
+    let folder = folder.with("late.fric", late);
+    for emit in ["ir", "c", "asm"] {
+        folder.check(&["build", "late.fric", "--emit", emit], 2, "--step");
+    }
+    let (ir, _) = folder.check(&["build", "late.fric", "--emit", "ir", "--step", "1ms"], 0, "");
+    assert!(ir.contains(" = ring ") && ir.contains("  write "), "{ir}");
+    folder.check(&["build", "late.fric", "--emit", "ir", "--solver", "adaptive"], 0, "derivatives:");
+    folder.check(&["build", "late.fric", "--emit", "ir", "--step", "10ms"], 1, "longer than this delay");
 }
 
 #[test]

@@ -394,6 +394,9 @@ fn each_run_is_checked_and_measured_with_its_own_values() {
     }
     let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 m, 2 m"], 2);
     assert!(err.contains("`fr.Fs` is a force, it cannot be a length"), "{err}");
+    let both = ["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 N, 2 N", "--set", "fr.Fs=3 N"];
+    let (_, err) = folder.run(&both, 2);
+    assert!(err.contains("`fr.Fs` is both set and varied"), "{err}");
     let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fx = 1 N, 2 N"], 1);
     assert!(err.contains("Fx"), "{err}");
     // The same table as Parquet: its rows lie beside it only until it is complete.
@@ -428,6 +431,15 @@ fn a_loop_is_linearised_where_its_run_is() {
     assert!((entry("B", 2, 0) + entry("D", 0, 0)).abs() <= 1e-12 * entry("D", 0, 0).abs(), "{object}");
     assert_eq!((entry("D", 1, 0), entry("C", 1, 1)), (0.0, 1.0));
     assert!(fs::read(folder.0.join("l.mat")).unwrap().starts_with(b"MATLAB 5.0 MAT-file"));
+    // What a parameter does, in closed form: F = sigma1 dz/dt + …, so dF/dsigma1 = dz/dt = v (1 − 1e5 z / g).
+    let point = ["linearise", "m.fric", "Bristle", "--at", "v=0.1mm/s,z=2um", "--params", "sigma1", "--json"];
+    let object: Value = serde_json::from_str(folder.run(&point, 0).0.trim()).unwrap();
+    let g = 1.0 + 0.5 * (-0.01f64).exp();
+    let rate = 1e-4 * (1.0 - 1e5 * 2e-6 / g);
+    assert!((object["Q"][0][0].as_f64().unwrap() - rate).abs() < 1e-12 * rate, "{}", object["Q"]);
+    assert_eq!((&object["P"][0][0], &object["params"][0]["name"]), (&Value::from(0.0), &Value::from("sigma1")));
+    let (_, err) = folder.run(&["linearise", "m.fric", "Bristle", "--params", "sigma2"], 1);
+    assert!(err.contains("no parameter `sigma2`") && err.contains("did you mean `sigma1`?"), "{err}");
     folder.run(&["linearise", "m.fric", "Hanging", "--out", "l.npz"], 0);
     assert!(fs::read(folder.0.join("l.npz")).unwrap().starts_with(b"PK\x03\x04"));
     let (out, _) = folder.run(&["linearise", "m.fric", "Hanging", "--at", "x=0m"], 0);

@@ -277,11 +277,11 @@ impl Encode for Layout {
             return reader.wrong(format!("a block of {size} slots is too large"));
         }
         let layout = Layout::new(lens);
-        // Its length follows from the others; of more states it could not be counted.
-        let with_trial = (trial > 0 && lens[2] < 1 << 14).then(|| layout.clone().with_trial());
-        match with_trial {
-            Some(layout) if layout.trial.len == trial => Ok(layout.with_rings(rings)),
+        // Its length follows from the others and the number of guards; of more states it could not be counted.
+        let least = (lens[2] < 1 << 14).then(|| layout.clone().with_trial(0).trial.len);
+        match least.and_then(|least| trial.checked_sub(least)) {
             _ if trial == 0 => Ok(layout.with_rings(rings)),
+            Some(bounds) if bounds % 2 == 0 => Ok(layout.with_trial(bounds / 2).with_rings(rings)),
             _ => reader.wrong(format!("a trial step of {} states has not {trial} slots", lens[2])),
         }
     }

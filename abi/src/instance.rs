@@ -52,7 +52,12 @@ impl Instance {
 
     /// Runs one function once; returns its status, 0 for none.
     pub fn call(&mut self, function: Function) -> u64 {
-        self.code.call(function, &mut self.block, &self.description.pool, 1)
+        self.call_up_to(function, 1)
+    }
+
+    /// Runs one function up to `n` times; returns the first status that is not 0, at which it stops.
+    pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
+        self.code.call(function, &mut self.block, &self.description.pool, n)
     }
 
     /// Puts the model at t = 0 for steps of `h` seconds: initial values and the blocks due at 0, then transitions
@@ -78,7 +83,7 @@ impl Instance {
 
     /// Advances by up to `n` fixed steps; returns the first status that is not 0, at which it stops.
     pub fn advance(&mut self, n: u64) -> u64 {
-        self.code.call(Function::Step, &mut self.block, &self.description.pool, n)
+        self.call_up_to(Function::Step, n)
     }
 }
 

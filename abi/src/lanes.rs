@@ -2,6 +2,7 @@
 
 use crate::description::Slot;
 use std::any::Any;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Machine code that advances all lanes by up to `count` fixed steps, at least by one if `count` is not 0, and stops at the
@@ -52,12 +53,32 @@ impl Lanes {
     pub fn name(&self) -> &str {
         &self.name
     }
+
+    /// Slots of a block.
+    pub(crate) fn size(&self) -> usize {
+        self.size
+    }
+
+    /// Numbers that all blocks and what the code needs behind them take.
+    pub(crate) fn room(&self) -> usize {
+        self.size * self.width + self.scratch
+    }
+
+    /// Runs the code.
+    ///
+    /// # Safety
+    /// `numbers` must begin at a multiple of 64 bytes and have as many as there is [`room`](Lanes::room) for, the pool as
+    /// many as the code needs, and `statuses` one a lane.
+    pub(crate) unsafe fn run(&self, numbers: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64 {
+        // SAFETY: `Lanes::new` was promised that the entry accesses only these.
+        unsafe { (self.entry)(numbers, pool, count, statuses) }
+    }
 }
 
 /// Eight numbers that lie where vectors want them.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-struct Line([u64; 8]);
+pub(crate) struct Line([u64; 8]);
 
 /// As many instances as the code has lanes, with their numbers.
 #[derive(Clone)]
@@ -71,7 +92,7 @@ impl Batch {
     /// All numbers 0.
     pub fn new(lanes: Lanes) -> Batch {
         let lines = |numbers: usize| vec![Line([0; 8]); numbers.div_ceil(8)];
-        let numbers = lines(lanes.size * lanes.width + lanes.scratch);
+        let numbers = lines(lanes.room());
         let statuses = lines(lanes.width);
         Batch { lanes, numbers, statuses }
     }
@@ -116,6 +137,39 @@ impl Batch {
         }
     }
 
+    /// Where the first of these slots lies; the others follow at a distance of the width.
+    fn begin(&self, lane: usize, slots: &Range<usize>) -> usize {
+        let Lanes { width, size, .. } = self.lanes;
+        assert!(slots.end <= size && lane < width, "slots {slots:?} of {size}, lane {lane} of {width}");
+        slots.start * width + lane
+    }
+
+    /// As [`Batch::load`], of these slots alone.
+    pub fn load_part(&mut self, lane: usize, slots: Range<usize>, block: &[f64]) {
+        let (width, mut at) = (self.lanes.width, self.begin(lane, &slots));
+        for value in &block[slots] {
+            self.numbers[at / 8].0[at % 8] = value.to_bits();
+            at += width;
+        }
+    }
+
+    /// As [`Batch::save`], of these slots alone.
+    pub fn save_part(&self, lane: usize, slots: Range<usize>, block: &mut [f64]) {
+        let (width, mut at) = (self.lanes.width, self.begin(lane, &slots));
+        for value in &mut block[slots] {
+            *value = f64::from_bits(self.numbers[at / 8].0[at % 8]);
+            at += width;
+        }
+    }
+
+    /// Gives a lane the numbers of another one.
+    pub fn copy_lane(&mut self, from: usize, to: usize) {
+        for slot in 0..self.lanes.size {
+            let value = self.get(Slot(slot as u32), from);
+            self.set(Slot(slot as u32), to, value);
+        }
+    }
+
     /// The status of a lane after its last step, 0 for none.
     pub fn status(&self, lane: usize) -> u64 {
         assert!(lane < self.lanes.width, "lane {lane} of {}", self.lanes.width);
@@ -134,9 +188,8 @@ impl Batch {
         self.statuses.fill(Line([0; 8]));
         while done < n && (0..self.lanes.width).all(|lane| self.status(lane) == 0) {
             let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
-            // SAFETY: `Lanes::new` was promised that the entry accesses only what `Batch::new` has made room for, and the
-            // pool.
-            done += unsafe { (self.lanes.entry)(numbers, pool.as_ptr(), n - done, statuses) };
+            // SAFETY: `Batch::new` has made room, and the pool is as long as needed.
+            done += unsafe { self.lanes.run(numbers, pool.as_ptr(), n - done, statuses) };
         }
         done
     }

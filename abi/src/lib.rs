@@ -5,12 +5,14 @@
 
 pub mod unit;
 pub mod description;
+pub mod pace;
 pub mod trial;
 pub mod rodas5p;
+pub mod lanes;
+pub mod ahead;
 pub mod table;
 pub mod series;
 pub mod instance;
-pub mod lanes;
 pub mod rig;
 pub mod plan;
 pub mod encode;

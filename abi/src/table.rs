@@ -1,5 +1,6 @@
 //! The functions of a compiled model, behind one door, whatever made them.
 
+use crate::ahead::Ahead;
 use std::any::Any;
 use std::sync::Arc;
 
@@ -22,8 +23,7 @@ pub enum Function {
     Transitions,
     /// One fixed step with all that belongs to it: states, count, time, ticks, transitions, outputs, guards.
     Step,
-    /// One adaptive step, tried: t, h and the start in the segment `trial` → everything else there. Its status is 1
-    /// where the elimination met a pivot that is too small; then nothing it wrote counts.
+    /// Up to `count` adaptive steps, tried and as far as possible settled: see [`trial`](crate::trial).
     Rosenbrock,
 }
 
@@ -84,6 +84,8 @@ pub struct Machine {
     entries: [Option<Entry>; Function::ALL.len()],
     size: usize,
     pool_len: usize,
+    /// The step again, in two parts.
+    ahead: Option<Arc<Ahead>>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
@@ -99,7 +101,20 @@ impl Machine {
         pool_len: usize,
         memory: Arc<dyn Any + Send + Sync>,
     ) -> Machine {
-        Machine { entries, size, pool_len, _memory: memory }
+        Machine { entries, size, pool_len, ahead: None, _memory: memory }
+    }
+
+    /// The same, which takes many steps in two parts.
+    ///
+    /// # Safety
+    /// The parts must give the bits of the step that is there, and work on the same block and pool.
+    pub unsafe fn with_ahead(self, ahead: Ahead) -> Machine {
+        Machine { ahead: Some(Arc::new(ahead)), ..self }
+    }
+
+    /// Whether many steps are taken in two parts.
+    pub fn goes_ahead(&self) -> bool {
+        self.ahead.is_some()
     }
 
     /// As [`Code::call`].
@@ -108,8 +123,20 @@ impl Machine {
         assert!(pool.len() >= self.pool_len, "pool of {} numbers, {} needed", pool.len(), self.pool_len);
         let entry =
             self.entries[function as usize].unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
+        let mut left = count;
+        if let Some(ahead) = &self.ahead
+            && function == Function::Step
+            && count >= ahead.pays()
+        {
+            // SAFETY: the lengths were just checked.
+            let (done, status) = unsafe { ahead.advance(block, pool, count) };
+            left -= done;
+            if status != 0 {
+                return status;
+            }
+        }
         // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
-        unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), count) }
+        unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), left) }
     }
 }
 
@@ -119,6 +146,14 @@ impl Code {
         match self {
             Code::Machine(machine) => machine.entries[function as usize].is_some(),
             Code::Interpreted(code) => code.has(function),
+        }
+    }
+
+    /// The entry of a function, for whoever calls it himself; none if there is no machine code of it.
+    pub fn entry(&self, function: Function) -> Option<Entry> {
+        match self {
+            Code::Machine(machine) => machine.entries[function as usize],
+            Code::Interpreted(_) => None,
         }
     }
 

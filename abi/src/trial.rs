@@ -1,13 +1,28 @@
-//! Where the numbers of one adaptive step lie, as `Function::Rosenbrock` reads and writes them.
+//! Where the numbers of adaptive steps lie, as `Function::Rosenbrock` reads and writes them.
 //!
-//! The step goes from (t, x0) over h; between its ends its states are
+//! A step goes from (t, x0) over h; between its ends its states are
 //!
 //!   x(t + θh) = x0 + θ (x1 − x0) + θ (1 − θ) (k1 + θ (k2 + θ k3))
 //!
-//! Everything but the first five entries is written by the function. A step that is accepted becomes the start of the
-//! next: [`Trial::to`] is copied to [`Trial::from`], which has the same order.
+//! A call tries up to `count` steps. One that needs nobody is settled by the function itself: accepted, the end becomes the
+//! start of the next, or refused for its error; either way the next length is chosen. At the first other one the call
+//! ends, with the status [`LOOK`] or [`PIVOT`]: nothing of it is settled, and the trial is there to be looked at. So does
+//! every one that somebody attends. Whoever settles it copies [`Trial::to`] to [`Trial::from`], which has the same order.
 
 use crate::description::{Layout, Segment, Slot};
+
+/// A status: the elimination met a pivot that is too small; nothing of the trial counts.
+pub const PIVOT: u64 = 1;
+
+/// A status: the trial crosses a switching surface, or comes close to one, reaches an instant that is met or looked at,
+/// leaves a range, is not finite, or somebody attends it.
+pub const LOOK: u64 = 2;
+
+/// Every trial is to be looked at.
+pub const ATTEND_EACH: f64 = 1.0;
+
+/// Each accepted step that asks whether the method suits is to be looked at.
+pub const ATTEND_ASKED: f64 = 0.5;
 
 /// The segment `trial` of a layout, by its parts.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -15,7 +30,11 @@ pub struct Trial {
     start: u32,
     states: u32,
     roots: u32,
+    guards: u32,
 }
+
+/// Entries before the first segment.
+const SINGLE: u32 = 17;
 
 /// States, their derivatives and the Jacobian at one point: n, n and n² + n numbers, one behind the other.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -37,9 +56,9 @@ impl Point {
 }
 
 impl Layout {
-    /// The same with room for a trial step behind all else.
-    pub fn with_trial(mut self) -> Layout {
-        let trial = Trial { start: self.size() as u32, states: self.states.len, roots: self.roots.len };
+    /// The same with room for a trial step behind all else, of a model with so many guards.
+    pub fn with_trial(mut self, guards: u32) -> Layout {
+        let trial = Trial { start: self.size() as u32, states: self.states.len, roots: self.roots.len, guards };
         self.trial = Segment { start: trial.start, len: trial.len() };
         self
     }
@@ -48,8 +67,9 @@ impl Layout {
 impl Trial {
     /// None of a layout without room for it.
     pub fn of(layout: &Layout) -> Option<Trial> {
-        let trial = Trial { start: layout.trial.start, states: layout.states.len, roots: layout.roots.len };
-        (layout.trial.len > 0).then_some(trial)
+        let trial = Trial { start: layout.trial.start, states: layout.states.len, roots: layout.roots.len, guards: 0 };
+        let bounds = layout.trial.len.checked_sub(trial.len())?;
+        (bounds % 2 == 0).then_some(Trial { guards: bounds / 2, ..trial })
     }
 
     /// Number of slots.
@@ -57,34 +77,127 @@ impl Trial {
         self.defect().0 + 1 - self.start
     }
 
-    /// t in s, read.
+    /// The entries before the first segment: how the run stands, and what is said of the trial.
+    pub fn single(self) -> Segment {
+        Segment { start: self.start, len: SINGLE }
+    }
+
+    /// t in s, read and written.
     pub fn time(self) -> Slot {
         Slot(self.start)
     }
 
-    /// h in s, read.
-    pub fn step(self) -> Slot {
+    /// Length of the next step in s, as far as the error allows it; read and written.
+    pub fn next(self) -> Slot {
         Slot(self.start + 1)
     }
 
-    /// Where the last stages are evaluated: t + h, or just before it if a signal has a corner there; read.
-    pub fn end(self) -> Slot {
+    /// Length of the last accepted step in s, 0 if there was none since a restart; read and written.
+    pub fn last_step(self) -> Slot {
         Slot(self.start + 2)
+    }
+
+    /// The fifth root of its error; read and written.
+    pub fn last_root(self) -> Slot {
+        Slot(self.start + 3)
+    }
+
+    /// 1 if the last trial was refused, else 0; read and written.
+    pub fn rejected(self) -> Slot {
+        Slot(self.start + 4)
+    }
+
+    /// Number of steps accepted so far, read and written: every [`ASKS`](crate::pace::ASKS)-th asks whether the method
+    /// suits.
+    pub fn accepted(self) -> Slot {
+        Slot(self.start + 5)
+    }
+
+    /// Number of trials refused by the function itself, read and written.
+    pub fn refused(self) -> Slot {
+        Slot(self.start + 6)
+    }
+
+    /// The next instant that is met exactly, in s; read.
+    pub fn stop(self) -> Slot {
+        Slot(self.start + 7)
+    }
+
+    /// The instant just before it, where the last stages of a step that ends there are evaluated: what jumps at the stop
+    /// has not jumped yet. In s, read.
+    pub fn before_stop(self) -> Slot {
+        Slot(self.start + 8)
+    }
+
+    /// The longest step, in s; read.
+    pub fn longest(self) -> Slot {
+        Slot(self.start + 9)
+    }
+
+    /// A step that ends at this instant or behind it is to be looked at; in s, infinite if there is none; read.
+    pub fn watched(self) -> Slot {
+        Slot(self.start + 10)
+    }
+
+    /// [`ATTEND_EACH`] if every trial is to be looked at, [`ATTEND_ASKED`] if each one is that asks whether the method
+    /// suits, else 0: then only those whose mean eigenvalue does not say so; read.
+    pub fn attend(self) -> Slot {
+        Slot(self.start + 11)
     }
 
     /// Relative tolerance, read.
     pub fn tol(self) -> Slot {
-        Slot(self.start + 3)
+        Slot(self.start + 12)
+    }
+
+    /// Length of the trial in s.
+    pub fn step(self) -> Slot {
+        Slot(self.start + 13)
+    }
+
+    /// Where its last stages are evaluated: t + h, or `before_stop`.
+    pub fn end(self) -> Slot {
+        Slot(self.start + 14)
+    }
+
+    /// 1 if the trial crosses a switching surface or comes close to one, else 0.
+    pub fn met(self) -> Slot {
+        Slot(self.start + 15)
+    }
+
+    /// 1 if a quantity that is watched is not fine at the end, else 0.
+    pub fn outside(self) -> Slot {
+        Slot(self.start + 16)
     }
 
     /// For each state, what its size is measured with: tol · (|x| + s) is allowed. SI, read.
     pub fn scales(self) -> Segment {
-        Segment { start: self.start + 4, len: self.states }
+        Segment { start: self.start + SINGLE, len: self.states }
     }
 
-    /// The start, read.
+    /// For each guard the least value that is still fine, SI, read.
+    pub fn lows(self) -> Segment {
+        Segment { start: end(self.scales()), len: self.guards }
+    }
+
+    /// For each guard the greatest value that is still fine, SI, read.
+    pub fn highs(self) -> Segment {
+        Segment { start: end(self.lows()), len: self.guards }
+    }
+
+    /// The side of each switching surface, −1 or 1, or 0 on it; read.
+    pub fn sides(self) -> Segment {
+        Segment { start: end(self.highs()), len: self.roots }
+    }
+
+    /// Switching surfaces at the start; read and written.
+    pub fn here(self) -> Segment {
+        Segment { start: end(self.sides()), len: self.roots }
+    }
+
+    /// The start; read and written.
     pub fn from(self) -> Point {
-        self.point(end(self.scales()))
+        self.point(end(self.here()))
     }
 
     /// The end.
@@ -144,10 +257,31 @@ mod tests {
 
     #[test]
     fn the_parts_fill_the_segment_without_overlap() {
-        let layout = Layout::new([2, 0, 3, 1, 1, 4, 3, 2, 12, 1]).with_trial();
+        let layout = Layout::new([2, 0, 3, 1, 1, 4, 3, 2, 12, 1]).with_trial(3);
         let trial = Trial::of(&layout).unwrap();
         let one = |slot: Slot| Segment { start: slot.0, len: 1 };
-        let mut parts = vec![one(trial.time()), one(trial.step()), one(trial.end()), one(trial.tol()), trial.scales()];
+        let mut parts: Vec<Segment> = [
+            trial.time(),
+            trial.next(),
+            trial.last_step(),
+            trial.last_root(),
+            trial.rejected(),
+            trial.accepted(),
+            trial.refused(),
+            trial.stop(),
+            trial.before_stop(),
+            trial.longest(),
+            trial.watched(),
+            trial.attend(),
+            trial.tol(),
+            trial.step(),
+            trial.end(),
+            trial.met(),
+            trial.outside(),
+        ]
+        .map(one)
+        .into();
+        parts.extend([trial.scales(), trial.lows(), trial.highs(), trial.sides(), trial.here()]);
         for point in [trial.from(), trial.to()] {
             parts.extend([point.states, point.derivatives, point.jacobian]);
         }

@@ -3,12 +3,14 @@
 //! In: a [`Program`] and how it is stepped. Out: [`Code`]. Whatever makes it, the bits are the same, so *when* a
 //! function becomes machine code can be told from the clock alone.
 
+use crate::backend::wide::{self, Width};
 use crate::backend::{interp::Interpreter, jit, target};
 use crate::ir::Func;
 use crate::opt::contract::contract;
 use crate::opt::regroup::regroup;
 use crate::program::Program;
 use crate::{derive, discretize, math, rosenbrock};
+use abi::lanes::Lanes;
 use abi::plan::Method;
 use abi::table::{Code, Interpret, Machine};
 use abi::{Description, Function, Layout};
@@ -47,6 +49,28 @@ pub fn step(program: &Program, method: Method) -> Func {
     contract(&regroup(&discretize::step(program, method)))
 }
 
+/// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;
+/// none if it has none, or the model no such function: then each instance runs for itself, with the same bits.
+pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
+    // The many operations of an adaptive step leave fewer registers to more vectors.
+    let vectors = |width: Width| if method == Method::Adaptive { 2 } else { width.vectors() };
+    Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
+}
+
+/// The function that makes a method's steps before elementary functions are expanded: what lanes are made of.
+pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
+    match method {
+        Method::Adaptive => Some((Function::Rosenbrock, rosenbrock::rosenbrock(program)?)),
+        _ => Some((Function::Step, step(program, method))),
+    }
+}
+
+/// The same in so many vectors of this width.
+pub fn lanes_of(program: &Program, method: Method, width: Width, vectors: usize) -> Option<Lanes> {
+    let (_, func) = of_lanes(program, method)?;
+    wide::compile(&func, &program.description.layout, program.description.pool.len(), width, vectors).ok()
+}
+
 /// Whether a method needs a function, if there can be such.
 fn needs(program: &Program, method: Method, which: Function) -> bool {
     let adaptive = method == Method::Adaptive;
@@ -70,20 +94,15 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     }
     match jit::compile(functions, layout, pool) {
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
-        Err(why) => (interpreted(), vec![slow(&why)]),
+        Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
     }
-}
-
-fn slow(why: &target::Unsupported) -> String {
-    format!("runs interpreted, some fifty times slower: {why}")
 }
 
 /// Code for runs that nobody waits for in real time: each function is made when it is first called, and compiled once
 /// it has been called often enough to pay. So a text is at its first step before any machine code is made, and what
 /// runs once, as the start does, never costs its compiling.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
-    let operations = |func: &Func| func.ops.len();
-    let size = operations(&program.derivatives) + operations(&program.outputs) + operations(&program.start);
+    let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
     match target::here() {
         // What may be too large for machine code is made at once, so that it is told at once.
         Ok(_) if !interpret && size <= LARGE => {
@@ -110,7 +129,7 @@ struct Late {
 /// What there is of a function.
 #[derive(Default)]
 struct Made {
-    func: OnceLock<Option<Func>>,
+    func: OnceLock<Option<(Function, Func)>>,
     interpreter: OnceLock<Interpreter>,
     /// None: too large.
     machine: OnceLock<Option<Machine>>,
@@ -124,15 +143,15 @@ impl Late {
     }
 
     /// The function as arithmetic.
-    fn func(&self, which: Function) -> Option<&Func> {
-        let make = || function(&self.program, self.method, which);
+    fn func(&self, which: Function) -> Option<&(Function, Func)> {
+        let make = || Some((which, function(&self.program, self.method, which)?));
         self.made[which as usize].func.get_or_init(make).as_ref()
     }
 
     /// What a back end makes of one function.
     fn make<T>(&self, which: Function, back_end: impl FnOnce(&[(Function, Func)], &Layout, usize) -> T) -> T {
         let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
-        back_end(&[(which, func.clone())], &self.program.description.layout, self.program.description.pool.len())
+        back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
     }
 }
 

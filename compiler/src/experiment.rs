@@ -129,7 +129,7 @@ pub fn read(
         let error = Diagnostic::error("E0201", format!("there is no experiment `{name}`"));
         return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
     };
-    let misread = loaded.diagnostics.iter().any(|d| d.is_error() && !outside_of(experiment.span, d));
+    let misread = loaded.misread(experiment.span);
     let mut experiment = std::borrow::Cow::Borrowed(experiment);
     if !also.is_empty() {
         experiment.to_mut().body.extend(also);

@@ -114,7 +114,9 @@ pub fn varying(
         coded.description.guards = vary::in_code(&variant, paths);
         let functions = functions(&coded, variant.experiment.solver.method);
         let (code, notes) = code(&functions, &coded.description, options.interpret);
-        vary::Varying::new(variant, paths, &loaded.files, code, notes)
+        let alone = options.interpret || variant.experiment.bench.is_some();
+        let lanes = if alone { None } else { code::lanes(&coded, variant.experiment.solver.method) };
+        vary::Varying::new(variant, paths, &loaded.files, code, lanes, notes)
     };
     Ok(variants.into_iter().map(one).collect())
 }
@@ -127,7 +129,8 @@ pub struct Built {
     pub solver: Option<abi::plan::Solver>,
 }
 
-/// Compiles a model on its own, its inputs open, or the first combination of an experiment's sweeps.
+/// Compiles a model on its own, its inputs open, or the first combination of an experiment's sweeps. A model that delays
+/// something can be stepped with `changes.step` only: how much of the past is kept depends on it.
 ///
 /// # Errors
 /// Everything that is wrong with it.
@@ -146,8 +149,18 @@ pub fn build(
     };
     let given = experiment::overrides(loaded, changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
-    let (system, types, ()) = sound(loaded, sources, model, overrides, warnings, |_, _| ())?;
-    Ok(Built { program: lower::lower(&system, &types, &[]).program, solver: None })
+    let step = changes.step.filter(|_| changes.method != Some(Method::Adaptive));
+    let (system, types, ()) = sound(loaded, sources, model, overrides, warnings, |system, diagnostics| {
+        delays::check(system, diagnostics);
+        if let Some(step) = step {
+            delays::fits(system, step, None, diagnostics);
+        }
+    })?;
+    let mut program = lower::lower(&system, &types, &[]).program;
+    if let Some(step) = step.filter(|_| !program.description.delays.is_empty()) {
+        program.size_rings(step);
+    }
+    Ok(Built { program, solver: None })
 }
 
 /// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
@@ -175,7 +188,9 @@ pub fn linear(
         }
         let (code, _) = code(&functions, &variant.program.description, options.interpret);
         let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
-        return Ok(linearise::Linear::new(&variant.program, instance, Some(variant.experiment), &variant.ports));
+        let params = options.changes.ports.as_ref().map_or(&[][..], |ports| &ports.params);
+        let experiment = Some(variant.experiment);
+        return Ok(linearise::Linear::new(&variant.program, instance, experiment, &variant.ports, params));
     };
     let given = experiment::overrides(loaded, &options.changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
@@ -193,10 +208,10 @@ pub fn linear(
     let slot = |path: &str| program.description.quantity(path).map(|quantity| quantity.slot);
     let inputs = opened.inputs.iter().filter_map(|(path, moved)| Some((path.clone(), slot(moved)?)));
     let outputs = opened.outputs.iter().zip(observed).map(|((path, _), slot)| (path.clone(), slot));
-    let ports = (inputs.collect(), outputs.collect());
+    let slots = (inputs.collect(), outputs.collect());
     let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    Ok(linearise::Linear::new(&program, instance, None, &ports))
+    Ok(linearise::Linear::new(&program, instance, None, &slots, &ports.params))
 }
 
 /// A rig, ready to run.
@@ -517,13 +532,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let mut all = loaded.diagnostics.clone();
     let root = loaded.root();
     let ast = loaded.files.get(root).ast.clone();
-    let inside = |d: &Diagnostic, item: grammar::span::Span| {
-        d.is_error() && d.span().file == root && item.start <= d.span().start && d.span().end <= item.end
-    };
-    let gaps = ast.items.iter().any(|item| match item {
-        Item::Model(model) => loaded.diagnostics.iter().any(|d| inside(d, model.span)),
-        _ => false,
-    });
+    let gaps = loaded.models().iter().any(|model| loaded.misread(model.span));
     for item in &ast.items {
         match item {
             Item::Model(model) => all.extend(check_model(loaded, sources, model, true)),
@@ -636,11 +645,7 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(lints::check(&system, &types, &loaded.files, physics));
     }
-    let misread = loaded.diagnostics.iter().any(|d| {
-        let (span, place) = (d.span(), model.span);
-        d.is_error() && span.file == file && place.start <= span.start && span.end <= place.end
-    });
-    if misread {
+    if loaded.misread(model.span) {
         // What could not be read is missing elsewhere: say the cause.
         diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
     }

@@ -2,7 +2,8 @@
 //!
 //! In: a model or an experiment, the names of inputs and outputs. Out: a [`Linear`], which gives A, B, C and D at any
 //! point of its block, by the derivative pass. An input that gets its value inside the model is moved by a small amount
-//! that is added to it. Sampled states, regimes and branches are held.
+//! that is added to it. Sampled states, regimes and branches are held. Where parameters are named, P and Q say what small
+//! changes of these do.
 
 use crate::backend::interp::run_once;
 use crate::derive;
@@ -28,6 +29,8 @@ pub struct Ports {
     pub inputs: Vec<String>,
     /// Outputs, or any other quantity.
     pub outputs: Vec<String>,
+    /// Parameters, for P and Q; none unless named.
+    pub params: Vec<String>,
 }
 
 /// Inputs and outputs by path, with the slots of their values.
@@ -132,10 +135,12 @@ pub struct Linear {
     pub inputs: Vec<(String, Quantity)>,
     /// Outputs y: path and quantity.
     pub outputs: Vec<(String, Quantity)>,
+    /// Parameters p that were named and are there.
+    pub params: Vec<Quantity>,
     func: Func,
 }
 
-/// dx/dt = A x + B u, y = C x + D u, around a point; SI. Row by row.
+/// dx/dt = A x + B u + P p, y = C x + D u + Q p, around a point; SI. Row by row.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Matrices {
@@ -143,13 +148,21 @@ pub struct Matrices {
     pub b: Vec<f64>,
     pub c: Vec<f64>,
     pub d: Vec<f64>,
+    pub p: Vec<f64>,
+    pub q: Vec<f64>,
     /// dx/dt at the point itself: 0 at rest.
     pub rates: Vec<f64>,
 }
 
 impl Linear {
-    /// Of a program and its ports.
-    pub fn new(program: &Program, instance: Instance, experiment: Option<Experiment>, ports: &PortSlots) -> Linear {
+    /// Of a program and its ports; `params`: paths of parameters, those that are none being left out.
+    pub fn new(
+        program: &Program,
+        instance: Instance,
+        experiment: Option<Experiment>,
+        ports: &PortSlots,
+        params: &[String],
+    ) -> Linear {
         let description: &Arc<Description> = instance.description();
         let layout = &description.layout;
         let at = |slot: Slot| description.quantities.iter().find(|quantity| quantity.slot == slot).cloned();
@@ -158,8 +171,10 @@ impl Linear {
             ports.iter().filter_map(|(path, slot)| Some((path.clone(), at(*slot)?))).collect()
         };
         let (inputs, outputs) = (with(&ports.0), with(&ports.1));
-        let directions: Vec<Slot> =
-            layout.states.range().map(|slot| Slot(slot as u32)).chain(inputs.iter().map(|(_, q)| q.slot)).collect();
+        let param = |path: &String| description.quantity(path).filter(|quantity| quantity.kind == Kind::Param).cloned();
+        let params: Vec<Quantity> = params.iter().filter_map(param).collect();
+        let of_ports = inputs.iter().map(|(_, quantity)| quantity).chain(&params).map(|quantity| quantity.slot);
+        let directions: Vec<Slot> = layout.states.range().map(|slot| Slot(slot as u32)).chain(of_ports).collect();
         let build = Shared::new(Build::new("linearised").with_pool(description.pool.clone()));
         let of_rates = derive::inline(&build, &program.derivatives, &mut Env::new(), &directions);
         let of_outputs = derive::inline(&build, &program.outputs, &mut Env::new(), &directions);
@@ -178,12 +193,13 @@ impl Linear {
             }
         }
         let func = crate::math::expand(&build.finish());
-        Linear { instance, experiment, states, inputs, outputs, func }
+        Linear { instance, experiment, states, inputs, outputs, params, func }
     }
 
     /// The matrices where the instance is.
     pub fn at(&mut self) -> Matrices {
         let (n, m, p) = (self.states.len(), self.inputs.len(), self.outputs.len());
+        let width = n + m + self.params.len();
         if n > 0 {
             self.instance.call(abi::Function::Derivatives);
         }
@@ -191,9 +207,9 @@ impl Linear {
         let description = self.instance.description().clone();
         let size = description.layout.size();
         let mut block = self.instance.block().to_vec();
-        block.resize(size + (n + p) * (n + m), 0.0);
+        block.resize(size + (n + p) * width, 0.0);
         run_once(&self.func, &mut block, &description.pool);
-        let rows: Vec<&[f64]> = block[size..].chunks_exact((n + m).max(1)).collect();
+        let rows: Vec<&[f64]> = block[size..].chunks_exact(width.max(1)).collect();
         let part =
             |rows: &[&[f64]], from: usize, to: usize| rows.iter().flat_map(|row| &row[from..to]).copied().collect();
         let (above, below) = rows.split_at(n.min(rows.len()));
@@ -202,6 +218,8 @@ impl Linear {
             b: part(above, n, n + m),
             c: part(below, 0, n),
             d: part(below, n, n + m),
+            p: part(above, n + m, width),
+            q: part(below, n + m, width),
             rates: block[description.layout.derivatives.range()].to_vec(),
         }
     }

@@ -82,7 +82,7 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let mut moved = Layout::new(lens);
     // What is delayed is looked up outside, before each evaluation.
     if (1..=MOST_FUSED).contains(&moved.states.len) && description.delays.is_empty() {
-        moved = moved.with_trial();
+        moved = moved.with_trial(description.guards.len() as u32);
     }
     let shift = |slot: Slot| match description.layout.due.contains(slot) {
         true => Slot(slot.0 - description.layout.due.start + moved.due.start),

@@ -122,6 +122,13 @@ impl Loaded {
         FileId(0)
     }
 
+    /// Whether something in this place could not be read.
+    pub fn misread(&self, place: Span) -> bool {
+        self.diagnostics.iter().any(|d| {
+            d.is_error() && place.file == d.span().file && place.start <= d.span().start && d.span().end <= place.end
+        })
+    }
+
     /// Experiments of the asked-for file, in order.
     pub fn experiments(&self) -> Vec<ExperimentInfo> {
         let experiment = |item: &Item| match item {

@@ -1,22 +1,27 @@
-//! One adaptive step, tried: the whole of Rodas5P around a model as one straight-line function.
+//! Adaptive steps: the whole of Rodas5P around a model as one straight-line function, with the choice of the next length.
 //!
-//! In: a [`Program`]. Out: a function over the segment [`Trial`]: from t, h and the states, derivatives and Jacobian at
-//! the start, to the states, derivatives and Jacobian at the end, the course between, the estimated errors and the
-//! switching surfaces on the way. So f and its derivatives at the end share what they have in common and serve the next
-//! step; zeros and constants of the Jacobian are known, so that rows like dx/dt = v cost no division; and nothing goes
-//! through memory between the stages. Chooses no step length and knows no event.
+//! In: a [`Program`]. Out: a function over the segment [`Trial`]: from t, the wanted length, the states, derivatives and
+//! Jacobian at the start, to those at the end, the course between, the estimated errors and the switching surfaces on the
+//! way. So f and its derivatives at the end share what they have in common and serve the next step; zeros and constants
+//! of the Jacobian are known, so that rows like dx/dt = v cost no division; and nothing goes through memory between the
+//! stages. A trial at which nothing happens is settled here, so that a loop around the function makes step after step:
+//! accepted, or refused for its error. What happens at an event is not known here.
 
 use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
-use crate::ir::expr::{Real, Shared};
+use crate::ir::expr::{Int, Real, Shared, Truth};
 use crate::ir::{Func, Op, Unary, Value};
 use crate::math::POOL;
 use crate::program::Program;
 use abi::Slot;
 use abi::description::Segment;
+use abi::pace::{
+    ASKS, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_REFUSED, NEARLY, ROOT_CONSTANT,
+    SAFETY, STIFF,
+};
 use abi::rodas5p::{A, C, D, GAMMA, H, STAGES, W};
-use abi::trial::{Point, Trial};
+use abi::trial::{ATTEND_ASKED, LOOK, PIVOT, Point, Trial};
 use std::collections::HashSet;
 use std::sync::OnceLock;
 
@@ -35,10 +40,11 @@ pub fn rosenbrock(program: &Program) -> Option<Func> {
     }
     let trial = Trial::of(&program.description.layout)?;
     let build = Shared::new(Build::new("rosenbrock").with_pool(program.description.pool.clone()));
-    let singular = Step { program, build: &build, trial }.build();
+    let (singular, look) = Step { program, build: &build, trial }.build();
     let mut build = build.into_inner();
-    let (one, zero) = (build.int(1), build.int(0));
-    let status = build.select(singular, one, zero);
+    let (pivot, looked_at, zero) = (build.int(PIVOT as i64), build.int(LOOK as i64), build.int(0));
+    let why = build.select(singular, pivot, looked_at);
+    let status = build.select(look, why, zero);
     build.status(status);
     // The model's equations stand in the order of the text: a contact that sticks holds by differences that are exactly
     // zero, which neither regrouping nor contraction would keep. What the method adds is contracted: its sums weigh
@@ -97,6 +103,31 @@ pub fn pooled(func: &Func) -> Func {
     build.finish_as(func, &values)
 }
 
+/// How long a step is.
+struct Length<'a> {
+    /// As wanted and allowed, if no stop were near.
+    wanted: Real<'a>,
+    h: Real<'a>,
+    /// Where its last stages are evaluated.
+    end: Real<'a>,
+    /// Whether it reaches the stop.
+    hits: Truth<'a>,
+}
+
+/// A trial from t over h, and what is at its end.
+struct Found<'f, 'a> {
+    t: Real<'a>,
+    h: Real<'a>,
+    end: Real<'a>,
+    wanted: Real<'a>,
+    x: &'f [Real<'a>],
+    f: &'f [Real<'a>],
+    jacobian: &'f [Real<'a>],
+    surfaces: &'f [Real<'a>],
+    /// Rows of ∂f/∂x at its start.
+    rows: &'f [Gradient],
+}
+
 struct Step<'a> {
     program: &'a Program,
     build: &'a Shared,
@@ -104,10 +135,13 @@ struct Step<'a> {
 }
 
 impl<'a> Step<'a> {
-    /// Appends and stores everything; gives whether a pivot is too small.
-    fn build(self) -> Value {
+    /// Appends and stores everything; gives whether a pivot is too small, and whether anybody has to look.
+    fn build(self) -> (Value, Value) {
         let n = self.program.description.layout.states.len as usize;
-        let (t, h, end) = (self.load(self.trial.time()), self.load(self.trial.step()), self.load(self.trial.end()));
+        let t = self.load(self.trial.time());
+        let Length { wanted, h, end, hits } = self.length(t);
+        self.keep(self.trial.step(), h);
+        self.keep(self.trial.end(), end);
         let from = self.trial.from();
         let (x0, f0) = (self.loads(from.states), self.loads(from.derivatives));
         let (rows, df_dt) = self.jacobian(t, &x0, from);
@@ -152,7 +186,9 @@ impl<'a> Step<'a> {
         for (segment, k) in self.trial.course().into_iter().zip(&course) {
             self.store(segment, k);
         }
-        let f1 = self.end(end, &x1, &rows);
+        let (f1, jacobian) = self.end(end, &x1, &rows);
+        let mut met = Truth::from((false, self.build));
+        let mut on_the_way: Vec<Vec<Real>> = Vec::new();
         if let Some(roots) = &self.program.roots {
             let surfaces = self.program.description.layout.roots;
             let half = |i: usize| {
@@ -164,15 +200,19 @@ impl<'a> Step<'a> {
             for (time, x, segment) in at {
                 let mut env = self.env(time, &x);
                 self.build.borrow_mut().inline(roots, &mut env);
-                let values: Vec<Real> = surfaces.range().map(|slot| self.read(Slot(slot as u32), &env)).collect();
+                let values: Vec<Real> = slots(surfaces).map(|slot| self.read(slot, &env)).collect();
                 self.store(segment, &values);
+                on_the_way.push(values);
             }
+            met = self.meets(&on_the_way[0], &on_the_way[1]);
         }
+        self.keep(self.trial.met(), met.choose(1.0, t.constant(0.0)));
 
         // What is allowed to each state, and how much of it the two measures of the error take.
         let tol = self.load(self.trial.tol());
         let scales = self.loads(self.trial.scales());
-        let fastest = self.fastest(h, &rows);
+        let rate = 1.0 / h;
+        let fastest = self.fastest(rate, &rows);
         let (mut worst, mut defect) = (h.constant(0.0), h.constant(0.0));
         let mut finite: Option<Real> = None;
         for i in 0..n {
@@ -181,17 +221,171 @@ impl<'a> Step<'a> {
             let share = 1.0 / (tol * (size + scales[i]));
             let larger = |a: Real<'a>, b: Real<'a>| a.below(b).choose(b, a);
             worst = larger(worst, u[7][i].abs() * share);
-            let slope = (x1[i] - x0[i] - course[0][i] - course[1][i] - course[2][i]) / h;
+            let slope = (x1[i] - x0[i] - course[0][i] - course[1][i] - course[2][i]) * rate;
             defect = larger(defect, (f1[i] - slope).abs() * share);
             finite = Some(finite.map_or(0.0 * x1[i], |sum| sum + 0.0 * x1[i]));
         }
         let defect = defect * (1.0 / fastest.sqrt());
         // Zero times what is not finite is NaN.
         let worst = finite.map_or(worst, |zero| worst + zero);
-        let mut build = self.build.borrow_mut();
-        build.store(self.trial.worst(), worst.value);
-        build.store(self.trial.defect(), defect.value);
-        factors.singular.map_or_else(|| build.truth(false), |singular| singular.value)
+        self.keep(self.trial.worst(), worst);
+        self.keep(self.trial.defect(), defect);
+        let singular = factors.singular.unwrap_or_else(|| Truth::from((false, self.build)));
+        let surfaces = on_the_way.last().map_or(&[][..], |last| last);
+        let point = Found { t, h, end, wanted, x: &x1, f: &f1, jacobian: &jacobian, surfaces, rows: &rows };
+        let look = self.settle(point, worst, defect, met | hits | singular);
+        (singular.value, look.value)
+    }
+
+    /// How long the step is: as wanted, but no longer than allowed, to the stop if that is near, and half the way if the
+    /// stop is less than two steps away.
+    fn length(&self, t: Real<'a>) -> Length<'a> {
+        let left = self.load(self.trial.stop()) - t;
+        let (next, longest) = (self.load(self.trial.next()), self.load(self.trial.longest()));
+        let wanted = next.below(longest).choose(next, longest);
+        let hits = wanted.above(NEARLY * left);
+        let half = HALFWAY * left;
+        let h = hits.choose(left, wanted.above(half).choose(half, wanted));
+        let end = hits.choose(self.load(self.trial.before_stop()), t + h);
+        Length { wanted, h, end, hits }
+    }
+
+    /// Whether a surface is crossed in the middle or at the end, or may be between: there a parabola through the three
+    /// values tells how near it comes.
+    fn meets(&self, middle: &[Real<'a>], last: &[Real<'a>]) -> Truth<'a> {
+        let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
+        let mut met = Truth::from((false, self.build));
+        for (((side, a), b), c) in sides.into_iter().zip(here).zip(middle).zip(last) {
+            let (b, c) = (*b, *c);
+            let stays = (side * b).above(0.0) & (side * c).above(0.0);
+            // Least at θ = rise / bend, where it is a − rise² / bend; nothing is divided.
+            let (rise, bend) = (1.5 * a - 2.0 * b + 0.5 * c, 2.0 * (a - 2.0 * b + c));
+            let steep = bend.abs();
+            let inside = (rise * bend).above(0.0) & rise.abs().below(steep);
+            let least = side * (a * steep - rise * rise.abs());
+            let (size_a, size_b, size_c) = (a.abs(), b.abs(), c.abs());
+            let smaller = size_a.below(size_b).choose(size_a, size_b);
+            let near = 0.2 * smaller.below(size_c).choose(smaller, size_c);
+            let turns = inside & least.below(near * steep);
+            met = met | !stays | turns;
+        }
+        met
+    }
+
+    /// Accepts or refuses the trial, unless somebody has to look, and gives whether; `met`: there is something to see.
+    fn settle(&self, found: Found<'_, 'a>, worst: Real<'a>, defect: Real<'a>, met: Truth<'a>) -> Truth<'a> {
+        let trial = self.trial;
+        let Found { t, h, end, wanted, .. } = found;
+        let below_one = !worst.above(1.0);
+        let error = (below_one & worst.below(defect)).choose(defect, worst);
+        let fine = !error.above(1.0);
+        let accepted = self.load(trial.accepted()) + 1.0;
+
+        // The next length, by Gustafsson's predictive control.
+        let error = error.below(LEAST_ERROR).choose(LEAST_ERROR, error);
+        let inverse = self.inverse_fifth_root(error);
+        let plain = SAFETY * inverse;
+        let square = inverse * inverse;
+        let (last_step, last_root) = (self.load(trial.last_step()), self.load(trial.last_root()));
+        // What the error did from step to step, it will do again.
+        let foretold = (SAFETY * (h / last_step) * last_root) * square;
+        let part = (last_step.above(0.0) & foretold.below(plain)).choose(foretold, plain);
+        let rejected = self.load(trial.rejected());
+        let part = (rejected.above(0.0) & part.above(1.0)).choose(1.0, part);
+        let part = part.below(LEAST_GAIN).choose(LEAST_GAIN, part);
+        let part = part.above(GREATEST_GAIN).choose(GREATEST_GAIN, part);
+        let longer = part * h;
+        let longer = (h.below(wanted) & longer.below(wanted)).choose(wanted, longer);
+        let root = error * (square * square);
+        let root = root.below(LEAST_ROOT).choose(LEAST_ROOT, root);
+        let less = plain.below(LEAST_GAIN).choose(LEAST_GAIN, plain);
+        let shorter = less.above(MOST_REFUSED).choose(MOST_REFUSED, less) * h;
+        let next = fine.choose(longer, shorter);
+
+        // Whether the method suits is asked now and then, where its mean eigenvalue does not say so.
+        let part = (1.0 / f64::from(ASKS)) * accepted;
+        let n = found.x.len() as u32;
+        // Their mean, and that of their squares, are known from the matrix and its square.
+        let (mut trace, mut squares) = (h.constant(0.0), h.constant(0.0));
+        for (i, row) in found.rows.iter().enumerate() {
+            for (j, entry) in row.iter().filter(|(j, _)| *j <= i as u32) {
+                let (entry, other) = (h.same(*entry), derive::entry(&found.rows[*j as usize], i as u32));
+                trace = if *j == i as u32 { trace + entry } else { trace };
+                let twice = if *j == i as u32 { 1.0 } else { 2.0 };
+                squares = other.map_or(squares, |other| squares + twice * (entry * h.same(other)));
+            }
+        }
+        let stiff = (h * trace.abs()).above(STIFF * f64::from(n))
+            | ((h * h) * squares.abs()).above(STIFF * STIFF * f64::from(n));
+        let attend = self.load(trial.attend());
+        let asked = part.floor().is(part) & (!stiff | attend.above(0.0));
+        let outside = self.outside(end, found.x);
+        self.keep(trial.outside(), outside.choose(1.0, t.constant(0.0)));
+        let stop = self.load(trial.stop());
+        let now = t + h;
+        let least = LEAST_STEP * stop.abs();
+        let seen = met
+            | attend.above(ATTEND_ASKED)
+            | !error.finite()
+            | next.below(least)
+            | (fine & (asked | outside | !now.below(self.load(trial.watched()))))
+            | (fine & (stop - now).below(4.0 * least));
+        let goes = fine & !seen;
+
+        let (from, accepted_before, refused) = (trial.from(), self.load(trial.accepted()), self.load(trial.refused()));
+        let varies = self.varies(end, found.x);
+        let settled = |slot: Slot, new: Real<'a>| {
+            let new = if varies[new.value.index()] { goes.choose(new, self.load(slot)) } else { new };
+            self.keep(slot, new);
+        };
+        self.keep(trial.time(), goes.choose(now, t));
+        self.keep(trial.last_step(), goes.choose(h, last_step));
+        self.keep(trial.last_root(), goes.choose(root, last_root));
+        self.keep(trial.accepted(), goes.choose(accepted, accepted_before));
+        self.keep(trial.next(), seen.choose(self.load(trial.next()), next));
+        self.keep(trial.rejected(), seen.choose(rejected, fine.choose(0.0, h.constant(1.0))));
+        self.keep(trial.refused(), (fine | seen).choose(refused, refused + 1.0));
+        let point = [(from.states, found.x), (from.derivatives, found.f), (from.jacobian, found.jacobian)];
+        for (segment, new) in point.into_iter().chain([(trial.here(), found.surfaces)]) {
+            slots(segment).zip(new).for_each(|(slot, new)| settled(slot, *new));
+        }
+        seen
+    }
+
+    /// Whether a quantity that is watched is not fine where the step ends.
+    fn outside(&self, end: Real<'a>, x: &[Real<'a>]) -> Truth<'a> {
+        let guards = &self.program.description.guards;
+        let mut env = self.env(end, x);
+        let mut fine = Truth::from((true, self.build));
+        if guards.iter().any(|guard| !self.program.description.layout.states.contains(guard.slot)) {
+            let status = self.build.borrow_mut().inline(&self.program.outputs, &mut env);
+            fine = status.map_or(fine, |status| Int::new(self.build, status).is(0));
+        }
+        let mut zero = end.constant(0.0);
+        for ((guard, low), high) in guards.iter().zip(self.loads(self.trial.lows())).zip(self.loads(self.trial.highs()))
+        {
+            let value = self.read(guard.slot, &env);
+            // Of what is not finite this is NaN, and so is the sum.
+            zero = value.fma(0.0, zero);
+            fine = fine & !value.below(low) & !value.above(high);
+        }
+        !(fine & zero.is(0.0))
+    }
+
+    /// x^(−1/5) of a positive number to four digits, by Newton's method from its exponent: no division, since the next
+    /// step waits for it. As [`abi::pace::inverse_fifth_root`] to the bit.
+    fn inverse_fifth_root(&self, x: Real<'a>) -> Real<'a> {
+        let bits = x.bits();
+        let mut fifth = bits.shift_right(3) + bits.shift_right(4);
+        for n in [4, 8, 16] {
+            fifth = fifth + fifth.shift_right(n);
+        }
+        let mut y = (Int::from((ROOT_CONSTANT, self.build)) - fifth).real_of_bits();
+        for _ in 0..2 {
+            let square = y * y;
+            y = y * (1.2 - (0.2 * x * y) * (square * square));
+        }
+        y
     }
 
     /// State i at which a stage evaluates f; `last` is that of the stage before.
@@ -228,20 +422,21 @@ impl<'a> Step<'a> {
         (rows, df_dt)
     }
 
-    /// Stores f and the Jacobian at the end; gives f.
-    fn end(&self, t: Real<'a>, x: &[Real<'a>], at_start: &[Gradient]) -> Vec<Real<'a>> {
+    /// Stores f and the Jacobian at the end; gives both.
+    fn end(&self, t: Real<'a>, x: &[Real<'a>], at_start: &[Gradient]) -> (Vec<Real<'a>>, Vec<Real<'a>>) {
         let (n, to) = (x.len(), self.trial.to());
         let (f, gradients) = self.gradients(t, x);
         debug_assert_eq!(gradients.len(), at_start.len());
         self.store(to.derivatives, &f);
+        let mut jacobian = vec![t.constant(0.0); n * n + n];
         for (i, gradient) in gradients.iter().enumerate() {
             for j in 0..=n {
-                let value = derive::entry(gradient, j as u32).unwrap_or_else(|| self.build.borrow_mut().real(0.0));
                 let entry = if j < n { i * n + j } else { n * n + i };
-                self.build.borrow_mut().store(to.jacobian.slot(entry), value);
+                jacobian[entry] = derive::entry(gradient, j as u32).map_or(jacobian[entry], |value| t.same(value));
             }
         }
-        f
+        self.store(to.jacobian, &jacobian);
+        (f, jacobian)
     }
 
     /// f, and for each state its derivatives along the states and, as the last direction, time.
@@ -269,12 +464,12 @@ impl<'a> Step<'a> {
     }
 
     /// The square of the fastest frequency that the Jacobian knows: exact for a mass on a spring, and for what decays.
-    fn fastest(&self, h: Real<'a>, rows: &[Gradient]) -> Real<'a> {
-        let mut fastest = 1.0 / (h * h);
+    fn fastest(&self, rate: Real<'a>, rows: &[Gradient]) -> Real<'a> {
+        let mut fastest = rate * rate;
         for (i, row) in rows.iter().enumerate() {
             for (j, entry) in row.iter().filter(|(j, _)| *j as usize <= i) {
                 let Some(other) = derive::entry(&rows[*j as usize], i as u32) else { continue };
-                let square = (h.same(*entry) * h.same(other)).abs();
+                let square = (rate.same(*entry) * rate.same(other)).abs();
                 fastest = fastest.below(square).choose(square, fastest);
             }
         }
@@ -304,9 +499,11 @@ impl<'a> Step<'a> {
     }
 
     fn store(&self, segment: Segment, values: &[Real<'a>]) {
-        for (slot, value) in slots(segment).zip(values) {
-            self.build.borrow_mut().store(slot, value.value);
-        }
+        slots(segment).zip(values).for_each(|(slot, value)| self.keep(slot, *value));
+    }
+
+    fn keep(&self, slot: Slot, value: Real<'a>) {
+        self.build.borrow_mut().store(slot, value.value);
     }
 }
 
@@ -464,19 +661,25 @@ experiment waves { run Waves() for 1 s }
                 let size = if name == "waves" { 1.0 } else { [1e-2, 1e-3, 1e-5][case % 3] };
                 let x0: Vec<f64> = (0..n).map(|_| random.within(-size, size)).collect();
                 let (t, h) = (random.within(0.0, 2.0), [1e-2, 1e-4, 1e-6][case % 3]);
-                let end = (t + h).next_down();
+                let (h, end) = ((t + h) - t, (t + h).next_down());
                 let u = stages(&mut plain, t, h, end, &x0);
                 let mut block = plain.block.clone();
                 let set = |block: &mut Vec<f64>, slot: Slot, value| block[slot.index()] = value;
                 set(&mut block, trial.time(), t);
-                set(&mut block, trial.step(), h);
-                set(&mut block, trial.end(), end);
+                set(&mut block, trial.next(), h);
+                set(&mut block, trial.longest(), 1.0);
+                set(&mut block, trial.stop(), t + h);
+                set(&mut block, trial.before_stop(), end);
+                set(&mut block, trial.watched(), f64::INFINITY);
                 set(&mut block, trial.tol(), 1e-6);
                 block[trial.scales().range()].fill(1.0);
                 block[trial.from().states.range()].copy_from_slice(&x0);
                 block[trial.from().derivatives.range()].copy_from_slice(&plain.f(t, &x0));
                 block[trial.from().jacobian.range()].copy_from_slice(&plain.jacobian(t, &x0));
-                assert_eq!(run_once(&func, &mut block, &program.description.pool), 0, "{name} {case}");
+                let from = block[trial.from().whole().range()].to_vec();
+                assert_eq!(run_once(&func, &mut block, &program.description.pool), LOOK, "{name} {case}");
+                assert_eq!(block[trial.from().whole().range()], from[..], "{name} {case}: nothing is settled");
+                assert_eq!((block[trial.step().index()], block[trial.end().index()]), (h, end), "{name} {case}");
                 let found = |segment: Segment| &block[segment.range()];
                 let x1 = found(trial.to().states).to_vec();
                 let most = |i: usize| u.iter().map(|u| u[i].abs()).fold(1e-9 * x0[i].abs() + 1e-15, f64::max);
@@ -538,19 +741,42 @@ experiment waves { run Waves() for 1 s }
         block[trial.from().states.range()].copy_from_slice(&x0);
         block[trial.from().derivatives.range()].copy_from_slice(&f);
         block[trial.from().jacobian.range()].copy_from_slice(&jacobian);
-        for step in 0..500 {
-            let t = 1e-4 * f64::from(step);
-            for (slot, value) in [(trial.time(), t), (trial.step(), 1e-4), (trial.end(), t + 1e-4)] {
-                block[slot.index()] = value;
-            }
+        let numbers = [
+            (trial.next(), 1e-4),
+            (trial.longest(), 0.1),
+            (trial.stop(), 20.0),
+            (trial.before_stop(), 20f64.next_down()),
+        ];
+        numbers.into_iter().for_each(|(slot, value)| block[slot.index()] = value);
+        block[trial.watched().index()] = f64::INFINITY;
+        block[trial.lows().range()].fill(f64::NEG_INFINITY);
+        block[trial.highs().range()].fill(f64::INFINITY);
+        let (mut settled, mut left) = (0.0, 0);
+        for _ in 0..200 {
             let mut other = block.clone();
-            assert_eq!(machine.call(Function::Rosenbrock, &mut block, pool, 1), 0);
-            assert_eq!(reference.call(Function::Rosenbrock, &mut other, pool, 1), 0);
+            let status = machine.call(Function::Rosenbrock, &mut block, pool, 7);
+            assert_eq!(reference.call(Function::Rosenbrock, &mut other, pool, 7), status);
             for (slot, (a, b)) in block.iter().zip(&other).enumerate() {
-                assert_eq!(a.to_bits(), b.to_bits(), "step {step}, slot {slot} of {trial:?}: {a} and {b}");
+                assert_eq!(a.to_bits(), b.to_bits(), "slot {slot} of {trial:?}: {a} and {b}");
             }
-            block.copy_within(trial.to().whole().range(), trial.from().states.start as usize);
+            // What is left is settled by force.
+            settled = block[trial.accepted().index()];
+            if status == 0 {
+                continue;
+            }
+            left += 1;
+            block[trial.accepted().index()] += 1.0;
+            if block[trial.worst().index()].max(block[trial.defect().index()]) > 1.0 {
+                block[trial.next().index()] = 0.3 * block[trial.step().index()];
+            } else {
+                block.copy_within(trial.to().whole().range(), trial.from().states.start as usize);
+                block[trial.time().index()] = block[trial.end().index()];
+                for ((last, here), side) in trial.last().range().zip(trial.here().range()).zip(trial.sides().range()) {
+                    (block[here], block[side]) = (block[last], block[last].signum());
+                }
+            }
         }
-        assert!(block.iter().all(|x| x.is_finite()));
+        assert!(settled > 300.0 && left > 3, "{settled} settled, {left} left");
+        assert!(block[trial.from().whole().range()].iter().all(|x| x.is_finite()));
     }
 }

@@ -12,6 +12,7 @@ use crate::lower::formulas;
 use crate::source::Files;
 use crate::system::*;
 use abi::description::{Guard, Kind, Quantity};
+use abi::lanes::Lanes;
 use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot};
 use abi::table::Code;
 use abi::unit::Unit;
@@ -31,6 +32,7 @@ pub struct Varying {
     description: Arc<Description>,
     params: Vec<f64>,
     code: Code,
+    lanes: Option<Lanes>,
     formulas: Func,
     size: usize,
     /// What the values of the formulas are for, in their order.
@@ -68,7 +70,14 @@ pub struct Fitted {
 
 impl Varying {
     /// From what was read, and its code.
-    pub fn new(variant: Variant, vary: &[String], files: &Files, code: Code, notes: Vec<String>) -> Varying {
+    pub fn new(
+        variant: Variant,
+        vary: &[String],
+        files: &Files,
+        code: Code,
+        lanes: Option<Lanes>,
+        notes: Vec<String>,
+    ) -> Varying {
         let Variant { label, system, types, program, mut experiment, places, .. } = variant;
         let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
         let (mut exprs, mut uses) = (Vec::new(), Vec::new());
@@ -138,11 +147,17 @@ impl Varying {
             description: Arc::new(program.description),
             params: program.params,
             code,
+            lanes,
             formulas,
             size,
             uses,
             expects,
         }
+    }
+
+    /// The code that makes steps of many runs at once, if there is such.
+    pub fn lanes(&self) -> Option<&Lanes> {
+        self.lanes.as_ref()
     }
 
     /// The parameter of this path, if a run can be given another value for it.

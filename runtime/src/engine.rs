@@ -4,19 +4,17 @@
 //! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
 //! writes no file: whoever calls may look at the fraction done and stop the run.
 
+use crate::course::{self, Course, Rest};
 use crate::dry;
-use crate::observe::{Observer, Probe, check_finite, check_status};
+use crate::fixed::Fixed;
+use crate::observe::{Observer, Probe};
 use crate::outcome::Stop;
 pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
 use crate::record::Recording;
-use crate::show;
-use crate::solver::adaptive;
+use crate::solver::adaptive::Adaptive;
 use abi::description::Kind;
 use abi::plan::{Experiment, Method};
 use abi::{Instance, Slot};
-
-/// Fixed steps between two looks at the caller and at the whole block.
-const BATCH: u64 = 4096;
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
 ///
@@ -51,14 +49,8 @@ pub fn run_on(
     begin: &mut dyn FnMut(&mut Instance),
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> (Instance, Result<Outcome, Failure>) {
-    let mut run = Run::new(instance, experiment);
-    let result = run.go(begin, watch);
-    let instance = run.instance.clone();
-    let result = match result {
-        Ok(()) => Ok(run.outcome()),
-        Err(stop) => Err(Failure { cause: stop.cause, time: stop.time, recording: run.observer.recorder.recording() }),
-    };
-    (instance, result)
+    let (rest, result) = go(instance, experiment, Observer::new(experiment), begin, watch);
+    (rest.instance.clone(), ended(rest, result))
 }
 
 /// Values of `slots` at instants in s, ascending, row by row: the rows up to where the run came, and how it ended. An
@@ -74,139 +66,79 @@ pub fn sample(
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> (Vec<f64>, Result<(), Failure>) {
     let bare = Experiment { plots: Vec::new(), expects: Vec::new(), ..experiment.clone() };
-    let mut run = Run::new(instance, &bare);
-    run.observer.probe = Probe::new(instants, slots);
-    let result = run.go(&mut |_| (), watch);
+    let mut observer = Observer::new(&bare);
+    observer.probe = Probe::new(instants, slots);
+    let (rest, result) = go(instance, &bare, observer, &mut |_| (), watch);
     let failed = |stop: Stop| Failure { cause: stop.cause, time: stop.time, recording: Recording::default() };
-    (run.observer.probe.values(), result.map_err(failed))
+    (rest.observer.probe.values(), result.map_err(failed))
 }
 
-/// A run under way.
-struct Run<'a> {
+/// A run to its end or to the reason why not.
+fn go(
     instance: Instance,
-    experiment: &'a Experiment,
+    experiment: &Experiment,
     observer: Observer,
-    work: Work,
-    notes: Vec<String>,
+    begin: &mut dyn FnMut(&mut Instance),
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> (Rest, Result<(), Stop>) {
+    let duration = experiment.duration;
+    assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
+    if let Some(bench) = &experiment.bench {
+        let mut rest = Rest::of(instance, observer);
+        let result = dry::run(&mut rest.instance, bench, experiment, &mut rest.observer, &mut rest.work, watch);
+        return (rest, result);
+    }
+    match start(instance, experiment, observer, begin) {
+        Ok(mut course) => {
+            let result = course::alone(&mut *course, watch);
+            (course.rest(), result)
+        }
+        Err(failed) => {
+            let (rest, stop) = *failed;
+            (rest, Err(stop))
+        }
+    }
 }
 
-impl<'a> Run<'a> {
-    fn new(instance: Instance, experiment: &'a Experiment) -> Run<'a> {
-        let observer = Observer::new(experiment);
-        Run { instance, experiment, observer, work: Work::default(), notes: Vec::new() }
+/// Starts a run. `begin` sees the instance at t = 0 and may put its states elsewhere.
+///
+/// # Errors
+/// What is left of a run that did not begin, and why. In boxes, since it is rare.
+pub(crate) fn start(
+    instance: Instance,
+    experiment: &Experiment,
+    observer: Observer,
+    begin: &mut dyn FnMut(&mut Instance),
+) -> Result<Box<dyn Course>, Box<(Rest, Stop)>> {
+    match experiment.solver.method {
+        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+            Ok(Box::new(Fixed::start(instance, experiment, observer, begin)?))
+        }
+        Method::Adaptive => Ok(Box::new(Adaptive::start(instance, experiment, observer, begin)?)),
     }
+}
 
-    fn go(&mut self, begin: &mut dyn FnMut(&mut Instance), watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
-        let duration = self.experiment.duration;
-        assert!(duration >= 0.0 && duration.is_finite(), "a run of {duration} s");
-        if let Some(bench) = &self.experiment.bench {
-            return dry::run(&mut self.instance, bench, self.experiment, &mut self.observer, &mut self.work, watch);
-        }
-        match self.experiment.solver.method {
-            Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => self.fixed(begin, watch),
-            Method::Adaptive => {
-                adaptive::run(&mut self.instance, self.experiment, &mut self.observer, &mut self.work, begin, watch)
-            }
-        }
+/// What became of a run.
+pub(crate) fn ended(rest: Rest, result: Result<(), Stop>) -> Result<Outcome, Failure> {
+    let Rest { instance, observer, work, notes } = rest;
+    if let Err(stop) = result {
+        return Err(Failure { cause: stop.cause, time: stop.time, recording: observer.recorder.recording() });
     }
-
-    /// A whole number of fixed steps.
-    fn fixed(
-        &mut self,
-        begin: &mut dyn FnMut(&mut Instance),
-        watch: &mut dyn FnMut(f64) -> Continue,
-    ) -> Result<(), Stop> {
-        let step = self.experiment.solver.step;
-        assert!(step > 0.0 && step.is_finite(), "a step of {step} s");
-        let total = (self.experiment.duration / step).round() as u64;
-        let end = total as f64 * step;
-        if (end - self.experiment.duration).abs() > 1e-9 * self.experiment.duration {
-            self.notes.push(format!("The run ends at {}, after a whole number of steps.", show::time(end)));
-        }
-        let each = !self.observer.only_last() || self.observer.probe.next().is_some();
-        let status = self.instance.start(step);
-        begin(&mut self.instance);
-        check_status(&self.instance, status)?;
-        check_finite(&self.instance)?;
-        self.observer.see(&self.instance)?;
-        self.probe(step);
-        let mut saved = self.instance.block().to_vec();
-        while self.work.steps < total {
-            let count = BATCH.min(total - self.work.steps);
-            saved.copy_from_slice(self.instance.block());
-            let status = if each { self.seen_steps(step, count)? } else { self.instance.advance(count) };
-            // In a batch, what was not finite may have become so many steps ago, and may be why a guard fired.
-            if check_finite(&self.instance).is_err() {
-                self.instance.block_mut().copy_from_slice(&saved);
-                return Err(self.first_not_finite(count));
-            }
-            if status != 0 {
-                // The step that went too far is worth seeing.
-                if !each {
-                    self.observer.see(&self.instance)?;
-                }
-                check_status(&self.instance, status)?;
-            }
-            self.work.steps += count;
-            if watch(self.work.steps as f64 / total as f64).is_break() {
-                return Err(Stop { cause: Cause::Stopped, time: self.instance.get(Slot::TIME) });
-            }
-        }
-        if !each {
-            self.observer.see(&self.instance)?;
-        }
-        Ok(())
-    }
-
-    /// Steps one by one, each shown; returns the first status that is not 0.
-    fn seen_steps(&mut self, step: f64, count: u64) -> Result<u64, Stop> {
-        for _ in 0..count {
-            let status = self.instance.advance(1);
-            self.observer.see(&self.instance)?;
-            self.probe(step);
-            if status != 0 {
-                return Ok(status);
-            }
-        }
-        Ok(0)
-    }
-
-    /// Keeps what is wanted at an instant that this step is nearest to.
-    fn probe(&mut self, step: f64) {
-        let time = self.instance.get(Slot::TIME);
-        while self.observer.probe.next().is_some_and(|instant| instant < time + 0.5 * step) {
-            self.observer.probe.take(self.instance.block());
-        }
-    }
-
-    /// Repeats the last batch step by step up to where a state or output is not finite.
-    fn first_not_finite(&mut self, count: u64) -> Stop {
-        for _ in 0..count {
-            self.instance.advance(1);
-            if let Err(stop) = check_finite(&self.instance) {
-                return stop;
-            }
-        }
-        unreachable!("the same {count} steps gave a value that is not finite before")
-    }
-
-    fn outcome(self) -> Outcome {
-        let outputs = self.instance.description().quantities.iter().filter(|quantity| quantity.kind == Kind::Output);
-        let finals = outputs.map(|quantity| Final {
-            path: quantity.path.clone(),
-            value: self.instance.get(quantity.slot),
-            unit: quantity.unit.clone(),
-            boolean: quantity.boolean,
-        });
-        Outcome {
-            verdicts: self.observer.expectations.verdicts(),
-            recording: self.observer.recorder.recording(),
-            finals: finals.collect(),
-            time: self.instance.get(Slot::TIME),
-            work: self.work,
-            notes: self.notes,
-        }
-    }
+    let outputs = instance.description().quantities.iter().filter(|quantity| quantity.kind == Kind::Output);
+    let finals = outputs.map(|quantity| Final {
+        path: quantity.path.clone(),
+        value: instance.get(quantity.slot),
+        unit: quantity.unit.clone(),
+        boolean: quantity.boolean,
+    });
+    Ok(Outcome {
+        verdicts: observer.expectations.verdicts(),
+        recording: observer.recorder.recording(),
+        finals: finals.collect(),
+        time: instance.get(Slot::TIME),
+        work,
+        notes,
+    })
 }
 
 #[cfg(test)]

@@ -17,6 +17,9 @@ mod outcome;
 
 mod observe;
 
+mod course;
+mod fixed;
+
 mod solver;
 
 pub mod lag;
@@ -25,6 +28,7 @@ mod dry;
 
 pub mod engine;
 pub mod steady;
+pub mod lanes;
 pub mod sweep;
 
 pub mod blob;

@@ -34,6 +34,11 @@ impl Probe {
         Probe { instants: instants.to_vec(), slots: slots.to_vec(), values: Vec::new() }
     }
 
+    /// The slots that are wanted.
+    pub(crate) fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+
     /// The next instant, in s.
     pub(crate) fn next(&self) -> Option<f64> {
         let row = if self.slots.is_empty() { return None } else { self.values.len() / self.slots.len() };

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Condvar, Mutex};
+use std::sync::{Condvar, Mutex, MutexGuard};
 use std::time::Duration;
 
 /// One run of a sweep.
@@ -49,73 +49,112 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
     cases.par_iter().with_max_len(1).map(run).collect()
 }
 
-/// Results that wait for an earlier one, at most, for each thread.
-const WAITING: u64 = 64;
+/// Results that wait for an earlier one, at most, for each thread: more than there are lanes.
+const WAITING: u64 = 128;
 
-/// Does `job` for each number of a range on `threads` threads and hands the results to `take` one by one in their order,
-/// as soon as they are there. Memory is bounded: nobody runs far ahead of the slowest. Ends early where `take` says so,
-/// or where a job gives nothing because it was stopped.
+/// Where workers get the numbers of what is to be done, and hand in what came of it.
+pub struct Desk<T> {
+    state: Mutex<State<T>>,
+    room: Condvar,
+    news: Condvar,
+    /// Results that wait for an earlier one, at most.
+    most: u64,
+    end: u64,
+}
+
+struct State<T> {
+    next: u64,
+    taken: u64,
+    waiting: BTreeMap<u64, Option<T>>,
+    closed: bool,
+}
+
+/// What there is to do.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Ticket {
+    /// This.
+    Number(u64),
+    /// Nothing before an earlier number is handed in.
+    Later,
+    /// Nothing any more.
+    Nothing,
+}
+
+impl<T> Desk<T> {
+    fn state(&self) -> MutexGuard<'_, State<T>> {
+        self.state.lock().expect("nobody panics at the desk")
+    }
+
+    /// The next number. Who has others under way gets [`Ticket::Later`] rather than waiting for one of them.
+    pub fn number(&self, has_others: bool) -> Ticket {
+        let mut state = self.state();
+        while state.next >= state.taken + self.most && !state.closed {
+            if has_others {
+                return Ticket::Later;
+            }
+            state = self.room.wait(state).expect("nobody panics at the desk");
+        }
+        if state.closed || state.next >= self.end {
+            return Ticket::Nothing;
+        }
+        state.next += 1;
+        Ticket::Number(state.next - 1)
+    }
+
+    /// What came of a number; nothing if it was stopped.
+    pub fn hand_in(&self, number: u64, result: Option<T>) {
+        self.state().waiting.insert(number, result);
+        self.news.notify_one();
+    }
+}
+
+/// Lets `worker` work on `threads` threads until all numbers of a range are done, and hands the results to `take` one by one
+/// in their order, as soon as they are there. Memory is bounded: nobody runs far ahead of the slowest. Ends early where
+/// `take` says so, or where a number came to nothing because it was stopped.
 pub fn ordered<T: Send>(
     numbers: Range<u64>,
     threads: usize,
-    job: &(dyn Fn(u64) -> Option<T> + Sync),
+    worker: &(dyn Fn(&Desk<T>) + Sync),
     take: &mut dyn FnMut(u64, T) -> Continue,
 ) {
-    struct Desk<T> {
-        next: u64,
-        taken: u64,
-        waiting: BTreeMap<u64, Option<T>>,
-        closed: bool,
-    }
-    let desk = Mutex::new(Desk { next: numbers.start, taken: numbers.start, waiting: BTreeMap::new(), closed: false });
-    let (room, news) = (Condvar::new(), Condvar::new());
+    let state = State { next: numbers.start, taken: numbers.start, waiting: BTreeMap::new(), closed: false };
     let most = WAITING * threads.max(1) as u64;
-    let work = || {
-        loop {
-            let number = {
-                let mut desk = desk.lock().expect("nobody panics at the desk");
-                while desk.next >= desk.taken + most && !desk.closed {
-                    desk = room.wait(desk).expect("nobody panics at the desk");
-                }
-                if desk.closed || desk.next >= numbers.end {
-                    return;
-                }
-                desk.next += 1;
-                desk.next - 1
-            };
-            let result = job(number);
-            desk.lock().expect("nobody panics at the desk").waiting.insert(number, result);
-            news.notify_one();
-        }
-    };
+    let desk = Desk { state: Mutex::new(state), room: Condvar::new(), news: Condvar::new(), most, end: numbers.end };
     std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(work)).collect();
+        let workers: Vec<_> = (0..threads.max(1)).map(|_| scope.spawn(|| worker(&desk))).collect();
         let mut number = numbers.start;
         while number < numbers.end {
             let result = {
-                let mut desk = desk.lock().expect("nobody panics at the desk");
+                let mut state = desk.state();
                 loop {
-                    if let Some(result) = desk.waiting.remove(&number) {
-                        desk.taken = number + 1;
+                    if let Some(result) = state.waiting.remove(&number) {
+                        state.taken = number + 1;
                         break result;
                     }
                     // A worker that panicked brings no more news: its panic is handed on by the scope.
-                    if workers.iter().any(|worker| worker.is_finished()) && desk.next < numbers.end {
+                    if workers.iter().any(|worker| worker.is_finished()) && state.next < numbers.end {
                         break None;
                     }
-                    desk = news.wait_timeout(desk, Duration::from_millis(200)).expect("nobody panics at the desk").0;
+                    state = desk.news.wait_timeout(state, Duration::from_millis(200)).expect("nobody panics").0;
                 }
             };
-            room.notify_all();
+            desk.room.notify_all();
             let Some(result) = result else { break };
             if take(number, result).is_break() {
                 break;
             }
             number += 1;
         }
-        desk.lock().expect("nobody panics at the desk").closed = true;
-        room.notify_all();
+        desk.state().closed = true;
+        desk.room.notify_all();
     });
+}
+
+/// A worker that does one job after the other.
+pub fn one_by_one<T>(desk: &Desk<T>, job: &dyn Fn(u64) -> Option<T>) {
+    while let Ticket::Number(number) = desk.number(false) {
+        desk.hand_in(number, job(number));
+    }
 }
 
 #[cfg(test)]
@@ -133,7 +172,7 @@ mod tests {
                 });
                 Some(n * n)
             };
-            ordered(3..1000, threads, &job, &mut |n, square| {
+            ordered(3..1000, threads, &|desk| one_by_one(desk, &job), &mut |n, square| {
                 seen.push((n, square));
                 Continue::Continue(())
             });
@@ -144,18 +183,18 @@ mod tests {
     #[test]
     fn what_is_done_is_kept_when_somebody_stops() {
         let mut seen = 0;
-        ordered(0..1_000_000, 3, &Some, &mut |n, _| {
+        ordered(0..1_000_000, 3, &|desk| one_by_one(desk, &Some), &mut |n, _| {
             seen = n + 1;
             if n == 500 { Continue::Break(()) } else { Continue::Continue(()) }
         });
         assert_eq!(seen, 501);
         let mut seen = 0;
-        ordered(0..1_000_000, 3, &|n| (n < 700).then_some(n), &mut |n, _| {
+        ordered(0..1_000_000, 3, &|desk| one_by_one(desk, &|n| (n < 700).then_some(n)), &mut |n, _| {
             seen = n + 1;
             Continue::Continue(())
         });
         assert_eq!(seen, 700);
-        ordered(5..5, 2, &Some, &mut |_, _| unreachable!("there is nothing to do"));
+        ordered(5..5, 2, &|desk| one_by_one(desk, &Some), &mut |_, _| unreachable!("there is nothing to do"));
     }
     use crate::engine::Cause;
     use crate::models::{Model, fixed, plot, reading};

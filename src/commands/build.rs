@@ -74,6 +74,12 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     if !found.is_empty() {
         reported(&loaded, &found, terminal);
     }
+    let delays = &built.program.description.delays;
+    if args.stepped.step.is_none() && compile::unsized_delays(&built, args.stepped.solver) {
+        let each = if delays.len() == 1 { "a `delay`".into() } else { format!("{} `delay`s", delays.len()) };
+        terminal.error(&format!("`{name}` has {each}: how much of the past is kept depends on the step; give it with --step, such as --step 1ms"));
+        return End::Misused;
+    }
     let bytes = match compile::emit(&built, emit, args.stepped.solver, args.target, &args.features) {
         Ok(bytes) => bytes,
         Err(why) => {

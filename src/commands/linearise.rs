@@ -1,4 +1,4 @@
-//! `fric linearise`: A, B, C, D at a point, and the modes of A.
+//! `fric linearise`: A, B, C, D at a point, and the modes of A; P and Q, how rates and outputs depend on parameters.
 
 use super::{End, load, reported};
 use crate::args::Linearise;
@@ -18,7 +18,7 @@ use std::f64::consts::TAU;
 
 pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(&args.file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
-    let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone() };
+    let ports = Ports { inputs: args.inputs.clone(), outputs: args.outputs.clone(), params: args.params.clone() };
     let changes = Changes { ports: Some(ports), ..args.set.changes() };
     let options = Options { changes, ..Options::default() };
     let mut linear = match compile::linear(&mut loaded, &project::Disk, &args.name, &options, &mut Vec::new()) {
@@ -28,12 +28,19 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
+    if let Some(unknown) = args.params.iter().find(|path| !linear.params.iter().any(|param| param.path == **path)) {
+        let known = linear.movable().filter(|quantity| quantity.kind == Kind::Param);
+        let help = compile::nearest(unknown, known.map(|quantity| quantity.path.as_str()));
+        let help = help.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
+        terminal.error(&format!("there is no parameter `{unknown}`{help}"));
+        return End::Failed;
+    }
     if let Err(message) = go_to_point(&mut linear, args) {
         terminal.error(&message);
         return End::Failed;
     }
     let found = linear.at();
-    let all = [&found.a, &found.b, &found.c, &found.d];
+    let all = [&found.a, &found.b, &found.c, &found.d, &found.p, &found.q];
     if !all.iter().all(|matrix| matrix.iter().all(|entry| entry.is_finite())) {
         terminal.error("the derivatives are not finite at this point; give another one with --at");
         return End::Failed;
@@ -145,15 +152,20 @@ fn given(quantity: &Quantity, text: &str) -> Result<f64, String> {
     }
 }
 
-fn named<'a>(linear: &Linear, found: &'a Matrices) -> [Matrix<'a>; 4] {
-    let (n, m, p) = (linear.states.len(), linear.inputs.len(), linear.outputs.len());
+/// P and Q only if parameters were named.
+fn named<'a>(linear: &Linear, found: &'a Matrices) -> Vec<Matrix<'a>> {
+    let (n, m, p, q) = (linear.states.len(), linear.inputs.len(), linear.outputs.len(), linear.params.len());
     let matrix = |name, rows, columns, values| Matrix { name, rows, columns, values };
-    [
+    let mut all = vec![
         matrix("A", n, n, &found.a[..]),
         matrix("B", n, m, &found.b),
         matrix("C", p, n, &found.c),
         matrix("D", p, m, &found.d),
-    ]
+    ];
+    if q > 0 {
+        all.extend([matrix("P", n, q, &found.p), matrix("Q", p, q, &found.q)]);
+    }
+    all
 }
 
 fn object(linear: &Linear, found: &Matrices, modes: &[Mode]) -> Value {
@@ -189,6 +201,16 @@ fn object(linear: &Linear, found: &Matrices, modes: &[Mode]) -> Value {
         "outputs": linear.outputs.iter().map(port).collect::<Value>(),
         "modes": modes.iter().map(mode).collect::<Value>(),
     });
+    if !linear.params.is_empty() {
+        let param = |quantity: &Quantity| {
+            json!({
+                "name": quantity.path,
+                "unit": Unit::si(quantity.unit.dimension).text,
+                "value": number(linear.instance.get(quantity.slot)),
+            })
+        };
+        object["params"] = linear.params.iter().map(param).collect::<Value>();
+    }
     for matrix in named(linear, found) {
         object[matrix.name] = rows(&matrix);
     }
@@ -223,9 +245,10 @@ fn words(linear: &Linear, found: &Matrices, modes: &[Mode], terminal: &Terminal)
     let outputs: Vec<&str> = linear.outputs.iter().map(|(path, _)| path.as_str()).collect();
     let rates: Vec<String> = names.iter().map(|name| format!("d{name}/dt")).collect();
     let rates: Vec<&str> = rates.iter().map(String::as_str).collect();
-    for (matrix, (rows, columns)) in
-        named(linear, found).iter().zip([(&rates, &names), (&rates, &inputs), (&outputs, &names), (&outputs, &inputs)])
-    {
+    let params: Vec<&str> = linear.params.iter().map(|quantity| quantity.path.as_str()).collect();
+    let titles = [&names, &inputs, &params].map(|columns| [(&rates, columns), (&outputs, columns)]);
+    let [[a, c], [b, d], [p, q]] = titles;
+    for (matrix, (rows, columns)) in named(linear, found).iter().zip([a, b, c, d, p, q]) {
         if matrix.rows > 0 && matrix.columns > 0 {
             out += &format!("\n{}", table(matrix, rows, columns));
         }

@@ -6,22 +6,24 @@
 
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
-use crate::compile::{self, Changes, Loaded, Options, Stopwatch, Varying};
+use crate::compile::{self, Changes, Fitted, Loaded, Options, Stopwatch, Varying};
 use crate::parquet::{self, Holds};
 use crate::plot::{self, Axis, Curve, Figure, Panel};
 use crate::terminal::{Style, Terminal};
 use crate::value::{self, count, significant};
 use crate::vary::{Dice, Vary};
 use crate::{project, results};
-use abi::Slot;
 use abi::plan::Measure;
+use abi::{Description, Slot};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use runtime::engine::{self, Cause, Continue};
-use runtime::sweep;
+use runtime::engine::{self, Cause, Continue, Failure, Outcome};
+use runtime::lanes::{self, Next};
+use runtime::sweep::{self, Desk, Ticket};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -41,6 +43,10 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
     for (k, vary) in args.vary.iter().enumerate() {
         if args.vary[..k].iter().any(|other| other.path == vary.path) {
             terminal.error(&format!("`{}` is varied twice; give it one --vary", vary.path));
+            return End::Misused;
+        }
+        if args.changed.stepped.set.all.iter().any(|(path, _)| *path == vary.path) {
+            terminal.error(&format!("`{}` is both set and varied; leave out --set or --vary", vary.path));
             return End::Misused;
         }
     }
@@ -109,6 +115,16 @@ struct Table {
     draws: u64,
     seed: u64,
     columns: Vec<Column>,
+}
+
+/// A run of a sweep.
+struct Run {
+    number: u64,
+    /// Number of its case.
+    at: usize,
+    /// What is varied, SI.
+    values: Vec<f64>,
+    description: Arc<Description>,
 }
 
 /// A column of the file.
@@ -187,49 +203,119 @@ impl Table {
         (case, values)
     }
 
-    /// One run as a row; none if it was stopped.
-    fn row(&self, run: u64, dice: &Dice, stopped: &AtomicBool) -> Option<Vec<u8>> {
-        let (at, values) = self.values(run, dice);
-        let case = &self.cases[at];
+    /// The number of the case of a run.
+    fn case_of(&self, run: u64) -> usize {
+        (run / self.draws / self.grid) as usize
+    }
+
+    /// Makes runs and hands in their rows: in lanes where there are some and runs enough to fill them.
+    fn work(&self, desk: &Desk<Vec<u8>>, dice: &Dice, stopped: &AtomicBool, each: u64) {
+        let watch = &mut |_| match stopped.load(Ordering::Relaxed) {
+            true => Continue::Break(()),
+            false => Continue::Continue(()),
+        };
+        // A run that was taken and is of the next case.
+        let mut first = None;
+        loop {
+            let number = match first.take() {
+                Some(number) => number,
+                None => match desk.number(false) {
+                    Ticket::Number(number) => number,
+                    Ticket::Later | Ticket::Nothing => return,
+                },
+            };
+            let at = self.case_of(number);
+            let Some(lanes) = self.cases[at].lanes().filter(|lanes| each >= lanes.width() as u64 / 2) else {
+                let row = match self.fitted(number, dice) {
+                    Ok((run, fitted)) => {
+                        let Fitted { instance, experiment } = fitted;
+                        self.row(run, engine::run(instance, &experiment, watch))
+                    }
+                    Err(row) => Some(row),
+                };
+                desk.hand_in(number, row);
+                continue;
+            };
+            first = Some(number);
+            let mut next = |busy: bool| loop {
+                let number = match first.take().map_or_else(|| desk.number(busy), Ticket::Number) {
+                    Ticket::Number(number) => number,
+                    Ticket::Later => return Next::Later,
+                    Ticket::Nothing => return Next::Nothing,
+                };
+                if self.case_of(number) != at {
+                    first = Some(number);
+                    return Next::Nothing;
+                }
+                match self.fitted(number, dice) {
+                    Ok((run, fitted)) => return Next::Run(run, Box::new((fitted.instance, fitted.experiment))),
+                    Err(row) => desk.hand_in(number, Some(row)),
+                }
+            };
+            let mut give = |run: Run, result| {
+                let number = run.number;
+                desk.hand_in(number, self.row(run, result));
+            };
+            lanes::run(lanes, &mut next, &mut give, watch);
+        }
+    }
+
+    /// A run with its values; the row of one that they do not let run.
+    fn fitted(&self, number: u64, dice: &Dice) -> Result<(Run, Fitted), Vec<u8>> {
+        let (at, values) = self.values(number, dice);
         let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
+        let description = |fitted: &Fitted| fitted.instance.description().clone();
+        match self.cases[at].fit(&given) {
+            Ok(fitted) => Ok((Run { number, at, values, description: description(&fitted) }, fitted)),
+            Err(broken) => Err(self.cells(number, at, &values, &[], &[], &format!("not run: {broken}"))),
+        }
+    }
+
+    /// What became of a run as a row; none if it was stopped.
+    fn row(&self, run: Run, result: Result<Outcome, Failure>) -> Option<Vec<u8>> {
+        let Run { number, at, values, description } = run;
+        let case = &self.cases[at];
         let mut readings: Vec<Vec<(String, f64)>> = Vec::new();
         let mut verdicts = Vec::new();
-        let status = match case.fit(&given) {
-            Err(broken) => format!("not run: {broken}"),
-            Ok(fitted) => {
-                let description = fitted.instance.description().clone();
-                let mut watch = |_| match stopped.load(Ordering::Relaxed) {
-                    true => Continue::Break(()),
-                    false => Continue::Continue(()),
-                };
-                match engine::run(fitted.instance, &fitted.experiment, &mut watch) {
-                    Err(failure) if failure.cause == Cause::Stopped => return None,
-                    Err(failure) => format!("stopped: {failure}"),
-                    Ok(outcome) => {
-                        let (own, watched) = outcome.verdicts.split_at(case.expects());
-                        let extremes: Vec<(f64, f64)> = watched
-                            .iter()
-                            .map(|verdict| {
-                                let value =
-                                    |k: usize| verdict.readings.get(k).map_or(f64::NAN, |reading| reading.value);
-                                (value(0), value(1))
-                            })
-                            .collect();
-                        for verdict in own {
-                            let read = |r: &runtime::measure::Reading| (r.text.clone(), r.unit.from_si(r.value));
-                            readings.push(verdict.readings.iter().map(read).collect());
-                            verdicts.push(verdict.holds);
-                        }
-                        let problem = own.iter().find_map(|verdict| verdict.problem.clone());
-                        match (case.left(&description, &extremes), problem) {
-                            (Some(left), _) => format!("stopped: {left}"),
-                            (None, Some(problem)) => problem,
-                            (None, None) => "ok".into(),
-                        }
-                    }
+        let status = match result {
+            Err(failure) if failure.cause == Cause::Stopped => return None,
+            Err(failure) => format!("stopped: {failure}"),
+            Ok(outcome) => {
+                let (own, watched) = outcome.verdicts.split_at(case.expects());
+                let extremes: Vec<(f64, f64)> = watched
+                    .iter()
+                    .map(|verdict| {
+                        let value = |k: usize| verdict.readings.get(k).map_or(f64::NAN, |reading| reading.value);
+                        (value(0), value(1))
+                    })
+                    .collect();
+                for verdict in own {
+                    let read = |r: &runtime::measure::Reading| (r.text.clone(), r.unit.from_si(r.value));
+                    readings.push(verdict.readings.iter().map(read).collect());
+                    verdicts.push(verdict.holds);
+                }
+                let problem = own.iter().find_map(|verdict| verdict.problem.clone());
+                match (case.left(&description, &extremes), problem) {
+                    (Some(left), _) => format!("stopped: {left}"),
+                    (None, Some(problem)) => problem,
+                    (None, None) => "ok".into(),
                 }
             }
         };
+        Some(self.cells(number, at, &values, &readings, &verdicts, &status))
+    }
+
+    /// A row.
+    fn cells(
+        &self,
+        run: u64,
+        at: usize,
+        values: &[f64],
+        readings: &[Vec<(String, f64)>],
+        verdicts: &[bool],
+        status: &str,
+    ) -> Vec<u8> {
+        let case = &self.cases[at];
         let cell = |column: &Column| match column.kind {
             ColumnKind::Run => run.to_string(),
             ColumnKind::Case => case.label.clone(),
@@ -246,7 +332,7 @@ impl Table {
             ColumnKind::Verdict(k) => verdicts.get(k).map_or(String::new(), bool::to_string),
             ColumnKind::Status => status.split_whitespace().collect::<Vec<_>>().join(" "),
         };
-        Some(line(self.columns.iter().map(cell)))
+        line(self.columns.iter().map(cell))
     }
 
     fn run(&self, args: &Sweep, loaded: &Loaded, terminal: &mut Terminal) -> Result<End, String> {
@@ -344,7 +430,7 @@ impl Table {
 
     /// Appends rows; returns how many.
     fn append(&self, args: &Sweep, file: &mut File, range: Range<u64>, threads: usize) -> io::Result<u64> {
-        let stopped = std::sync::Arc::new(AtomicBool::new(false));
+        let stopped = Arc::new(AtomicBool::new(false));
         let flag = stopped.clone();
         // A second Ctrl-C ends the process at once; what is written is whole rows but for the last, which --resume drops.
         let _ = ctrlc::set_handler(move || {
@@ -362,8 +448,9 @@ impl Table {
         let mut writer = BufWriter::new(file);
         let (mut written, mut failed) = (0, None);
         let mut flushed = Instant::now();
-        let job = |run: u64| self.row(run, &dice, &stopped);
-        sweep::ordered(range, threads, &job, &mut |_, row| {
+        let each = (range.end - range.start) / threads.max(1) as u64;
+        let worker = |desk: &Desk<Vec<u8>>| self.work(desk, &dice, &stopped, each);
+        sweep::ordered(range, threads, &worker, &mut |_, row: Vec<u8>| {
             let mut put = || {
                 writer.write_all(&row)?;
                 if flushed.elapsed() > Duration::from_millis(200) {

@@ -36,30 +36,38 @@ pub fn run(cases: &Path, results: &Path) {
     done(command.arg(cases).arg(results), "the harness");
 }
 
-/// The emulator, where one is needed, and the harness.
+/// The emulator, where one is needed, and the harness, under its name once it is whole: other runs may be using it.
 fn harness() -> (Option<PathBuf>, PathBuf) {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/agreement/harness.c");
     let harness = Path::new(env!("CARGO_TARGET_TMPDIR")).join("harness-aarch64");
+    let begun = harness.with_extension(format!("begun-{}", std::process::id()));
+    let emulator = compiled(&begun);
+    std::fs::rename(&begun, &harness).expect("target/ can be written");
+    (emulator, harness)
+}
+
+/// Compiles the harness, and gives the emulator that it needs, if any.
+fn compiled(harness: &Path) -> Option<PathBuf> {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/agreement/harness.c");
     let flags = ["-std=gnu11", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1", "-static", "-o"];
     if cfg!(target_arch = "aarch64") {
-        done(Command::new("gcc").args(flags).arg(&harness).arg(&source), "gcc");
-        return (None, harness);
+        done(Command::new("gcc").args(flags).arg(harness).arg(&source), "gcc");
+        return None;
     }
     let emulator = ["qemu-aarch64-static", "qemu-aarch64"].into_iter().find_map(on_path);
     let compiler = on_path("aarch64-linux-gnu-gcc");
     if let (Some(emulator), Some(compiler)) = (emulator, compiler) {
-        done(Command::new(compiler).args(flags).arg(&harness).arg(&source), "aarch64-linux-gnu-gcc");
-        return (Some(emulator), harness);
+        done(Command::new(compiler).args(flags).arg(harness).arg(&source), "aarch64-linux-gnu-gcc");
+        return Some(emulator);
     }
     let wanted = "code for 64-bit Arm cannot be tried: there is no qemu-aarch64 with aarch64-linux-gnu-gcc";
     let usr = unpacked("aarch64-tools", &PACKAGES, wanted).join("usr");
     let (bin, target) = (usr.join("bin"), usr.join("aarch64-linux-gnu"));
     let mut across = Command::new(bin.join("aarch64-linux-gnu-gcc-12"));
     across.env("LD_LIBRARY_PATH", usr.join("lib/x86_64-linux-gnu"));
-    across.args(flags).arg(&harness).arg(&source);
+    across.args(flags).arg(harness).arg(&source);
     across.arg(format!("-B{}/aarch64-linux-gnu-", bin.display()));
     across.arg(format!("-B{}/lib", target.display())).arg(format!("-L{}/lib", target.display()));
     across.arg("-isystem").arg(target.join("include"));
     done(&mut across, "the cross compiler");
-    (Some(bin.join("qemu-aarch64-static")), harness)
+    Some(bin.join("qemu-aarch64-static"))
 }

@@ -1,8 +1,8 @@
 /* Runs images of compiled models: what tests/agreement holds 64-bit Arm against, under emulation.
    In: a file of cases. Out: a file of what the functions returned and left in their blocks.
-     cases      u64 count, then each: u64 bytes of the image, image, u64 calls, (u64 function, u64 count)...,
-                u64 starts, u64 slots, starts * slots doubles
-     results    for each start of each case: the last status u64, slots doubles */
+     cases      u64 count, then each: u64 bytes of the image, image, u64 slots, u64 runs, then each:
+                u64 calls, (u64 function, u64 count)..., slots doubles
+     results    for each run of each case: the last status u64, slots doubles */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -46,15 +46,16 @@ int main(int argc, char **argv)
         memcpy(code, image + code_at, code_len);
         if (mprotect(code, code_len, PROT_READ | PROT_EXEC)) fail("the code cannot be made executable");
         __builtin___clear_cache((char *)code, (char *)code + code_len);
-        uint64_t calls = number(in), which[16], counts[16];
-        if (calls > 16) fail("too many calls");
-        for (uint64_t k = 0; k < calls; k++) {
-            which[k] = number(in);
-            counts[k] = number(in);
-        }
-        uint64_t starts = number(in), slots = number(in);
+        uint64_t slots = number(in), runs = number(in);
         double *block = calloc(slots, sizeof *block);
-        for (; starts; starts--) {
+        if (!block) fail("no memory for a block");
+        for (; runs; runs--) {
+            uint64_t calls = number(in), which[16], counts[16];
+            if (calls > 16) fail("too many calls");
+            for (uint64_t k = 0; k < calls; k++) {
+                which[k] = number(in);
+                counts[k] = number(in);
+            }
             if (fread(block, sizeof *block, slots, in) != slots) fail("a block ends too early");
             uint64_t status = 0;
             for (uint64_t k = 0; k < calls; k++) {

@@ -219,15 +219,17 @@ fn a_package_for_arm_runs_to_the_bit_as_one_for_x86() {
         let count = |function: Function| if function == Function::Step { STEPS } else { 1 };
         number(&mut cases, bytes.len() as u64);
         cases.extend(&bytes);
-        number(&mut cases, calls.len() as u64);
-        for function in &calls {
-            number(&mut cases, *function as u64);
-            number(&mut cases, count(*function));
-        }
         let begin = starts(&image);
-        number(&mut cases, begin.len() as u64);
         number(&mut cases, begin[0].len() as u64);
-        begin.iter().flatten().for_each(|x| cases.extend(x.to_le_bytes()));
+        number(&mut cases, begin.len() as u64);
+        for block in &begin {
+            number(&mut cases, calls.len() as u64);
+            for function in &calls {
+                number(&mut cases, *function as u64);
+                number(&mut cases, count(*function));
+            }
+            block.iter().for_each(|x| cases.extend(x.to_le_bytes()));
+        }
 
         // The same calls on the package for this processor.
         // SAFETY: the compiler has just made it.

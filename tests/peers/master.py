@@ -11,20 +11,10 @@ import time
 
 import canopen
 
+from network import connect
+
 # Neither side need be prompt on a busy computer, or on an emulated one.
 PATIENCE = 30
-
-
-def connect(where):
-    network = canopen.Network()
-    if where.startswith("vcan"):
-        network.connect(interface="socketcan", channel=where)
-    elif ":" in where:
-        host, port = where.rsplit(":", 1)
-        network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
-    else:
-        network.connect(interface="slcan", channel=where, bitrate=1_000_000, sleep_after_open=0.1)
-    return network
 
 
 def dictionary():

@@ -14,24 +14,14 @@ import time
 import canopen
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes as kinds
 
+from network import connect
+
 NODE = 5
 PERIOD = 0.04
 INERTIA = 1.0
 RATED = 2.0
 COUNT = 2 * 3.141592653589793 / 65536
 SPEED_UNIT = 0.01 * 3.141592653589793 / 30
-
-
-def connect(where):
-    network = canopen.Network()
-    if where.startswith("vcan"):
-        network.connect(interface="socketcan", channel=where)
-    elif ":" in where:
-        host, port = where.rsplit(":", 1)
-        network.connect(interface="socketcand", host=host, port=int(port), channel="can0", tcp_tune=True)
-    else:
-        network.connect(interface="slcan", channel=where, bitrate=1_000_000, sleep_after_open=0.1)
-    return network
 
 
 def dictionary():

@@ -1,12 +1,16 @@
 //! Every back end gives the bits of the interpreter; machine code is never writable and is given back.
 
+use super::clif::Facts;
+use super::cut::{Lengths, cut};
 use super::interp::Interpreter;
-use super::jit::compile;
+use super::jit::{compile, cut_at};
+use super::target::{Coder, with};
 use super::wide::{self, Width};
 use crate::ir::build::Build;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
 use crate::ir::{Func, Op, Unary, Value};
 use crate::math;
+use abi::image::Target;
 use abi::lanes::Batch;
 use abi::{Code, Function, Layout, Slot};
 use std::sync::Arc;
@@ -19,8 +23,22 @@ fn same(a: &[f64], b: &[f64]) -> bool {
 /// Runs `func` as machine code and interpreted, each from the same block for `count` iterations.
 #[track_caller]
 fn check(func: &Func, layout: &Layout, blocks: &[Vec<f64>], pool: &[f64], count: u64, what: &str) {
+    check_cut(func, layout, blocks, pool, count, Lengths::USUAL, what);
+}
+
+/// The same, cut into pieces of these lengths.
+#[track_caller]
+fn check_cut(
+    func: &Func,
+    layout: &Layout,
+    blocks: &[Vec<f64>],
+    pool: &[f64],
+    count: u64,
+    lengths: Lengths,
+    what: &str,
+) {
     let funcs = [(Function::Step, func.clone())];
-    let machine = Code::Machine(compile(&funcs, layout, pool.len()).unwrap().0);
+    let machine = Code::Machine(cut_at(&funcs, layout, pool.len(), lengths).unwrap().0);
     let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
     for start in blocks {
         let (mut found, mut expected) = (start.clone(), start.clone());
@@ -83,17 +101,23 @@ fn minimum_and_maximum_agree_at_the_edges() {
     check(&build.finish(), &layout(), &blocks, &[], 1, "extremes");
 }
 
+/// A function made of chance, a pool and a layout for it, and four blocks to begin with.
+fn of_chance(random: &mut Random) -> (Func, Vec<f64>, Layout, Vec<Vec<f64>>) {
+    let len = 20 + random.below(120);
+    let func = random::func(random, len);
+    let pool = (0..POOL_LEN).map(|_| random.real()).collect();
+    let layout = random::layout();
+    let blocks = (0..4).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
+    (func, pool, layout, blocks)
+}
+
 #[test]
 fn random_programs_agree() {
     // 2,000 in the full run; the distribution says whether they are worth anything.
     let (mut stopped, mut nans, mut total) = (0, 0, 0);
     for seed in 0..2000 {
         let mut random = Random(seed);
-        let len = 20 + random.below(120);
-        let func = random::func(&mut random, len);
-        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
-        let layout = random::layout();
-        let blocks: Vec<Vec<f64>> = (0..4).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
+        let (func, pool, layout, blocks) = of_chance(&mut random);
         let count = 1 + random.below(5) as u64;
         check(&func, &layout, &blocks, &pool, count, &format!("seed {seed}, {count} iterations"));
         let code = Interpreter::new(&[(Function::Step, func)], &layout, POOL_LEN);
@@ -105,6 +129,30 @@ fn random_programs_agree() {
     }
     println!("of 8000 runs {stopped} stopped with a status; {nans} of {total} values are NaN");
     assert!(stopped > 200 && nans * 4 < total);
+}
+
+/// Wherever a function is cut, its bits stay; also where there is no room to keep what is computed once.
+#[test]
+fn pieces_agree() {
+    let (mut pieces, mut crossing) = (0, 0);
+    for seed in 0..1500 {
+        let mut random = Random(seed);
+        let (func, pool, layout, blocks) = of_chance(&mut random);
+        let least = 1 + random.below(8);
+        let facts = Facts::of(&func);
+        let lengths = Lengths { whole: 0, least, most: least + random.below(9), words: u32::MAX };
+        let all = cut(&func, &facts, lengths).expect("there is room");
+        let again = cut(&func, &facts, Lengths { words: all.words.saturating_sub(1), ..lengths });
+        let words = again.map_or(all.words, |cut| cut.words);
+        for words in [all.words, words] {
+            let what = format!("seed {seed}, {lengths:?} with {words} words");
+            check_cut(&func, &layout, &blocks, &pool, 1 + random.below(5) as u64, Lengths { words, ..lengths }, &what);
+        }
+        pieces += all.pieces.len();
+        crossing += all.homes.len();
+    }
+    println!("{pieces} pieces, {crossing} values that cross");
+    assert!(pieces > 10_000 && crossing > 10_000);
 }
 
 /// The loop in the code does what as many single calls do, and stops where they stop.
@@ -128,10 +176,96 @@ fn iterations_in_one_call_equal_single_calls() {
     }
 }
 
+/// A function that keeps time as a step does: operations on time, parameters and inputs by chance, then others by chance
+/// that take some of these for what they load.
+fn on_time(random: &mut Random) -> Func {
+    let layout = random::layout();
+    let len = 60 + random.below(80);
+    let mut func = Func { stores: Vec::new(), writes: Vec::new(), status: None, ..random::func(random, len) };
+    for op in &mut func.ops {
+        match *op {
+            // What a ring holds depends on states.
+            Op::Ring { .. } => *op = Op::Load(Slot::TIME),
+            Op::Load(slot) if !layout.params.contains(slot) && !layout.inputs.contains(slot) => {
+                *op = Op::Load([Slot::TIME, Slot::COUNT][random.below(2)]);
+            }
+            _ => {}
+        }
+    }
+    let types = crate::ir::verify::types(&func).unwrap();
+    let first = func.ops.len();
+    let len = 20 + random.below(80);
+    let other = random::func(random, len);
+    let mut values = Vec::new();
+    for op in &other.ops {
+        let leaf = matches!(op, Op::Load(_) | Op::Int(_) | Op::Bool(_));
+        func.ops.push(op.map(|operand| values[operand.index()]));
+        let here = Value(func.ops.len() as u32 - 1);
+        let fit = |value: &Value| types[value.index()] == crate::ir::verify::result(*op, |_| unreachable!()).unwrap();
+        let ahead: Vec<Value> = match leaf {
+            true => (first - 20..first).map(|i| Value(i as u32)).filter(fit).collect(),
+            false => Vec::new(),
+        };
+        let take = !ahead.is_empty() && random.below(4) > 0;
+        values.push(if take { ahead[random.below(ahead.len())] } else { here });
+    }
+    let at = |value: Value| values[value.index()];
+    let clock = [Slot::TIME, Slot::COUNT, Slot::STEP];
+    let stores = other.stores.iter().filter(|(slot, _)| !clock.contains(slot));
+    func.stores = stores.map(|(slot, value)| (*slot, at(*value))).collect();
+    func.writes = other.writes.iter().map(|write| write.map(at)).collect();
+    func.status = other.status.map(at);
+    let mut push = |op: Op| {
+        func.ops.push(op);
+        Value(func.ops.len() as u32 - 1)
+    };
+    let [count, one, step] = [Op::Load(Slot::COUNT), Op::Real(1f64.to_bits()), Op::Load(Slot::STEP)].map(&mut push);
+    let next = push(Op::Add(count, one));
+    let time = push(Op::Mul(next, step));
+    func.stores.extend([(Slot::COUNT, next), (Slot::TIME, time)]);
+    func
+}
+
+/// What goes ahead of the steps is what they would compute, in any number of steps, with a status on the way and without.
+#[test]
+fn what_goes_ahead_agrees() {
+    let (mut ahead, mut stopped, mut odd) = (0, 0, 0);
+    for seed in 0..1500 {
+        let mut random = Random(seed);
+        let func = on_time(&mut random);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let layout = random::layout();
+        let funcs = [(Function::Step, func.clone())];
+        ahead += usize::from(compile(&funcs, &layout, POOL_LEN).unwrap().0.goes_ahead());
+        let block = |random: &mut Random| {
+            let mut block: Vec<f64> = (0..layout.size()).map(|_| random.real()).collect();
+            let whole = [0.0, random.below(1000) as f64, 9007199254740992.0 - random.below(200) as f64, 0.5];
+            let count = whole[random.below(4)];
+            if random.below(8) > 0 {
+                block[Slot::COUNT.index()] = count;
+                block[Slot::STEP.index()] = random.within(0.0, 1e-2);
+            }
+            block
+        };
+        let blocks: Vec<Vec<f64>> = (0..4).map(|_| block(&mut random)).collect();
+        let count = random.below(90) as u64;
+        check(&func, &layout, &blocks, &pool, count, &format!("seed {seed}, {count} iterations"));
+        let code = Interpreter::new(&funcs, &layout, POOL_LEN);
+        for mut block in blocks {
+            odd += usize::from(block[Slot::COUNT.index()].fract() != 0.0);
+            stopped += usize::from(abi::table::Interpret::call(&code, Function::Step, &mut block, &pool, count) != 0);
+        }
+    }
+    println!(
+        "of 1500 programs {ahead} go ahead; of 6000 runs {stopped} stopped with a status, {odd} with an odd count"
+    );
+    assert!(Width::here().is_none() || ahead > 300 && stopped > 200 && odd > 200);
+}
+
 /// Every lane ends with the bits and the status of an instance alone, up to the step at which the first of them stops.
 #[test]
 fn lanes_agree_with_instances_alone() {
-    let widths: Vec<Width> = [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()).collect();
+    let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let (mut compared, mut refused, mut stopped) = (0, 0, 0);
     for seed in 0..6000 {
         let mut random = Random(seed);
@@ -174,6 +308,22 @@ fn lanes_agree_with_instances_alone() {
     assert!(widths.is_empty() || compared > 20_000 && stopped > 500);
 }
 
+/// Pairs are for every processor: their code can be made for one of another kind, too, and needs nothing but itself.
+#[test]
+fn pairs_can_be_made_for_any_processor() {
+    for target in [Target::X86_64, Target::Aarch64] {
+        let isa = with(target, &[]);
+        let mut coder = Coder::new(&isa);
+        let mut made = 0;
+        for seed in 0..600 {
+            let mut random = Random(seed);
+            let func = random::func(&mut random, 60);
+            made += usize::from(coder.pairs(&func, &random::layout(), 1 + seed as usize % 3).is_ok());
+        }
+        assert!(made > 50, "{made} of 600 programs have no ring");
+    }
+}
+
 /// e^x has instructions of its own in the widest lanes: the same bits from the least to the greatest argument.
 #[test]
 fn exponentials_in_lanes_agree_with_instances_alone() {
@@ -195,7 +345,7 @@ fn exponentials_in_lanes_agree_with_instances_alone() {
     let mut random = Random(12);
     let any = (0..40_000).map(|_| random.real());
     let arguments: Vec<f64> = edges.chain(spread).chain(any).collect();
-    for width in [Width::Avx2, Width::Avx512].into_iter().filter(|width| width.is_here()) {
+    for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
         let lanes = wide::compile(&func, &layout, math::pool().len(), width, 2).expect("this processor can");
         let mut batch = Batch::new(lanes);
         for some in arguments.chunks(batch.width()) {

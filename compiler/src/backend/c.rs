@@ -69,7 +69,8 @@ fn purpose(function: Function) -> &'static str {
              Returns 0, or the number of the guard that stopped it."
         }
         Function::Rosenbrock => {
-            "One adaptive step, tried. Returns 0, or 1 where the elimination met too small a pivot."
+            "Tries an adaptive step. Returns 0 if it is settled, 1 where the elimination met too small a pivot,\n   \
+             2 where somebody has to look at it."
         }
     }
 }
@@ -294,8 +295,9 @@ struct Writer<'a> {
     uses: Vec<usize>,
     /// The names of what is stored.
     stored: HashMap<Value, String>,
-    /// What rings are written with: computed before anything is stored.
-    written: HashSet<Value>,
+    /// What has a name wherever it is used: what rings are written with, which is computed before anything is stored, and
+    /// what gcc looks into wrongly or warns of.
+    apart: HashSet<Value>,
     /// How each value is written where it is used.
     text: Vec<String>,
     helpers: &'a mut BTreeSet<Helper>,
@@ -320,8 +322,20 @@ impl<'a> Writer<'a> {
         for (slot, value) in &func.stores {
             stored.entry(*value).or_insert_with(|| names.next(*slot));
         }
-        let written = func.writes.iter().flat_map(|write| [write.index, write.value]).collect();
-        Writer { func, names, types, uses, stored, written, text: vec![String::new(); func.ops.len()], helpers, tables }
+        let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
+        // gcc 12 takes `0.0 - x` for `-x` where it sees that x is never -0, as of `fabs(y)` or `c ? 1.0 : 0.0`: so it gets
+        // -0 of 0. And it warns of `71 == (2 & n)`, which cannot be. It does not look behind a name.
+        let op = |value: Value| func.ops[value.index()];
+        let seen_into = func.ops.iter().flat_map(|of| match *of {
+            Op::Sub(a, b) if op(a) == Op::Real(0.0f64.to_bits()) => vec![b],
+            Op::IntEqual(a, b) => {
+                let masked = |value: &Value| matches!(op(*value), Op::IntAnd(..) | Op::IntOr(..));
+                [a, b].into_iter().filter(masked).collect()
+            }
+            _ => Vec::new(),
+        });
+        let apart = written.chain(seen_into).collect();
+        Writer { func, names, types, uses, stored, apart, text: vec![String::new(); func.ops.len()], helpers, tables }
     }
 
     fn function(&mut self, function: Function) -> String {
@@ -334,7 +348,7 @@ impl<'a> Writer<'a> {
             let written = self.expression(op);
             let constant = matches!(op, Op::Real(_) | Op::Int(_) | Op::Bool(_));
             let once = self.uses[i] == 1 || self.uses[i] == 0 && self.func.status == Some(value);
-            let named = self.stored.contains_key(&value) || self.written.contains(&value);
+            let named = self.stored.contains_key(&value) || self.apart.contains(&value);
             let short = once && written.len() <= LONGEST && !named;
             self.text[i] = if constant {
                 written

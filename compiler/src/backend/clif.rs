@@ -6,16 +6,28 @@
 //!         again while there are iterations left and the status is 0
 //! exit:   store; return the status
 //! ```
+//! Of a choice that takes many operations on one side, only the side that is chosen is computed: see [`Sides`].
 //! A status `if failed then detail else 0` tests `failed` in the loop; what only the detail needs is computed on the way
 //! out.
 //! Each operation becomes one instruction or a fixed few. There are no calls, no symbols and no traps.
 
-use crate::ir::{Func, Op, Type, Value, verify};
+use crate::ir::{Func, Op, Type, Value, Write, verify};
+use abi::Slot;
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
 use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, Signature, types};
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
 use std::collections::HashMap;
+
+/// Numbers that a loop is given for each of its iterations: loads from `first` on read these. One slot's lie side by side,
+/// those of the next slot `lanes` numbers on.
+#[derive(Clone, Copy)]
+pub struct GoneAhead {
+    /// Stands for the first of them; no slot of the block lies behind it.
+    pub first: Slot,
+    /// Most iterations.
+    pub lanes: usize,
+}
 
 /// The signature of [`abi::table::Entry`].
 pub fn signature(isa: &dyn TargetIsa) -> Signature {
@@ -25,18 +37,30 @@ pub fn signature(isa: &dyn TargetIsa) -> Signature {
     signature
 }
 
-/// Writes `func`, which is sound and expanded, into the empty `target`.
-pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuilderContext, isa: &dyn TargetIsa) {
+/// Writes `func`, which is sound and expanded, into the empty `target`; with numbers that have gone ahead it gets the
+/// signature of [`abi::ahead::RestEntry`].
+pub fn emit(
+    func: &Func,
+    ahead: Option<GoneAhead>,
+    target: &mut clif::Function,
+    context: &mut FunctionBuilderContext,
+    isa: &dyn TargetIsa,
+) {
     target.signature = signature(isa);
+    if ahead.is_some() {
+        target.signature.params.push(AbiParam::new(types::I64));
+    }
     let mut b = FunctionBuilder::new(target, context);
     let [entry, prepare, body, more, failed, exit, nothing] = [(); 7].map(|()| b.create_block());
     b.append_block_params_for_function_params(entry);
     b.switch_to_block(entry);
-    let &[block, pool, count] = b.block_params(entry) else { unreachable!("three parameters") };
+    let &[block, pool, count, ref gone_ahead @ ..] = b.block_params(entry) else { unreachable!("three parameters") };
+    let gone_ahead = gone_ahead.first().copied();
     b.ins().brif(count, prepare, &[], nothing, &[]);
 
     b.switch_to_block(prepare);
-    let mut emitter = Emitter::new(func, block, pool);
+    let facts = Facts::of_rest(func, ahead);
+    let mut emitter = Emitter { ahead, ..Emitter::new(func, &facts, block, pool) };
     let ops = || (0..func.ops.len()).map(|i| Value(i as u32));
     let (watch, late) = Watch::of(func);
     // The slots that an iteration hands to the next: in registers, or, if they are many, where the next one loads them.
@@ -44,34 +68,32 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
     let (carried, in_block) =
         if handed.len() > IN_REGISTERS { (&handed[..0], &handed[..]) } else { (&handed[..], &handed[..0]) };
     let in_loop = |emitter: &Emitter, value: Value| {
-        emitter.varies[value.index()] && (!in_block.is_empty() || !matches!(func.op(value), Op::Load(_)))
+        let in_register = match func.op(value) {
+            Op::Load(slot) => in_block.is_empty() && emitter.gone_ahead(slot).is_none(),
+            _ => false,
+        };
+        facts.varies[value.index()] && !in_register
     };
-    for value in ops().filter(|value| !late[value.index()]) {
-        if !in_loop(&emitter, value) {
-            emitter.operation(value, &mut b);
-        }
-    }
+    let list: Vec<Value> = ops().filter(|value| !late[value.index()] && !in_loop(&emitter, *value)).collect();
+    emitter.list(&list, &mut b);
     let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, &mut b))).collect();
     // Nothing changes from one iteration to the next: one is enough.
     let count = if handed.is_empty() && func.writes.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
-    let first: Vec<BlockArg> = first.into_iter().chain([BlockArg::Value(count)]).collect();
+    let first: Vec<BlockArg> =
+        first.into_iter().chain([count].into_iter().chain(gone_ahead).map(BlockArg::Value)).collect();
     b.ins().jump(body, &first);
 
     for (load, _) in carried {
         emitter.values[load.index()] = Some(b.append_block_param(body, types::F64));
     }
     let left = b.append_block_param(body, types::I64);
+    if gone_ahead.is_some() {
+        emitter.instant = Some(b.append_block_param(body, types::I64));
+    }
     b.switch_to_block(body);
-    for value in ops().filter(|value| !late[value.index()]) {
-        if in_loop(&emitter, value) {
-            emitter.operation(value, &mut b);
-        }
-    }
-    for write in &func.writes {
-        let (address, offset) = emitter.entry(block, write.base.0, write.len, write.index, &mut b);
-        let value = emitter.get(write.value, &mut b);
-        b.ins().store(MemFlagsData::trusted(), value, address, offset);
-    }
+    let list: Vec<Value> = ops().filter(|value| !late[value.index()] && in_loop(&emitter, *value)).collect();
+    emitter.list(&list, &mut b);
+    emitter.writes(&func.writes, &mut b);
     let left = b.ins().iadd_imm_s(left, -1);
     match watch {
         Watch::Nothing => {
@@ -81,9 +103,10 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
             let status = emitter.get(status, &mut b);
             b.ins().brif(status, failed, &[], more, &[]);
         }
-        Watch::Failed { when, .. } => {
+        Watch::Failed { when, is, .. } => {
             let when = emitter.get(when, &mut b);
-            b.ins().brif(when, failed, &[], more, &[]);
+            let (yes, no) = if is { (failed, more) } else { (more, failed) };
+            b.ins().brif(when, yes, &[], no, &[]);
         }
     }
     b.switch_to_block(more);
@@ -93,7 +116,8 @@ pub fn emit(func: &Func, target: &mut clif::Function, context: &mut FunctionBuil
         b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
     }
     let next: Vec<BlockArg> = carried.iter().map(|(_, store)| BlockArg::Value(emitter.get(*store, &mut b))).collect();
-    let next: Vec<BlockArg> = next.into_iter().chain([BlockArg::Value(left)]).collect();
+    let instant = emitter.instant.map(|instant| b.ins().iadd_imm_s(instant, 8));
+    let next: Vec<BlockArg> = next.into_iter().chain([left].into_iter().chain(instant).map(BlockArg::Value)).collect();
     let zero = b.ins().iconst(types::I64, 0);
     b.ins().brif(left, body, &next, exit, &[BlockArg::Value(zero)]);
 
@@ -130,24 +154,24 @@ const IN_REGISTERS: usize = 24;
 
 /// What ends the loop before its count.
 #[derive(Clone, Copy)]
-enum Watch {
+pub enum Watch {
+    /// It runs to its end.
     Nothing,
     /// A status that is not 0.
     Status(Value),
-    /// A truth; the status then is `detail`.
-    Failed {
-        when: Value,
-        detail: Value,
-    },
+    /// Whether a truth `is` so; the status then is `detail`.
+    #[allow(missing_docs)]
+    Failed { when: Value, is: bool, detail: Value },
 }
 
 impl Watch {
     /// How to watch the status of `func`, and which operations only its detail needs.
-    fn of(func: &Func) -> (Watch, Vec<bool>) {
+    pub fn of(func: &Func) -> (Watch, Vec<bool>) {
         let mut late = vec![false; func.ops.len()];
         let Some(status) = func.status else { return (Watch::Nothing, late) };
-        let (when, detail) = match func.op(status) {
-            Op::Select(when, detail, zero) if func.op(zero) == Op::Int(0) => (when, detail),
+        let (when, is, detail) = match func.op(status) {
+            Op::Select(when, detail, zero) if func.op(zero) == Op::Int(0) => (when, true, detail),
+            Op::Select(when, zero, detail) if func.op(zero) == Op::Int(0) => (when, false, detail),
             _ => return (Watch::Status(status), late),
         };
         let mut needed = vec![false; func.ops.len()];
@@ -163,35 +187,137 @@ impl Watch {
             }
             late[i] = !needed[i];
         }
-        (Watch::Failed { when, detail }, late)
+        (Watch::Failed { when, is, detail }, late)
     }
 }
 
 /// Bytes from the beginning of a block or pool to its `index`-th number.
-fn offset(index: u32) -> i32 {
+pub fn offset(index: u32) -> i32 {
     i32::try_from(index * 8).expect("blocks and pools are smaller than 2 GiB")
 }
 
-struct Emitter<'a> {
-    func: &'a Func,
-    types: Vec<Type>,
-    /// Whether an iteration can change the value.
-    varies: Vec<bool>,
-    /// For tables: whether the number is needed as such and not only its bits.
-    as_real: Vec<bool>,
-    values: Vec<Option<clif::Value>>,
-    block: clif::Value,
-    pool: clif::Value,
+/// Which operations of a list only one side of a choice needs: these are written where that side is taken. A choice whose
+/// sides are short stays one operation: it costs less than to foresee the side.
+struct Sides {
+    /// The operations of each side, in order; first those of no side.
+    members: Vec<Vec<Value>>,
+    /// The two sides of a choice that is taken apart.
+    of_choice: HashMap<Value, [usize; 2]>,
 }
 
-impl Emitter<'_> {
-    fn new(func: &Func, block: clif::Value, pool: clif::Value) -> Emitter<'_> {
+/// Operations, by their cost, from which on a side is long.
+const LONG_SIDE: u32 = 4;
+/// Choices within choices, at most.
+const DEEPEST: usize = 24;
+
+impl Sides {
+    fn of(func: &Func, list: &[Value]) -> Sides {
+        // A side has its choice, and which of its operands it is; 0 is no side.
+        struct Side {
+            choice: Value,
+            within: usize,
+            depth: usize,
+            cost: u32,
+        }
+        let mut sides = vec![Side { choice: Value(0), within: 0, depth: 0, cost: 0 }];
+        let mut of_choice: HashMap<Value, [usize; 2]> = HashMap::new();
+        // The innermost side that holds all uses so far of a value; none: no use yet.
+        let mut side_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
+        let listed = side_of.clone();
+        let common = |sides: &[Side], mut a: usize, mut b: usize| {
+            while a != b {
+                if sides[a].depth >= sides[b].depth { a = sides[a].within } else { b = sides[b].within }
+            }
+            a
+        };
+        // What is read from elsewhere belongs to no side.
+        let mut elsewhere = |value: Value| {
+            if let Some(side) = side_of.get_mut(&value) {
+                *side = Some(0);
+            }
+        };
+        func.results().for_each(&mut elsewhere);
+        for (i, op) in func.ops.iter().enumerate() {
+            if !listed.contains_key(&Value(i as u32)) {
+                op.each_operand(&mut elsewhere);
+            }
+        }
+        for value in list.iter().rev() {
+            let own = side_of[value].unwrap_or(0);
+            sides[own].cost += cost(func.op(*value));
+            let mut used = |operand: Value, at: usize, sides: &[Side]| {
+                if let Some(known) = side_of.get_mut(&operand) {
+                    *known = Some(known.map_or(at, |known| common(sides, known, at)));
+                }
+            };
+            match func.op(*value) {
+                Op::Select(when, yes, no) if yes != no && when != yes && when != no && sides[own].depth < DEEPEST => {
+                    let depth = sides[own].depth + 1;
+                    let first = sides.len();
+                    sides.extend([(); 2].map(|()| Side { choice: *value, within: own, depth, cost: 0 }));
+                    of_choice.insert(*value, [first, first + 1]);
+                    used(when, own, &sides);
+                    used(yes, first, &sides);
+                    used(no, first + 1, &sides);
+                }
+                op => op.each_operand(|operand| used(operand, own, &sides)),
+            }
+        }
+        // Short sides are no sides: what they hold belongs to what they lie in. Inner sides stand behind outer ones.
+        for side in (1..sides.len()).rev() {
+            let (within, cost) = (sides[side].within, sides[side].cost);
+            sides[within].cost += cost;
+        }
+        let long = |side: usize| sides[side].cost >= LONG_SIDE;
+        of_choice.retain(|_, pair| pair.iter().any(|side| long(*side)));
+        let kept = |mut side: usize| {
+            while side != 0 && !of_choice.contains_key(&sides[side].choice) {
+                side = sides[side].within;
+            }
+            side
+        };
+        let mut members = vec![Vec::new(); sides.len()];
+        for value in list {
+            members[kept(side_of[value].unwrap_or(0))].push(*value);
+        }
+        Sides { members, of_choice }
+    }
+}
+
+/// Rough cost in cycles of a processor that is busy.
+fn cost(op: Op) -> u32 {
+    match op {
+        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
+        Op::Div(..) | Op::Sqrt(_) => 6,
+        Op::Pool { .. } | Op::Ring { .. } => 2,
+        _ => 1,
+    }
+}
+
+/// What is known of the values of a function.
+pub struct Facts {
+    /// Their types.
+    types: Vec<Type>,
+    /// Whether an iteration can change the value.
+    pub varies: Vec<bool>,
+    /// For tables: whether the number is needed as such and not only its bits.
+    as_real: Vec<bool>,
+}
+
+impl Facts {
+    /// Of a function that is sound.
+    pub fn of(func: &Func) -> Facts {
+        Facts::of_rest(func, None)
+    }
+
+    /// Of one some of whose numbers have gone ahead.
+    fn of_rest(func: &Func, ahead: Option<GoneAhead>) -> Facts {
         let stored: HashMap<_, _> = func.stores.iter().copied().collect();
         let mut varies = vec![false; func.ops.len()];
         let mut as_real = vec![false; func.ops.len()];
         for (i, op) in func.ops.iter().enumerate() {
             let mut changes = match op {
-                Op::Load(slot) => stored.contains_key(slot),
+                Op::Load(slot) => stored.contains_key(slot) || ahead.is_some_and(|ahead| ahead.first <= *slot),
                 Op::Ring { .. } => !func.writes.is_empty(),
                 _ => false,
             };
@@ -204,12 +330,61 @@ impl Emitter<'_> {
         for value in func.results() {
             as_real[value.index()] = true;
         }
-        let types = verify::types(func).expect("the function is sound");
-        Emitter { func, types, varies, as_real, values: vec![None; func.ops.len()], block, pool }
+        Facts { types: verify::types(func).expect("the function is sound"), varies, as_real }
+    }
+
+    /// As Cranelift names it.
+    pub fn type_of(&self, value: Value) -> clif::Type {
+        match self.types[value.index()] {
+            Type::Real => types::F64,
+            Type::Int => types::I64,
+            Type::Bool => types::I8,
+        }
+    }
+}
+
+/// Writes operations of a function.
+pub struct Emitter<'a> {
+    /// The function.
+    pub func: &'a Func,
+    /// What is known of its values.
+    pub facts: &'a Facts,
+    /// The values that are there, constants apart.
+    pub values: Vec<Option<clif::Value>>,
+    /// Where the block is.
+    pub block: clif::Value,
+    /// Where the pool is.
+    pub pool: clif::Value,
+    /// What has gone ahead, and where this iteration's number of its first slot lies.
+    ahead: Option<GoneAhead>,
+    instant: Option<clif::Value>,
+}
+
+impl<'a> Emitter<'a> {
+    /// Without any value yet.
+    pub fn new(func: &'a Func, facts: &'a Facts, block: clif::Value, pool: clif::Value) -> Emitter<'a> {
+        Emitter::with(func, facts, vec![None; func.ops.len()], block, pool)
+    }
+
+    /// With values that are there already: as many places as the function has operations.
+    pub fn with(
+        func: &'a Func,
+        facts: &'a Facts,
+        values: Vec<Option<clif::Value>>,
+        block: clif::Value,
+        pool: clif::Value,
+    ) -> Emitter<'a> {
+        Emitter { func, facts, values, block, pool, ahead: None, instant: None }
+    }
+
+    /// Numbers from the iteration's first that went ahead to that of the slot, if it is one of these.
+    fn gone_ahead(&self, slot: Slot) -> Option<u32> {
+        let ahead = self.ahead?;
+        (ahead.first <= slot).then(|| (slot.0 - ahead.first.0) * ahead.lanes as u32)
     }
 
     /// Loads of slots that are stored too, with what is stored.
-    fn carried(&self) -> Vec<(Value, Value)> {
+    pub fn carried(&self) -> Vec<(Value, Value)> {
         let stored: HashMap<_, _> = self.func.stores.iter().copied().collect();
         let of_load = |(i, op): (usize, &Op)| match op {
             Op::Load(slot) => stored.get(slot).map(|value| (Value(i as u32), *value)),
@@ -218,8 +393,17 @@ impl Emitter<'_> {
         self.func.ops.iter().enumerate().filter_map(of_load).collect()
     }
 
+    /// Writes to rings.
+    pub fn writes(&self, writes: &[Write], b: &mut FunctionBuilder) {
+        for write in writes {
+            let (address, offset) = self.entry(self.block, write.base.0, write.len, write.index, b);
+            let value = self.get(write.value, b);
+            b.ins().store(MemFlagsData::trusted(), value, address, offset);
+        }
+    }
+
     /// The instruction's value. Constants are made anew at each use: kept, they would fill the registers.
-    fn get(&self, value: Value, b: &mut FunctionBuilder) -> clif::Value {
+    pub fn get(&self, value: Value, b: &mut FunctionBuilder) -> clif::Value {
         match self.func.op(value) {
             Op::Pool { base, len, index } if let Op::Int(index) = self.func.op(index) => {
                 let entry = (index as u64).min(u64::from(len) - 1) as u32;
@@ -232,7 +416,36 @@ impl Emitter<'_> {
         }
     }
 
-    fn operation(&mut self, value: Value, b: &mut FunctionBuilder) {
+    /// Writes operations of which each stands behind its operands.
+    fn list(&mut self, list: &[Value], b: &mut FunctionBuilder) {
+        let sides = Sides::of(self.func, list);
+        self.side(0, &sides, b);
+    }
+
+    /// Writes the operations of one side of a choice, or of none (0).
+    fn side(&mut self, number: usize, sides: &Sides, b: &mut FunctionBuilder) {
+        for value in &sides.members[number] {
+            let Some([first, second]) = sides.of_choice.get(value) else {
+                self.operation(*value, b);
+                continue;
+            };
+            let Op::Select(when, yes, no) = self.func.op(*value) else { unreachable!("it is a choice") };
+            let when = self.get(when, b);
+            let [chosen, other, behind] = [(); 3].map(|()| b.create_block());
+            b.ins().brif(when, chosen, &[], other, &[]);
+            for (block, side, result) in [(chosen, first, yes), (other, second, no)] {
+                b.switch_to_block(block);
+                self.side(*side, sides, b);
+                let result = self.get(result, b);
+                b.ins().jump(behind, &[BlockArg::Value(result)]);
+            }
+            self.values[value.index()] = Some(b.append_block_param(behind, self.facts.type_of(*value)));
+            b.switch_to_block(behind);
+        }
+    }
+
+    /// Writes one operation whose operands are there.
+    pub fn operation(&mut self, value: Value, b: &mut FunctionBuilder) {
         let flags = MemFlagsData::trusted();
         let op = self.func.op(value);
         let mut operands = [None; 3];
@@ -240,7 +453,7 @@ impl Emitter<'_> {
         // Of a table only the bits may be needed: then the number is never loaded.
         if let Op::Pool { base, len, index } = op {
             let constant = matches!(self.func.op(index), Op::Int(_));
-            if !constant && self.as_real[value.index()] {
+            if !constant && self.facts.as_real[value.index()] {
                 let (address, offset) = self.entry(self.pool, base, len, index, b);
                 self.values[value.index()] = Some(b.ins().load(types::F64, flags, address, offset));
             }
@@ -273,7 +486,10 @@ impl Emitter<'_> {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) => return,
             Op::Pool { .. } | Op::Ring { .. } => unreachable!("done above"),
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
-            Op::Load(slot) => b.ins().load(types::F64, flags, self.block, offset(slot.0)),
+            Op::Load(slot) => match self.gone_ahead(slot).zip(self.instant) {
+                Some((distance, instant)) => b.ins().load(types::F64, flags, instant, offset(distance)),
+                None => b.ins().load(types::F64, flags, self.block, offset(slot.0)),
+            },
             Op::Add(..) => b.ins().fadd(x(0), x(1)),
             Op::Sub(..) => b.ins().fsub(x(0), x(1)),
             Op::Mul(..) => b.ins().fmul(x(0), x(1)),
@@ -306,14 +522,7 @@ impl Emitter<'_> {
             Op::ToInt(_) => b.ins().fcvt_to_sint_sat(types::I64, x(0)),
             Op::ToReal(_) => b.ins().fcvt_from_sint(types::F64, x(0)),
         };
-        debug_assert_eq!(
-            b.func.dfg.value_type(result),
-            match self.types[value.index()] {
-                Type::Real => types::F64,
-                Type::Int => types::I64,
-                Type::Bool => types::I8,
-            }
-        );
+        debug_assert_eq!(b.func.dfg.value_type(result), self.facts.type_of(value));
         self.values[value.index()] = Some(result);
     }
 

@@ -1,18 +1,19 @@
 //! Machine code in memory, made for the processor it runs on.
 //!
 //! The memory is written first and made executable afterwards, never both at once, and is given back when the last
-//! clone of the code goes. The code has no symbols, calls nothing and needs no relocation.
+//! clone of the code goes. The code has no symbols, calls nothing but its own pieces and needs no relocation.
 
+use super::ahead;
 use super::clif::signature;
-use super::target::{Coder, here, in_order};
+use super::cut::Lengths;
+use super::memory::Memory;
+use super::target::{Coder, here};
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
 use abi::table::{Entry, Machine};
 use abi::{Function, Layout};
-use cranelift_codegen::isa::OwnedTargetIsa;
-use cranelift_jit::{JITBuilder, JITModule};
 use cranelift_module::Module;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 pub use super::target::Unsupported;
 
@@ -28,18 +29,28 @@ pub struct Stats {
 /// # Panics
 /// If a function is not sound or not expanded: a mistake of the passes before.
 pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Result<(Machine, Stats), Unsupported> {
-    let (entries, memory, stats) = generate(funcs, layout, pool_len)?;
+    cut_at(funcs, layout, pool_len, Lengths::USUAL)
+}
+
+/// The same, with functions cut into pieces of these lengths.
+pub(super) fn cut_at(
+    funcs: &[(Function, Func)],
+    layout: &Layout,
+    pool_len: usize,
+    lengths: Lengths,
+) -> Result<(Machine, Stats), Unsupported> {
+    let (entries, memory, stats) = generate(funcs, layout, pool_len, lengths)?;
     // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and
     // every table in the pool, the index of a table is held inside it, and code without calls does not unwind.
     let machine = unsafe { Machine::new(entries, layout.size(), pool_len, Arc::new(memory)) };
+    let step = funcs.iter().find(|(function, _)| *function == Function::Step);
+    let machine = match step.and_then(|(_, step)| ahead::compile(step, layout, pool_len)) {
+        // SAFETY: it is the step again, in two parts.
+        Some(ahead) => unsafe { machine.with_ahead(ahead) },
+        None => machine,
+    };
     Ok((machine, stats))
 }
-
-/// Operations from which on code is kept in their order: else the time to find registers grows with the square of them.
-const LONG: usize = 2000;
-
-/// Operations of which code is still made within seconds; to find registers for more takes minutes.
-const MOST: usize = 50_000;
 
 type Entries = [Option<Entry>; Function::ALL.len()];
 
@@ -47,24 +58,17 @@ fn generate(
     funcs: &[(Function, Func)],
     layout: &Layout,
     pool_len: usize,
+    lengths: Lengths,
 ) -> Result<(Entries, Memory, Stats), Unsupported> {
     let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
-    let (mut coder, mut keeping) = (Coder::new(isa), Coder::new(in_order()?));
+    let mut coder = Coder::new(isa);
+    coder.cut_at(lengths);
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
-        if func.ops.len() > MOST {
-            let many = func.ops.len();
-            return Err(Unsupported(format!(
-                "`{}` has {many} operations, and of more than {MOST} code is no gain",
-                func.name
-            )));
-        }
-        let long = *function == Function::Rosenbrock || func.ops.len() > LONG;
-        let coder = if long { &mut keeping } else { &mut coder };
         let bytes = coder.function(func)?;
         let failed = |error| Unsupported(format!("no memory for the code of `{}`: {error}", func.name));
         let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
@@ -81,56 +85,6 @@ fn generate(
         entries[function as usize] = Some(unsafe { std::mem::transmute::<*const u8, Entry>(address) });
     }
     Ok((entries, memory, stats))
-}
-
-/// Code that was made elsewhere, where it can be executed; given back with its last owner.
-pub struct Executable {
-    _memory: Memory,
-    address: usize,
-}
-
-impl Executable {
-    /// The code, beginning at a multiple of `alignment` bytes.
-    pub fn new(code: &[u8], alignment: u64) -> Result<Executable, Unsupported> {
-        let isa = here()?;
-        let mut memory = Memory::new(isa);
-        let module = memory.module();
-        let failed = |error: cranelift_module::ModuleError| Unsupported(format!("no memory for code: {error}"));
-        let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
-        module.define_function_bytes(id, alignment, code, &[]).map_err(failed)?;
-        module.finalize_definitions().map_err(failed)?;
-        let address = module.get_finalized_function(id) as usize;
-        Ok(Executable { _memory: memory, address })
-    }
-
-    /// Where it begins.
-    pub fn address(&self) -> *const u8 {
-        self.address as *const u8
-    }
-}
-
-/// The memory of the code.
-struct Memory(Mutex<Option<JITModule>>);
-
-impl Memory {
-    fn new(isa: &OwnedTargetIsa) -> Memory {
-        let no_calls = Box::new(|call| unreachable!("the code calls nothing, so not {call:?}"));
-        Memory(Mutex::new(Some(JITModule::new(JITBuilder::with_isa(isa.clone(), no_calls)))))
-    }
-
-    fn module(&mut self) -> &mut JITModule {
-        self.0.get_mut().expect("nothing panics here").as_mut().expect("taken by drop only")
-    }
-}
-
-impl Drop for Memory {
-    fn drop(&mut self) {
-        let module = self.0.get_mut().ok().and_then(Option::take);
-        if let Some(module) = module {
-            // SAFETY: this is the last owner: `Machine` keeps it alive as long as an entry can be called.
-            unsafe { module.free_memory() }
-        }
-    }
 }
 
 #[cfg(all(test, target_os = "linux"))]
@@ -158,7 +112,8 @@ mod tests {
         let x = build.load(Slot(3));
         let next = build.add(x, x);
         build.store(Slot(3), next);
-        let (entries, memory, stats) = generate(&[(Function::Step, build.finish())], &layout, 0).unwrap();
+        let (entries, memory, stats) =
+            generate(&[(Function::Step, build.finish())], &layout, 0, Lengths::USUAL).unwrap();
         assert_eq!(stats.functions.len(), 1);
         let address = entries[Function::Step as usize].unwrap() as usize;
         let executable = || mapped("r-xp").iter().any(|range| range.contains(&address));

@@ -1,13 +1,17 @@
 //! Runs the straight-line program: an interpreter that says what is right, and machine code that agrees to the bit.
 //!
-//! Cranelift is known to `clif`, `target` and `jit` only.
+//! Cranelift is known to `clif`, `pieces`, `target`, `memory`, `jit` and `wide::pairs` only.
 
 pub mod interp;
 mod clif;
+mod cut;
+mod pieces;
 pub mod target;
+mod memory;
+pub mod wide;
+mod ahead;
 pub mod jit;
 pub mod blob;
 pub mod c;
-pub mod wide;
 #[cfg(test)]
 mod agree;

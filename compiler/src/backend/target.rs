@@ -1,13 +1,20 @@
 //! What processor code is made for, and the code of one function for it.
 //!
-//! In: a sound, expanded function. Out: bytes that can lie anywhere: no symbols, no calls, no relocation.
+//! In: a sound, expanded function. Out: bytes that can lie anywhere: no symbols, no calls but of its own pieces, no
+//! relocation left.
 
-use super::clif;
+use super::clif::{self, Facts};
+use super::cut::{Lengths, cut};
+use super::pieces;
+use super::wide::pairs;
 use crate::ir::Func;
 use abi::image::{Feature, Target};
+use abi::{Layout, Slot};
+use cranelift_codegen::binemit::Reloc;
+use cranelift_codegen::ir::{self as cranelift, ExternalName};
 use cranelift_codegen::isa::{self, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
-use cranelift_codegen::{CodegenError, Context};
+use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
 use std::fmt;
 use std::sync::OnceLock;
@@ -29,6 +36,7 @@ pub struct Coder<'a> {
     isa: &'a dyn TargetIsa,
     context: Context,
     builder: FunctionBuilderContext,
+    lengths: Lengths,
 }
 
 /// Code of a function, and the power of two at a multiple of which it must begin.
@@ -42,15 +50,64 @@ pub struct Bytes {
 impl<'a> Coder<'a> {
     /// For this processor or target.
     pub fn new(isa: &'a OwnedTargetIsa) -> Coder<'a> {
-        Coder { isa: &**isa, context: Context::new(), builder: FunctionBuilderContext::new() }
+        Coder { isa: &**isa, context: Context::new(), builder: FunctionBuilderContext::new(), lengths: Lengths::USUAL }
     }
 
-    /// The code of a function with the signature of [`abi::table::Entry`].
+    /// Other lengths of functions and pieces than the usual.
+    pub(super) fn cut_at(&mut self, lengths: Lengths) {
+        self.lengths = lengths;
+    }
+
+    /// The code of a function with the signature of [`abi::table::Entry`], which is its beginning.
     ///
     /// # Panics
-    /// If the code needs a relocation: a mistake of `clif`.
+    /// If the code calls anything but its own pieces: a mistake of `clif`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        self.emit(func);
+        let mut all = Bytes { code: Vec::new(), alignment: 1 };
+        let mut begins: Vec<usize> = Vec::new();
+        let mut calls: Vec<(usize, Call)> = Vec::new();
+        self.each_part(func, |isa, context| {
+            let compiled =
+                context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
+            let alignment = compiled.buffer.alignment as usize;
+            all.alignment = all.alignment.max(alignment);
+            all.code.resize(all.code.len().next_multiple_of(alignment), 0);
+            let begin = all.code.len();
+            begins.push(begin);
+            all.code.extend(compiled.code_buffer());
+            let relocations = compiled.buffer.relocs().to_vec();
+            for relocation in relocations {
+                let call = Call::of(&relocation, &context.func)
+                    .unwrap_or_else(|| panic!("{} needs a relocation: {relocation:?}", func.name));
+                calls.push((begin + relocation.offset as usize, call));
+            }
+            Ok(())
+        })?;
+        for (at, call) in calls {
+            // The loop lies first.
+            call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
+        }
+        Ok(all)
+    }
+
+    /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are
+    /// numbers that `lanes` steps have each its own of.
+    pub fn rest(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
+        self.context.clear();
+        let ahead = Some(clif::GoneAhead { first: Slot(size as u32), lanes });
+        clif::emit(func, ahead, &mut self.context.func, &mut self.builder, self.isa);
+        self.bytes(func)
+    }
+
+    /// The code of a function for lanes, and the numbers it needs behind the blocks.
+    pub fn pairs(&mut self, func: &Func, layout: &Layout, vectors: usize) -> Result<(Bytes, usize), Unsupported> {
+        self.context.clear();
+        let scratch = pairs::emit(func, layout, vectors, &mut self.context.func, &mut self.builder, self.isa)?;
+        Ok((self.bytes(func)?, scratch))
+    }
+
+    /// Of what was just written and calls nothing.
+    fn bytes(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
         let Coder { isa, context, .. } = self;
         let compiled = context.compile(*isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
         assert!(compiled.buffer.relocs().is_empty(), "{} needs relocations", func.name);
@@ -58,53 +115,107 @@ impl<'a> Coder<'a> {
     }
 
     /// The function as Cranelift's own IR.
-    pub fn clif(&mut self, func: &Func) -> String {
-        self.emit(func);
-        self.context.func.display().to_string()
+    pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
+        let mut text = String::new();
+        self.each_part(func, |_, context| {
+            text += &context.func.display().to_string();
+            Ok(())
+        })?;
+        Ok(text)
     }
 
     /// The function as assembly, as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
-        self.emit(func);
-        self.context.set_disasm(true);
-        let Coder { isa, context, .. } = self;
-        let compiled = context.compile(*isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
-        let text = compiled.vcode.clone().unwrap_or_default();
-        self.context.set_disasm(false);
+        let mut text = String::new();
+        self.each_part(func, |isa, context| {
+            context.set_disasm(true);
+            let compiled = context.compile(isa, &mut Default::default());
+            text += compiled.map_err(|error| refused(func, &error.inner))?.vcode.as_deref().unwrap_or_default();
+            Ok(())
+        })?;
         Ok(text)
     }
 
-    fn emit(&mut self, func: &Func) {
-        self.context.clear();
-        clif::emit(func, &mut self.context.func, &mut self.builder, self.isa);
+    /// Gives the function as Cranelift's own, whole or cut: then the loop first and the pieces in their order.
+    fn each_part(
+        &mut self,
+        func: &Func,
+        mut part: impl FnMut(&dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
+    ) -> Result<(), Unsupported> {
+        let Coder { isa, context, builder, lengths } = self;
+        if func.ops.len() <= lengths.whole {
+            context.clear();
+            clif::emit(func, None, &mut context.func, builder, *isa);
+            return part(*isa, context);
+        }
+        let facts = Facts::of(func);
+        let cut = cut(func, &facts, *lengths).ok_or_else(|| too_large(func))?;
+        context.clear();
+        pieces::emit_loop(func, &facts, &cut, &mut context.func, builder, *isa);
+        part(*isa, context)?;
+        let mut values = Vec::new();
+        for number in 0..cut.pieces.len() {
+            context.clear();
+            pieces::emit_piece(func, &facts, (&cut, number), &mut values, &mut context.func, builder, *isa);
+            part(*isa, context)?;
+        }
+        Ok(())
     }
 }
 
+/// A call of a piece.
+struct Call {
+    kind: Reloc,
+    piece: usize,
+    addend: i64,
+}
+
+impl Call {
+    /// The call that a relocation stands for, if it does for one.
+    fn of(relocation: &FinalizedMachReloc, func: &cranelift::Function) -> Option<Call> {
+        let FinalizedRelocTarget::ExternalName(ExternalName::User(name)) = relocation.target else { return None };
+        let piece = func.params.user_named_funcs()[name].index as usize;
+        let known = matches!(relocation.kind, Reloc::X86CallPCRel4 | Reloc::Arm64Call);
+        known.then_some(Call { kind: relocation.kind, piece, addend: relocation.addend })
+    }
+
+    /// Puts the distance from the call at byte `at` to what begins at byte `to` into the code; none if it is too far.
+    fn resolve(&self, code: &mut [u8], at: usize, to: usize) -> Option<()> {
+        let distance = to as i64 + self.addend - at as i64;
+        let field = &mut code[at..at + 4];
+        let instruction = u32::from_le_bytes(field.try_into().expect("four bytes"));
+        let resolved = match self.kind {
+            Reloc::X86CallPCRel4 => i32::try_from(distance).ok()? as u32,
+            // 26 bits, in words.
+            _ => {
+                let words = distance / 4;
+                (-(1 << 25)..1 << 25).contains(&words).then_some(())?;
+                instruction & !0x03ff_ffff | words as u32 & 0x03ff_ffff
+            }
+        };
+        field.copy_from_slice(&resolved.to_le_bytes());
+        Some(())
+    }
+}
+
+fn too_large(func: &Func) -> Unsupported {
+    Unsupported(format!("`{}` is too large for machine code: {} operations", func.name, func.ops.len()))
+}
+
 fn refused(func: &Func, error: &CodegenError) -> Unsupported {
-    let ops = func.ops.len();
     match error {
-        CodegenError::CodeTooLarge | CodegenError::ImplLimitExceeded => {
-            Unsupported(format!("`{}` is too large for machine code: {ops} operations", func.name))
-        }
-        error => Unsupported(format!("no machine code for `{}` of {ops} operations: {error}", func.name)),
+        CodegenError::CodeTooLarge | CodegenError::ImplLimitExceeded => too_large(func),
+        error => Unsupported(format!("no machine code for `{}` of {} operations: {error}", func.name, func.ops.len())),
     }
 }
 
 /// The processor this program runs on, with all it has.
 pub fn here() -> Result<&'static OwnedTargetIsa, Unsupported> {
     static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
-    ISA.get_or_init(|| native("speed")).as_ref().map_err(Clone::clone)
+    ISA.get_or_init(native).as_ref().map_err(Clone::clone)
 }
 
-/// The same for functions of many hundred operations, which it keeps in their order. Else Cranelift makes one value of
-/// equal constants and computes things where their result is used: this fills the registers, and what does not fit goes
-/// through memory.
-pub fn in_order() -> Result<&'static OwnedTargetIsa, Unsupported> {
-    static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
-    ISA.get_or_init(|| native("none")).as_ref().map_err(Clone::clone)
-}
-
-fn native(level: &str) -> Result<OwnedTargetIsa, Unsupported> {
+fn native() -> Result<OwnedTargetIsa, Unsupported> {
     // Without them fma, floor and nearest would be calls.
     #[cfg(target_arch = "x86_64")]
     for feature in [Feature::Fma, Feature::Sse41] {
@@ -113,18 +224,7 @@ fn native(level: &str) -> Result<OwnedTargetIsa, Unsupported> {
         }
     }
     let native = cranelift_native::builder().map_err(|what| Unsupported(what.into()))?;
-    native.finish(flags(level)).map_err(|what| Unsupported(what.to_string()))
-}
-
-/// A target, with nothing but what it [needs](Target::needs).
-pub fn of(target: Target) -> &'static OwnedTargetIsa {
-    static X86_64: OnceLock<OwnedTargetIsa> = OnceLock::new();
-    static AARCH64: OnceLock<OwnedTargetIsa> = OnceLock::new();
-    let isa = match target {
-        Target::X86_64 => &X86_64,
-        Target::Aarch64 => &AARCH64,
-    };
-    isa.get_or_init(|| with(target, &[]))
+    native.finish(flags()).map_err(|what| Unsupported(what.to_string()))
 }
 
 /// A target with more than it needs.
@@ -150,13 +250,15 @@ pub fn with(target: Target, more: &[Feature]) -> OwnedTargetIsa {
         };
         isa.enable(flag).expect("a flag of this version");
     }
-    isa.finish(flags("speed")).expect("flags that fit together")
+    isa.finish(flags()).expect("flags that fit together")
 }
 
-fn flags(level: &str) -> Flags {
+fn flags() -> Flags {
     let mut flags = builder();
     for (flag, setting) in [
-        ("opt_level", level),
+        // Our own passes have shared, folded and ordered. Else Cranelift makes one value of equal constants and computes
+        // things where their result is used: this fills the registers, and what does not fit goes through memory.
+        ("opt_level", "none"),
         ("is_pic", "false"),
         // A frame larger than a page is touched page by page, in line.
         ("enable_probestack", "true"),

@@ -4,7 +4,7 @@
 //! Constants may stand wherever a value may.
 
 use super::build::Build;
-use super::{Op, Unary, Value};
+use super::{Unary, Value};
 use std::cell::RefCell;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Shl, Shr, Sub};
 
@@ -147,7 +147,7 @@ impl<'a> Real<'a> {
     /// Whether it is written as −(a · a): it is then not above 0, or NaN.
     pub fn is_minus_square(self) -> bool {
         let build = self.build.borrow();
-        matches!(build.get(self.value), Op::Neg(square) if matches!(build.get(square), Op::Mul(a, b) if a == b))
+        super::is_minus_square(self.value, |value| build.get(value))
     }
 
     /// self · b + c, rounded once.
@@ -214,6 +214,12 @@ impl<'a> Real<'a> {
     /// Its bits.
     pub fn bits(self) -> Int<'a> {
         Int { value: self.build.borrow_mut().to_bits(self.value), build: self.build }
+    }
+
+    /// Itself, but at least the limit; NaN stays NaN.
+    pub fn at_least(self, limit: f64) -> Real<'a> {
+        let limit = self.constant(limit);
+        self.with(|b| b.max(limit.value, self.value))
     }
 
     /// Itself, but at most the limit; NaN stays NaN.

@@ -169,6 +169,11 @@ pub enum Op {
     ToReal(Value),
 }
 
+/// Whether a value is written as −(a · a): it is then not above 0, or NaN. `op`: what gives a value.
+pub fn is_minus_square(value: Value, op: impl Fn(Value) -> Op) -> bool {
+    matches!(op(value), Op::Neg(square) if matches!(op(square), Op::Mul(a, b) if a == b))
+}
+
 /// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Write {

@@ -31,18 +31,31 @@ const fn two_to(n: i32) -> f64 {
 
 /// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
-    expand_but(func, &[])
+    expand_by(func, &|function, x| Some(unary(function, x)))
 }
 
-/// The same, but for functions that a back end has instructions for: those must give the same bits.
-pub fn expand_but(func: &Func, kept: &[Unary]) -> Func {
+/// The same bits for lanes, of which many go side by side: in the fewest operations. `kept` are functions that a back end has
+/// instructions for: those must give the same bits.
+pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
+    expand_by(func, &|function, x| match function {
+        function if kept.contains(&function) => None,
+        Unary::Exp => Some(exponential::exp_of_lanes(x)),
+        function => Some(unary(function, x)),
+    })
+}
+
+/// Replaces functions of one argument by what `by` makes of them, if it does.
+fn expand_by(func: &Func, by: &dyn for<'a> Fn(Unary, Real<'a>) -> Option<Real<'a>>) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, live) in func.ops.iter().zip(func.live()) {
         let at = |operand: Value| Real::new(&build, values[operand.index()]);
         let value = match *op {
             _ if !live => Value(u32::MAX),
-            Op::Unary(function, x) if !kept.contains(&function) => unary(function, at(x)).value,
+            Op::Unary(function, x) => match by(function, at(x)) {
+                Some(value) => value.value,
+                None => build.borrow_mut().op(Op::Unary(function, values[x.index()])),
+            },
             Op::Binary(function, x, y) => binary(function, at(x), at(y)).value,
             op => build.borrow_mut().op(op.map(|operand| values[operand.index()])),
         };

@@ -25,7 +25,11 @@ pub fn contract(func: &Func) -> Func {
             Op::Mul(a, b) if uses[value.index()] == 1 => Some((at(a), at(b))),
             _ => None,
         };
-        let cancels = |other: Value| matches!(func.op(other), Op::Mul(..));
+        // A product or one with its sign turned, as in the mirror image.
+        let cancels = |other: Value| match func.op(other) {
+            Op::Neg(plain) => matches!(func.op(plain), Op::Mul(..)),
+            op => matches!(op, Op::Mul(..)),
+        };
         let fused = match *op {
             Op::Add(x, y) => match (product(x), product(y)) {
                 (Some((a, b)), _) if !cancels(y) => Some(build.fma(a, b, at(y))),
@@ -94,6 +98,21 @@ mod tests {
             b.sub(z, product)
         });
         assert_eq!((count(&less, "fma"), count(&less, "mul"), count(&less, "sub")), (1, 0, 0), "{less}");
+    }
+
+    #[test]
+    fn mirror_images_are_fused_alike() {
+        // v − x z is not fused for v = w y; nor is −v − x z.
+        for turned in [false, true] {
+            let listing = contracted(|b, [x, y, z, w]| {
+                let (speed, product) = (b.mul(w, y), b.mul(x, z));
+                let minus = b.neg(speed);
+                let difference = b.sub(if turned { minus } else { speed }, product);
+                let ratio = b.div(difference, speed);
+                b.div(ratio, minus)
+            });
+            assert_eq!(count(&listing, "fma"), 0, "{listing}");
+        }
     }
 
     #[test]

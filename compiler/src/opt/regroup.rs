@@ -5,10 +5,11 @@
 //! it stands before every back end. It touches only what the longest of these chains needs to get shorter, so sums that
 //! have time keep the text's order, and with it their exact cancellations:
 //!
-//! - x / p → x · (1/p) for p that no iteration changes; 1/p is computed once.
+//! - x / p → x · (1/p) for p that no iteration changes, where 1/p is computed once, or that depends on time alone, where it
+//!   is computed ahead.
 //! - Factors are multiplied in the order in which they are ready, constants of the loop first, divisors last:
 //!   `sigma0 * abs(v) / g * z` → `(sigma0 |v| z) / g`.
-//! - What is affine in a late value L is split: f(L) → f(0) + C L, with C a constant of the loop:
+//! - What is affine in a late value L is split: f(L) → f(0) + C L, with C a constant of the loop or of time alone:
 //!   v + h (u − (σ0 z + σ1 (w − L)))/m → [v + h (u − (σ0 z + σ1 w))/m] + (h σ1/m) L.
 
 use crate::ir::build::Build;
@@ -17,20 +18,29 @@ use abi::Slot;
 use std::collections::HashSet;
 
 /// When a value is ready, in processor cycles after the beginning of an iteration; none: it is constant in the loop.
-type Ready = Option<u32>;
+type Ready = Option<i32>;
+
+/// When time is ready: long before, for no state holds it back. What depends on time alone stays below 0, and keeps its order.
+const EARLY: i32 = i32::MIN / 2;
 
 /// Regroups a function that is iterated.
 pub fn regroup(func: &Func) -> Func {
-    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
-    let carried: HashSet<Slot> = func.loads().into_iter().filter(|slot| stored.contains(slot)).collect();
+    let carried = carried(func);
     let after = after(func, &carried);
     // First everything, to learn how short the longest chain can be; then only what is needed for that.
     let (_, shortest) = rebuilt(func, Pass::new(func, &carried), &after, 0);
     rebuilt(func, Pass::new(func, &carried), &after, shortest).0
 }
 
+/// Slots that an iteration takes over from the one before, time and the count of steps apart: no state holds them back.
+fn carried(func: &Func) -> HashSet<Slot> {
+    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let waits = |slot: &Slot| stored.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
+    func.loads().into_iter().filter(waits).collect()
+}
+
 /// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(func: &Func, mut pass: Pass, after: &[Option<u32>], enough: u32) -> (Func, u32) {
+fn rebuilt(func: &Func, mut pass: Pass, after: &[Ready], enough: i32) -> (Func, i32) {
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
@@ -39,12 +49,12 @@ fn rebuilt(func: &Func, mut pass: Pass, after: &[Option<u32>], enough: u32) -> (
         values.push(if long { pass.sooner(plain) } else { plain });
     }
     let handed = func.stores.iter().filter(|(slot, _)| pass.carried.contains(slot));
-    let longest = handed.filter_map(|(_, value)| pass.at(values[value.index()])).max().unwrap_or(0);
+    let longest = handed.filter_map(|(_, value)| pass.at(values[value.index()])).fold(0, i32::max);
     (pass.build.finish_as(func, &values), longest)
 }
 
 /// For each operation, the cycles from its value to a result; none if no result needs it.
-fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Option<u32>> {
+fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Ready> {
     let mut after = vec![None; func.ops.len()];
     for (slot, value) in &func.stores {
         if results.contains(slot) {
@@ -62,20 +72,19 @@ fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Option<u32>> {
 
 /// Cycles of the longest chain from what an iteration takes over to what it hands on.
 pub fn critical_path(func: &Func) -> u32 {
-    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let carried = carried(func);
     let mut ready: Vec<Ready> = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
-        let mut last = matches!(op, Op::Load(slot) if stored.contains(slot)).then_some(0);
+        let mut last = matches!(op, Op::Load(slot) if carried.contains(slot)).then_some(0);
         op.each_operand(|operand| last = last.max(ready[operand.index()]));
         ready.push(last.map(|last| last + latency(*op)));
     }
-    let loaded: HashSet<Slot> = func.loads().into_iter().collect();
-    let handed = func.stores.iter().filter(|(slot, _)| loaded.contains(slot));
-    handed.filter_map(|(_, value)| ready[value.index()]).max().unwrap_or(0)
+    let handed = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
+    handed.filter_map(|(_, value)| ready[value.index()]).fold(0, i32::max).cast_unsigned()
 }
 
 /// Latency in cycles, rounded from current processors; only its order of size matters.
-pub(super) fn latency(op: Op) -> u32 {
+pub(super) fn latency(op: Op) -> i32 {
     match op {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
         Op::Neg(_) | Op::Abs(_) => 1,
@@ -132,6 +141,7 @@ impl<'a> Pass<'a> {
             let op = self.build.get(Value(self.ready.len() as u32));
             let mut last = match op {
                 Op::Load(slot) if self.carried.contains(&slot) => Some(0),
+                Op::Load(Slot::TIME | Slot::COUNT) => Some(EARLY),
                 Op::Ring { .. } => Some(0),
                 _ => None,
             };
@@ -142,6 +152,11 @@ impl<'a> Pass<'a> {
 
     fn at(&self, value: Value) -> Ready {
         self.ready[value.index()]
+    }
+
+    /// Whether no state holds it back: it is constant in the loop or depends on time alone.
+    fn is_early(&self, value: Value) -> bool {
+        self.at(value).is_none_or(|ready| ready < 0)
     }
 
     /// The value, or the same computed earlier.
@@ -168,7 +183,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Collects factors; divisors that are constant in the loop become factors.
+    /// Collects factors; divisors that no state holds back become factors.
     fn factors(&mut self, value: Value, inverted: bool, product: &mut Product) {
         // Deep enough for physics, and bounded.
         let full = product.above.len() + product.below.len() >= 8;
@@ -181,7 +196,7 @@ impl<'a> Pass<'a> {
                 self.factors(a, inverted, product);
                 self.factors(b, !inverted, product);
             }
-            _ if inverted && self.at(value).is_none() => {
+            _ if inverted && self.is_early(value) => {
                 let one = self.op(Op::Real(1f64.to_bits()));
                 let inverse = self.op(Op::Div(one, value));
                 product.above.push(inverse);
@@ -218,12 +233,12 @@ impl<'a> Pass<'a> {
                         b
                     }
                 }
-                Op::Mul(a, b) if self.at(a).is_none() => b,
-                Op::Mul(a, b) if self.at(b).is_none() => a,
+                Op::Mul(a, b) if self.is_early(a) => b,
+                Op::Mul(a, b) if self.is_early(b) => a,
                 _ => break,
             };
             links.push((op, late));
-            if self.at(late).is_none() {
+            if self.is_early(late) {
                 return sum;
             }
         }
@@ -328,6 +343,23 @@ mod tests {
                         v6 = mul v0 v1; v7 = add v2 v5; v8 = mul v4 v6; v9 = sub v7 v8; store 6 = v9";
         let found: Vec<&str> = listing.lines().skip(1).map(str::trim).collect();
         assert_eq!(found.join("; "), expected);
+    }
+
+    #[test]
+    fn time_is_there_before_the_states() {
+        // z + h (v − p |v| / g z) with v and g of time: 1/g and z + h v are computed ahead, and one fused product is left.
+        let layout = layout();
+        let build = Shared::new(Build::new("step"));
+        let load = |slot| Real::new(&build, build.borrow_mut().load(slot));
+        let (t, h, p, z) =
+            (load(Slot::TIME), load(Slot::STEP), load(layout.params.slot(0)), load(layout.states.slot(0)));
+        let v = t.of(Unary::Sin);
+        let g = 1.0 + (-(v * v)).of(Unary::Exp);
+        let next = (z + h * (v - p * v.abs() / g * z)).value;
+        let mut build = build.into_inner();
+        build.store(layout.states.slot(0), next);
+        let func = crate::opt::contract::contract(&regroup(&build.finish()));
+        assert!(critical_path(&func) <= 11, "{func}");
     }
 
     /// The same algebra: values agree up to rounding.

@@ -38,7 +38,7 @@ pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(M
     instance.start(0.0);
     let named = |slots: &[Slot]| slots.iter().map(|slot| (String::new(), *slot)).collect::<Vec<_>>();
     let ports: PortSlots = (named(inputs), named(outputs));
-    let mut linear = Linear::new(program, instance, None, &ports);
+    let mut linear = Linear::new(program, instance, None, &ports, &[]);
     let fits = linear.inputs.len() == inputs.len() && linear.outputs.len() == outputs.len();
     let states = linear.states.len();
     fits.then(|| (linear.at(), states))

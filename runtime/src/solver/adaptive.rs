@@ -7,18 +7,25 @@
 //! Nothing here depends on the platform's elementary functions, so a run has the same bits everywhere.
 
 use super::explicit::Explicit;
-use super::fused::{Fused, Judged};
+use super::fused::{Fused, Judged, Pace};
 use super::jacobian::Entries;
 use super::points::Points;
 use super::rosenbrock::Rosenbrock;
-use super::step::{Step, System};
+use super::step::{Step, System, copy};
 use super::surfaces::{Crossing, Surfaces};
+use crate::course::{Course, Rest};
 use crate::observe::{Observer, check_finite, check_status};
 use crate::outcome::{Cause, Chatter, Continue, Stop, Work};
-use abi::description::Kind;
+use abi::description::{Guard, Kind};
+use abi::pace::{
+    ASKS, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_REFUSED, NEARLY, SAFETY, STIFF,
+    inverse_fifth_root,
+};
 use abi::plan::Experiment;
+use abi::trial::{ATTEND_ASKED, ATTEND_EACH};
 use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
+use std::ops::Range;
 
 /// Steps tried at most between two stops. A run that needs more is told so; it would take minutes.
 const MOST_ATTEMPTS: u64 = 5_000_000;
@@ -36,38 +43,15 @@ const MOST_IN_PLACE: u64 = 20_000;
 /// So often a step is made again to end before a surface without anything coming of it.
 const MOST_AIMS: u8 = 4;
 
-/// Steps are chosen this part of what the error would allow.
-const SAFETY: f64 = 0.9;
+/// Tries between two looks at the caller.
+const WATCHED: u64 = 64;
 
-/// The fifth root of an error of a hundredth: a smaller one says little about the next step.
-const LEAST_ROOT: f64 = 0.4;
-
-/// Runs the experiment on the instance to its end or to the reason why not.
-pub(crate) fn run(
-    instance: &mut Instance,
-    experiment: &Experiment,
-    observer: &mut Observer,
-    work: &mut Work,
-    begin: &mut dyn FnMut(&mut Instance),
-    watch: &mut dyn FnMut(f64) -> Continue,
-) -> Result<(), Stop> {
-    if !instance.has(Function::Derivatives) && instance.description().layout.states.len > 0 {
-        return Err(Stop { cause: Cause::NoDerivatives, time: 0.0 });
-    }
-    let status = instance.start(0.0);
-    begin(instance);
-    check_status(instance, status)?;
-    check_finite(instance)?;
-    let mut run = Adaptive::new(instance, experiment, observer);
-    let result = run.go(watch);
-    run.work.evaluations = run.system.evaluations;
-    *work = run.work;
-    result
-}
-
-struct Adaptive<'a> {
-    system: System<'a>,
+/// Such a run under way; it stands still where steps are tried by the model's own function.
+pub(crate) struct Adaptive {
+    system: System,
     duration: f64,
+    /// The next instant that is met exactly, and the number of tries at the one before.
+    goal: Option<(f64, u64)>,
     /// Instants that are met exactly, ascending.
     corners: Vec<f64>,
     tol: f64,
@@ -91,9 +75,13 @@ struct Adaptive<'a> {
     /// The same as one function of the model, if it has it; and whether the last step was made by it.
     fused: Option<Fused>,
     was_fused: bool,
+    /// Whether it is known to meet no surface and to end with everything in its range.
+    calm: bool,
     explicit: Explicit,
     /// Which of the two is at work.
     stiff: bool,
+    /// For each guard the least and the greatest value that are fine, SI.
+    fine: Vec<(f64, f64)>,
     /// How often in a row the Jacobian spoke for the other one, and how often it must before the stiff one goes.
     doubts: u32,
     patience: u32,
@@ -110,6 +98,8 @@ struct Adaptive<'a> {
     beside: Vec<f64>,
     slopes: Vec<f64>,
     surfaces: Surfaces,
+    /// Whether anything in the block beside the trial may have changed since the last call.
+    moved: bool,
     /// Whether no step has been made since the last restart.
     fresh: bool,
     /// Time and a crossed surface of each of the last events.
@@ -124,14 +114,36 @@ struct Adaptive<'a> {
     place: (u64, f64),
     /// For each sampled block its period in s and the number of its next tick.
     ticks: Vec<(f64, u64)>,
-    points: Points<'a>,
+    points: Points,
     /// θ of the step up to which the past is kept.
     kept: f64,
     work: Work,
 }
 
-impl<'a> Adaptive<'a> {
-    fn new(instance: &'a mut Instance, experiment: &'a Experiment, observer: &'a mut Observer) -> Adaptive<'a> {
+impl Adaptive {
+    pub(crate) fn start(
+        mut instance: Instance,
+        experiment: &Experiment,
+        observer: Observer,
+        begin: &mut dyn FnMut(&mut Instance),
+    ) -> Result<Adaptive, Box<(Rest, Stop)>> {
+        let failed = |instance, observer, stop| Err(Box::new((Rest::of(instance, observer), stop)));
+        if !instance.has(Function::Derivatives) && instance.description().layout.states.len > 0 {
+            return failed(instance, observer, Stop { cause: Cause::NoDerivatives, time: 0.0 });
+        }
+        let status = instance.start(0.0);
+        begin(&mut instance);
+        if let Err(stop) = check_status(&instance, status).and_then(|()| check_finite(&instance)) {
+            return failed(instance, observer, stop);
+        }
+        let mut run = Adaptive::new(instance, experiment, observer);
+        match run.begin() {
+            Ok(()) => Ok(run),
+            Err(stop) => Err(Box::new((Box::new(run).rest(), stop))),
+        }
+    }
+
+    fn new(mut instance: Instance, experiment: &Experiment, observer: Observer) -> Adaptive {
         let description = instance.description().clone();
         let states = &description.layout.states;
         let scale = |i: usize| {
@@ -150,13 +162,24 @@ impl<'a> Adaptive<'a> {
         let ticks = description.ticks.iter().map(|tick| (period(tick.period), 1)).collect();
         let tol = experiment.solver.tol;
         assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
-        let points = Points::new(instance, observer, experiment);
-        let fused = Fused::new(instance, tol, &scales);
+        let points = Points::new(&instance, observer, experiment);
+        // Ranges that are watched, with the slack of a millionth that fixed steps have; what error control may be off by
+        // is no way out of a range.
+        let fine = |guard: &Guard| {
+            let (low, high) = guard.range;
+            let (width, share) = (high - low, (10.0 * tol).max(1e-6));
+            let slack = |bound: f64| share * if width.is_finite() { width } else { bound.abs() };
+            let least = if low == f64::NEG_INFINITY { low } else { low - slack(low) };
+            (least, if high == f64::INFINITY { high } else { high + slack(high) })
+        };
+        let fine: Vec<(f64, f64)> = description.guards.iter().map(fine).collect();
+        let fused = Fused::new(&mut instance, tol, &scales, &fine);
         let system = System::new(instance);
         let n = system.n;
         let entries = Entries::new(n, &description.coupling);
         Adaptive {
             duration: experiment.duration,
+            goal: None,
             corners: experiment.corners.clone(),
             tol,
             t: 0.0,
@@ -173,7 +196,9 @@ impl<'a> Adaptive<'a> {
             rosenbrock: Rosenbrock::new(n, entries.coupled()),
             entries,
             fused,
+            fine,
             was_fused: false,
+            calm: false,
             explicit: Explicit::new(n),
             stiff: true,
             doubts: 0,
@@ -186,6 +211,7 @@ impl<'a> Adaptive<'a> {
             beside: vec![0.0; n],
             slopes: vec![0.0; 4 * n],
             surfaces: Surfaces::new(&system, 1e-12 * experiment.duration),
+            moved: true,
             fresh: true,
             events: VecDeque::new(),
             crossings: 0,
@@ -201,20 +227,21 @@ impl<'a> Adaptive<'a> {
         }
     }
 
-    fn go(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+    /// Shows the start and chooses the first step.
+    fn begin(&mut self) -> Result<(), Stop> {
         self.points.here(&mut self.system, self.t, &self.x)?;
         self.restart();
         self.h = self.first_step();
-        while self.t < self.duration {
-            let stop = self.next_stop();
-            self.reach(stop, watch)?;
-            self.arrive()?;
-        }
+        Ok(())
+    }
+
+    /// The outputs at the end, for whoever looks at them.
+    fn finish(&mut self) -> Result<(), Stop> {
         let (t, x) = (self.t, &self.x);
         self.system.place(t, x);
         let status = self.system.instance.call(Function::Outputs);
-        check_status(self.system.instance, status)?;
-        check_finite(self.system.instance)?;
+        check_status(&self.system.instance, status)?;
+        check_finite(&self.system.instance)?;
         self.points.end(&self.system)
     }
 
@@ -226,80 +253,121 @@ impl<'a> Adaptive<'a> {
         corner.min(tick).min(self.duration)
     }
 
-    /// Steps up to `stop`.
-    fn reach(&mut self, stop: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
-        let before = self.attempts();
-        while stop - self.t > 32.0 * f64::EPSILON * stop {
-            if self.attempts().is_multiple_of(64) && watch(self.t / self.duration).is_break() {
-                return Err(self.stop(Cause::Stopped));
-            }
-            if self.attempts() - before >= MOST_ATTEMPTS {
-                return Err(self.stop(Cause::TooManySteps { steps: self.attempts(), path: self.worst() }));
-            }
-            if self.attempts() - self.place.0 > MOST_IN_PLACE {
-                if self.t - self.place.1 < 1e-6 * self.duration {
-                    return Err(self.in_place(before));
-                }
-                self.place = (self.attempts(), self.t);
-            }
-            if self.crossings > MOST_CROSSINGS {
-                return Err(self.chatter(MOST_CROSSINGS, self.t - self.crossings_since));
-            }
-            let left = stop - self.t;
-            let wanted = self.h.min(self.longest);
-            let mut h = wanted;
-            let hits = h > 0.999 * left;
-            if hits {
-                h = left;
-            } else if h > 0.5 * left {
-                h = 0.5 * left;
-            }
-            if !hits && h < (16.0 * f64::EPSILON * self.t).max(f64::MIN_POSITIVE) {
-                return Err(self.too_short(h));
-            }
-            self.step.t = self.t;
-            self.step.h = h;
-            // What jumps at the stop has not jumped before it.
-            self.step.end = if hits { stop.next_down() } else { self.t + h };
-            if self.attempt() {
-                let reached = if hits { stop } else { self.t + h };
-                if h < wanted {
-                    self.h = self.h.max(wanted);
-                }
-                self.accept(reached)?;
-            }
+    /// Whether somebody wants the run to end, or it leads nowhere.
+    fn look_around(&mut self, before: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
+        if self.attempts().is_multiple_of(WATCHED) && watch(self.t / self.duration).is_break() {
+            return Err(self.stop(Cause::Stopped));
         }
-        self.t = stop;
+        if self.attempts() - before >= MOST_ATTEMPTS {
+            return Err(self.stop(Cause::TooManySteps { steps: self.attempts(), path: self.worst() }));
+        }
+        if self.attempts() - self.place.0 > MOST_IN_PLACE {
+            if self.t - self.place.1 < 1e-6 * self.duration {
+                return Err(self.in_place(before));
+            }
+            self.place = (self.attempts(), self.t);
+        }
+        if self.crossings > MOST_CROSSINGS {
+            return Err(self.chatter(MOST_CROSSINGS, self.t - self.crossings_since));
+        }
         Ok(())
     }
 
-    /// Tries a step; chooses the length of the next. Returns whether the step is accurate enough.
-    fn attempt(&mut self) -> bool {
-        let h = self.step.h;
+    /// Puts all that the model's own function needs into the block. It settles steps by itself as long as they are ordinary
+    /// ones: no other kind of step is under way, and nobody looks at each.
+    fn prepare(&mut self, stop: f64) -> u64 {
+        self.know_slope();
+        if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
+            self.step.t = self.t;
+            self.step.x0.copy_from_slice(&self.x);
+            self.know_jacobian();
+        }
+        let attend = self.fresh
+            || self.creep.is_finite()
+            || self.usual.is_some()
+            || self.points.are_shown()
+            || self.aimed.iter().any(|aimed| *aimed > 0);
+        let fused = self.fused.as_mut().expect("asked before");
+        if !fused.ready {
+            fused.begin(&mut self.system, &self.x, &self.step.f0, &self.jacobian);
+        }
+        let pace =
+            Pace { t: self.t, next: self.h, last: self.last, rejected: self.rejected, accepted: self.work.steps };
+        // Doubts about the method are settled when it is asked for the next time.
+        let attended = if attend {
+            ATTEND_EACH
+        } else if self.doubts > 0 {
+            ATTEND_ASKED
+        } else {
+            0.0
+        };
+        fused.prepare(&mut self.system, pace, stop, self.longest, self.points.next_probe(), attended);
+        fused.prepare_surfaces(&mut self.system, self.surfaces.sides(), self.surfaces.here());
+        if attend { 1 } else { WATCHED - self.attempts() % WATCHED }
+    }
+
+    /// Tries a step by the routines for any model and settles it.
+    fn try_step(&mut self, stop: f64) -> Result<(), Stop> {
+        let left = stop - self.t;
+        let wanted = self.h.min(self.longest);
+        let hits = wanted > NEARLY * left;
+        self.step.t = self.t;
+        self.step.h = if hits { left } else { wanted.min(HALFWAY * left) };
+        if self.is_too_short(stop) {
+            return Err(self.too_short(self.step.h));
+        }
+        // What jumps at the stop has not jumped before it.
+        self.step.end = if hits { stop.next_down() } else { self.t + self.step.h };
         self.step.x0.copy_from_slice(&self.x);
+        self.know_slope();
+        (self.was_stiff, self.was_fused, self.calm) = (self.stiff, false, false);
+        let error = if self.stiff {
+            self.stiff_attempt()
+        } else {
+            self.explicit.attempt(&mut self.system, &mut self.step);
+            self.end_slope.copy_from_slice(self.explicit.last_slope());
+            self.error()
+        };
+        self.conclude(error, stop)
+    }
+
+    /// Whether the step goes up to the stop.
+    fn hits(&self, stop: f64) -> bool {
+        self.step.h == stop - self.t
+    }
+
+    fn is_too_short(&self, stop: f64) -> bool {
+        !self.hits(stop) && self.step.h < (16.0 * f64::EPSILON * self.t).max(f64::MIN_POSITIVE)
+    }
+
+    /// dx/dt at the present point.
+    fn know_slope(&mut self) {
         if !self.slope_known {
             self.system.slope(self.t, &self.x, &mut self.step.f0);
             self.slope_known = true;
         }
-        let stiff = self.stiff;
-        self.was_stiff = stiff;
-        let judged = if stiff { self.fused_attempt() } else { None };
-        self.was_fused = judged.is_some();
-        let error = match judged {
-            Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
-            Some(Judged { error, defect }) if error <= 1.0 => error.max(defect),
-            Some(Judged { error, .. }) => error,
-            None if stiff => self.stiff_attempt(),
-            None => {
-                self.explicit.attempt(&mut self.system, &mut self.step);
-                self.end_slope.copy_from_slice(self.explicit.last_slope());
-                self.error()
-            }
-        };
+    }
+
+    /// Settles the step, whose error this is as a part of what is allowed.
+    fn conclude(&mut self, error: f64, stop: f64) -> Result<(), Stop> {
+        let wanted = self.h.min(self.longest);
+        if !self.judge(error) {
+            return Ok(());
+        }
+        let reached = if self.hits(stop) { stop } else { self.t + self.step.h };
+        if self.step.h < wanted {
+            self.h = self.h.max(wanted);
+        }
+        self.accept(reached)
+    }
+
+    /// Whether the step is accurate enough; chooses the length of the next.
+    fn judge(&mut self, error: f64) -> bool {
+        let h = self.step.h;
         if error.is_nan() || error > 1.0 {
             self.work.rejected += 1;
-            let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(0.2) } else { 0.1 };
-            self.h = part.min(0.9) * h;
+            let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(LEAST_GAIN) } else { 0.1 };
+            self.h = part.min(MOST_REFUSED) * h;
             // Where the step ran over a surface, that may be all that is wrong with it.
             let ahead = self.surfaces.guess(&mut self.system, &self.step);
             self.overran = ahead.is_some();
@@ -310,7 +378,7 @@ impl<'a> Adaptive<'a> {
             self.rejected = true;
             return false;
         }
-        let error = error.max(1e-10);
+        let error = error.max(LEAST_ERROR);
         let inverse = inverse_fifth_root(error);
         let mut part = SAFETY * inverse;
         if let Some((last_h, last_root)) = self.last {
@@ -320,27 +388,14 @@ impl<'a> Adaptive<'a> {
         if self.rejected {
             part = part.min(1.0);
         }
-        self.h = part.clamp(0.2, 6.0) * h;
+        self.h = part.clamp(LEAST_GAIN, GREATEST_GAIN) * h;
         let square = inverse * inverse;
         self.last = Some((h, (error * (square * square)).max(LEAST_ROOT)));
         self.rejected = false;
         self.work.steps += 1;
-        self.work.stiff_steps += u64::from(stiff);
+        self.work.stiff_steps += u64::from(self.was_stiff);
         self.consider_method();
         true
-    }
-
-    /// A stiff step by the model's own function, if it has it and its elimination went well.
-    fn fused_attempt(&mut self) -> Option<Judged> {
-        if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
-            self.know_jacobian();
-        }
-        let fused = self.fused.as_mut()?;
-        if !fused.ready {
-            fused.begin(&mut self.system, &self.x, &self.step.f0, &self.jacobian);
-        }
-        self.work.jacobians += 1;
-        fused.attempt(&mut self.system, &mut self.step, &mut self.end_slope)
     }
 
     /// A stiff step by the routine for any model. Gives its error as a part of what is allowed.
@@ -400,14 +455,20 @@ impl<'a> Adaptive<'a> {
     /// up to about 3.3 times its largest eigenvalue, of which only the order of magnitude is known. Each return to the
     /// stiff method makes the next change away from it slower.
     fn consider_method(&mut self) {
-        if !self.work.steps.is_multiple_of(8) {
+        let each = if self.fused.is_some() { u64::from(ASKS) } else { 8 };
+        if !self.work.steps.is_multiple_of(each) {
             return;
         }
         self.know_jacobian();
         let n = self.system.n;
-        // The mean eigenvalue is cheap to know.
+        // The mean eigenvalue is cheap to know, and the mean of their squares.
         let trace = self.entries.trace(&self.jacobian);
-        if self.stiff && self.step.h * trace.abs() > 0.5 * n as f64 {
+        if self.stiff && self.step.h * trace.abs() > STIFF * n as f64 {
+            self.doubts = 0;
+            return;
+        }
+        let square = self.step.h * self.step.h * self.entries.trace_of_square(&self.jacobian).abs();
+        if self.stiff && square > STIFF * STIFF * n as f64 {
             self.doubts = 0;
             return;
         }
@@ -440,6 +501,9 @@ impl<'a> Adaptive<'a> {
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
         self.kept = 0.0;
+        if self.calm && !self.fresh && self.aimed.iter().all(|aimed| *aimed == 0) {
+            return self.accept_calm(reached);
+        }
         let known = self.fused.as_ref().filter(|_| self.was_fused);
         self.surfaces.begin(&mut self.system, &self.step, self.fresh, known);
         if self.ends_before_condition() {
@@ -473,6 +537,19 @@ impl<'a> Adaptive<'a> {
         if from == 0.0 && self.usual.is_none() {
             self.aimed.iter_mut().for_each(|aimed| *aimed = aimed.saturating_sub(1));
         }
+        self.go_to_end(reached)?;
+        self.guard()
+    }
+
+    /// Follows an accepted step that meets nothing.
+    fn accept_calm(&mut self, reached: f64) -> Result<(), Stop> {
+        let fused = self.fused.as_ref().expect("it made the step");
+        self.surfaces.go_on(fused.surfaces(&self.system)[1]);
+        self.go_to_end(reached)
+    }
+
+    /// Shows a step up to its end at time `reached`, from where the next one starts.
+    fn go_to_end(&mut self, reached: f64) -> Result<(), Stop> {
         if self.creep.is_infinite() {
             // The condition that a step was aimed at has moved on.
             self.h = self.h.max(self.usual.take().unwrap_or(0.0));
@@ -482,8 +559,8 @@ impl<'a> Adaptive<'a> {
         self.points.until(&mut self.system, &self.step, 1.0, reached)?;
         self.keep(1.0, reached)?;
         self.t = reached;
-        self.x.copy_from_slice(&self.step.x1);
-        self.step.f0.copy_from_slice(&self.end_slope);
+        copy(&self.step.x1, &mut self.x);
+        copy(&self.end_slope, &mut self.step.f0);
         self.slope_known = true;
         self.jacobian_known = false;
         if let Some(fused) = &mut self.fused {
@@ -492,7 +569,7 @@ impl<'a> Adaptive<'a> {
                 false => fused.ready = false,
             }
         }
-        self.guard()
+        Ok(())
     }
 
     /// A condition is decided by the last bit of the states: where one may change, the step is made again so that it
@@ -576,7 +653,7 @@ impl<'a> Adaptive<'a> {
         }
         self.x.copy_from_slice(&self.system.instance.block()[self.system.states.clone()]);
         if !self.x.iter().all(|x| x.is_finite()) {
-            check_finite(self.system.instance)?;
+            check_finite(&self.system.instance)?;
         }
         self.t = time;
         self.work.events += 1;
@@ -607,17 +684,17 @@ impl<'a> Adaptive<'a> {
             // What jumps at the end has not jumped before it.
             run.system.place(run.step.time(theta).min(run.step.end), &run.beside);
             let status = run.system.instance.call(Function::Outputs);
-            check_status(run.system.instance, status)
+            check_status(&run.system.instance, status)
         };
         at(self, 0.5 * (from + theta))?;
-        let middle = self.system.history.present(self.system.instance);
+        let middle = self.system.history.present(&self.system.instance);
         at(self, theta)?;
-        let pieces = self.system.history.pieces(&middle, self.system.instance, self.tol);
+        let pieces = self.system.history.pieces(&middle, &self.system.instance, self.tol);
         for piece in 1..=pieces {
             let theta = from + (theta - from) * f64::from(piece) / f64::from(pieces);
             at(self, theta)?;
             let t = if piece == pieces { time } else { self.step.time(theta) };
-            self.system.history.push(t, self.system.instance);
+            self.system.history.push(t, &self.system.instance);
         }
         Ok(())
     }
@@ -629,8 +706,8 @@ impl<'a> Adaptive<'a> {
         }
         self.system.place(self.t, &self.x);
         let status = self.system.instance.call(Function::Outputs);
-        check_status(self.system.instance, status)?;
-        for echo in self.system.history.push(self.t, self.system.instance) {
+        check_status(&self.system.instance, status)?;
+        for echo in self.system.history.push(self.t, &self.system.instance) {
             if let Err(at) = self.corners.binary_search_by(|corner| corner.total_cmp(&echo)) {
                 self.corners.insert(at, echo);
             }
@@ -651,7 +728,7 @@ impl<'a> Adaptive<'a> {
             let block = self.system.instance.block();
             let before = (block[states.clone()].to_vec(), block[active.clone()].to_vec());
             let status = self.system.instance.call(Function::Transitions);
-            check_status(self.system.instance, status)?;
+            check_status(&self.system.instance, status)?;
             let block = self.system.instance.block();
             if block[states.clone()] == before.0[..] && block[active.clone()] == before.1[..] {
                 return Ok(happened);
@@ -722,7 +799,7 @@ impl<'a> Adaptive<'a> {
             for tick in &description.ticks {
                 self.system.instance.set(tick.due, 0.0);
             }
-            check_status(self.system.instance, status)?;
+            check_status(&self.system.instance, status)?;
             self.work.ticks += 1;
         } else if self.corners.binary_search_by(|corner| corner.total_cmp(&self.t)).is_err() {
             return Ok(());
@@ -737,6 +814,7 @@ impl<'a> Adaptive<'a> {
 
     /// Forgets what belongs to the course before an event.
     fn restart(&mut self) {
+        self.moved = true;
         self.surfaces.restart(&mut self.system, self.t, &self.x);
         self.slope_known = false;
         self.jacobian_known = false;
@@ -754,7 +832,7 @@ impl<'a> Adaptive<'a> {
         if fastest > 0.0 { self.longest.min(0.01 / fastest) } else { self.longest }
     }
 
-    /// Ranges that are watched, with the slack of a millionth that fixed steps have.
+    /// Whether a quantity has left its range.
     fn guard(&mut self) -> Result<(), Stop> {
         if self.system.instance.description().guards.is_empty() {
             return Ok(());
@@ -763,20 +841,13 @@ impl<'a> Adaptive<'a> {
         self.system.place(self.t, &self.x);
         if description.guards.iter().any(|guard| !description.layout.states.contains(guard.slot)) {
             let status = self.system.instance.call(Function::Outputs);
-            check_status(self.system.instance, status)?;
+            check_status(&self.system.instance, status)?;
         }
-        let left = description.guards.iter().position(|guard| {
-            let (low, high) = guard.range;
-            let width = high - low;
-            // What error control may be off by is no way out of a range.
-            let share = (10.0 * self.tol).max(1e-6);
-            let slack = |bound: f64| share * if width.is_finite() { width } else { bound.abs() };
+        let left = description.guards.iter().zip(&self.fine).position(|(guard, (least, greatest))| {
             let value = self.system.instance.get(guard.slot);
-            let above = low == f64::NEG_INFINITY || value >= low - slack(low);
-            let below = high == f64::INFINITY || value <= high + slack(high);
-            !(above && below && value.is_finite())
+            !(value >= *least && value <= *greatest && value.is_finite())
         });
-        check_status(self.system.instance, left.map_or(0, |guard| guard as u64 + 1))
+        check_status(&self.system.instance, left.map_or(0, |guard| guard as u64 + 1))
     }
 
     /// Steps tried so far.
@@ -868,23 +939,98 @@ impl<'a> Adaptive<'a> {
     }
 }
 
-/// x^(−1/5) of a positive number to four digits, by Newton's method from its exponent: the same bits on every machine, and
-/// no division, since the next step waits for it.
-fn inverse_fifth_root(x: f64) -> f64 {
-    // Minus a fifth of the exponent, and of the fraction as if the logarithm were straight in between; the constant
-    // makes the errors of both signs equal.
-    let mut y = f64::from_bits(0x4cb8_a7ef_9db2_2d0e - x.to_bits() / 5);
-    for _ in 0..2 {
-        let square = y * y;
-        y *= 1.2 - (0.2 * x * y) * (square * square);
+impl Course for Adaptive {
+    fn function(&self) -> Function {
+        Function::Rosenbrock
     }
-    y
-}
 
-#[test]
-fn inverse_fifth_roots() {
-    for n in -300..300 {
-        let x = 10f64.powf(0.1 * f64::from(n));
-        assert!((inverse_fifth_root(x) * x.powf(0.2) - 1.0).abs() < 3e-5, "{x}");
+    fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop> {
+        // The end is a goal like any other: what is due there is done.
+        while self.goal.is_some() || self.t < self.duration {
+            let (stop, before) = self.goal.unwrap_or_else(|| (self.next_stop(), self.attempts()));
+            self.goal = Some((stop, before));
+            if stop - self.t <= LEAST_STEP * stop {
+                self.t = stop;
+                self.goal = None;
+                self.arrive()?;
+                continue;
+            }
+            self.look_around(before, watch)?;
+            if self.stiff && self.fused.is_some() {
+                return Ok(Some(self.prepare(stop)));
+            }
+            self.try_step(stop)?;
+        }
+        self.finish()?;
+        Ok(None)
+    }
+
+    /// Takes over the steps that the function has settled, and settles the one that it left, if any.
+    fn take(&mut self, _: u64, status: u64) -> Result<(), Stop> {
+        self.moved = false;
+        let (stop, _) = self.goal.expect("there was one when it was prepared");
+        let fused = self.fused.as_ref().expect("it made trials");
+        let (pace, refused) = fused.settled(&self.system);
+        let accepted = pace.accepted - self.work.steps;
+        if accepted > 0 {
+            (self.t, self.last) = (pace.t, pace.last);
+            let (x, f) = fused.start(&self.system);
+            self.x.copy_from_slice(x);
+            self.step.f0.copy_from_slice(f);
+            self.surfaces.go_on(fused.here(&self.system));
+            self.jacobian_known = false;
+        }
+        if accepted + refused > 0 {
+            (self.h, self.rejected) = (pace.next, pace.rejected);
+            self.overran &= refused == 0;
+        }
+        self.work.steps += accepted;
+        self.work.stiff_steps += accepted;
+        self.work.rejected += refused;
+        let trials = accepted + refused + u64::from(status != 0);
+        self.work.jacobians += trials;
+        self.system.evaluations += 8 * trials;
+        if status == 0 {
+            return Ok(());
+        }
+        let fused = self.fused.as_ref().expect("it made trials");
+        self.step.t = self.t;
+        self.step.x0.copy_from_slice(&self.x);
+        let judged = fused.left(&self.system, &mut self.step, &mut self.end_slope, status);
+        if self.is_too_short(stop) {
+            return Err(self.too_short(self.step.h));
+        }
+        self.was_stiff = true;
+        self.was_fused = judged.is_some();
+        self.calm = judged.as_ref().is_some_and(|judged| !judged.met && !judged.outside);
+        let error = match judged {
+            Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
+            Some(Judged { error, defect, .. }) if error <= 1.0 => error.max(defect),
+            Some(Judged { error, .. }) => error,
+            None => self.stiff_attempt(),
+        };
+        self.conclude(error, stop)
+    }
+
+    fn instance(&mut self) -> &mut Instance {
+        &mut self.system.instance
+    }
+
+    fn fetch(&mut self, _: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64])) {
+        let fused = self.fused.as_ref().expect("it made trials");
+        fused.fetch(status, self.system.instance.block_mut(), from);
+    }
+
+    fn bring(&self, to: &mut dyn FnMut(Range<usize>, &[f64])) {
+        let (fused, block) = (self.fused.as_ref().expect("it is to make trials"), self.system.instance.block());
+        match self.moved {
+            true => to(0..block.len(), block),
+            false => fused.given().iter().for_each(|range| to(range.clone(), block)),
+        }
+    }
+
+    fn rest(self: Box<Self>) -> Rest {
+        let work = Work { evaluations: self.system.evaluations, ..self.work };
+        Rest { instance: self.system.instance, observer: self.points.observer(), work, notes: Vec::new() }
     }
 }

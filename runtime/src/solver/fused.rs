@@ -1,16 +1,37 @@
-//! The stiff step as one function of the model: the same method as [`rosenbrock`](super::rosenbrock), unrolled around it.
+//! Stiff steps by one function of the model: the same method as [`rosenbrock`](super::rosenbrock), unrolled around it.
 //!
-//! In: a model that has it. Out: a [`Step`], its error, and surfaces on its way, from one call. The end of an accepted
-//! step stays in the block as the start of the next.
+//! In: a model that has it, and how the run stands. Out: steps that it has settled by itself, and one that somebody has to
+//! look at: a [`Step`], its error, and surfaces on its way. The end of an accepted step stays in the block as the start of
+//! the next.
 
-use super::step::{Step, System};
-use abi::trial::Trial;
-use abi::{Function, Instance};
+use super::step::{Step, System, copy};
+use abi::description::Segment;
+use abi::trial::{PIVOT, Trial};
+use abi::{Function, Instance, Slot};
+use std::ops::Range;
 
 pub(crate) struct Fused {
     pub(crate) trial: Trial,
+    /// Parts of the block that are read, those that are left by steps that were settled, and all that is written.
+    read: [Range<usize>; 2],
+    settled: [Range<usize>; 2],
+    written: Range<usize>,
     /// Whether the start in the block is the present point.
     pub(crate) ready: bool,
+}
+
+/// How far a run is, and how its next step is chosen.
+#[derive(Clone, Copy)]
+pub(crate) struct Pace {
+    pub(crate) t: f64,
+    /// Length wanted for the next step, in s.
+    pub(crate) next: f64,
+    /// Length of the last accepted step, and the fifth root of its error; none after a restart.
+    pub(crate) last: Option<(f64, f64)>,
+    /// Whether the last trial was refused.
+    pub(crate) rejected: bool,
+    /// Steps accepted so far.
+    pub(crate) accepted: u64,
 }
 
 /// How far a step is off, as parts of what is allowed.
@@ -19,15 +40,43 @@ pub(crate) struct Judged {
     pub(crate) error: f64,
     /// By how it fails the equations at its end.
     pub(crate) defect: f64,
+    /// Whether it crosses a surface or comes close to one.
+    pub(crate) met: bool,
+    /// Whether a quantity has left its range where it ends.
+    pub(crate) outside: bool,
 }
 
 impl Fused {
-    /// None of a model without that function.
-    pub(crate) fn new(instance: &mut Instance, tol: f64, scales: &[f64]) -> Option<Fused> {
+    /// None of a model without that function. `fine`: for each guard the least and the greatest value.
+    pub(crate) fn new(instance: &mut Instance, tol: f64, scales: &[f64], fine: &[(f64, f64)]) -> Option<Fused> {
         let trial = Trial::of(&instance.description().layout).filter(|_| instance.has(Function::Rosenbrock))?;
         instance.set(trial.tol(), tol);
-        instance.block_mut()[trial.scales().range()].copy_from_slice(scales);
-        Some(Fused { trial, ready: false })
+        let block = instance.block_mut();
+        block[trial.scales().range()].copy_from_slice(scales);
+        for ((low, high), (least, greatest)) in trial.lows().range().zip(trial.highs().range()).zip(fine) {
+            (block[low], block[high]) = (*least, *greatest);
+        }
+        let (single, from, last) = (trial.single().range(), trial.from().whole().range(), trial.defect().index() + 1);
+        Some(Fused {
+            trial,
+            read: [single.clone(), trial.sides().range().start..from.end],
+            settled: [single.clone(), trial.here().range().start..from.end],
+            written: single.start..last,
+            ready: false,
+        })
+    }
+
+    /// Parts of the block that whoever prepares a trial may have changed.
+    pub(crate) fn given(&self) -> &[Range<usize>] {
+        &self.read
+    }
+
+    /// Brings what is to be looked at after trials with this status from where they were made.
+    pub(crate) fn fetch(&self, status: u64, block: &mut [f64], from: &dyn Fn(Range<usize>, &mut [f64])) {
+        match status {
+            0 => self.settled.iter().for_each(|range| from(range.clone(), block)),
+            _ => from(self.written.clone(), block),
+        }
     }
 
     /// Makes (t, x) with these derivatives the start.
@@ -40,27 +89,84 @@ impl Fused {
         self.ready = true;
     }
 
-    /// Fills in the step from its `t`, `h` and `end`, and the slope at its end. None where a pivot is too small.
-    pub(crate) fn attempt(&self, system: &mut System, step: &mut Step, end_slope: &mut [f64]) -> Option<Judged> {
+    /// How the run stands and where it goes: to `stop`, by no longer steps than `longest`; those that reach `watched` are
+    /// left to be looked at, and those that somebody attends.
+    pub(crate) fn prepare(&self, system: &mut System, pace: Pace, stop: f64, longest: f64, watched: f64, attend: f64) {
         let trial = self.trial;
-        let instance = &mut *system.instance;
-        instance.set(trial.time(), step.t);
-        instance.set(trial.step(), step.h);
-        instance.set(trial.end(), step.end);
-        let status = instance.call(Function::Rosenbrock);
-        system.evaluations += 8;
-        if status != 0 {
+        let (last_step, last_root) = pace.last.unwrap_or((0.0, 0.0));
+        let numbers = [
+            (trial.time(), pace.t),
+            (trial.next(), pace.next),
+            (trial.last_step(), last_step),
+            (trial.last_root(), last_root),
+            (trial.rejected(), f64::from(u8::from(pace.rejected))),
+            (trial.accepted(), pace.accepted as f64),
+            (trial.refused(), 0.0),
+            (trial.stop(), stop),
+            (trial.before_stop(), stop.next_down()),
+            (trial.longest(), longest),
+            (trial.watched(), watched),
+            (trial.attend(), attend),
+        ];
+        numbers.into_iter().for_each(|(slot, value)| system.instance.set(slot, value));
+    }
+
+    /// On which side of each surface the model is, and the values at the start.
+    pub(crate) fn prepare_surfaces(&self, system: &mut System, sides: &[f64], here: &[f64]) {
+        let block = system.instance.block_mut();
+        for (segment, values) in [(self.trial.sides(), sides), (self.trial.here(), here)] {
+            block[segment.range()].copy_from_slice(values);
+        }
+    }
+
+    /// How the run stands after the trials, and how many were refused.
+    pub(crate) fn settled(&self, system: &System) -> (Pace, u64) {
+        let (trial, get) = (self.trial, |slot| system.instance.get(slot));
+        let last_step = get(trial.last_step());
+        let pace = Pace {
+            t: get(trial.time()),
+            next: get(trial.next()),
+            last: (last_step > 0.0).then(|| (last_step, get(trial.last_root()))),
+            rejected: get(trial.rejected()) > 0.0,
+            accepted: get(trial.accepted()) as u64,
+        };
+        (pace, get(trial.refused()) as u64)
+    }
+
+    /// States at the start, and their derivatives.
+    pub(crate) fn start<'a>(&self, system: &'a System) -> (&'a [f64], &'a [f64]) {
+        let (from, block) = (self.trial.from(), system.instance.block());
+        (&block[from.states.range()], &block[from.derivatives.range()])
+    }
+
+    /// Surfaces at the start.
+    pub(crate) fn here<'a>(&self, system: &'a System) -> &'a [f64] {
+        &system.instance.block()[self.trial.here().range()]
+    }
+
+    /// Fills in the step that was left to be looked at from its length on, and the slope at its end. None where a pivot was
+    /// too small.
+    pub(crate) fn left(&self, system: &System, step: &mut Step, end_slope: &mut [f64], status: u64) -> Option<Judged> {
+        let (trial, block) = (self.trial, system.instance.block());
+        (step.h, step.end) = (block[trial.step().index()], block[trial.end().index()]);
+        if status == PIVOT {
             return None;
         }
-        let block = system.instance.block();
         let [k1, k2, k3] = trial.course();
-        step.x1.copy_from_slice(&block[trial.to().states.range()]);
-        step.error.copy_from_slice(&block[trial.error().range()]);
-        step.k1.copy_from_slice(&block[k1.range()]);
-        step.k2.copy_from_slice(&block[k2.range()]);
-        step.k3.copy_from_slice(&block[k3.range()]);
-        end_slope.copy_from_slice(&block[trial.to().derivatives.range()]);
-        Some(Judged { error: block[trial.worst().index()], defect: block[trial.defect().index()] })
+        let take = |to: &mut [f64], from: Segment| copy(&block[from.range()], to);
+        take(&mut step.x1, trial.to().states);
+        take(&mut step.error, trial.error());
+        take(&mut step.k1, k1);
+        take(&mut step.k2, k2);
+        take(&mut step.k3, k3);
+        take(end_slope, trial.to().derivatives);
+        let number = |slot: Slot| block[slot.index()];
+        Some(Judged {
+            error: number(trial.worst()),
+            defect: number(trial.defect()),
+            met: number(trial.met()) > 0.0,
+            outside: number(trial.outside()) > 0.0,
+        })
     }
 
     /// The end becomes the start.

@@ -68,6 +68,16 @@ impl Entries {
         diagonal.map(|(_, entry)| entry).sum()
     }
 
+    /// The sum of the squares of the eigenvalues; 0 where that is not cheap to know.
+    pub(crate) fn trace_of_square(&self, jacobian: &[f64]) -> f64 {
+        let n = self.n;
+        if !self.coupled.is_empty() || n > MOST_SQUARED {
+            return 0.0;
+        }
+        let product = |row: usize, column: usize| jacobian[row * n + column] * jacobian[column * n + row];
+        (0..n).flat_map(|row| (0..n).map(move |column| (row, column))).map(|(row, column)| product(row, column)).sum()
+    }
+
     /// Largest magnitude of an eigenvalue, to within a factor of about two; `scales`: one for each state, in which the
     /// Jacobian is measured so that it is as normal as it can be.
     pub(crate) fn spectral_radius(&mut self, jacobian: &[f64], scales: &[f64]) -> f64 {

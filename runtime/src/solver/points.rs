@@ -16,11 +16,13 @@ const LEAST_POINTS: f64 = 1009.0;
 const DEPTH: usize = 8;
 
 /// The points shown so far.
-pub(crate) struct Points<'a> {
-    observer: &'a mut Observer,
+pub(crate) struct Points {
+    observer: Observer,
     duration: f64,
     /// Slots that somebody looks at.
     slots: Vec<usize>,
+    /// Whether all that is looked at are states.
+    only_states: bool,
     /// θ of the last point shown.
     theta: f64,
     /// Rows of values of the slots: the last one shown, then room for those between.
@@ -36,13 +38,15 @@ pub(crate) struct Points<'a> {
     x: Vec<f64>,
 }
 
-impl<'a> Points<'a> {
-    pub(crate) fn new(instance: &Instance, observer: &'a mut Observer, experiment: &Experiment) -> Points<'a> {
+impl Points {
+    pub(crate) fn new(instance: &Instance, observer: Observer, experiment: &Experiment) -> Points {
         let slots: Vec<usize> = match observer.only_last() {
             true => Vec::new(),
             false => observer.slots().iter().map(|slot| slot.index()).collect(),
         };
+        let states = instance.description().layout.states;
         Points {
+            only_states: observer.slots().iter().chain(observer.probe.slots()).all(|slot| states.contains(*slot)),
             duration: experiment.duration,
             theta: 0.0,
             rows: vec![0.0; slots.len() * (DEPTH + 4)],
@@ -73,6 +77,21 @@ impl<'a> Points<'a> {
         Ok(())
     }
 
+    /// Who has seen the points.
+    pub(crate) fn observer(self) -> Observer {
+        self.observer
+    }
+
+    /// Whether every step is shown.
+    pub(crate) fn are_shown(&self) -> bool {
+        !self.slots.is_empty()
+    }
+
+    /// The next instant at which somebody wants a value, in s; infinite if there is none.
+    pub(crate) fn next_probe(&self) -> f64 {
+        self.observer.probe.next().unwrap_or(f64::INFINITY)
+    }
+
     /// A new step begins where the last one was shown.
     pub(crate) fn begin(&mut self) {
         self.theta = 0.0;
@@ -83,7 +102,7 @@ impl<'a> Points<'a> {
         while self.observer.probe.next().is_some_and(|instant| instant <= self.duration) {
             self.observer.probe.take(system.instance.block());
         }
-        if self.observer.only_last() { self.observer.see(system.instance) } else { Ok(()) }
+        if self.observer.only_last() { self.observer.see(&system.instance) } else { Ok(()) }
     }
 
     /// Shows the course of the step from where it was shown last to θ, whose point is said to be at `time`.
@@ -114,10 +133,18 @@ impl<'a> Points<'a> {
 
     /// Keeps what is wanted at the instant in the block.
     fn probe(&mut self, system: &mut System) -> Result<(), Stop> {
-        let status = system.instance.call(Function::Outputs);
-        check_status(system.instance, status)?;
+        self.compute(system)?;
         self.observer.probe.take(system.instance.block());
         Ok(())
+    }
+
+    /// Computes what is looked at, of states and time that are in the block.
+    fn compute(&self, system: &mut System) -> Result<(), Stop> {
+        if self.only_states {
+            return Ok(());
+        }
+        let status = system.instance.call(Function::Outputs);
+        check_status(&system.instance, status)
     }
 
     /// Shows one more point of the step.
@@ -189,8 +216,7 @@ impl<'a> Points<'a> {
     }
 
     fn sample_block(&mut self, system: &mut System, row: usize) -> Result<(), Stop> {
-        let status = system.instance.call(Function::Outputs);
-        check_status(system.instance, status)?;
+        self.compute(system)?;
         let width = self.slots.len();
         let block = system.instance.block();
         let mut doubt = 0.0;
@@ -198,7 +224,7 @@ impl<'a> Points<'a> {
             *value = block[*slot];
             doubt += 0.0 * *value;
         }
-        if doubt != 0.0 { self.observer.check(system.instance) } else { Ok(()) }
+        if doubt != 0.0 { self.observer.check(&system.instance) } else { Ok(()) }
     }
 
     fn emit(&mut self, row: usize, time: f64) {

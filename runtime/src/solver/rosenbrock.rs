@@ -214,14 +214,14 @@ mod tests {
 
     /// x' = −x² cos t, x = 1/(1 + sin t), to t = 2 s: nonlinear and not autonomous.
     fn error(steps: u32) -> (f64, f64) {
-        let mut instance = models::Model::new("Wave")
+        let instance = models::Model::new("Wave")
             .state("x", "m")
             .body(abi::Function::Derivatives, |m| m.set_dx(0, -m.x(0) * m.x(0) * m.t().cos()))
             .body(abi::Function::Jacobian, |m| {
                 m.set_jacobian(&[-2.0 * m.x(0) * m.t().cos(), m.x(0) * m.x(0) * m.t().sin()]);
             })
             .build();
-        let mut system = System::new(&mut instance);
+        let mut system = System::new(instance);
         let (mut method, mut step) = (Rosenbrock::new(1, None), Step::new(1));
         let exact = |t: f64| 1.0 / (1.0 + t.sin());
         let h = 2.0 / f64::from(steps);

@@ -6,8 +6,8 @@ use std::ops::Range;
 
 /// A model whose derivatives, Jacobian and switching surfaces are functions of time and states; everything else in
 /// its block is held.
-pub(crate) struct System<'a> {
-    pub(crate) instance: &'a mut Instance,
+pub(crate) struct System {
+    pub(crate) instance: Instance,
     /// Number of states.
     pub(crate) n: usize,
     pub(crate) states: Range<usize>,
@@ -20,8 +20,8 @@ pub(crate) struct System<'a> {
     pub(crate) history: History,
 }
 
-impl<'a> System<'a> {
-    pub(crate) fn new(instance: &'a mut Instance) -> System<'a> {
+impl System {
+    pub(crate) fn new(instance: Instance) -> System {
         let layout = &instance.description().layout;
         let roots = if instance.has(Function::Roots) { layout.roots.range() } else { 0..0 };
         System {
@@ -30,7 +30,7 @@ impl<'a> System<'a> {
             derivatives: layout.derivatives.range(),
             jacobian: layout.jacobian.range(),
             roots,
-            history: History::new(instance),
+            history: History::new(&instance),
             instance,
             evaluations: 0,
         }
@@ -126,6 +126,24 @@ impl<'a> System<'a> {
         self.place(t, x);
         self.instance.call(Function::Roots);
         g.copy_from_slice(&self.instance.block()[self.roots.clone()]);
+    }
+}
+
+/// Copies as many numbers; of as few as models mostly have, without a call.
+#[inline]
+pub(crate) fn copy(from: &[f64], to: &mut [f64]) {
+    fn fixed<const N: usize>(from: &[f64], to: &mut [f64]) {
+        if let (Ok(from), Ok(to)) = (<&[f64; N]>::try_from(from), <&mut [f64; N]>::try_from(to)) {
+            *to = *from;
+        }
+    }
+    match from.len() {
+        1 => fixed::<1>(from, to),
+        2 => fixed::<2>(from, to),
+        3 => fixed::<3>(from, to),
+        4 => fixed::<4>(from, to),
+        5 => fixed::<5>(from, to),
+        _ => to.copy_from_slice(from),
     }
 }
 

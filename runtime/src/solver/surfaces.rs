@@ -91,6 +91,21 @@ impl Surfaces {
         first
     }
 
+    /// On which side of each surface the model is.
+    pub(crate) fn sides(&self) -> &[f64] {
+        &self.sides
+    }
+
+    /// Values at the end of the last step.
+    pub(crate) fn here(&self) -> &[f64] {
+        &self.here
+    }
+
+    /// Steps that crossed nothing have led to a point with these values.
+    pub(crate) fn go_on(&mut self, here: &[f64]) {
+        self.here.copy_from_slice(here);
+    }
+
     /// The surfaces met most often since `forget`.
     pub(crate) fn often(&self) -> impl Iterator<Item = usize> {
         let most = self.met.iter().copied().max().unwrap_or(0);

@@ -4,7 +4,7 @@
 //! gives way (Belady). Loads, constants and what was computed before the loop lie in memory and cost no register; most
 //! instructions read one operand from there.
 
-use super::encode::{Assembler, Base, Instruction, Place, Width, instructions as i};
+use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Signs, What};
 use std::collections::HashMap;
 
@@ -25,7 +25,7 @@ pub struct Body<'a> {
     nodes: &'a Nodes,
     order: &'a [Node],
     homes: &'a HashMap<Node, Home>,
-    width: Width,
+    width: Vectors,
     vectors: usize,
     /// For each node the places of the order where it is read, ascending.
     uses: HashMap<Node, Vec<usize>>,
@@ -52,7 +52,7 @@ impl<'a> Body<'a> {
         nodes: &'a Nodes,
         order: &'a [Node],
         homes: &'a HashMap<Node, Home>,
-        width: Width,
+        width: Vectors,
         vectors: usize,
         spills_at: usize,
     ) -> Body<'a> {
@@ -133,8 +133,8 @@ impl<'a> Body<'a> {
             self.now = (self.order.len() + 1, k);
             let register = self.in_register(mask);
             match self.width {
-                Width::Avx512 => self.code.mask(i::MASK_TEST, register, 0, Place::Register(register)),
-                Width::Avx2 => {
+                Vectors::Avx512 => self.code.mask(i::MASK_TEST, register, 0, Place::Register(register)),
+                Vectors::Avx2 => {
                     // To r10.
                     self.code.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 5, 0x7d, 0x50, 0xd0 | register & 7]);
                     self.code.plain(&[0x45, 0x85, 0xd2]);
@@ -214,7 +214,7 @@ impl<'a> Body<'a> {
     fn load(&mut self, node: Node, register: u8, place: Place) {
         match place {
             _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
-            Place::Constant(_) if self.width == Width::Avx512 => {
+            Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::BROADCAST, register, 0, place, None);
             }
             place => self.code.vector(i::LOAD, register, 0, place, None),
@@ -317,6 +317,11 @@ impl<'a> Body<'a> {
 
     fn node(&mut self, node: Node) {
         let what = self.what(node);
+        let copy = self.copy(node);
+        if self.register.contains_key(&copy) || self.spills.contains_key(&copy) {
+            // It came with another.
+            return what.operands().for_each(|operand| self.release(operand));
+        }
         // What this instruction reads does not give way to what it loads.
         for operand in what.operands() {
             if let Some(register) = self.register.get(&self.copy(operand)) {
@@ -354,7 +359,7 @@ impl<'a> Body<'a> {
                 let to = self.result(node);
                 self.code.vector(i::COMPARE, to, first, last, Some(predicate));
             }
-            What::CompareInt(predicate, a, b) if self.width == Width::Avx512 => {
+            What::CompareInt(predicate, a, b) if self.width == Vectors::Avx512 => {
                 let first = self.in_register(a);
                 let last = self.place(b);
                 let to = self.result(node);
@@ -400,8 +405,8 @@ impl<'a> Body<'a> {
                 let chosen = self.place(a);
                 let to = self.result(node);
                 match self.width {
-                    Width::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Width::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
+                    Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
+                    Vectors::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
                 }
             }
             What::Permute(table, index) => {
@@ -412,17 +417,28 @@ impl<'a> Body<'a> {
                 self.code.vector(i::PERMUTE_TWO, to, by, second, None);
                 self.release(index);
             }
-            What::Gather { base, index } => {
+            What::Gather { base, index } if self.width == Vectors::Avx512 => {
                 let from = self.in_register(index);
-                let mask = self.take(self.width == Width::Avx512);
+                let mask = self.take(true);
                 let to = self.apart(node);
-                match self.width {
-                    Width::Avx512 => self.code.mask(i::MASK_NOT_XOR, mask, mask, Place::Register(mask)),
-                    Width::Avx2 => self.code.vector(i::INT_EQUAL_32, mask, mask, Place::Register(mask), None),
-                }
+                self.code.mask(i::MASK_NOT_XOR, mask, mask, Place::Register(mask));
                 // It keeps lanes that the mask leaves out, so it would wait for whatever was there.
                 self.code.vector(i::XOR, to, to, Place::Register(to), None);
                 self.code.gather(to, from, mask, 8 * base as i32);
+                self.release(index);
+            }
+            What::Gather { index, .. } => {
+                // All tables that are read at the same place, at once.
+                let same = |other: &&Node| matches!(self.what(**other), What::Gather { index: at, .. } if at == index);
+                let all: Vec<Node> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
+                let from = self.in_register(index);
+                let half = self.take(false);
+                let mut tables = Vec::new();
+                for node in all {
+                    let What::Gather { base, .. } = self.what(node) else { unreachable!("they are alike") };
+                    tables.push((self.apart(node), 8 * base as i32));
+                }
+                self.code.look_up(&tables, from, half);
                 self.release(index);
             }
         }

@@ -8,19 +8,19 @@ use std::collections::HashMap;
 
 /// Which vectors.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-pub enum Width {
+pub enum Vectors {
     /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
     Avx2,
     /// Eight lanes of 64 bits in 32 registers, and masks: AVX-512 F and DQ.
     Avx512,
 }
 
-impl Width {
+impl Vectors {
     /// Lanes of a vector.
     pub fn lanes(self) -> usize {
         match self {
-            Width::Avx2 => 4,
-            Width::Avx512 => 8,
+            Vectors::Avx2 => 4,
+            Vectors::Avx512 => 8,
         }
     }
 
@@ -32,8 +32,8 @@ impl Width {
     /// Vector registers.
     pub fn registers(self) -> u8 {
         match self {
-            Width::Avx2 => 16,
-            Width::Avx512 => 32,
+            Vectors::Avx2 => 16,
+            Vectors::Avx512 => 32,
         }
     }
 }
@@ -103,8 +103,14 @@ pub mod instructions {
     /// By a constant: /2 right, /4 right with the sign (as opcode 72), /6 left.
     pub const SHIFT: Instruction = Instruction(1, 1, [1, 0], 0x73);
     pub const SHIFT_SIGNED: Instruction = Instruction(1, 1, [1, 0], 0x72);
-    pub const INT_EQUAL_32: Instruction = Instruction(1, 1, [0, 0], 0x76);
     /// VEX only.
+    pub const UPPER_HALF: Instruction = Instruction(1, 3, [0, 0], 0x39);
+    pub const INSERT_HALF: Instruction = Instruction(1, 3, [0, 0], 0x18);
+    /// Of one number, to or from a general register or memory.
+    pub const TO_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x7e);
+    pub const SECOND_TO_GENERAL: Instruction = Instruction(1, 3, [1, 1], 0x16);
+    pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
+    pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
     pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
     pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
@@ -135,7 +141,7 @@ pub mod instructions {
 
 /// Code under way.
 pub struct Assembler {
-    width: Width,
+    width: Vectors,
     bytes: Vec<u8>,
     /// Constants in the order of their first use, and where each is wanted: the place of a distance, and the end of its
     /// instruction.
@@ -148,7 +154,7 @@ pub struct Assembler {
 }
 
 impl Assembler {
-    pub fn new(width: Width) -> Assembler {
+    pub fn new(width: Vectors) -> Assembler {
         Assembler {
             width,
             bytes: Vec::new(),
@@ -168,8 +174,8 @@ impl Assembler {
     /// An instruction with a mask register; 0: none. VEX has no masks.
     pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
         match self.width {
-            Width::Avx512 => self.evex(what, reg, second, last, mask),
-            Width::Avx2 => {
+            Vectors::Avx512 => self.evex(what, reg, second, last, mask),
+            Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
                 self.vex(what, reg, second, last, 1);
             }
@@ -183,27 +189,53 @@ impl Assembler {
         self.operand(reg, last, None);
     }
 
-    /// Entries of the table at `offset` bytes of the pool, at the indices in a vector; `mask`: a mask register, or a vector
-    /// whose signs are the mask. The mask is used up.
+    /// Entries of the table at `offset` bytes of the pool, at the indices in a vector, where a mask register is set. EVEX
+    /// only; the mask is used up.
     pub fn gather(&mut self, to: u8, index: u8, mask: u8, offset: i32) {
         let Instruction(pp, map, w, opcode) = instructions::GATHER;
-        let base = Base::Pool as u8;
-        match self.width {
-            Width::Avx512 => {
-                let bit = |register: u8, n: u8| (!register >> n) & 1;
-                let p0 = bit(to, 3) << 7 | bit(index, 3) << 6 | 1 << 5 | bit(to, 4) << 4 | map;
-                let p1 = w[0] << 7 | 0xf << 3 | 1 << 2 | pp;
-                let p2 = 2 << 5 | bit(index, 4) << 3 | mask;
-                self.bytes.extend([0x62, p0, p1, p2]);
-            }
-            Width::Avx2 => {
-                let p0 = (!to >> 3 & 1) << 7 | (!index >> 3 & 1) << 6 | 1 << 5 | map;
-                let p1 = w[1] << 7 | (!mask & 15) << 3 | 1 << 2 | pp;
-                self.bytes.extend([0xc4, p0, p1]);
+        let bit = |register: u8, n: u8| (!register >> n) & 1;
+        let p0 = bit(to, 3) << 7 | bit(index, 3) << 6 | 1 << 5 | bit(to, 4) << 4 | map;
+        let p1 = w[0] << 7 | 0xf << 3 | 1 << 2 | pp;
+        let p2 = 2 << 5 | bit(index, 4) << 3 | mask;
+        self.bytes.extend([0x62, p0, p1, p2, opcode]);
+        self.entry_of(to, index, offset);
+    }
+
+    /// Entries of tables at these bytes of the pool, each into a register of its own, at the indices in a vector; `half` is
+    /// overwritten. VEX only, and lane by lane through r10 and r11: its gathering instruction takes three times as long.
+    pub fn look_up(&mut self, tables: &[(u8, i32)], index: u8, half: u8) {
+        // vextracti128 half, index, 1
+        self.vex(instructions::UPPER_HALF, index, 0, Place::Register(half), 1);
+        self.operand(index, Place::Register(half), Some(1));
+        for (upper, from) in [index, half].into_iter().enumerate() {
+            // vmovq r10, from; vpextrq r11, from, 1
+            self.vex(instructions::TO_GENERAL, from, 0, Place::Register(10), 0);
+            self.operand(from, Place::Register(10), None);
+            self.vex(instructions::SECOND_TO_GENERAL, from, 0, Place::Register(11), 0);
+            self.operand(from, Place::Register(11), Some(1));
+            for (to, offset) in tables {
+                let into = if upper == 0 { *to } else { half };
+                self.entry(instructions::LOAD_FIRST, into, 0, 10, *offset);
+                self.entry(instructions::LOAD_SECOND, into, into, 11, *offset);
+                if upper == 1 {
+                    // vinsertf128 to, to, half, 1
+                    self.vex(instructions::INSERT_HALF, *to, *to, Place::Register(half), 1);
+                    self.operand(*to, Place::Register(half), Some(1));
+                }
             }
         }
-        // Base and index scaled by 8, with a distance of 32 bits.
-        self.bytes.extend([opcode, 0x84 | (to & 7) << 3, 0xc0 | (index & 7) << 3 | base]);
+    }
+
+    /// A VEX instruction on the entry of the table at `offset` bytes of the pool whose number a general register holds.
+    fn entry(&mut self, Instruction(pp, map, w, opcode): Instruction, reg: u8, second: u8, index: u8, offset: i32) {
+        let p0 = (!reg >> 3 & 1) << 7 | (!index >> 3 & 1) << 6 | 1 << 5 | map;
+        self.bytes.extend([0xc4, p0, w[1] << 7 | (!second & 15) << 3 | pp, opcode]);
+        self.entry_of(reg, index, offset);
+    }
+
+    /// The operand: base and index scaled by 8, with a distance of 32 bits.
+    fn entry_of(&mut self, reg: u8, index: u8, offset: i32) {
+        self.bytes.extend([0x84 | (reg & 7) << 3, 0xc0 | (index & 7) << 3 | Base::Pool as u8]);
         self.bytes.extend(offset.to_le_bytes());
     }
 
@@ -299,7 +331,7 @@ impl Assembler {
     /// The code and, behind it, its constants: to lie at a multiple of 64.
     pub fn finish(mut self) -> Vec<u8> {
         // EVEX spreads one number over the lanes as it reads it.
-        let copies = if self.width == Width::Avx512 { 1 } else { self.width.lanes() };
+        let copies = if self.width == Vectors::Avx512 { 1 } else { self.width.lanes() };
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
         let begin = self.bytes.len();
         for (at, end, number) in std::mem::take(&mut self.wanted) {
@@ -328,7 +360,7 @@ mod tests {
     use super::*;
 
     #[track_caller]
-    fn check(width: Width, write: impl Fn(&mut Assembler), expected: &[u8]) {
+    fn check(width: Vectors, write: impl Fn(&mut Assembler), expected: &[u8]) {
         let mut code = Assembler::new(width);
         write(&mut code);
         assert_eq!(code.bytes, expected, "{:02x?}", code.bytes);
@@ -337,55 +369,69 @@ mod tests {
     /// Against the GNU assembler's bytes.
     #[test]
     fn instructions_have_the_bytes_of_the_manual() {
+        let look_up = [
+            [0xc4, 0x63, 0x7d, 0x39, 0xd3, 1].as_slice(),
+            &[0xc4, 0x41, 0xf9, 0x7e, 0xd2],
+            &[0xc4, 0x43, 0xf9, 0x16, 0xd3, 1],
+            &[0xc4, 0x21, 0x7b, 0x10, 0x8c, 0xd6, 0x40, 0, 0, 0],
+            &[0xc4, 0x21, 0x31, 0x16, 0x8c, 0xde, 0x40, 0, 0, 0],
+            &[0xc4, 0xc1, 0xf9, 0x7e, 0xda],
+            &[0xc4, 0xc3, 0xf9, 0x16, 0xdb, 1],
+            &[0xc4, 0xa1, 0x7b, 0x10, 0x9c, 0xd6, 0x40, 0, 0, 0],
+            &[0xc4, 0xa1, 0x61, 0x16, 0x9c, 0xde, 0x40, 0, 0, 0],
+            &[0xc4, 0x63, 0x35, 0x18, 0xcb, 1],
+        ]
+        .concat();
         // vaddpd zmm17, zmm2, zmm30
         check(
-            Width::Avx512,
+            Vectors::Avx512,
             |c| c.vector(ADD, 17, 2, Place::Register(30), None),
             &[0x62, 0x81, 0xed, 0x48, 0x58, 0xce],
         );
         // vfmadd231pd ymm9, ymm1, [r8+0x100]
         check(
-            Width::Avx2,
+            Vectors::Avx2,
             |c| c.vector(FMA_231, 9, 1, Place::Memory(Base::Before, 0x100), None),
             &[0xc4, 0x42, 0xf5, 0xb8, 0x88, 0, 1, 0, 0],
         );
         // vblendmpd zmm1{k3}, zmm2, zmm4
         check(
-            Width::Avx512,
+            Vectors::Avx512,
             |c| c.masked(BLEND, 1, 2, Place::Register(4), None, 3),
             &[0x62, 0xf2, 0xed, 0x4b, 0x65, 0xcc],
         );
-        // vgatherqpd ymm1, [rsi+ymm10*8+0x40], ymm3
-        check(Width::Avx2, |c| c.gather(1, 10, 3, 0x40), &[0xc4, 0xa2, 0xe5, 0x93, 0x8c, 0xd6, 0x40, 0, 0, 0]);
+        // vextracti128 xmm3, ymm10, 1; vmovq r10, xmm10; vpextrq r11, xmm10, 1; vmovsd xmm9, [rsi+r10*8+0x40];
+        // vmovhpd xmm9, xmm9, [rsi+r11*8+0x40]; …; vinsertf128 ymm9, ymm9, xmm3, 1
+        check(Vectors::Avx2, |c| c.look_up(&[(9, 0x40)], 10, 3), &look_up);
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
-        check(Width::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
+        check(Vectors::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9
         check(
-            Width::Avx512,
+            Vectors::Avx512,
             |c| c.vector(ROUND, 3, 0, Place::Register(20), Some(9)),
             &[0x62, 0xb3, 0xfd, 0x48, 0x09, 0xdc, 0x09],
         );
         // vpsraq zmm18, zmm5, 7: the register it goes to stands where the second operand does.
         check(
-            Width::Avx512,
+            Vectors::Avx512,
             |c| c.vector(SHIFT_SIGNED, 4, 18, Place::Register(5), Some(7)),
             &[0x62, 0xf1, 0xed, 0x40, 0x72, 0xe5, 0x07],
         );
         // vblendvpd ymm1, ymm2, ymm3, ymm4
         check(
-            Width::Avx2,
+            Vectors::Avx2,
             |c| c.vector(BLEND_BY_SIGN, 1, 2, Place::Register(3), Some(4 << 4)),
             &[0xc4, 0xe3, 0x6d, 0x4b, 0xcb, 0x40],
         );
         // kandnb k1, k2, k3
-        check(Width::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x42, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x42, 0xcb]);
         // vcvtqq2pd zmm1, zmm2
         check(
-            Width::Avx512,
+            Vectors::Avx512,
             |c| c.vector(TO_REAL, 1, 0, Place::Register(2), None),
             &[0x62, 0xf1, 0xfe, 0x48, 0xe6, 0xca],
         );
         // korb k1, k2, k3
-        check(Width::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x45, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x45, 0xcb]);
     }
 }

@@ -1,5 +1,6 @@
-//! The same program for many instances at once, in the widest vectors of x86-64: a straight line with a loop around it,
-//! and the bits of a single instance in every lane.
+//! The same program for many instances at once, in vectors: a straight line with a loop around it, and the bits of a
+//! single instance in every lane. The wide vectors of x86-64 have an encoder of their own here; pairs, which any processor
+//! has, are Cranelift's.
 //!
 //! In: a step, expanded or not. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
 //! for itself. What no step changes is computed before the loop; what only the last step leaves behind (outputs) is
@@ -17,60 +18,119 @@
 mod body;
 mod encode;
 mod select;
+pub(super) mod pairs;
 
-use super::jit::Executable;
-use super::target::Unsupported;
+use super::memory::Executable;
+use super::target::{Coder, Unsupported, here};
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;
 use abi::lanes::{Lanes, LanesEntry};
 use abi::{Layout, Slot};
 use body::{Body, Home};
-pub use encode::Width;
-use encode::{Assembler, Base};
-use encode::{Place, instructions};
+use encode::{Assembler, Base, Place, Vectors, instructions};
 use select::{Node, Nodes, What, select};
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
+/// Which vectors.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Width {
+    /// Two lanes: any processor that there is machine code for.
+    Pairs,
+    /// Four lanes: AVX2 and FMA.
+    Avx2,
+    /// Eight lanes: AVX-512 F and DQ.
+    Avx512,
+}
+
 impl Width {
+    /// All of them, ascending.
+    pub const ALL: [Width; 3] = [Width::Pairs, Width::Avx2, Width::Avx512];
+
     /// The widest of this processor.
     pub fn here() -> Option<Width> {
-        [Width::Avx512, Width::Avx2].into_iter().find(|width| width.is_here())
+        Width::here_all().next()
+    }
+
+    /// Those of this processor, the widest first.
+    pub fn here_all() -> impl Iterator<Item = Width> {
+        Width::ALL.into_iter().rev().filter(|width| width.is_here())
     }
 
     /// Whether this processor has it, with the calling convention that the code is made for.
-    #[cfg(all(target_arch = "x86_64", unix))]
     pub fn is_here(self) -> bool {
-        match self {
-            Width::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
-            Width::Avx512 => {
-                std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")
-            }
+        match self.own() {
+            Some(vectors) => vectors.are_here(),
+            None => here().is_ok(),
         }
     }
 
-    /// Whether this processor has it, with the calling convention that the code is made for.
-    #[cfg(not(all(target_arch = "x86_64", unix)))]
-    pub fn is_here(self) -> bool {
-        false
+    /// Lanes of a vector.
+    pub fn lanes(self) -> usize {
+        self.own().map_or(pairs::LANES, Vectors::lanes)
     }
 
     /// Vectors side by side that pay on current processors.
     pub fn vectors(self) -> usize {
         match self {
-            Width::Avx2 => 3,
-            Width::Avx512 => 3,
+            Width::Pairs => 2,
+            Width::Avx2 | Width::Avx512 => 3,
         }
     }
 
     /// As its maker calls it.
     pub fn name(self) -> &'static str {
         match self {
+            Width::Pairs => "pairs",
             Width::Avx2 => "AVX2",
             Width::Avx512 => "AVX-512",
         }
     }
+
+    /// Vectors of our own encoder.
+    fn own(self) -> Option<Vectors> {
+        match self {
+            Width::Pairs => None,
+            Width::Avx2 => Some(Vectors::Avx2),
+            Width::Avx512 => Some(Vectors::Avx512),
+        }
+    }
+}
+
+impl Vectors {
+    #[cfg(all(target_arch = "x86_64", unix))]
+    fn are_here(self) -> bool {
+        match self {
+            Vectors::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
+            Vectors::Avx512 => {
+                std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")
+            }
+        }
+    }
+
+    #[cfg(not(all(target_arch = "x86_64", unix)))]
+    fn are_here(self) -> bool {
+        false
+    }
+}
+
+/// Machine code of a step for many instances, in the widest vectors of this processor that have instructions for it.
+///
+/// # Errors
+/// Why the widest have none, if no others have.
+///
+/// # Panics
+/// As [`compile`].
+pub fn widest(func: &Func, layout: &Layout, pool_len: usize) -> Result<Lanes, Unsupported> {
+    let mut refused = None;
+    for width in Width::here_all() {
+        match compile(func, layout, pool_len, width, width.vectors()) {
+            Ok(lanes) => return Ok(lanes),
+            Err(why) => refused = refused.or(Some(why)),
+        }
+    }
+    Err(refused.unwrap_or_else(|| Unsupported("there is no machine code for this processor".into())))
 }
 
 /// Machine code of a step for as many instances as `vectors` vectors have lanes.
@@ -93,13 +153,23 @@ pub fn compile(
     }
     let own: &[Unary] = match width {
         Width::Avx512 => &[Unary::Exp],
-        Width::Avx2 => &[],
+        Width::Avx2 | Width::Pairs => &[],
     };
     // Expanding works on the pool that every model begins with; what needs none may run with any.
     let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
-    let expanded = elementary.then(|| math::expand_but(func, own));
-    let (code, scratch) = generate(expanded.as_ref().unwrap_or(func), layout, width, vectors)?;
-    let executable = Executable::new(&code, 64)?;
+    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
+    let func = expanded.as_ref().unwrap_or(func);
+    let (code, alignment, scratch) = match width.own() {
+        Some(own) => {
+            let (code, scratch) = generate(func, layout, own, vectors)?;
+            (code, 64, scratch)
+        }
+        None => {
+            let (bytes, scratch) = Coder::new(here()?).pairs(func, layout, vectors)?;
+            (bytes.code, bytes.alignment as u64, scratch)
+        }
+    };
+    let executable = Executable::new(&code, alignment)?;
     // SAFETY: `address` is the beginning of code with the signature of `LanesEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, LanesEntry>(executable.address()) };
     let lanes = vectors * width.lanes();
@@ -110,17 +180,18 @@ pub fn compile(
 }
 
 /// What the vectors of one node have in memory.
-fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Width) -> Place {
+fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Vectors) -> Place {
     Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
 }
 
 /// The code, and the numbers it needs behind the block.
-fn generate(func: &Func, layout: &Layout, width: Width, vectors: usize) -> Result<(Vec<u8>, usize), Unsupported> {
+fn generate(func: &Func, layout: &Layout, width: Vectors, vectors: usize) -> Result<(Vec<u8>, usize), Unsupported> {
     let nodes = select(func, width)?;
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let loaded: HashSet<Slot> = func.loads().into_iter().collect();
     let carried: Vec<(Slot, Node)> = nodes.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
-    let varies = varying(&nodes, &stored);
+    // A step that hands nothing on is done once, and nothing before it.
+    let varies = if carried.is_empty() { vec![true; nodes.nodes.len()] } else { varying(&nodes, &stored) };
 
     // Behind the block: two areas of what is carried, what is computed once, what registers have no room for.
     let vector = width.bytes() as usize;

@@ -4,9 +4,9 @@
 //! comparison whose result a selection takes from becomes a minimum or maximum, what is negated enters the fused
 //! product, bits and numbers are one.
 
-use super::encode::{Instruction, Width, instructions as i};
+use super::encode::{Instruction, Vectors, instructions as i};
 use crate::backend::target::Unsupported;
-use crate::ir::{Func, Op, Type, Unary, Value, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, is_minus_square, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
@@ -134,9 +134,9 @@ impl What {
     }
 
     /// Whether it lies in a mask register.
-    pub fn is_mask(self, width: Width) -> bool {
+    pub fn is_mask(self, width: Vectors) -> bool {
         match self {
-            What::Compare(..) | What::CompareInt(..) => width == Width::Avx512,
+            What::Compare(..) | What::CompareInt(..) => width == Vectors::Avx512,
             What::Mask(_)
             | What::TestBits(..)
             | What::MaskAnd(..)
@@ -171,7 +171,7 @@ const SIGN: u64 = 1 << 63;
 
 /// # Errors
 /// If a width has no instructions for an operation.
-pub fn select(func: &Func, width: Width) -> Result<Nodes, Unsupported> {
+pub fn select(func: &Func, width: Vectors) -> Result<Nodes, Unsupported> {
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
@@ -198,7 +198,7 @@ pub fn select(func: &Func, width: Width) -> Result<Nodes, Unsupported> {
 }
 
 struct Selection {
-    width: Width,
+    width: Vectors,
     nodes: Vec<What>,
     known: HashMap<What, Node>,
 }
@@ -220,8 +220,8 @@ impl Selection {
 
     fn not(&mut self, mask: Node) -> What {
         match self.width {
-            Width::Avx512 => What::MaskNot(mask),
-            Width::Avx2 => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
+            Vectors::Avx512 => What::MaskNot(mask),
+            Vectors::Avx2 => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
         }
     }
 
@@ -231,7 +231,7 @@ impl Selection {
 
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[Node]) -> Result<Node, Unsupported> {
         let at = |value: Value| of[value.index()];
-        let wide = self.width == Width::Avx512;
+        let wide = self.width == Vectors::Avx512;
         let what = match op {
             Op::Real(bits) => What::Constant(bits),
             Op::Int(n) => What::Constant(n as u64),
@@ -270,8 +270,7 @@ impl Selection {
             Op::Floor(a) => What::One(i::ROUND, Some(9), at(a)),
             Op::Nearest(a) => What::One(i::ROUND, Some(8), at(a)),
             Op::Unary(Unary::Exp, x) => {
-                let falls = matches!(func.op(x), Op::Neg(square) if matches!(func.op(square), Op::Mul(a, b) if a == b));
-                return Ok(self.exp(at(x), falls));
+                return Ok(self.exp(at(x), is_minus_square(x, |value| func.op(value))));
             }
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Less(a, b) => What::Compare(0x11, at(a), at(b)),
@@ -386,7 +385,7 @@ impl Selection {
             return node;
         }
         let last = self.constant(u64::from(len) - 1);
-        if self.width == Width::Avx512 {
+        if self.width == Vectors::Avx512 {
             return self.add(What::Two(i::INT_MIN_UNSIGNED, true, node, last));
         }
         // Without a sign: with the top bit flipped, signed comparison is unsigned comparison.

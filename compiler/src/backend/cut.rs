@@ -1,0 +1,323 @@
+//! Cuts a long line into pieces, since the time to find registers grows faster than a function does.
+//!
+//! In: a sound, expanded function. Out: a [`Cut`]: which operations each piece computes, which values it leaves for later
+//! pieces and where, and when each slot may be stored. It knows nothing of processors.
+//!
+//! ```text
+//! before  what no iteration changes, once a call
+//! each    everything else, once an iteration; stores as soon as nothing reads the slot any more
+//! failed  what only the status needs, where the test for it says so
+//! ```
+//! Values that cross a cut lie in words of a scratch area. Few do: what a result needs stands in one place, operands
+//! first, and of the places to cut that come into question it is the one that the fewest values cross.
+
+use super::clif::{Facts, Watch};
+use crate::ir::{Func, Op, Value, Write};
+use abi::Slot;
+use std::collections::HashMap;
+use std::ops::Range;
+
+/// How long functions and their pieces are, in operations.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Lengths {
+    /// Functions that are longer are cut.
+    pub whole: usize,
+    /// The least of a piece but the last.
+    pub least: usize,
+    /// The most of a piece.
+    pub most: usize,
+    /// Words of the scratch area at most.
+    pub words: u32,
+}
+
+impl Lengths {
+    /// Pieces for which registers are found quickly, and an area that is part of what a thread in real time touches ahead.
+    pub const USUAL: Lengths = Lengths { whole: 2000, least: 600, most: 1200, words: 32_768 };
+}
+
+/// Consecutive operations, compiled together.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Piece {
+    /// What it computes, in this order; loads and constants are not among it: each piece makes its own.
+    pub ops: Vec<Value>,
+    /// What it stores at its end, all values taken before the first store.
+    pub stores: Vec<(Slot, Value)>,
+    /// What it writes to rings after that.
+    pub writes: Vec<Write>,
+}
+
+/// A function in pieces.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Cut {
+    /// In the order in which they run.
+    pub pieces: Vec<Piece>,
+    /// Of the pieces: those that run in each iteration. What stands before runs once, what stands behind if a guard failed.
+    pub each: Range<usize>,
+    /// Where a value lies between pieces, as words from the beginning of the scratch area.
+    pub homes: HashMap<Value, u32>,
+    /// Words of the scratch area.
+    pub words: u32,
+}
+
+/// The function in pieces; none if the scratch area has no room for what crosses them.
+pub fn cut(func: &Func, facts: &Facts, lengths: Lengths) -> Option<Cut> {
+    // What is computed once a call lies in the area through all of it: where that is too much, it is computed each time.
+    [true, false]
+        .into_iter()
+        .map(|once| Line::new(func, facts, once).cut(lengths))
+        .find(|cut| cut.words <= lengths.words)
+}
+
+/// Whether each piece makes the value itself where it needs it.
+fn made_anew(func: &Func, value: Value) -> bool {
+    match func.op(value) {
+        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => true,
+        Op::Pool { index, .. } => matches!(func.op(index), Op::Int(_)),
+        _ => false,
+    }
+}
+
+/// What code for an operation reads: of a table of which only the bits are wanted, that is the index.
+pub fn reads(func: &Func, op: Op) -> impl Iterator<Item = Value> {
+    let mut operands = [None; 3];
+    let mut n = 0;
+    let op = match op {
+        Op::ToBits(table) if let Op::Pool { .. } = func.op(table) => func.op(table),
+        op => op,
+    };
+    op.each_operand(|operand| {
+        operands[n] = Some(operand);
+        n += 1;
+    });
+    operands.into_iter().flatten()
+}
+
+/// The operations of a function in the order in which pieces compute them.
+struct Line<'a> {
+    func: &'a Func,
+    watch: Watch,
+    before: Vec<Value>,
+    each: Vec<Value>,
+    failed: Vec<Value>,
+}
+
+impl<'a> Line<'a> {
+    fn new(func: &'a Func, facts: &Facts, once: bool) -> Line<'a> {
+        let (watch, late) = Watch::of(func);
+        let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
+        // Loads that are not made anew, since something reads them after their slot may have been stored.
+        let mut kept = vec![false; func.ops.len()];
+        for value in values(func).filter(|value| late[value.index()]) {
+            for read in reads(func, func.op(value)) {
+                kept[read.index()] |= matches!(func.op(read), Op::Load(slot) if stored.contains_key(&slot));
+            }
+        }
+        let loads = func.loads();
+        let (next, rest): (Vec<_>, Vec<_>) =
+            func.stores.iter().copied().partition(|(slot, _)| loads.binary_search(slot).is_ok());
+        let mut order = Order { func, groups: vec![None; func.ops.len()], values: Vec::new() };
+        for (group, (_, value)) in next.into_iter().enumerate() {
+            order.visit(value, Some(group));
+        }
+        let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
+        // What a failed guard tells of the block is read before the block changes.
+        let read = values(func).filter(|value| kept[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
+        let (tested, detail) = match watch {
+            Watch::Nothing => (None, None),
+            Watch::Status(status) => (Some(status), None),
+            Watch::Failed { when, detail, .. } => (Some(when), Some(detail)),
+        };
+        for root in rest.into_iter().map(|(_, value)| value).chain(written).chain(tested).chain(read) {
+            order.visit(root, None);
+        }
+        let own = |value: &Value| kept[value.index()] || !made_anew(func, *value);
+        let (mut each, mut before) = (Vec::new(), Vec::new());
+        for value in order.take().filter(own) {
+            if once && !facts.varies[value.index()] { &mut before } else { &mut each }.push(value);
+        }
+        detail.into_iter().for_each(|detail| order.visit(detail, None));
+        let failed = order.take().filter(own).collect();
+        Line { func, watch, before, each, failed }
+    }
+
+    fn cut(&self, lengths: Lengths) -> Cut {
+        let parts = [&self.before, &self.each, &self.failed].map(|ops| self.parts(ops, lengths));
+        // There is a last piece of each iteration, which stores what is left.
+        let [before, each, failed] = [parts[0].len(), parts[1].len().max(1), parts[2].len()];
+        let mut pieces = vec![Piece::default(); before + each + failed];
+        let each = before..before + each;
+        for (begin, parts) in [0, each.start, each.end].into_iter().zip(parts) {
+            for (piece, ops) in pieces[begin..].iter_mut().zip(parts) {
+                piece.ops = ops;
+            }
+        }
+        self.store(&mut pieces, &each);
+        let homes = self.homes(&pieces, &each);
+        let words = homes.values().max().map_or(0, |last| last + 1);
+        Cut { pieces, each, homes, words }
+    }
+
+    /// The operations in parts, cut where the fewest values cross.
+    fn parts(&self, ops: &[Value], lengths: Lengths) -> Vec<Vec<Value>> {
+        let place: HashMap<Value, usize> = ops.iter().enumerate().map(|(place, value)| (*value, place)).collect();
+        let mut last: Vec<usize> = (0..ops.len()).collect();
+        for (user, value) in ops.iter().enumerate() {
+            for read in reads(self.func, self.func.op(*value)) {
+                if let Some(place) = place.get(&read) {
+                    last[*place] = user;
+                }
+            }
+        }
+        // Values that cross a cut before each operation.
+        let mut crossing = vec![0i64; ops.len() + 1];
+        for (place, last) in last.into_iter().enumerate() {
+            crossing[place + 1] += 1;
+            crossing[last + 1] -= 1;
+        }
+        for place in 1..crossing.len() {
+            crossing[place] += crossing[place - 1];
+        }
+        let mut parts = Vec::new();
+        let mut begin = 0;
+        while ops.len() - begin > lengths.most {
+            let cuts = begin + lengths.least..=begin + lengths.most;
+            // The longest of equals.
+            let end = cuts.rev().min_by_key(|place| crossing[*place]).expect("a range that is not empty");
+            parts.push(ops[begin..end].to_vec());
+            begin = end;
+        }
+        if begin < ops.len() {
+            parts.push(ops[begin..].to_vec());
+        }
+        parts
+    }
+
+    /// Puts each store into the first piece of an iteration at whose end its value is there and its slot is read no more.
+    fn store(&self, pieces: &mut [Piece], each: &Range<usize>) {
+        let last = each.end - 1;
+        let mut made: HashMap<Value, usize> = HashMap::new();
+        let mut read: HashMap<Slot, usize> = HashMap::new();
+        for (number, piece) in pieces.iter().enumerate().take(each.end) {
+            for value in &piece.ops {
+                made.insert(*value, number);
+                for slot in reads(self.func, self.func.op(*value)).chain([*value]).filter_map(|read| self.slot(read)) {
+                    read.insert(slot, number);
+                }
+            }
+        }
+        // What is only moved, and what is written to rings, is taken at the very end.
+        let moved = self.func.stores.iter().map(|(_, value)| *value);
+        let written = self.func.writes.iter().flat_map(|write| [write.index, write.value]);
+        for slot in moved.chain(written).chain(self.outcomes()).filter_map(|value| self.slot(value)) {
+            read.insert(slot, last);
+        }
+        for (slot, value) in &self.func.stores {
+            let ready = if self.slot(*value).is_some() { last } else { made.get(value).copied().unwrap_or(0) };
+            let number = ready.max(read.get(slot).copied().unwrap_or(0)).max(each.start);
+            pieces[number].stores.push((*slot, *value));
+        }
+        pieces[last].writes.clone_from(&self.func.writes);
+    }
+
+    /// The slot that a value is loaded from.
+    fn slot(&self, value: Value) -> Option<Slot> {
+        match self.func.op(value) {
+            Op::Load(slot) => Some(slot),
+            _ => None,
+        }
+    }
+
+    /// What is asked after an iteration.
+    fn outcomes(&self) -> impl Iterator<Item = Value> {
+        let (first, second) = match self.watch {
+            Watch::Nothing => (None, None),
+            Watch::Status(status) => (Some(status), None),
+            Watch::Failed { when, detail, .. } => (Some(when), Some(detail)),
+        };
+        first.into_iter().chain(second)
+    }
+
+    /// A word for each value that something reads outside its piece; a word is used again when nothing reads it any more.
+    fn homes(&self, pieces: &[Piece], each: &Range<usize>) -> HashMap<Value, u32> {
+        let mut made: HashMap<Value, usize> = HashMap::new();
+        let mut last: HashMap<Value, usize> = HashMap::new();
+        for (number, piece) in pieces.iter().enumerate() {
+            made.extend(piece.ops.iter().map(|value| (*value, number)));
+            let stored = piece.stores.iter().map(|(_, value)| *value);
+            let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
+            let read = piece.ops.iter().flat_map(|value| reads(self.func, self.func.op(*value)));
+            for value in read.chain(stored).chain(written) {
+                match made.get(&value) {
+                    // What was made before the loop is read again in the next iteration.
+                    Some(made) if *made < each.start && number >= each.start => last.insert(value, pieces.len()),
+                    Some(made) if *made < number => {
+                        last.insert(value, number.max(last.get(&value).copied().unwrap_or(0)))
+                    }
+                    _ => None,
+                };
+            }
+        }
+        for value in self.outcomes().filter(|value| made.contains_key(value)) {
+            last.insert(value, pieces.len());
+        }
+        let mut homes = HashMap::new();
+        let (mut free, mut words) = (Vec::new(), 0);
+        let mut ending: Vec<Vec<u32>> = vec![Vec::new(); pieces.len() + 1];
+        for (number, piece) in pieces.iter().enumerate() {
+            for (value, last) in piece.ops.iter().filter_map(|value| Some((*value, *last.get(value)?))) {
+                let home = free.pop().unwrap_or_else(|| {
+                    words += 1;
+                    words - 1
+                });
+                homes.insert(value, home);
+                ending[last].push(home);
+            }
+            free.append(&mut ending[number]);
+        }
+        homes
+    }
+}
+
+/// An order in which what a result needs stands in one place, operands first.
+struct Order<'a> {
+    func: &'a Func,
+    /// For each value that has been visited, where it belongs.
+    groups: Vec<Option<usize>>,
+    values: Vec<(usize, Value)>,
+}
+
+impl Order<'_> {
+    /// Puts what a result needs and nothing needed before into a group of its own, or, if there is `none`, right behind
+    /// what it needs of others: so an output of a part stands beside the states of that part.
+    fn visit(&mut self, root: Value, group: Option<usize>) {
+        let mut open = vec![(root, false)];
+        while let Some((value, ready)) = open.pop() {
+            if self.groups[value.index()].is_some() {
+                continue;
+            }
+            let operands = reads(self.func, self.func.op(value));
+            if ready {
+                let behind = operands.filter_map(|operand| self.groups[operand.index()]).max().unwrap_or(0);
+                let group = group.unwrap_or(behind);
+                self.groups[value.index()] = Some(group);
+                self.values.push((group, value));
+                continue;
+            }
+            open.push((value, true));
+            // The last pushed is done first.
+            let operands: Vec<Value> = operands.collect();
+            open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
+        }
+    }
+
+    /// What was visited since it was last asked.
+    fn take(&mut self) -> impl Iterator<Item = Value> + use<> {
+        let mut values = std::mem::take(&mut self.values);
+        values.sort_by_key(|(group, _)| *group);
+        values.into_iter().map(|(_, value)| value)
+    }
+}
+
+fn values(func: &Func) -> impl Iterator<Item = Value> + use<> {
+    (0..func.ops.len()).map(|i| Value(i as u32))
+}

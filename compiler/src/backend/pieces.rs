@@ -1,0 +1,182 @@
+//! A function that is [cut](super::cut) as functions of Cranelift: one that holds the loop, and the pieces that it calls.
+//!
+//! ```text
+//! entry:  pieces before the loop
+//! loop:   pieces of an iteration; again while there are iterations left and the status is 0
+//! failed: pieces that say which guard it was
+//! ```
+//! The scratch area lies on the stack. A piece is called by its number; whoever lays out the code puts in the distance.
+
+use super::clif::{Emitter, Facts, Watch, offset, signature};
+use super::cut::{self, Cut};
+use crate::ir::{Func, Op, Value};
+use cranelift_codegen::ir::{
+    self as clif, AbiParam, BlockArg, ExtFuncData, InstBuilder, MemFlagsData, Signature, StackSlotData, StackSlotKind,
+    UserExternalName, types,
+};
+use cranelift_codegen::isa::TargetIsa;
+use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
+use std::ops::Range;
+
+/// The signature of a piece: block, pool, scratch area.
+fn signature_of_piece(isa: &dyn TargetIsa) -> Signature {
+    let mut signature = Signature::new(isa.default_call_conv());
+    signature.params.extend([types::I64; 3].map(AbiParam::new));
+    signature
+}
+
+/// Writes the loop around the pieces of `func` into the empty `target`. It calls the piece of each number by that number.
+pub fn emit_loop(
+    func: &Func,
+    facts: &Facts,
+    cut: &Cut,
+    target: &mut clif::Function,
+    context: &mut FunctionBuilderContext,
+    isa: &dyn TargetIsa,
+) {
+    target.signature = signature(isa);
+    let mut b = FunctionBuilder::new(target, context);
+    let of_piece = b.import_signature(signature_of_piece(isa));
+    let pieces: Vec<clif::FuncRef> = (0..cut.pieces.len())
+        .map(|number| {
+            let name = UserExternalName { namespace: 0, index: number as u32 };
+            let name = clif::ExternalName::user(b.func.declare_imported_user_function(name));
+            b.import_function(ExtFuncData { name, signature: of_piece, colocated: true, patchable: false })
+        })
+        .collect();
+    let area = StackSlotData::new(StackSlotKind::ExplicitSlot, 8 * cut.words.max(1), 3);
+    let area = b.create_sized_stack_slot(area);
+    let [entry, prepare, body, more, failed, exit] = [(); 6].map(|()| b.create_block());
+    b.append_block_params_for_function_params(entry);
+    b.switch_to_block(entry);
+    let &[block, pool, count] = b.block_params(entry) else { unreachable!("three parameters") };
+    let zero = b.ins().iconst(types::I64, 0);
+    let status = b.append_block_param(exit, types::I64);
+    b.ins().brif(count, prepare, &[], exit, &[BlockArg::Value(zero)]);
+
+    b.switch_to_block(prepare);
+    let scratch = b.ins().stack_addr(types::I64, area, 0);
+    let call = |numbers: Range<usize>, b: &mut FunctionBuilder| {
+        for piece in &pieces[numbers] {
+            b.ins().call(*piece, &[block, pool, scratch]);
+        }
+    };
+    call(0..cut.each.start, &mut b);
+    // Nothing changes from one iteration to the next: one is enough.
+    let mut emitter = Emitter::new(func, facts, block, pool);
+    let same = emitter.carried().is_empty() && func.writes.is_empty();
+    let count = if same { b.ins().iconst(types::I64, 1) } else { count };
+    b.ins().jump(body, &[BlockArg::Value(count)]);
+
+    let left = b.append_block_param(body, types::I64);
+    b.switch_to_block(body);
+    call(cut.each.clone(), &mut b);
+    let (watch, _) = Watch::of(func);
+    let detail = match watch {
+        Watch::Nothing => {
+            b.ins().jump(more, &[]);
+            None
+        }
+        Watch::Status(status) => {
+            fetch(&mut emitter, status, cut, scratch, &mut b);
+            let status = emitter.get(status, &mut b);
+            b.ins().brif(status, exit, &[BlockArg::Value(status)], more, &[]);
+            None
+        }
+        Watch::Failed { when, is, detail } => {
+            fetch(&mut emitter, when, cut, scratch, &mut b);
+            let when = emitter.get(when, &mut b);
+            let (yes, no) = if is { (failed, more) } else { (more, failed) };
+            b.ins().brif(when, yes, &[], no, &[]);
+            Some(detail)
+        }
+    };
+    b.switch_to_block(more);
+    let left = b.ins().iadd_imm_s(left, -1);
+    b.ins().brif(left, body, &[BlockArg::Value(left)], exit, &[BlockArg::Value(zero)]);
+
+    b.set_cold_block(failed);
+    b.switch_to_block(failed);
+    call(cut.each.end..cut.pieces.len(), &mut b);
+    let found = detail.map_or(zero, |detail| {
+        fetch(&mut emitter, detail, cut, scratch, &mut b);
+        emitter.get(detail, &mut b)
+    });
+    b.ins().brif(found, exit, &[BlockArg::Value(found)], more, &[]);
+
+    b.switch_to_block(exit);
+    b.ins().return_(&[status]);
+    b.seal_all_blocks();
+    b.finalize(isa.frontend_config());
+}
+
+/// Writes one piece of `func` into the empty `target`.
+pub fn emit_piece(
+    func: &Func,
+    facts: &Facts,
+    (cut, number): (&Cut, usize),
+    values: &mut Vec<Option<clif::Value>>,
+    target: &mut clif::Function,
+    context: &mut FunctionBuilderContext,
+    isa: &dyn TargetIsa,
+) {
+    target.signature = signature_of_piece(isa);
+    let piece = &cut.pieces[number];
+    let mut b = FunctionBuilder::new(target, context);
+    let entry = b.create_block();
+    b.append_block_params_for_function_params(entry);
+    b.switch_to_block(entry);
+    let &[block, pool, scratch] = b.block_params(entry) else { unreachable!("three parameters") };
+    // The table of all values is kept from piece to piece, so that a piece costs what it holds.
+    values.resize(func.ops.len(), None);
+    let mut emitter = Emitter::with(func, facts, std::mem::take(values), block, pool);
+    let mut touched: Vec<Value> = Vec::new();
+    for value in &piece.ops {
+        for read in cut::reads(func, func.op(*value)) {
+            touched.extend(fetch(&mut emitter, read, cut, scratch, &mut b));
+        }
+        emitter.operation(*value, &mut b);
+        touched.push(*value);
+        if let (Some(home), Some(known)) = (cut.homes.get(value), emitter.values[value.index()]) {
+            b.ins().store(MemFlagsData::trusted(), known, scratch, offset(*home));
+        }
+    }
+    let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
+    for value in piece.stores.iter().map(|(_, value)| *value).chain(written) {
+        touched.extend(fetch(&mut emitter, value, cut, scratch, &mut b));
+    }
+    for (slot, value) in &piece.stores {
+        let value = emitter.get(*value, &mut b);
+        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
+    }
+    emitter.writes(&piece.writes, &mut b);
+    b.ins().return_(&[]);
+    b.seal_all_blocks();
+    b.finalize(isa.frontend_config());
+    *values = emitter.values;
+    touched.into_iter().for_each(|value| values[value.index()] = None);
+}
+
+/// Takes a value of another piece from where it lies, or loads what each piece loads itself; gives it if it did.
+fn fetch(
+    emitter: &mut Emitter,
+    value: Value,
+    cut: &Cut,
+    scratch: clif::Value,
+    b: &mut FunctionBuilder,
+) -> Option<Value> {
+    if emitter.values[value.index()].is_some() {
+        return None;
+    }
+    match (cut.homes.get(&value), emitter.func.op(value)) {
+        (Some(home), _) => {
+            let of = emitter.facts.type_of(value);
+            let loaded = b.ins().load(of, MemFlagsData::trusted(), scratch, offset(*home));
+            emitter.values[value.index()] = Some(loaded);
+        }
+        (None, Op::Load(_)) => emitter.operation(value, b),
+        // A constant is made at each use.
+        (None, _) => return None,
+    }
+    Some(value)
+}

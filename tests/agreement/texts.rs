@@ -1,0 +1,79 @@
+//! Texts through the whole compiler: to the programs of a fixed and of the adaptive method.
+
+use crate::case::{Case, of_program};
+use crate::support::Texts;
+use abi::plan::Method;
+use compiler::Changes;
+use compiler::experiment::Variant;
+use compiler::ir::random::Random;
+use compiler::program::Program;
+use grammar::ast::{ExperimentStatement, Item, Solver};
+use grammar::diagnostic::Diagnostic;
+
+/// The fixed methods, in turn.
+pub const FIXED: [Method; 4] = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit];
+
+/// Operations of all functions of a program beyond which it is left out: what takes gcc minutes shows nothing new.
+const MOST_OPERATIONS: usize = 5_000;
+
+/// The step of a fixed method where the text has none, in s.
+const STEP: f64 = 1e-4;
+
+/// Why a text gives no program: the code of its first mistake.
+pub type Fallen = String;
+
+/// What is wrong, by its code.
+pub fn fallen(found: &[Diagnostic]) -> Fallen {
+    let error = found.iter().find(|diagnostic| diagnostic.is_error());
+    error.map_or_else(|| "what could not be read".into(), |error| error.code.to_string())
+}
+
+/// All combinations of an experiment with a method, and the step in s: the text's own, if it has one.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<(Vec<Variant>, f64), Vec<Diagnostic>> {
+    let sources = Texts::default();
+    let mut loaded = compiler::load(name, text, &sources);
+    let has_step = loaded.files.get(loaded.root()).ast.items.iter().any(|item| match item {
+        Item::Experiment(own) if own.name.text == experiment => own
+            .body
+            .iter()
+            .any(|statement| matches!(statement, ExperimentStatement::Solver(Solver { step: Some(_), .. }))),
+        _ => false,
+    });
+    let step = (method != Method::Adaptive && !has_step).then_some(STEP);
+    let changes = Changes { method: Some(method), step, ..Changes::default() };
+    let read = compiler::experiment::read(&mut loaded, &sources, experiment, &changes, &mut Vec::new(), &mut |_| ());
+    let variants = read?;
+    let own = variants.first().map_or(0.0, |variant| variant.experiment.solver.step);
+    Ok((variants, if own > 0.0 { own } else { STEP }))
+}
+
+/// A model on its own, its inputs open, for fixed steps of `step` s.
+///
+/// # Errors
+/// Everything that is wrong with it.
+pub fn model(name: &str, text: &str, model: &str, method: Method, step: f64) -> Result<Program, Vec<Diagnostic>> {
+    let sources = Texts::default();
+    let mut loaded = compiler::load(name, text, &sources);
+    let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+    let built = compiler::build(&mut loaded, &sources, model, &changes, &mut Vec::new());
+    built.map(|built| built.program)
+}
+
+/// A case of a program, if it is not too large.
+///
+/// # Errors
+/// If it is.
+pub fn case(
+    name: &str,
+    text: &str,
+    program: &Program,
+    method: Method,
+    step: f64,
+    random: &mut Random,
+) -> Result<Case, Fallen> {
+    let case = of_program(name.to_string(), text, program, method, step, random);
+    if case.size() > MOST_OPERATIONS { Err("too large".into()) } else { Ok(case) }
+}
