@@ -25,9 +25,14 @@ pub const NEARLY: f64 = 0.999;
 /// And one that would leave less than itself goes so far.
 pub const HALFWAY: f64 = 0.5;
 
-/// So many accepted compiled steps after one another ask once whether the method suits: they cost hardly more than those of
-/// the explicit method.
-pub const ASKS: u32 = 32;
+/// A step that ran over a switching surface and is refused for its error is made again up to this part of the way there,
+pub const BEFORE_SURFACE: f64 = 0.95;
+
+/// but is shortened to at most this part of it,
+pub const MOST_BEFORE_SURFACE: f64 = 0.9;
+
+/// and so often in a row without anybody looking.
+pub const MOST_OVERRUNS: f64 = 3.0;
 
 /// Where the length of a step times the mean eigenvalue is larger, or the square of the one times the mean square of the
 /// other is larger than the square of this, the stiff method suits.

@@ -14,15 +14,9 @@ use crate::description::{Layout, Segment, Slot};
 /// A status: the elimination met a pivot that is too small; nothing of the trial counts.
 pub const PIVOT: u64 = 1;
 
-/// A status: the trial crosses a switching surface, or comes close to one, reaches an instant that is met or looked at,
-/// leaves a range, is not finite, or somebody attends it.
+/// A status: the trial is accurate and crosses a switching surface, or comes close to one, reaches an instant that is met or
+/// looked at, or leaves a range; or it runs over a surface again and again, is not finite, or somebody attends it.
 pub const LOOK: u64 = 2;
-
-/// Every trial is to be looked at.
-pub const ATTEND_EACH: f64 = 1.0;
-
-/// Each accepted step that asks whether the method suits is to be looked at.
-pub const ATTEND_ASKED: f64 = 0.5;
 
 /// The segment `trial` of a layout, by its parts.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -34,7 +28,7 @@ pub struct Trial {
 }
 
 /// Entries before the first segment.
-const SINGLE: u32 = 17;
+const SINGLE: u32 = 18;
 
 /// States, their derivatives and the Jacobian at one point: n, n and n² + n numbers, one behind the other.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -102,13 +96,12 @@ impl Trial {
         Slot(self.start + 3)
     }
 
-    /// 1 if the last trial was refused, else 0; read and written.
+    /// Number of trials refused since the last accepted one, read and written.
     pub fn rejected(self) -> Slot {
         Slot(self.start + 4)
     }
 
-    /// Number of steps accepted so far, read and written: every [`ASKS`](crate::pace::ASKS)-th asks whether the method
-    /// suits.
+    /// Number of steps accepted so far, read and written.
     pub fn accepted(self) -> Slot {
         Slot(self.start + 5)
     }
@@ -139,8 +132,7 @@ impl Trial {
         Slot(self.start + 10)
     }
 
-    /// [`ATTEND_EACH`] if every trial is to be looked at, [`ATTEND_ASKED`] if each one is that asks whether the method
-    /// suits, else 0: then only those whose mean eigenvalue does not say so; read.
+    /// 1 if every trial is to be looked at, else 0; read.
     pub fn attend(self) -> Slot {
         Slot(self.start + 11)
     }
@@ -168,6 +160,11 @@ impl Trial {
     /// 1 if a quantity that is watched is not fine at the end, else 0.
     pub fn outside(self) -> Slot {
         Slot(self.start + 16)
+    }
+
+    /// Number of trials refused by the function itself that ended behind a switching surface, read and written.
+    pub fn overruns(self) -> Slot {
+        Slot(self.start + 17)
     }
 
     /// For each state, what its size is measured with: tol · (|x| + s) is allowed. SI, read.
@@ -278,6 +275,7 @@ mod tests {
             trial.end(),
             trial.met(),
             trial.outside(),
+            trial.overruns(),
         ]
         .map(one)
         .into();

@@ -17,11 +17,11 @@ use crate::program::Program;
 use abi::Slot;
 use abi::description::Segment;
 use abi::pace::{
-    ASKS, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_REFUSED, NEARLY, ROOT_CONSTANT,
-    SAFETY, STIFF,
+    BEFORE_SURFACE, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_BEFORE_SURFACE,
+    MOST_OVERRUNS, MOST_REFUSED, NEARLY, ROOT_CONSTANT, SAFETY,
 };
 use abi::rodas5p::{A, C, D, GAMMA, H, STAGES, W};
-use abi::trial::{ATTEND_ASKED, LOOK, PIVOT, Point, Trial};
+use abi::trial::{LOOK, PIVOT, Point, Trial};
 use std::collections::HashSet;
 use std::sync::OnceLock;
 
@@ -124,8 +124,6 @@ struct Found<'f, 'a> {
     f: &'f [Real<'a>],
     jacobian: &'f [Real<'a>],
     surfaces: &'f [Real<'a>],
-    /// Rows of ∂f/∂x at its start.
-    rows: &'f [Gradient],
 }
 
 struct Step<'a> {
@@ -232,8 +230,8 @@ impl<'a> Step<'a> {
         self.keep(self.trial.defect(), defect);
         let singular = factors.singular.unwrap_or_else(|| Truth::from((false, self.build)));
         let surfaces = on_the_way.last().map_or(&[][..], |last| last);
-        let point = Found { t, h, end, wanted, x: &x1, f: &f1, jacobian: &jacobian, surfaces, rows: &rows };
-        let look = self.settle(point, worst, defect, met | hits | singular);
+        let point = Found { t, h, end, wanted, x: &x1, f: &f1, jacobian: &jacobian, surfaces };
+        let look = self.settle(point, worst, defect, met | hits, singular);
         (singular.value, look.value)
     }
 
@@ -272,8 +270,16 @@ impl<'a> Step<'a> {
         met
     }
 
-    /// Accepts or refuses the trial, unless somebody has to look, and gives whether; `met`: there is something to see.
-    fn settle(&self, found: Found<'_, 'a>, worst: Real<'a>, defect: Real<'a>, met: Truth<'a>) -> Truth<'a> {
+    /// Accepts or refuses the trial, unless somebody has to look, and gives whether; `met`: there is something to see if it
+    /// is accurate; `singular`: nothing of it counts.
+    fn settle(
+        &self,
+        found: Found<'_, 'a>,
+        worst: Real<'a>,
+        defect: Real<'a>,
+        met: Truth<'a>,
+        singular: Truth<'a>,
+    ) -> Truth<'a> {
         let trial = self.trial;
         let Found { t, h, end, wanted, .. } = found;
         let below_one = !worst.above(1.0);
@@ -300,36 +306,23 @@ impl<'a> Step<'a> {
         let root = root.below(LEAST_ROOT).choose(LEAST_ROOT, root);
         let less = plain.below(LEAST_GAIN).choose(LEAST_GAIN, plain);
         let shorter = less.above(MOST_REFUSED).choose(MOST_REFUSED, less) * h;
+        let (behind, to_surface) = self.overrun(h, found.surfaces);
+        let shorter = (behind & shorter.below(to_surface)).choose(to_surface, shorter);
         let next = fine.choose(longer, shorter);
 
-        // Whether the method suits is asked now and then, where its mean eigenvalue does not say so.
-        let part = (1.0 / f64::from(ASKS)) * accepted;
-        let n = found.x.len() as u32;
-        // Their mean, and that of their squares, are known from the matrix and its square.
-        let (mut trace, mut squares) = (h.constant(0.0), h.constant(0.0));
-        for (i, row) in found.rows.iter().enumerate() {
-            for (j, entry) in row.iter().filter(|(j, _)| *j <= i as u32) {
-                let (entry, other) = (h.same(*entry), derive::entry(&found.rows[*j as usize], i as u32));
-                trace = if *j == i as u32 { trace + entry } else { trace };
-                let twice = if *j == i as u32 { 1.0 } else { 2.0 };
-                squares = other.map_or(squares, |other| squares + twice * (entry * h.same(other)));
-            }
-        }
-        let stiff = (h * trace.abs()).above(STIFF * f64::from(n))
-            | ((h * h) * squares.abs()).above(STIFF * STIFF * f64::from(n));
-        let attend = self.load(trial.attend());
-        let asked = part.floor().is(part) & (!stiff | attend.above(0.0));
         let outside = self.outside(end, found.x);
         self.keep(trial.outside(), outside.choose(1.0, t.constant(0.0)));
         let stop = self.load(trial.stop());
         let now = t + h;
         let least = LEAST_STEP * stop.abs();
-        let seen = met
-            | attend.above(ATTEND_ASKED)
+        let again = behind & !rejected.below(MOST_OVERRUNS);
+        let seen = singular
+            | self.load(trial.attend()).above(0.0)
             | !error.finite()
             | next.below(least)
-            | (fine & (asked | outside | !now.below(self.load(trial.watched()))))
-            | (fine & (stop - now).below(4.0 * least));
+            | (fine & (met | outside | !now.below(self.load(trial.watched()))))
+            | (fine & (stop - now).below(4.0 * least))
+            | (!fine & again);
         let goes = fine & !seen;
 
         let (from, accepted_before, refused) = (trial.from(), self.load(trial.accepted()), self.load(trial.refused()));
@@ -343,13 +336,28 @@ impl<'a> Step<'a> {
         self.keep(trial.last_root(), goes.choose(root, last_root));
         self.keep(trial.accepted(), goes.choose(accepted, accepted_before));
         self.keep(trial.next(), seen.choose(self.load(trial.next()), next));
-        self.keep(trial.rejected(), seen.choose(rejected, fine.choose(0.0, h.constant(1.0))));
+        self.keep(trial.rejected(), seen.choose(rejected, fine.choose(0.0, rejected + 1.0)));
         self.keep(trial.refused(), (fine | seen).choose(refused, refused + 1.0));
+        let overruns = self.load(trial.overruns());
+        self.keep(trial.overruns(), (fine | seen | !behind).choose(overruns, overruns + 1.0));
         let point = [(from.states, found.x), (from.derivatives, found.f), (from.jacobian, found.jacobian)];
         for (segment, new) in point.into_iter().chain([(trial.here(), found.surfaces)]) {
             slots(segment).zip(new).for_each(|(slot, new)| settled(slot, *new));
         }
         seen
+    }
+
+    /// Whether the step ends behind a surface, and then how long one is that ends before the first of them, which it may have
+    /// failed for.
+    fn overrun(&self, h: Real<'a>, last: &[Real<'a>]) -> (Truth<'a>, Real<'a>) {
+        let mut first = (Truth::from((false, self.build)), h.constant(MOST_BEFORE_SURFACE));
+        let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
+        for ((side, a), b) in sides.into_iter().zip(here).zip(last) {
+            let behind = (side * *b).below(0.0);
+            let part = a / (a - *b);
+            first = (first.0 | behind, (behind & part.below(first.1)).choose(part, first.1));
+        }
+        (first.0, BEFORE_SURFACE * first.1 * h)
     }
 
     /// Whether a quantity that is watched is not fine where the step ends.
@@ -672,6 +680,7 @@ experiment waves { run Waves() for 1 s }
                 set(&mut block, trial.before_stop(), end);
                 set(&mut block, trial.watched(), f64::INFINITY);
                 set(&mut block, trial.tol(), 1e-6);
+                set(&mut block, trial.attend(), 1.0);
                 block[trial.scales().range()].fill(1.0);
                 block[trial.from().states.range()].copy_from_slice(&x0);
                 block[trial.from().derivatives.range()].copy_from_slice(&plain.f(t, &x0));

@@ -18,11 +18,10 @@ use crate::observe::{Observer, check_finite, check_status};
 use crate::outcome::{Cause, Chatter, Continue, Stop, Work};
 use abi::description::{Guard, Kind};
 use abi::pace::{
-    ASKS, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_REFUSED, NEARLY, SAFETY, STIFF,
-    inverse_fifth_root,
+    BEFORE_SURFACE, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_BEFORE_SURFACE,
+    MOST_REFUSED, NEARLY, SAFETY, STIFF, inverse_fifth_root,
 };
 use abi::plan::Experiment;
-use abi::trial::{ATTEND_ASKED, ATTEND_EACH};
 use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -33,8 +32,9 @@ const MOST_ATTEMPTS: u64 = 5_000_000;
 /// More events than this within a millionth of the run are chatter.
 const MOST_EVENTS: usize = 100;
 
-/// And so are more surfaces than this, met by steps of whatever outcome, while no state moves by more than a thousand
-/// tolerances.
+/// And so are more surfaces than this, met by steps of whatever outcome, while no state moves by more than three roots of the
+/// tolerance: what turns ever faster and loses less at each turn than is allowed as error, a part a² of its amplitude a,
+/// goes on for ever at an amplitude of about that root.
 const MOST_CROSSINGS: usize = 2000;
 
 /// More tries of a step than this within a millionth of the run lead nowhere.
@@ -87,7 +87,8 @@ pub(crate) struct Adaptive {
     patience: u32,
     /// Length of the last accepted step, and the fifth root of its error; none after a restart.
     last: Option<(f64, f64)>,
-    rejected: bool,
+    /// Trials refused since the last accepted one.
+    rejected: u64,
     /// The next step is no longer than this, for a surface is just ahead.
     creep: f64,
     /// For each surface, how often of late a step has been made again to end before it, and nothing came of it.
@@ -204,7 +205,7 @@ impl Adaptive {
             doubts: 0,
             patience: 3,
             last: None,
-            rejected: false,
+            rejected: 0,
             creep: f64::INFINITY,
             aimed: vec![0; system.surfaces()],
             usual: None,
@@ -293,15 +294,7 @@ impl Adaptive {
         }
         let pace =
             Pace { t: self.t, next: self.h, last: self.last, rejected: self.rejected, accepted: self.work.steps };
-        // Doubts about the method are settled when it is asked for the next time.
-        let attended = if attend {
-            ATTEND_EACH
-        } else if self.doubts > 0 {
-            ATTEND_ASKED
-        } else {
-            0.0
-        };
-        fused.prepare(&mut self.system, pace, stop, self.longest, self.points.next_probe(), attended);
+        fused.prepare(&mut self.system, pace, stop, self.longest, self.points.next_probe(), attend);
         fused.prepare_surfaces(&mut self.system, self.surfaces.sides(), self.surfaces.here());
         if attend { 1 } else { WATCHED - self.attempts() % WATCHED }
     }
@@ -372,10 +365,10 @@ impl Adaptive {
             let ahead = self.surfaces.guess(&mut self.system, &self.step);
             self.overran = ahead.is_some();
             if let Some(theta) = ahead {
-                self.meet();
-                self.h = self.h.max(0.95 * theta.min(0.9) * h);
+                self.meet(1);
+                self.h = self.h.max(BEFORE_SURFACE * theta.min(MOST_BEFORE_SURFACE) * h);
             }
-            self.rejected = true;
+            self.rejected += 1;
             return false;
         }
         let error = error.max(LEAST_ERROR);
@@ -385,13 +378,13 @@ impl Adaptive {
             // What the error did from step to step, it will do again.
             part = part.min((SAFETY * (h / last_h) * last_root) * (inverse * inverse));
         }
-        if self.rejected {
+        if self.rejected > 0 {
             part = part.min(1.0);
         }
         self.h = part.clamp(LEAST_GAIN, GREATEST_GAIN) * h;
         let square = inverse * inverse;
         self.last = Some((h, (error * (square * square)).max(LEAST_ROOT)));
-        self.rejected = false;
+        self.rejected = 0;
         self.work.steps += 1;
         self.work.stiff_steps += u64::from(self.was_stiff);
         self.consider_method();
@@ -453,10 +446,10 @@ impl Adaptive {
 
     /// Now and then, asks the Jacobian at the start of an accepted step which method suits: the explicit one is stable
     /// up to about 3.3 times its largest eigenvalue, of which only the order of magnitude is known. Each return to the
-    /// stiff method makes the next change away from it slower.
+    /// stiff method makes the next change away from it slower. Where the stiff one is a function of the model, its step takes
+    /// no longer than the six evaluations of the explicit one, and is larger at the same error.
     fn consider_method(&mut self) {
-        let each = if self.fused.is_some() { u64::from(ASKS) } else { 8 };
-        if !self.work.steps.is_multiple_of(each) {
+        if self.fused.is_some() || !self.work.steps.is_multiple_of(8) {
             return;
         }
         self.know_jacobian();
@@ -514,7 +507,7 @@ impl Adaptive {
             let jump = self.jump(crossing);
             // What swings through a surface at which nothing jumps is no chatter.
             if jump > 0.0 || self.surfaces.decided() {
-                self.meet()
+                self.meet(1)
             } else {
                 self.crossings = 0
             }
@@ -890,10 +883,10 @@ impl Adaptive {
         }
     }
 
-    /// Counts a surface that was met; anew where the model has moved since.
-    fn meet(&mut self) {
-        self.crossings += 1;
-        let far = (1e3 * self.tol).min(1e-3);
+    /// Counts surfaces that were met; anew where the model has moved since.
+    fn meet(&mut self, times: usize) {
+        self.crossings += times;
+        let far = 3.0 * self.tol.min(1e-6).sqrt();
         let moved = |i: usize| (self.x[i] - self.crossings_at[i]).abs() > far * (self.x[i].abs() + self.scales[i]);
         if (0..self.system.n).any(moved) {
             (self.crossings, self.crossings_since) = (0, self.t);
@@ -970,7 +963,7 @@ impl Course for Adaptive {
         self.moved = false;
         let (stop, _) = self.goal.expect("there was one when it was prepared");
         let fused = self.fused.as_ref().expect("it made trials");
-        let (pace, refused) = fused.settled(&self.system);
+        let (pace, refused, overruns) = fused.settled(&self.system);
         let accepted = pace.accepted - self.work.steps;
         if accepted > 0 {
             (self.t, self.last) = (pace.t, pace.last);
@@ -982,7 +975,10 @@ impl Course for Adaptive {
         }
         if accepted + refused > 0 {
             (self.h, self.rejected) = (pace.next, pace.rejected);
-            self.overran &= refused == 0;
+            self.overran = if refused > 0 { overruns > 0 } else { self.overran };
+        }
+        if overruns > 0 {
+            self.meet(overruns as usize);
         }
         self.work.steps += accepted;
         self.work.stiff_steps += accepted;

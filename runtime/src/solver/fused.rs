@@ -28,8 +28,8 @@ pub(crate) struct Pace {
     pub(crate) next: f64,
     /// Length of the last accepted step, and the fifth root of its error; none after a restart.
     pub(crate) last: Option<(f64, f64)>,
-    /// Whether the last trial was refused.
-    pub(crate) rejected: bool,
+    /// Trials refused since the last accepted one.
+    pub(crate) rejected: u64,
     /// Steps accepted so far.
     pub(crate) accepted: u64,
 }
@@ -90,8 +90,8 @@ impl Fused {
     }
 
     /// How the run stands and where it goes: to `stop`, by no longer steps than `longest`; those that reach `watched` are
-    /// left to be looked at, and those that somebody attends.
-    pub(crate) fn prepare(&self, system: &mut System, pace: Pace, stop: f64, longest: f64, watched: f64, attend: f64) {
+    /// left to be looked at, and all that somebody attends.
+    pub(crate) fn prepare(&self, system: &mut System, pace: Pace, stop: f64, longest: f64, watched: f64, attend: bool) {
         let trial = self.trial;
         let (last_step, last_root) = pace.last.unwrap_or((0.0, 0.0));
         let numbers = [
@@ -99,14 +99,15 @@ impl Fused {
             (trial.next(), pace.next),
             (trial.last_step(), last_step),
             (trial.last_root(), last_root),
-            (trial.rejected(), f64::from(u8::from(pace.rejected))),
+            (trial.rejected(), pace.rejected as f64),
             (trial.accepted(), pace.accepted as f64),
             (trial.refused(), 0.0),
+            (trial.overruns(), 0.0),
             (trial.stop(), stop),
             (trial.before_stop(), stop.next_down()),
             (trial.longest(), longest),
             (trial.watched(), watched),
-            (trial.attend(), attend),
+            (trial.attend(), f64::from(u8::from(attend))),
         ];
         numbers.into_iter().for_each(|(slot, value)| system.instance.set(slot, value));
     }
@@ -119,18 +120,18 @@ impl Fused {
         }
     }
 
-    /// How the run stands after the trials, and how many were refused.
-    pub(crate) fn settled(&self, system: &System) -> (Pace, u64) {
+    /// How the run stands after the trials, how many were refused, and how many of these ended behind a surface.
+    pub(crate) fn settled(&self, system: &System) -> (Pace, u64, u64) {
         let (trial, get) = (self.trial, |slot| system.instance.get(slot));
         let last_step = get(trial.last_step());
         let pace = Pace {
             t: get(trial.time()),
             next: get(trial.next()),
             last: (last_step > 0.0).then(|| (last_step, get(trial.last_root()))),
-            rejected: get(trial.rejected()) > 0.0,
+            rejected: get(trial.rejected()) as u64,
             accepted: get(trial.accepted()) as u64,
         };
-        (pace, get(trial.refused()) as u64)
+        (pace, get(trial.refused()) as u64, get(trial.overruns()) as u64)
     }
 
     /// States at the start, and their derivatives.
