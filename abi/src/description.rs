@@ -226,6 +226,8 @@ pub struct Root {
     pub text: String,
     /// Whether a transition or an event depends on it, rather than a branch only.
     pub decides: bool,
+    /// Whether derivatives at most bend there, as at x = 0 with |x|; else they may jump.
+    pub bends: bool,
 }
 
 /// All that is known of a compiled model besides its code.

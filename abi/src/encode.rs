@@ -319,7 +319,7 @@ encode_structs! {
     Segment { start, len }
     Delay { time, range, source, past, weight, slope, ring }
     Guard { path, slot, range, unit }
-    Root { text, decides }
+    Root { text, decides, bends }
 }
 
 /// Without the coupling of its Jacobian: what lies in a file makes fixed steps.

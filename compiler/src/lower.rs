@@ -672,8 +672,9 @@ impl<'a> Plan<'a> {
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
-        let mut surfaces: Vec<(Value, ExprId)> = Vec::new();
-        let mut known: HashMap<Value, ()> = HashMap::new();
+        // With whether derivatives at most bend there.
+        let mut surfaces: Vec<(Value, ExprId, bool)> = Vec::new();
+        let mut known: HashMap<Value, usize> = HashMap::new();
         let mut moving: HashMap<Value, bool> = HashMap::new();
         while let Some(id) = stack.pop() {
             if std::mem::replace(&mut seen[id.0 as usize], true) {
@@ -688,9 +689,15 @@ impl<'a> Plan<'a> {
                 _ => {}
             }
             stack.extend(operands.into_iter().rev());
+            let bends = matches!(node, Node::Call(Builtin::Abs | Builtin::Min | Builtin::Max | Builtin::Clamp, _));
             let mut add = |emit: &mut Emit, value: Value| {
-                if emit.moves(value, &mut moving) && known.insert(value, ()).is_none() {
-                    surfaces.push((value, id));
+                if !emit.moves(value, &mut moving) {
+                    return;
+                }
+                let place = *known.entry(value).or_insert(surfaces.len());
+                match surfaces.get_mut(place) {
+                    Some(surface) => surface.2 &= bends,
+                    None => surfaces.push((value, id, bends)),
                 }
             };
             match node {
@@ -747,9 +754,9 @@ impl<'a> Plan<'a> {
         let segment =
             abi::description::Segment { start: self.description.layout.roots.start, len: surfaces.len() as u32 };
         let mut roots = Vec::new();
-        for (k, (value, id)) in surfaces.iter().enumerate() {
+        for (k, (value, id, bends)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
-            roots.push(Root { text: self.root_text(*id), decides: deciding.contains(id) });
+            roots.push(Root { text: self.root_text(*id), decides: deciding.contains(id), bends: *bends });
         }
         (emit.build.finish(), roots)
     }

@@ -21,8 +21,10 @@ pub enum Next<T> {
     Nothing,
 }
 
-/// Steps of all lanes in one call, at most.
+/// Steps of all lanes in one call, at most; and the part that this may be of those since a run was last looked at: the step
+/// at which the loop is left before its end is made twice.
 const MOST: u64 = 4096;
+const PART: u64 = 16;
 
 /// Runs what `next` hands over in lanes, which must be of the function that the solver of all of them calls, until nothing
 /// is left; each outcome goes to `give`. `next` is told whether runs are under way: if not, it must not put off.
@@ -39,12 +41,13 @@ pub fn run<T>(
     let mut all: Vec<Option<Lane<T>>> = (0..batch.width()).map(|_| None).collect();
     // Which lanes without a run do what no run does.
     let mut astray = vec![true; batch.width()];
-    let (mut stride, mut more) = (1, true);
+    let (mut calm, mut total, mut more) = (0, 0, true);
     loop {
+        let stride = (calm / PART).clamp(1, MOST);
         for lane in 0..all.len() {
             while more && all[lane].is_none() {
                 match next(all.iter().any(Option::is_some)) {
-                    Next::Run(tag, what) => all[lane] = begin(tag, *what, &mut batch, lane, give, watch),
+                    Next::Run(tag, what) => all[lane] = begin(tag, *what, &mut batch, (lane, total), give, watch),
                     Next::Later => break,
                     Next::Nothing => more = false,
                 }
@@ -58,9 +61,10 @@ pub fn run<T>(
                 astray[lane] = false;
             }
         }
-        let most = all.iter().flatten().map(|lane| lane.left).min().expect("there is one");
+        let next = all.iter().flatten().map(|lane| lane.until).min().expect("there is one");
         let pool = all[model].as_mut().expect("there is one").course.instance().description().pool.clone();
-        let done = batch.advance(&pool, most.min(stride));
+        let done = batch.advance(&pool, (next - total).min(stride));
+        total += done;
         let mut looked = false;
         for (number, place) in all.iter_mut().enumerate() {
             let status = batch.status(number);
@@ -68,20 +72,17 @@ pub fn run<T>(
                 astray[number] |= status != 0;
                 continue;
             };
-            lane.done += done;
-            lane.left -= done;
-            if status == 0 && lane.left > 0 {
+            if status == 0 && lane.until > total {
                 continue;
             }
             looked |= status != 0;
-            if let Some(result) = lane.look(&mut batch, number, status, watch) {
+            if let Some(result) = lane.look(&mut batch, (number, total), status, watch) {
                 let lane = place.take().expect("it was there");
                 astray[number] = true;
                 give(lane.tag, ended(lane.course.rest(), result));
             }
         }
-        // Where runs are looked at often, a step is made for nothing each time the loop is left before its end.
-        stride = if looked { 1 } else { (2 * stride).min(MOST) };
+        calm = if looked { 0 } else { calm + done };
     }
 }
 
@@ -89,17 +90,17 @@ pub fn run<T>(
 struct Lane<T> {
     tag: T,
     course: Box<dyn Course>,
-    /// Calls since it was looked at, and how many may follow.
-    done: u64,
-    left: u64,
+    /// Number of the step, of all that the lanes make, behind which it was looked at last, and behind which it must be again.
+    since: u64,
+    until: u64,
 }
 
-/// Puts a run into a lane; none if it has ended already.
+/// Puts a run into a lane, behind so many steps; none if it has ended already.
 fn begin<T>(
     tag: T,
     (instance, experiment): (Instance, Experiment),
     batch: &mut Batch,
-    number: usize,
+    (number, total): (usize, u64),
     give: &mut dyn FnMut(T, Result<Outcome, Failure>),
     watch: &mut dyn FnMut(f64) -> Continue,
 ) -> Option<Lane<T>> {
@@ -114,7 +115,7 @@ fn begin<T>(
     match course.next(watch) {
         Ok(Some(left)) => {
             batch.load(number, course.instance().block());
-            Some(Lane { tag, course, done: 0, left })
+            Some(Lane { tag, course, since: total, until: total.saturating_add(left) })
         }
         result => {
             give(tag, ended(course.rest(), result.map(|_| ())));
@@ -124,22 +125,22 @@ fn begin<T>(
 }
 
 impl<T> Lane<T> {
-    /// Lets the run look at what was left in its lane and go on to its next call; how it ended, if it has.
+    /// Lets the run look at what was left in its lane behind so many steps and go on to its next call; how it ended, if it has.
     fn look(
         &mut self,
         batch: &mut Batch,
-        number: usize,
+        (number, total): (usize, u64),
         status: u64,
         watch: &mut dyn FnMut(f64) -> Continue,
     ) -> Option<Result<(), Stop>> {
-        let done = std::mem::take(&mut self.done);
+        let done = total - std::mem::replace(&mut self.since, total);
         self.course.fetch(done, status, &|slots, block| batch.save_part(number, slots, block));
         if let Err(stop) = self.course.take(done, status) {
             return Some(Err(stop));
         }
         match self.course.next(watch) {
             Ok(Some(left)) => {
-                self.left = left;
+                self.until = total.saturating_add(left);
                 self.course.bring(&mut |slots, block| batch.load_part(number, slots, block));
                 None
             }

@@ -75,7 +75,8 @@ pub(crate) struct Adaptive {
     /// The same as one function of the model, if it has it; and whether the last step was made by it.
     fused: Option<Fused>,
     was_fused: bool,
-    /// Whether it is known to meet no surface and to end with everything in its range.
+    /// Whether it is known to end with everything in its range, and to meet no surface either.
+    inside: bool,
     calm: bool,
     explicit: Explicit,
     /// Which of the two is at work.
@@ -199,6 +200,7 @@ impl Adaptive {
             fused,
             fine,
             was_fused: false,
+            inside: false,
             calm: false,
             explicit: Explicit::new(n),
             stiff: true,
@@ -280,7 +282,7 @@ impl Adaptive {
         self.know_slope();
         if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
             self.step.t = self.t;
-            self.step.x0.copy_from_slice(&self.x);
+            copy(&self.x, &mut self.step.x0);
             self.know_jacobian();
         }
         let attend = self.fresh
@@ -311,9 +313,9 @@ impl Adaptive {
         }
         // What jumps at the stop has not jumped before it.
         self.step.end = if hits { stop.next_down() } else { self.t + self.step.h };
-        self.step.x0.copy_from_slice(&self.x);
+        copy(&self.x, &mut self.step.x0);
         self.know_slope();
-        (self.was_stiff, self.was_fused, self.calm) = (self.stiff, false, false);
+        (self.was_stiff, self.was_fused, self.inside, self.calm) = (self.stiff, false, false, false);
         let error = if self.stiff {
             self.stiff_attempt()
         } else {
@@ -531,7 +533,7 @@ impl Adaptive {
             self.aimed.iter_mut().for_each(|aimed| *aimed = aimed.saturating_sub(1));
         }
         self.go_to_end(reached)?;
-        self.guard()
+        if self.inside { Ok(()) } else { self.guard() }
     }
 
     /// Follows an accepted step that meets nothing.
@@ -734,6 +736,9 @@ impl Adaptive {
     /// By how much derivatives jump at a crossing, as error tolerances of their states gathered per second; 0 where
     /// they jump by less than their own tolerance, or change about as much beside the crossing in the same time.
     fn jump(&mut self, crossing: Crossing) -> f64 {
+        if self.surfaces.bend() {
+            return 0.0;
+        }
         let n = self.system.n;
         let width = crossing.far - crossing.near;
         let beside = [crossing.near - width, crossing.near, crossing.far, crossing.far + width];
@@ -890,7 +895,7 @@ impl Adaptive {
         let moved = |i: usize| (self.x[i] - self.crossings_at[i]).abs() > far * (self.x[i].abs() + self.scales[i]);
         if (0..self.system.n).any(moved) {
             (self.crossings, self.crossings_since) = (0, self.t);
-            self.crossings_at.copy_from_slice(&self.x);
+            copy(&self.x, &mut self.crossings_at);
             self.surfaces.forget();
         }
     }
@@ -968,8 +973,8 @@ impl Course for Adaptive {
         if accepted > 0 {
             (self.t, self.last) = (pace.t, pace.last);
             let (x, f) = fused.start(&self.system);
-            self.x.copy_from_slice(x);
-            self.step.f0.copy_from_slice(f);
+            copy(x, &mut self.x);
+            copy(f, &mut self.step.f0);
             self.surfaces.go_on(fused.here(&self.system));
             self.jacobian_known = false;
         }
@@ -991,14 +996,15 @@ impl Course for Adaptive {
         }
         let fused = self.fused.as_ref().expect("it made trials");
         self.step.t = self.t;
-        self.step.x0.copy_from_slice(&self.x);
+        copy(&self.x, &mut self.step.x0);
         let judged = fused.left(&self.system, &mut self.step, &mut self.end_slope, status);
         if self.is_too_short(stop) {
             return Err(self.too_short(self.step.h));
         }
         self.was_stiff = true;
         self.was_fused = judged.is_some();
-        self.calm = judged.as_ref().is_some_and(|judged| !judged.met && !judged.outside);
+        self.inside = judged.as_ref().is_some_and(|judged| !judged.outside);
+        self.calm = self.inside && judged.as_ref().is_some_and(|judged| !judged.met);
         let error = match judged {
             Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
             Some(Judged { error, defect, .. }) if error <= 1.0 => error.max(defect),

@@ -116,7 +116,7 @@ impl Fused {
     pub(crate) fn prepare_surfaces(&self, system: &mut System, sides: &[f64], here: &[f64]) {
         let block = system.instance.block_mut();
         for (segment, values) in [(self.trial.sides(), sides), (self.trial.here(), here)] {
-            block[segment.range()].copy_from_slice(values);
+            copy(values, &mut block[segment.range()]);
         }
     }
 

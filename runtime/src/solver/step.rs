@@ -46,7 +46,7 @@ impl System {
         let states = self.states.clone();
         let block = self.instance.block_mut();
         block[Slot::TIME.index()] = t;
-        block[states].copy_from_slice(x);
+        copy(x, &mut block[states]);
         self.history.place(t, block);
     }
 
@@ -62,12 +62,12 @@ impl System {
         let (states, derivatives) = (self.states.start, self.derivatives.start);
         let block = self.instance.block_mut();
         block[Slot::TIME.index()] = t;
-        block[states..states + n].copy_from_slice(&x[..n]);
+        copy(&x[..n], &mut block[states..states + n]);
         self.history.place(t, block);
         if n > 0 {
             self.instance.call(Function::Derivatives);
         }
-        f[..n].copy_from_slice(&self.instance.block()[derivatives..derivatives + n]);
+        copy(&self.instance.block()[derivatives..derivatives + n], &mut f[..n]);
     }
 
     /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: one-sided differences
@@ -125,7 +125,7 @@ impl System {
     pub(crate) fn roots(&mut self, t: f64, x: &[f64], g: &mut [f64]) {
         self.place(t, x);
         self.instance.call(Function::Roots);
-        g.copy_from_slice(&self.instance.block()[self.roots.clone()]);
+        copy(&self.instance.block()[self.roots.clone()], g);
     }
 }
 

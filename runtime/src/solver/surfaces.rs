@@ -4,7 +4,7 @@
 //! condition has its old value and at whose far end some have their new one.
 
 use super::fused::Fused;
-use super::step::{Step, System};
+use super::step::{Step, System, copy};
 
 /// Where the first crossing of a step lies, in θ.
 #[derive(Clone, Copy, Debug)]
@@ -21,6 +21,8 @@ pub(crate) struct Surfaces {
     sides: Vec<f64>,
     /// Whether a transition or an event depends on the surface: then leaving it, too, is a crossing.
     decides: Vec<bool>,
+    /// Whether derivatives at most bend there.
+    bends: Vec<bool>,
     /// Whether only those are looked for.
     pub(crate) only_conditions: bool,
     /// Values at the end of the last step, or where the search stands within this one.
@@ -49,6 +51,7 @@ impl Surfaces {
         Surfaces {
             sides: zeros(),
             decides: system.instance.description().roots.iter().map(|root| root.decides).collect(),
+            bends: system.instance.description().roots.iter().map(|root| root.bends).collect(),
             only_conditions: false,
             here: zeros(),
             nodes: Vec::new(),
@@ -103,7 +106,7 @@ impl Surfaces {
 
     /// Steps that crossed nothing have led to a point with these values.
     pub(crate) fn go_on(&mut self, here: &[f64]) {
-        self.here.copy_from_slice(here);
+        copy(here, &mut self.here);
     }
 
     /// The surfaces met most often since `forget`.
@@ -119,8 +122,8 @@ impl Surfaces {
 
     /// Goes back to the start of the step that was looked at last.
     pub(crate) fn again(&mut self) {
-        self.here.copy_from_slice(&self.start);
-        self.sides.copy_from_slice(&self.start_sides);
+        copy(&self.start, &mut self.here);
+        copy(&self.start_sides, &mut self.sides);
     }
 
     /// Looks along a step. Between two points that are looked at, a surface that is touched and left again would be
@@ -134,8 +137,8 @@ impl Surfaces {
         if m == 0 {
             return;
         }
-        self.start.copy_from_slice(&self.here);
-        self.start_sides.copy_from_slice(&self.sides);
+        copy(&self.here, &mut self.start);
+        copy(&self.sides, &mut self.start_sides);
         if fresh {
             [1e-6, 1e-4, 1e-2, 0.1, 0.25].into_iter().for_each(|theta| self.look(system, step, theta));
         }
@@ -191,7 +194,7 @@ impl Surfaces {
             if self.nodes[k] <= near {
                 continue;
             }
-            self.far.copy_from_slice(&self.values[k * m..(k + 1) * m]);
+            copy(&self.values[k * m..(k + 1) * m], &mut self.far);
             if self.crossed(&self.far) {
                 return Some(self.bracket(system, step, near, self.nodes[k]));
             }
@@ -211,6 +214,11 @@ impl Surfaces {
         self.changed().any(|i| self.decides[i])
     }
 
+    /// Whether derivatives at most bend at all of them.
+    pub(crate) fn bend(&self) -> bool {
+        self.changed().all(|i| self.bends[i] && !self.decides[i])
+    }
+
     /// Whether a transition or an event depends on any surface.
     pub(crate) fn has_conditions(&self) -> bool {
         self.decides.contains(&true)
@@ -223,7 +231,7 @@ impl Surfaces {
                 *side = if *g == 0.0 { *side } else { sign(*g) };
             }
         }
-        self.here.copy_from_slice(&self.far);
+        copy(&self.far, &mut self.here);
     }
 
     fn crossed(&self, g: &[f64]) -> bool {
