@@ -94,6 +94,8 @@ pub(crate) struct Adaptive {
     creep: f64,
     /// For each surface, how often of late a step has been made again to end before it, and nothing came of it.
     aimed: Vec<u8>,
+    /// Number of the try that was to end so little behind a bend that it cannot matter.
+    bent: Option<u64>,
     /// Length of the step that was made again: how long steps may be when the condition is behind.
     usual: Option<f64>,
     /// States beside a crossing, and four slopes around it.
@@ -210,6 +212,7 @@ impl Adaptive {
             rejected: 0,
             creep: f64::INFINITY,
             aimed: vec![0; system.surfaces()],
+            bent: None,
             usual: None,
             beside: vec![0.0; n],
             slopes: vec![0.0; 4 * n],
@@ -620,6 +623,9 @@ impl Adaptive {
             let margin = (0.05 / jump).max(4.0 * (crossing.far - crossing.near) * h);
             if to > 2.0 * margin { (to - margin, 2.0 * margin) } else { (to + margin, f64::INFINITY) }
         } else {
+            if self.bent.take() == Some(self.attempts()) {
+                return false;
+            }
             let bend = self.bend(crossing);
             if 0.5 * bend * behind * behind <= 0.1 {
                 return false;
@@ -631,6 +637,7 @@ impl Adaptive {
         }
         (self.h, self.creep) = (shorter, creep);
         self.retake();
+        self.bent = (jump == 0.0).then_some(self.attempts() + 1);
         true
     }
 
