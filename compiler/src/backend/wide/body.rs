@@ -16,7 +16,7 @@ pub struct Home {
     pub index: usize,
 }
 
-/// One vector of a node.
+/// One vector of a node; what is the same in every vector has but the first.
 type Copy = usize;
 
 /// A straight line being written.
@@ -147,7 +147,7 @@ impl<'a> Body<'a> {
     }
 
     fn copy(&self, node: Node) -> Copy {
-        node.index() * self.vectors + self.now.1
+        node.index() * self.vectors + if self.what(node).is_shared() { 0 } else { self.now.1 }
     }
 
     fn what(&self, node: Node) -> What {
@@ -163,6 +163,10 @@ impl<'a> Body<'a> {
         let (node, k) = (Node((copy / self.vectors) as u32), copy % self.vectors);
         let (at, now) = self.now;
         let uses = self.uses.get(&node)?;
+        if self.what(node).is_shared() {
+            let first = uses.partition_point(|place| *place < at || *place == at && now + 1 == self.vectors);
+            return uses.get(first).map(|place| place * self.vectors + if *place == at { now + 1 } else { 0 });
+        }
         let first = uses.partition_point(|place| *place < at || *place == at && k <= now);
         uses.get(first).map(|place| place * self.vectors + k)
     }
@@ -175,21 +179,46 @@ impl<'a> Body<'a> {
         Place::Memory(Base::Block, (self.spills_at + number * self.width.bytes() as usize) as i32)
     }
 
-    /// Where a node can be read: its register, or memory.
+    /// Where a node can be read: its register, or memory. What is read again is loaded, for the processor adds faster than it
+    /// reads, if there is a register that nobody needs before.
     fn place(&mut self, node: Node) -> Place {
         let copy = self.copy(node);
+        let mask = self.is_mask(node);
         if let Some(register) = self.register.get(&copy) {
             let register = *register;
-            self.locked.push((self.is_mask(node), register));
+            self.locked.push((mask, register));
             return Place::Register(register);
         }
-        match self.what(node) {
-            What::Constant(bits) => Place::Constant(bits),
-            _ => self.memory(node),
+        let place = self.memory(node);
+        if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
+            return place;
         }
+        let register = self.take(mask);
+        self.load(node, register, place);
+        self.own(copy, mask, register);
+        Place::Register(register)
     }
 
-    fn memory(&self, node: Node) -> Place {
+    /// Whether a vector register is free, or holds what lies in memory too and is read later.
+    fn is_room_until(&self, next: usize) -> bool {
+        (0..self.vector_of.len()).any(|register| {
+            let later = |copy: Copy| self.is_in_memory(copy) && self.next_use(copy).is_none_or(|other| other > next);
+            !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
+        })
+    }
+
+    /// Whether a copy can be read from memory.
+    fn is_in_memory(&self, copy: Copy) -> bool {
+        let node = Node((copy / self.vectors) as u32);
+        self.what(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&copy)
+    }
+
+    fn memory(&mut self, node: Node) -> Place {
+        match self.what(node) {
+            What::Constant(bits) => return Place::Constant(bits),
+            What::Row(table, second) => return self.code.row(table.row(second)),
+            _ => {}
+        }
         if let Some(number) = self.spills.get(&self.copy(node)) {
             return self.spill_place(*number);
         }
@@ -244,9 +273,12 @@ impl<'a> Body<'a> {
         let free = (first..table.len()).find(|register| table[*register].is_none() && !locked(*register));
         let register = free.unwrap_or_else(|| {
             let candidates = (first..table.len()).filter(|register| !locked(*register));
+            // What has to be stored first is worth more.
             let last = candidates.max_by_key(|register| {
                 let copy = table[*register].expect("none is free");
-                self.next_use(copy).unwrap_or(usize::MAX)
+                let wait =
+                    |next: usize| (next - self.now.0 * self.vectors) * if self.is_in_memory(copy) { 4 } else { 1 };
+                self.next_use(copy).map_or(usize::MAX, wait)
             });
             last.expect("an instruction locks fewer registers than there are")
         });
@@ -263,9 +295,7 @@ impl<'a> Body<'a> {
         let copy = table[register as usize].take().expect("somebody owns it");
         self.register.remove(&copy);
         let node = Node((copy / self.vectors) as u32);
-        let known = self.homes.contains_key(&node) || self.spills.contains_key(&copy);
-        let constant = matches!(self.what(node), What::Constant(_));
-        if self.next_use(copy).is_some() && !known && !constant {
+        if self.next_use(copy).is_some() && !self.is_in_memory(copy) {
             let number = self.free_spills.pop().unwrap_or_else(|| {
                 self.spilled += 1;
                 self.spilled - 1
@@ -329,7 +359,7 @@ impl<'a> Body<'a> {
             }
         }
         match what {
-            What::Load(_) | What::Constant(_) => unreachable!("they lie in memory"),
+            What::Load(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             What::One(instruction, immediate, a) => {
                 let last = self.place(a);
@@ -409,13 +439,13 @@ impl<'a> Body<'a> {
                     Vectors::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
                 }
             }
-            What::Permute(table, index) => {
+            What::Permute(first, second, index) => {
                 let by = self.in_register(index);
+                let [first, second] = [first, second].map(|row| self.place(row));
                 let to = self.apart(node);
-                let [first, second] = table.rows().map(|row| self.code.row(row));
                 self.code.vector(i::LOAD, to, 0, first, None);
                 self.code.vector(i::PERMUTE_TWO, to, by, second, None);
-                self.release(index);
+                what.operands().for_each(|operand| self.release(operand));
             }
             What::Gather { base, index } if self.width == Vectors::Avx512 => {
                 let from = self.in_register(index);

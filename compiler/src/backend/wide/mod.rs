@@ -311,7 +311,7 @@ fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
         let mut open = vec![(*root, false)];
         while let Some((node, ready)) = open.pop() {
             let what = nodes.nodes[node.index()];
-            if done[node.index()] || !wanted[node.index()] || matches!(what, What::Load(_) | What::Constant(_)) {
+            if done[node.index()] || !wanted[node.index()] || what.is_leaf() {
                 continue;
             }
             if ready {
@@ -336,7 +336,7 @@ fn needed_once(nodes: &Nodes, orders: &[&[Node]], failed: Option<Node>, varies: 
     let mut seen = HashSet::new();
     read.chain(stored)
         .filter(|node| !varies[node.index()])
-        .filter(|node| !matches!(nodes.nodes[node.index()], What::Load(_) | What::Constant(_)))
+        .filter(|node| !nodes.nodes[node.index()].is_leaf())
         .filter(|node| seen.insert(*node))
         .collect()
 }

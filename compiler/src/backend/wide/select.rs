@@ -74,8 +74,10 @@ pub enum What {
         base: u32,
         index: Node,
     },
-    /// Entries of sixteen, by the low four bits of an integer. AVX-512 only.
-    Permute(Sixteen, Node),
+    /// Half a table: the same in every vector. AVX-512 only.
+    Row(Sixteen, bool),
+    /// Entries of sixteen, in two rows, by the low four bits of an integer. AVX-512 only.
+    Permute(Node, Node, Node),
 }
 
 /// A quarter of a table for exponentials: i begins with 16 times the number.
@@ -88,8 +90,8 @@ pub enum Sixteen {
 }
 
 impl Sixteen {
-    /// Its two vectors, by the bits of their entries.
-    pub fn rows(self) -> [[u64; 8]; 2] {
+    /// Its first or second half, by the bits of the entries.
+    pub fn row(self, second: bool) -> [u64; 8] {
         let (Sixteen::Power(quarter) | Sixteen::Tail(quarter)) = self;
         let entry = |place: usize| {
             let i = 16 * usize::from(quarter) + place;
@@ -98,7 +100,7 @@ impl Sixteen {
                 Sixteen::Tail(_) => math::POOL[tables::EXP_TAIL as usize + i].to_bits(),
             }
         };
-        [0, 8].map(|row| std::array::from_fn(|place| entry(row + place)))
+        std::array::from_fn(|place| entry(8 * usize::from(second) + place))
     }
 }
 
@@ -114,23 +116,31 @@ impl What {
     /// Operands from left to right.
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
-            What::Load(_) | What::Constant(_) | What::Mask(_) => [None; 3],
-            What::One(_, _, a)
-            | What::Shift(_, a, _)
-            | What::MaskNot(a)
-            | What::Gather { index: a, .. }
-            | What::Permute(_, a) => [Some(a), None, None],
+            What::Load(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
+            What::One(_, _, a) | What::Shift(_, a, _) | What::MaskNot(a) | What::Gather { index: a, .. } => {
+                [Some(a), None, None]
+            }
             What::Two(_, _, a, b)
             | What::Compare(_, a, b)
             | What::CompareInt(_, a, b)
             | What::TestBits(a, b)
             | What::MaskAnd(a, b)
             | What::MaskOr(a, b) => [Some(a), Some(b), None],
-            What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) => {
+            What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) | What::Permute(a, b, c) => {
                 [Some(a), Some(b), Some(c)]
             }
         };
         all.into_iter().flatten()
+    }
+
+    /// Whether it lies in memory from the beginning.
+    pub fn is_leaf(self) -> bool {
+        matches!(self, What::Load(_)) || self.is_shared()
+    }
+
+    /// Whether it is the same in every vector, and lies in memory from the beginning.
+    pub fn is_shared(self) -> bool {
+        matches!(self, What::Constant(_) | What::Row(..))
     }
 
     /// Whether it lies in a mask register.
@@ -151,6 +161,7 @@ impl What {
             | What::Shift(..)
             | What::Select(..)
             | What::Gather { .. }
+            | What::Row(..)
             | What::Permute(..) => false,
         }
     }
@@ -360,7 +371,10 @@ impl Selection {
 
     /// Entries of a table of 64 by the low six bits of an integer.
     fn sixty_four(&mut self, quarter: fn(u8) -> Sixteen, index: Node) -> Node {
-        let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| self.add(What::Permute(quarter(number), index)));
+        let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| {
+            let [first, second] = [false, true].map(|second| self.add(What::Row(quarter(number), second)));
+            self.add(What::Permute(first, second, index))
+        });
         let [sixteen, thirty_two] = [16, 32].map(|bit| {
             let bit = self.constant(bit);
             self.add(What::TestBits(index, bit))
