@@ -6,7 +6,9 @@
 
 use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Signs, What};
+use crate::math;
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// Where a node's vectors lie in memory: the `index`-th group of vectors behind `begin` bytes.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -126,24 +128,34 @@ impl<'a> Body<'a> {
         }
     }
 
-    /// Jumps that are taken if a mask has a lane; their targets are open.
-    pub fn test(&mut self, mask: Node) -> Vec<usize> {
-        let mut jumps = Vec::new();
-        for k in 0..self.vectors {
-            self.now = (self.order.len() + 1, k);
-            let register = self.in_register(mask);
+    /// A jump that is taken if a mask has a lane; its target is open. It ends the line.
+    pub fn test(&mut self, mask: Node) -> usize {
+        self.now = (self.order.len() + 1, 0);
+        let all = self.in_register(mask);
+        for k in 1..self.vectors {
+            self.now.1 = k;
             match self.width {
-                Vectors::Avx512 => self.code.mask(i::MASK_TEST, register, 0, Place::Register(register)),
-                Vectors::Avx2 => {
-                    // To r10.
-                    self.code.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 5, 0x7d, 0x50, 0xd0 | register & 7]);
-                    self.code.plain(&[0x45, 0x85, 0xd2]);
+                Vectors::Avx512 => {
+                    let more = self.in_register(mask);
+                    self.code.mask(i::MASK_OR, all, all, Place::Register(more));
+                }
+                Vectors::Avx | Vectors::Avx2 => {
+                    let more = self.place(mask);
+                    self.code.vector(i::OR, all, all, more, None);
                 }
             }
-            jumps.push(self.code.jump(&[0x0f, 0x85]));
-            self.done(mask);
+            self.locked.truncate(1);
         }
-        jumps
+        match self.width {
+            Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
+            Vectors::Avx | Vectors::Avx2 => {
+                // To r10.
+                let l = u8::from(self.width == Vectors::Avx2);
+                self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
+                self.code.plain(&[0x45, 0x85, 0xd2]);
+            }
+        }
+        self.code.jump(&[0x0f, 0x85])
     }
 
     fn copy(&self, node: Node) -> Copy {
@@ -173,6 +185,14 @@ impl<'a> Body<'a> {
 
     fn at_home(&self, home: Home, k: usize) -> Place {
         super::place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
+    }
+
+    /// The number of a place in memory that nobody needs.
+    fn spill_number(&mut self) -> usize {
+        self.free_spills.pop().unwrap_or_else(|| {
+            self.spilled += 1;
+            self.spilled - 1
+        })
     }
 
     fn spill_place(&self, number: usize) -> Place {
@@ -296,10 +316,7 @@ impl<'a> Body<'a> {
         self.register.remove(&copy);
         let node = Node((copy / self.vectors) as u32);
         if self.next_use(copy).is_some() && !self.is_in_memory(copy) {
-            let number = self.free_spills.pop().unwrap_or_else(|| {
-                self.spilled += 1;
-                self.spilled - 1
-            });
+            let number = self.spill_number();
             self.spills.insert(copy, number);
             self.store(node, register, self.spill_place(number));
         }
@@ -378,16 +395,13 @@ impl<'a> Body<'a> {
                 self.code.vector(instruction, digit, to, Place::Register(from), Some(n));
             }
             What::Compare(predicate, a, b) => {
-                // The other way round: LT is GT, LE is GE.
-                let turned = [(0x11, 0x1e), (0x12, 0x1d), (0, 0)].into_iter().find(|(known, _)| *known == predicate);
-                let turned = turned.expect("a known predicate").1;
                 let (first, last, predicate) = match (self.place(a), self.place(b)) {
                     (Place::Register(a), last) => (a, last, predicate),
-                    (last, Place::Register(b)) => (b, last, turned),
+                    (last, Place::Register(b)) => (b, last, predicate.turned()),
                     (_, last) => (self.in_register(a), last, predicate),
                 };
                 let to = self.result(node);
-                self.code.vector(i::COMPARE, to, first, last, Some(predicate));
+                self.code.vector(i::COMPARE, to, first, last, Some(predicate as u8));
             }
             What::CompareInt(predicate, a, b) if self.width == Vectors::Avx512 => {
                 let first = self.in_register(a);
@@ -436,7 +450,9 @@ impl<'a> Body<'a> {
                 let to = self.result(node);
                 match self.width {
                     Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Vectors::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
+                    Vectors::Avx | Vectors::Avx2 => {
+                        self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4))
+                    }
                 }
             }
             What::Permute(first, second, index) => {
@@ -447,7 +463,7 @@ impl<'a> Body<'a> {
                 self.code.vector(i::PERMUTE_TWO, to, by, second, None);
                 what.operands().for_each(|operand| self.release(operand));
             }
-            What::Gather { base, index } if self.width == Vectors::Avx512 => {
+            What::Gather { base, index, .. } if self.width == Vectors::Avx512 => {
                 let from = self.in_register(index);
                 let mask = self.take(true);
                 let to = self.apart(node);
@@ -461,15 +477,48 @@ impl<'a> Body<'a> {
                 // All tables that are read at the same place, at once.
                 let same = |other: &&Node| matches!(self.what(**other), What::Gather { index: at, .. } if at == index);
                 let all: Vec<Node> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
-                let from = self.in_register(index);
-                let half = self.take(false);
-                let mut tables = Vec::new();
-                for node in all {
-                    let What::Gather { base, .. } = self.what(node) else { unreachable!("they are alike") };
-                    tables.push((self.apart(node), 8 * base as i32));
-                }
-                self.code.look_up(&tables, from, half);
+                self.look_up(&all, index);
                 self.release(index);
+            }
+        }
+    }
+
+    /// Entries of tables at the same place: of two tables of elementary functions, which are known here, both by one load.
+    fn look_up(&mut self, all: &[Node], index: Node) {
+        let nodes = self.nodes;
+        let table = |node: &Node| match self.what(*node) {
+            What::Gather { base, len, .. } => base as usize..(base + len) as usize,
+            _ => unreachable!("all are alike"),
+        };
+        let tables: Vec<_> = all.iter().map(table).collect();
+        let both = |two: &[Range<usize>]| {
+            let known = |table: &Range<usize>| nodes.pooled && table.end <= math::POOL.len();
+            matches!(two, [a, b] if a.len() == b.len() && known(a) && known(b))
+        };
+        let scale = if tables.chunks(2).any(both) { 4 } else { 8 };
+        let from = self.in_register(index);
+        let half = self.take(false);
+        let number = self.spill_number();
+        let place = self.spill_place(number);
+        self.left_spills.push(number);
+        let Place::Memory(base, offset) = place else { unreachable!("it lies in memory") };
+        match scale {
+            4 => {
+                self.code.vector(i::INT_ADD, half, from, Place::Register(from), None);
+                self.code.vector(i::STORE, half, 0, place, None);
+            }
+            _ => self.code.vector(i::STORE, from, 0, place, None),
+        }
+        for (two, tables) in all.chunks(2).zip(tables.chunks(2)) {
+            let to: Vec<u8> = two.iter().map(|node| self.apart(*node)).collect();
+            if let ([first, second], true) = (to.as_slice(), both(tables)) {
+                let entries = tables[0].clone().zip(tables[1].clone()).flat_map(|(a, b)| [a, b]);
+                let distance = self.code.table(entries.map(|at| math::POOL[at].to_bits()).collect());
+                self.code.look_up_two([*first, *second], (base, offset), distance, half);
+            } else {
+                for (to, table) in to.into_iter().zip(tables) {
+                    self.code.look_up(to, (base, offset), scale, 8 * table.start as i32, half);
+                }
             }
         }
     }
