@@ -184,19 +184,22 @@ impl Assembler {
     /// An instruction with a mask register; 0: none. VEX has no masks.
     pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
         match self.width {
-            Vectors::Avx512 => self.evex(what, reg, second, last, mask),
+            Vectors::Avx512 => {
+                self.evex(what, reg, second, last, mask);
+                self.operand(reg, last, immediate, self.width.bytes());
+            }
             Vectors::Avx | Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
                 self.vex(what, reg, second, last, u8::from(self.width == Vectors::Avx2));
+                self.operand(reg, last, immediate, 1);
             }
         }
-        self.operand(reg, last, immediate);
     }
 
     /// An instruction on mask registers.
     pub fn mask(&mut self, (what, l): (Instruction, u8), reg: u8, second: u8, last: Place) {
         self.vex(what, reg, second, last, l);
-        self.operand(reg, last, None);
+        self.operand(reg, last, None, 1);
     }
 
     /// Entries of the table at `offset` bytes of the pool, at the indices in a vector, where a mask register is set. EVEX
@@ -246,8 +249,8 @@ impl Assembler {
 
     /// A number of a vector in memory, to r10.
     fn number(&mut self, (base, offset): (Base, i32), lane: usize) {
-        self.bytes.extend([0x4c | base as u8 >> 3, 0x8b, 0x90 | base as u8 & 7]);
-        self.bytes.extend((offset + 8 * lane as i32).to_le_bytes());
+        self.bytes.extend([0x4c | base as u8 >> 3, 0x8b]);
+        self.address(2 << 3, base, offset + 8 * lane as i32, 1);
     }
 
     /// A VEX instruction on the entry of a table, behind a register and a distance, whose number r10 holds.
@@ -261,8 +264,14 @@ impl Assembler {
     ) {
         let p0 = (!reg >> 3 & 1) << 7 | (!base >> 3 & 1) << 5 | map;
         self.bytes.extend([0xc4, p0, w[1] << 7 | (!second & 15) << 3 | l << 2 | pp, opcode]);
-        self.bytes.extend([0x84 | (reg & 7) << 3, (scale.trailing_zeros() as u8) << 6 | 2 << 3 | base & 7]);
-        self.bytes.extend(distance.to_le_bytes());
+        let (reg, index) = ((reg & 7) << 3, (scale.trailing_zeros() as u8) << 6 | 2 << 3 | base & 7);
+        match i8::try_from(distance) {
+            Ok(distance) => self.bytes.extend([0x44 | reg, index, distance as u8]),
+            Err(_) => {
+                self.bytes.extend([0x84 | reg, index]);
+                self.bytes.extend(distance.to_le_bytes());
+            }
+        }
     }
 
     /// The operand: base and index scaled by 8, with a distance of 32 bits.
@@ -291,19 +300,20 @@ impl Assembler {
             Place::Memory(base, _) => !(base as u8) >> 3 & 1,
             Place::Constant(_) | Place::Row(_) => 1,
         };
-        let p0 = (!reg >> 3 & 1) << 7 | 1 << 6 | b << 5 | map;
-        let p1 = w[1] << 7 | (!second & 15) << 3 | l << 2 | pp;
-        self.bytes.extend([0xc4, p0, p1, opcode]);
+        let r = (!reg >> 3 & 1) << 7;
+        let rest = (!second & 15) << 3 | l << 2 | pp;
+        match (map, w[1], b) {
+            (1, 0, 1) => self.bytes.extend([0xc5, r | rest, opcode]),
+            _ => self.bytes.extend([0xc4, r | 1 << 6 | b << 5 | map, w[1] << 7 | rest, opcode]),
+        }
     }
 
-    fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>) {
+    /// The last operand, and what follows it. A short distance counts in units.
+    fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>, unit: i32) {
         let reg = (reg & 7) << 3;
         match last {
             Place::Register(register) => self.bytes.push(0xc0 | reg | register & 7),
-            Place::Memory(base, offset) => {
-                self.bytes.push(0x80 | reg | base as u8 & 7);
-                self.bytes.extend(offset.to_le_bytes());
-            }
+            Place::Memory(base, offset) => self.address(reg, base, offset, unit),
             Place::Constant(bits) => {
                 let next = self.constants.len();
                 let number = *self.numbers.entry(bits).or_insert(next);
@@ -319,6 +329,19 @@ impl Assembler {
             }
         }
         self.bytes.extend(immediate);
+    }
+
+    /// An operand at a distance from a base: none, or one byte of units, or four bytes.
+    fn address(&mut self, reg: u8, base: Base, offset: i32, unit: i32) {
+        let base = base as u8 & 7;
+        match i8::try_from(offset / unit) {
+            Ok(0) if offset == 0 => self.bytes.push(reg | base),
+            Ok(units) if offset % unit == 0 => self.bytes.extend([0x40 | reg | base, units as u8]),
+            _ => {
+                self.bytes.push(0x80 | reg | base);
+                self.bytes.extend(offset.to_le_bytes());
+            }
+        }
     }
 
     /// An operand behind the code; gives where its distance stands.
@@ -425,23 +448,23 @@ mod tests {
     fn instructions_have_the_bytes_of_the_manual() {
         let look_up = [
             [0x4c, 0x8b, 0x97, 0, 1, 0, 0].as_slice(),
-            &[0xc4, 0x21, 0x7b, 0x10, 0x8c, 0x96, 0x40, 0, 0, 0],
+            &[0xc4, 0x21, 0x7b, 0x10, 0x4c, 0x96, 0x40],
             &[0x4c, 0x8b, 0x97, 8, 1, 0, 0],
-            &[0xc4, 0x21, 0x31, 0x16, 0x8c, 0x96, 0x40, 0, 0, 0],
+            &[0xc4, 0x21, 0x31, 0x16, 0x4c, 0x96, 0x40],
             &[0x4c, 0x8b, 0x97, 16, 1, 0, 0],
-            &[0xc4, 0xa1, 0x7b, 0x10, 0x9c, 0x96, 0x40, 0, 0, 0],
+            &[0xc4, 0xa1, 0x7b, 0x10, 0x5c, 0x96, 0x40],
             &[0x4c, 0x8b, 0x97, 24, 1, 0, 0],
-            &[0xc4, 0xa1, 0x61, 0x16, 0x9c, 0x96, 0x40, 0, 0, 0],
+            &[0xc4, 0xa1, 0x61, 0x16, 0x5c, 0x96, 0x40],
             &[0xc4, 0x63, 0x35, 0x18, 0xcb, 1],
         ]
         .concat();
         let look_up_two = [
             [0x4c, 0x8b, 0x97, 0, 1, 0, 0].as_slice(),
-            &[0xc4, 0x81, 0x79, 0x28, 0x9c, 0xd3, 0x40, 0, 0, 0],
+            &[0xc4, 0x81, 0x79, 0x28, 0x5c, 0xd3, 0x40],
             &[0x4c, 0x8b, 0x97, 8, 1, 0, 0],
-            &[0xc4, 0x81, 0x79, 0x28, 0xa4, 0xd3, 0x40, 0, 0, 0],
-            &[0xc4, 0x61, 0x61, 0x14, 0xcc],
-            &[0xc4, 0xe1, 0x61, 0x15, 0xe4],
+            &[0xc4, 0x81, 0x79, 0x28, 0x64, 0xd3, 0x40],
+            &[0xc5, 0x61, 0x14, 0xcc],
+            &[0xc5, 0xe1, 0x15, 0xe4],
         ]
         .concat();
         // vaddpd zmm17, zmm2, zmm30
@@ -455,6 +478,22 @@ mod tests {
             Vectors::Avx2,
             |c| c.vector(FMA_231, 9, 1, Place::Memory(Base::Before, 0x100), None),
             &[0xc4, 0x42, 0xf5, 0xb8, 0x88, 0, 1, 0, 0],
+        );
+        // vaddpd ymm9, ymm1, [r8]; vmovapd [rcx-0x20], ymm1; vaddpd zmm1, zmm2, [r8+0x1fc0]
+        check(
+            Vectors::Avx2,
+            |c| c.vector(ADD, 9, 1, Place::Memory(Base::Before, 0), None),
+            &[0xc4, 0x41, 0x75, 0x58, 0x08],
+        );
+        check(
+            Vectors::Avx2,
+            |c| c.vector(STORE, 1, 0, Place::Memory(Base::Statuses, -0x20), None),
+            &[0xc5, 0xfd, 0x29, 0x49, 0xe0],
+        );
+        check(
+            Vectors::Avx512,
+            |c| c.vector(ADD, 1, 2, Place::Memory(Base::Before, 0x1fc0), None),
+            &[0x62, 0xd1, 0xed, 0x48, 0x58, 0x48, 0x7f],
         );
         // vblendmpd zmm1{k3}, zmm2, zmm4
         check(
@@ -489,7 +528,7 @@ mod tests {
             &[0xc4, 0xe3, 0x6d, 0x4b, 0xcb, 0x40],
         );
         // kandnb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x42, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x42, 0xcb]);
         // vcvtqq2pd zmm1, zmm2
         check(
             Vectors::Avx512,
@@ -497,6 +536,6 @@ mod tests {
             &[0x62, 0xf1, 0xfe, 0x48, 0xe6, 0xca],
         );
         // korb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x45, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x45, 0xcb]);
     }
 }
