@@ -319,13 +319,22 @@ fn varying(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
 /// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first,
 /// so that what is computed is soon used.
 fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+    let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
+    // Registers that a node takes while it is computed, if nothing is shared.
+    let mut need: Vec<usize> = Vec::with_capacity(nodes.nodes.len());
+    for (index, node) in nodes.nodes.iter().enumerate() {
+        let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
+        of.sort_unstable_by(|a, b| b.cmp(a));
+        let most = of.iter().enumerate().map(|(before, need)| need + before).max();
+        need.push(if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) });
+    }
     let mut done = vec![false; nodes.nodes.len()];
     let mut out = Vec::new();
     for root in roots {
         let mut open = vec![(*root, false)];
         while let Some((node, ready)) = open.pop() {
             let what = nodes.nodes[node.index()];
-            if done[node.index()] || !wanted[node.index()] || what.is_leaf() {
+            if done[node.index()] || is_read(node) {
                 continue;
             }
             if ready {
@@ -335,7 +344,8 @@ fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
             }
             open.push((node, true));
             // The last pushed is done first.
-            let operands: Vec<Node> = what.operands().collect();
+            let mut operands: Vec<Node> = what.operands().collect();
+            operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
             open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
         }
     }
