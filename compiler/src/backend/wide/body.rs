@@ -1,8 +1,9 @@
 //! Nodes as instructions, several vectors side by side, with registers given out on the way.
 //!
 //! The line is straight, so it is known when each value is read next: where registers run out, the one that is read last
-//! gives way (Belady). Loads, constants and what was computed before the loop lie in memory and cost no register; most
-//! instructions read one operand from there.
+//! gives way (Belady), sooner if it need not be stored. Loads, constants and what was computed before the loop lie in memory;
+//! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
+//! registers are free.
 
 use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Signs, What};
@@ -297,7 +298,7 @@ impl<'a> Body<'a> {
             let last = candidates.max_by_key(|register| {
                 let copy = table[*register].expect("none is free");
                 let wait =
-                    |next: usize| (next - self.now.0 * self.vectors) * if self.is_in_memory(copy) { 4 } else { 1 };
+                    |next: usize| (next - self.now.0 * self.vectors) * if self.is_in_memory(copy) { 2 } else { 1 };
                 self.next_use(copy).map_or(usize::MAX, wait)
             });
             last.expect("an instruction locks fewer registers than there are")

@@ -1,6 +1,6 @@
 //! The same program for many instances at once, in vectors: a straight line with a loop around it, and the bits of a
-//! single instance in every lane. The wide vectors of x86-64 have an encoder of their own here; pairs, which any processor
-//! has, are Cranelift's.
+//! single instance in every lane. The vectors of x86-64 have an encoder of their own here, of two lanes too; pairs of any
+//! processor are Cranelift's.
 //!
 //! In: a step, expanded or not. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
 //! for itself. What no step changes is computed before the loop; what only the last step leaves behind (outputs) is
@@ -77,7 +77,8 @@ impl Width {
     pub fn vectors(self) -> usize {
         match self {
             Width::Pairs => 2,
-            Width::Avx | Width::Avx2 | Width::Avx512 => 3,
+            Width::Avx => 4,
+            Width::Avx2 | Width::Avx512 => 3,
         }
     }
 
@@ -316,8 +317,8 @@ fn varying(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
     varies
 }
 
-/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first,
-/// so that what is computed is soon used.
+/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first, of
+/// these the one that needs most registers, so that few others wait meanwhile (Sethi and Ullman, 1970).
 fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
     let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
     // Registers that a node takes while it is computed, if nothing is shared.
