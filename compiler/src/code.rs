@@ -53,7 +53,11 @@ pub fn step(program: &Program, method: Method) -> Func {
 /// none if it has none, or the model no such function: then each instance runs for itself, with the same bits.
 pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
     // The many operations of an adaptive step leave fewer registers to more vectors.
-    let vectors = |width: Width| if method == Method::Adaptive { 2 } else { width.vectors() };
+    let vectors = |width: Width| match (method, width) {
+        (Method::Adaptive, Width::Pairs | Width::Avx512) => 2,
+        (Method::Adaptive, Width::Avx | Width::Avx2) => 3,
+        (Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit, _) => width.vectors(),
+    };
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
 }
 

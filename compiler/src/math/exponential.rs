@@ -73,16 +73,17 @@ impl<'a> Parts<'a> {
         let large = x.above(0.0);
         let nearer = scale + large.choose_int(-1009 << 52, 1022 << 52);
         let rest = large.choose(two_to(1009), two_to(-1022));
-        let edge = Parts { scale: nearer, ..self }.normal() * rest;
-        let beyond = x.above(745.0).choose(f64::INFINITY, x.below(-746.0).choose(0.0, edge));
+        // Far below there is 0 before the product: one that is too small for any digit takes the processor ten times as long.
+        let edge = x.below(-746.0).choose(0.0, Parts { scale: nearer, ..self }.normal()) * rest;
+        let beyond = x.above(745.0).choose(f64::INFINITY, edge);
         x.abs().below(707.0).choose(normal, beyond)
     }
 
     /// e^x for x that is not above 0, or NaN.
     fn scaled_below(self, x: Real<'a>) -> Real<'a> {
         let nearer = self.scale + (1022 << 52);
-        let edge = Parts { scale: nearer, ..self }.normal() * two_to(-1022);
-        x.above(-707.0).choose(self.normal(), x.below(-746.0).choose(0.0, edge))
+        let edge = x.below(-746.0).choose(0.0, Parts { scale: nearer, ..self }.normal()) * two_to(-1022);
+        x.above(-707.0).choose(self.normal(), edge)
     }
 
     /// e^x − 1 as high and low part, for −50 < x < 700.
@@ -114,8 +115,6 @@ pub fn exp_of_lanes(x: Real) -> Real {
     if !x.is_minus_square() {
         return exp(x);
     }
-    // From here on down the result is 0. NaN stays.
-    let x = x.at_least(-746.0);
     // 1022 doublings are a whole number of steps, and so are their bits.
     let round = ROUND + 1022.0 * f64::from(tables::EXP_LEN);
     let rounded = x.fma(STEPS, round);
@@ -124,7 +123,9 @@ pub fn exp_of_lanes(x: Real) -> Real {
     let index = bits & i64::from(tables::EXP_LEN - 1);
     let scale = index.entry(tables::EXP_SCALE, tables::EXP_LEN).bits() + (bits << 46);
     let tail = index.entry(tables::EXP_TAIL, tables::EXP_LEN);
-    Parts { scale, r, tail, q: polynomial(r, &EXP) }.normal() * two_to(-1022)
+    let large = Parts { scale, r, tail, q: polynomial(r, &EXP) }.normal();
+    // From here on down the result is 0, before the product as above. NaN stays.
+    x.below(-746.0).choose(0.0, large) * two_to(-1022)
 }
 
 /// e^x − 1, within 1 ulp.

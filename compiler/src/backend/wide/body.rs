@@ -1,12 +1,15 @@
 //! Nodes as instructions, several vectors side by side, with registers given out on the way.
 //!
 //! The line is straight, so it is known when each value is read next: where registers run out, the one that is read last
-//! gives way (Belady). Loads, constants and what was computed before the loop lie in memory and cost no register; most
-//! instructions read one operand from there.
+//! gives way (Belady), sooner if it need not be stored. Loads, constants and what was computed before the loop lie in memory;
+//! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
+//! registers are free.
 
 use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Signs, What};
+use crate::math;
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// Where a node's vectors lie in memory: the `index`-th group of vectors behind `begin` bytes.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -16,7 +19,7 @@ pub struct Home {
     pub index: usize,
 }
 
-/// One vector of a node.
+/// One vector of a node; what is the same in every vector has but the first.
 type Copy = usize;
 
 /// A straight line being written.
@@ -126,28 +129,38 @@ impl<'a> Body<'a> {
         }
     }
 
-    /// Jumps that are taken if a mask has a lane; their targets are open.
-    pub fn test(&mut self, mask: Node) -> Vec<usize> {
-        let mut jumps = Vec::new();
-        for k in 0..self.vectors {
-            self.now = (self.order.len() + 1, k);
-            let register = self.in_register(mask);
+    /// A jump that is taken if a mask has a lane; its target is open. It ends the line.
+    pub fn test(&mut self, mask: Node) -> usize {
+        self.now = (self.order.len() + 1, 0);
+        let all = self.in_register(mask);
+        for k in 1..self.vectors {
+            self.now.1 = k;
             match self.width {
-                Vectors::Avx512 => self.code.mask(i::MASK_TEST, register, 0, Place::Register(register)),
-                Vectors::Avx2 => {
-                    // To r10.
-                    self.code.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 5, 0x7d, 0x50, 0xd0 | register & 7]);
-                    self.code.plain(&[0x45, 0x85, 0xd2]);
+                Vectors::Avx512 => {
+                    let more = self.in_register(mask);
+                    self.code.mask(i::MASK_OR, all, all, Place::Register(more));
+                }
+                Vectors::Avx | Vectors::Avx2 => {
+                    let more = self.place(mask);
+                    self.code.vector(i::OR, all, all, more, None);
                 }
             }
-            jumps.push(self.code.jump(&[0x0f, 0x85]));
-            self.done(mask);
+            self.locked.truncate(1);
         }
-        jumps
+        match self.width {
+            Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
+            Vectors::Avx | Vectors::Avx2 => {
+                // To r10.
+                let l = u8::from(self.width == Vectors::Avx2);
+                self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
+                self.code.plain(&[0x45, 0x85, 0xd2]);
+            }
+        }
+        self.code.jump(&[0x0f, 0x85])
     }
 
     fn copy(&self, node: Node) -> Copy {
-        node.index() * self.vectors + self.now.1
+        node.index() * self.vectors + if self.what(node).is_shared() { 0 } else { self.now.1 }
     }
 
     fn what(&self, node: Node) -> What {
@@ -163,6 +176,10 @@ impl<'a> Body<'a> {
         let (node, k) = (Node((copy / self.vectors) as u32), copy % self.vectors);
         let (at, now) = self.now;
         let uses = self.uses.get(&node)?;
+        if self.what(node).is_shared() {
+            let first = uses.partition_point(|place| *place < at || *place == at && now + 1 == self.vectors);
+            return uses.get(first).map(|place| place * self.vectors + if *place == at { now + 1 } else { 0 });
+        }
         let first = uses.partition_point(|place| *place < at || *place == at && k <= now);
         uses.get(first).map(|place| place * self.vectors + k)
     }
@@ -171,25 +188,58 @@ impl<'a> Body<'a> {
         super::place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
     }
 
+    /// The number of a place in memory that nobody needs.
+    fn spill_number(&mut self) -> usize {
+        self.free_spills.pop().unwrap_or_else(|| {
+            self.spilled += 1;
+            self.spilled - 1
+        })
+    }
+
     fn spill_place(&self, number: usize) -> Place {
         Place::Memory(Base::Block, (self.spills_at + number * self.width.bytes() as usize) as i32)
     }
 
-    /// Where a node can be read: its register, or memory.
+    /// Where a node can be read: its register, or memory. What is read again is loaded, for the processor adds faster than it
+    /// reads, if there is a register that nobody needs before.
     fn place(&mut self, node: Node) -> Place {
         let copy = self.copy(node);
+        let mask = self.is_mask(node);
         if let Some(register) = self.register.get(&copy) {
             let register = *register;
-            self.locked.push((self.is_mask(node), register));
+            self.locked.push((mask, register));
             return Place::Register(register);
         }
-        match self.what(node) {
-            What::Constant(bits) => Place::Constant(bits),
-            _ => self.memory(node),
+        let place = self.memory(node);
+        if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
+            return place;
         }
+        let register = self.take(mask);
+        self.load(node, register, place);
+        self.own(copy, mask, register);
+        Place::Register(register)
     }
 
-    fn memory(&self, node: Node) -> Place {
+    /// Whether a vector register is free, or holds what lies in memory too and is read later.
+    fn is_room_until(&self, next: usize) -> bool {
+        (0..self.vector_of.len()).any(|register| {
+            let later = |copy: Copy| self.is_in_memory(copy) && self.next_use(copy).is_none_or(|other| other > next);
+            !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
+        })
+    }
+
+    /// Whether a copy can be read from memory.
+    fn is_in_memory(&self, copy: Copy) -> bool {
+        let node = Node((copy / self.vectors) as u32);
+        self.what(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&copy)
+    }
+
+    fn memory(&mut self, node: Node) -> Place {
+        match self.what(node) {
+            What::Constant(bits) => return Place::Constant(bits),
+            What::Row(table, second) => return self.code.row(table.row(second)),
+            _ => {}
+        }
         if let Some(number) = self.spills.get(&self.copy(node)) {
             return self.spill_place(*number);
         }
@@ -244,9 +294,12 @@ impl<'a> Body<'a> {
         let free = (first..table.len()).find(|register| table[*register].is_none() && !locked(*register));
         let register = free.unwrap_or_else(|| {
             let candidates = (first..table.len()).filter(|register| !locked(*register));
+            // What has to be stored first is worth more.
             let last = candidates.max_by_key(|register| {
                 let copy = table[*register].expect("none is free");
-                self.next_use(copy).unwrap_or(usize::MAX)
+                let wait =
+                    |next: usize| (next - self.now.0 * self.vectors) * if self.is_in_memory(copy) { 2 } else { 1 };
+                self.next_use(copy).map_or(usize::MAX, wait)
             });
             last.expect("an instruction locks fewer registers than there are")
         });
@@ -263,13 +316,8 @@ impl<'a> Body<'a> {
         let copy = table[register as usize].take().expect("somebody owns it");
         self.register.remove(&copy);
         let node = Node((copy / self.vectors) as u32);
-        let known = self.homes.contains_key(&node) || self.spills.contains_key(&copy);
-        let constant = matches!(self.what(node), What::Constant(_));
-        if self.next_use(copy).is_some() && !known && !constant {
-            let number = self.free_spills.pop().unwrap_or_else(|| {
-                self.spilled += 1;
-                self.spilled - 1
-            });
+        if self.next_use(copy).is_some() && !self.is_in_memory(copy) {
+            let number = self.spill_number();
             self.spills.insert(copy, number);
             self.store(node, register, self.spill_place(number));
         }
@@ -329,7 +377,7 @@ impl<'a> Body<'a> {
             }
         }
         match what {
-            What::Load(_) | What::Constant(_) => unreachable!("they lie in memory"),
+            What::Load(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             What::One(instruction, immediate, a) => {
                 let last = self.place(a);
@@ -348,16 +396,13 @@ impl<'a> Body<'a> {
                 self.code.vector(instruction, digit, to, Place::Register(from), Some(n));
             }
             What::Compare(predicate, a, b) => {
-                // The other way round: LT is GT, LE is GE.
-                let turned = [(0x11, 0x1e), (0x12, 0x1d), (0, 0)].into_iter().find(|(known, _)| *known == predicate);
-                let turned = turned.expect("a known predicate").1;
                 let (first, last, predicate) = match (self.place(a), self.place(b)) {
                     (Place::Register(a), last) => (a, last, predicate),
-                    (last, Place::Register(b)) => (b, last, turned),
+                    (last, Place::Register(b)) => (b, last, predicate.turned()),
                     (_, last) => (self.in_register(a), last, predicate),
                 };
                 let to = self.result(node);
-                self.code.vector(i::COMPARE, to, first, last, Some(predicate));
+                self.code.vector(i::COMPARE, to, first, last, Some(predicate as u8));
             }
             What::CompareInt(predicate, a, b) if self.width == Vectors::Avx512 => {
                 let first = self.in_register(a);
@@ -406,18 +451,20 @@ impl<'a> Body<'a> {
                 let to = self.result(node);
                 match self.width {
                     Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Vectors::Avx2 => self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4)),
+                    Vectors::Avx | Vectors::Avx2 => {
+                        self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4))
+                    }
                 }
             }
-            What::Permute(table, index) => {
+            What::Permute(first, second, index) => {
                 let by = self.in_register(index);
+                let [first, second] = [first, second].map(|row| self.place(row));
                 let to = self.apart(node);
-                let [first, second] = table.rows().map(|row| self.code.row(row));
                 self.code.vector(i::LOAD, to, 0, first, None);
                 self.code.vector(i::PERMUTE_TWO, to, by, second, None);
-                self.release(index);
+                what.operands().for_each(|operand| self.release(operand));
             }
-            What::Gather { base, index } if self.width == Vectors::Avx512 => {
+            What::Gather { base, index, .. } if self.width == Vectors::Avx512 => {
                 let from = self.in_register(index);
                 let mask = self.take(true);
                 let to = self.apart(node);
@@ -431,15 +478,48 @@ impl<'a> Body<'a> {
                 // All tables that are read at the same place, at once.
                 let same = |other: &&Node| matches!(self.what(**other), What::Gather { index: at, .. } if at == index);
                 let all: Vec<Node> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
-                let from = self.in_register(index);
-                let half = self.take(false);
-                let mut tables = Vec::new();
-                for node in all {
-                    let What::Gather { base, .. } = self.what(node) else { unreachable!("they are alike") };
-                    tables.push((self.apart(node), 8 * base as i32));
-                }
-                self.code.look_up(&tables, from, half);
+                self.look_up(&all, index);
                 self.release(index);
+            }
+        }
+    }
+
+    /// Entries of tables at the same place: of two tables of elementary functions, which are known here, both by one load.
+    fn look_up(&mut self, all: &[Node], index: Node) {
+        let nodes = self.nodes;
+        let table = |node: &Node| match self.what(*node) {
+            What::Gather { base, len, .. } => base as usize..(base + len) as usize,
+            _ => unreachable!("all are alike"),
+        };
+        let tables: Vec<_> = all.iter().map(table).collect();
+        let both = |two: &[Range<usize>]| {
+            let known = |table: &Range<usize>| nodes.pooled && table.end <= math::POOL.len();
+            matches!(two, [a, b] if a.len() == b.len() && known(a) && known(b))
+        };
+        let scale = if tables.chunks(2).any(both) { 4 } else { 8 };
+        let from = self.in_register(index);
+        let half = self.take(false);
+        let number = self.spill_number();
+        let place = self.spill_place(number);
+        self.left_spills.push(number);
+        let Place::Memory(base, offset) = place else { unreachable!("it lies in memory") };
+        match scale {
+            4 => {
+                self.code.vector(i::INT_ADD, half, from, Place::Register(from), None);
+                self.code.vector(i::STORE, half, 0, place, None);
+            }
+            _ => self.code.vector(i::STORE, from, 0, place, None),
+        }
+        for (two, tables) in all.chunks(2).zip(tables.chunks(2)) {
+            let to: Vec<u8> = two.iter().map(|node| self.apart(*node)).collect();
+            if let ([first, second], true) = (to.as_slice(), both(tables)) {
+                let entries = tables[0].clone().zip(tables[1].clone()).flat_map(|(a, b)| [a, b]);
+                let distance = self.code.table(entries.map(|at| math::POOL[at].to_bits()).collect());
+                self.code.look_up_two([*first, *second], (base, offset), distance, half);
+            } else {
+                for (to, table) in to.into_iter().zip(tables) {
+                    self.code.look_up(to, (base, offset), scale, 8 * table.start as i32, half);
+                }
             }
         }
     }

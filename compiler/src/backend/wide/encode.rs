@@ -1,4 +1,4 @@
-//! Vector instructions of x86-64 as bytes: VEX with 256 bits, EVEX with 512 bits.
+//! Vector instructions of x86-64 as bytes: VEX with 128 and 256 bits, EVEX with 512 bits.
 //!
 //! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
 //! is reached relative to the instruction. Knows nothing of programs.
@@ -9,6 +9,8 @@ use std::collections::HashMap;
 /// Which vectors.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Vectors {
+    /// Two lanes of 64 bits in 16 registers: AVX and FMA.
+    Avx,
     /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
     Avx2,
     /// Eight lanes of 64 bits in 32 registers, and masks: AVX-512 F and DQ.
@@ -19,6 +21,7 @@ impl Vectors {
     /// Lanes of a vector.
     pub fn lanes(self) -> usize {
         match self {
+            Vectors::Avx => 2,
             Vectors::Avx2 => 4,
             Vectors::Avx512 => 8,
         }
@@ -32,7 +35,7 @@ impl Vectors {
     /// Vector registers.
     pub fn registers(self) -> u8 {
         match self {
-            Vectors::Avx2 => 16,
+            Vectors::Avx | Vectors::Avx2 => 16,
             Vectors::Avx512 => 32,
         }
     }
@@ -83,6 +86,8 @@ pub mod instructions {
     pub const MAX: Instruction = Instruction(1, 1, [1, 0], 0x5f);
     pub const SQRT: Instruction = Instruction(1, 1, [1, 0], 0x51);
     pub const AND: Instruction = Instruction(1, 1, [1, 0], 0x54);
+    /// ¬v ∧ rm
+    pub const AND_NOT: Instruction = Instruction(1, 1, [1, 0], 0x55);
     pub const OR: Instruction = Instruction(1, 1, [1, 0], 0x56);
     pub const XOR: Instruction = Instruction(1, 1, [1, 0], 0x57);
     pub const COMPARE: Instruction = Instruction(1, 1, [1, 0], 0xc2);
@@ -104,11 +109,11 @@ pub mod instructions {
     pub const SHIFT: Instruction = Instruction(1, 1, [1, 0], 0x73);
     pub const SHIFT_SIGNED: Instruction = Instruction(1, 1, [1, 0], 0x72);
     /// VEX only.
-    pub const UPPER_HALF: Instruction = Instruction(1, 3, [0, 0], 0x39);
     pub const INSERT_HALF: Instruction = Instruction(1, 3, [0, 0], 0x18);
-    /// Of one number, to or from a general register or memory.
-    pub const TO_GENERAL: Instruction = Instruction(1, 1, [1, 1], 0x7e);
-    pub const SECOND_TO_GENERAL: Instruction = Instruction(1, 3, [1, 1], 0x16);
+    /// Of each two lanes the first, or the second: v's, then rm's.
+    pub const FIRST_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x14);
+    pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
+    /// Of one number, from memory.
     pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
     pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
     pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
@@ -151,6 +156,9 @@ pub struct Assembler {
     /// The same of vectors of constants.
     rows: Vec<[u64; 8]>,
     wanted_rows: Vec<(usize, usize, usize)>,
+    /// Tables behind the code, and where the distance to them is wanted, if r11 is to hold their address.
+    tables: Vec<Vec<u64>>,
+    wanted_tables: Option<usize>,
 }
 
 impl Assembler {
@@ -163,6 +171,8 @@ impl Assembler {
             wanted: Vec::new(),
             rows: Vec::new(),
             wanted_rows: Vec::new(),
+            tables: Vec::new(),
+            wanted_tables: None,
         }
     }
 
@@ -174,19 +184,22 @@ impl Assembler {
     /// An instruction with a mask register; 0: none. VEX has no masks.
     pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
         match self.width {
-            Vectors::Avx512 => self.evex(what, reg, second, last, mask),
-            Vectors::Avx2 => {
+            Vectors::Avx512 => {
+                self.evex(what, reg, second, last, mask);
+                self.operand(reg, last, immediate, self.width.bytes());
+            }
+            Vectors::Avx | Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
-                self.vex(what, reg, second, last, 1);
+                self.vex(what, reg, second, last, u8::from(self.width == Vectors::Avx2));
+                self.operand(reg, last, immediate, 1);
             }
         }
-        self.operand(reg, last, immediate);
     }
 
     /// An instruction on mask registers.
     pub fn mask(&mut self, (what, l): (Instruction, u8), reg: u8, second: u8, last: Place) {
         self.vex(what, reg, second, last, l);
-        self.operand(reg, last, None);
+        self.operand(reg, last, None, 1);
     }
 
     /// Entries of the table at `offset` bytes of the pool, at the indices in a vector, where a mask register is set. EVEX
@@ -201,36 +214,64 @@ impl Assembler {
         self.entry_of(to, index, offset);
     }
 
-    /// Entries of tables at these bytes of the pool, each into a register of its own, at the indices in a vector; `half` is
-    /// overwritten. VEX only, and lane by lane through r10 and r11: its gathering instruction takes three times as long.
-    pub fn look_up(&mut self, tables: &[(u8, i32)], index: u8, half: u8) {
-        // vextracti128 half, index, 1
-        self.vex(instructions::UPPER_HALF, index, 0, Place::Register(half), 1);
-        self.operand(index, Place::Register(half), Some(1));
-        for (upper, from) in [index, half].into_iter().enumerate() {
-            // vmovq r10, from; vpextrq r11, from, 1
-            self.vex(instructions::TO_GENERAL, from, 0, Place::Register(10), 0);
-            self.operand(from, Place::Register(10), None);
-            self.vex(instructions::SECOND_TO_GENERAL, from, 0, Place::Register(11), 0);
-            self.operand(from, Place::Register(11), Some(1));
-            for (to, offset) in tables {
-                let into = if upper == 0 { *to } else { half };
-                self.entry(instructions::LOAD_FIRST, into, 0, 10, *offset);
-                self.entry(instructions::LOAD_SECOND, into, into, 11, *offset);
-                if upper == 1 {
-                    // vinsertf128 to, to, half, 1
-                    self.vex(instructions::INSERT_HALF, *to, *to, Place::Register(half), 1);
-                    self.operand(*to, Place::Register(half), Some(1));
-                }
-            }
+    /// Entries of a table of the pool, `distance` bytes behind its beginning, at the numbers in a vector in memory, each
+    /// times `scale` bytes; `half` is overwritten. VEX only, and lane by lane through r10: its gathering instruction takes
+    /// longer.
+    pub fn look_up(&mut self, to: u8, numbers: (Base, i32), scale: u8, distance: i32, half: u8) {
+        let pool = (Base::Pool as u8, scale, distance);
+        for (upper, into) in [to, half].into_iter().enumerate().take(self.width.lanes() / 2) {
+            self.number(numbers, 2 * upper);
+            self.entry(instructions::LOAD_FIRST, into, 0, 0, pool);
+            self.number(numbers, 2 * upper + 1);
+            self.entry(instructions::LOAD_SECOND, into, into, 0, pool);
+        }
+        if self.width == Vectors::Avx2 {
+            self.vector(instructions::INSERT_HALF, to, to, Place::Register(half), Some(1));
         }
     }
 
-    /// A VEX instruction on the entry of the table at `offset` bytes of the pool whose number a general register holds.
-    fn entry(&mut self, Instruction(pp, map, w, opcode): Instruction, reg: u8, second: u8, index: u8, offset: i32) {
-        let p0 = (!reg >> 3 & 1) << 7 | (!index >> 3 & 1) << 6 | 1 << 5 | map;
-        self.bytes.extend([0xc4, p0, w[1] << 7 | (!second & 15) << 3 | pp, opcode]);
-        self.entry_of(reg, index, offset);
+    /// Entries of the two tables that lie side by side `distance` bytes behind r11, at half the numbers in a vector in memory;
+    /// `half` is overwritten. VEX only, after [`Assembler::reach_tables`].
+    pub fn look_up_two(&mut self, [first, second]: [u8; 2], numbers: (Base, i32), distance: i32, half: u8) {
+        let table = (11, 8, distance);
+        for (lane, into) in [half, second].into_iter().enumerate() {
+            self.number(numbers, lane);
+            self.entry(instructions::LOAD, into, 0, 0, table);
+            if self.width == Vectors::Avx2 {
+                self.number(numbers, lane + 2);
+                self.entry(instructions::INSERT_HALF, into, into, 1, table);
+                self.bytes.push(1);
+            }
+        }
+        self.vector(instructions::FIRST_OF_TWO, first, half, Place::Register(second), None);
+        self.vector(instructions::SECOND_OF_TWO, second, half, Place::Register(second), None);
+    }
+
+    /// A number of a vector in memory, to r10.
+    fn number(&mut self, (base, offset): (Base, i32), lane: usize) {
+        self.bytes.extend([0x4c | base as u8 >> 3, 0x8b]);
+        self.address(2 << 3, base, offset + 8 * lane as i32, 1);
+    }
+
+    /// A VEX instruction on the entry of a table, behind a register and a distance, whose number r10 holds.
+    fn entry(
+        &mut self,
+        Instruction(pp, map, w, opcode): Instruction,
+        reg: u8,
+        second: u8,
+        l: u8,
+        (base, scale, distance): (u8, u8, i32),
+    ) {
+        let p0 = (!reg >> 3 & 1) << 7 | (!base >> 3 & 1) << 5 | map;
+        self.bytes.extend([0xc4, p0, w[1] << 7 | (!second & 15) << 3 | l << 2 | pp, opcode]);
+        let (reg, index) = ((reg & 7) << 3, (scale.trailing_zeros() as u8) << 6 | 2 << 3 | base & 7);
+        match i8::try_from(distance) {
+            Ok(distance) => self.bytes.extend([0x44 | reg, index, distance as u8]),
+            Err(_) => {
+                self.bytes.extend([0x84 | reg, index]);
+                self.bytes.extend(distance.to_le_bytes());
+            }
+        }
     }
 
     /// The operand: base and index scaled by 8, with a distance of 32 bits.
@@ -259,19 +300,20 @@ impl Assembler {
             Place::Memory(base, _) => !(base as u8) >> 3 & 1,
             Place::Constant(_) | Place::Row(_) => 1,
         };
-        let p0 = (!reg >> 3 & 1) << 7 | 1 << 6 | b << 5 | map;
-        let p1 = w[1] << 7 | (!second & 15) << 3 | l << 2 | pp;
-        self.bytes.extend([0xc4, p0, p1, opcode]);
+        let r = (!reg >> 3 & 1) << 7;
+        let rest = (!second & 15) << 3 | l << 2 | pp;
+        match (map, w[1], b) {
+            (1, 0, 1) => self.bytes.extend([0xc5, r | rest, opcode]),
+            _ => self.bytes.extend([0xc4, r | 1 << 6 | b << 5 | map, w[1] << 7 | rest, opcode]),
+        }
     }
 
-    fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>) {
+    /// The last operand, and what follows it. A short distance counts in units.
+    fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>, unit: i32) {
         let reg = (reg & 7) << 3;
         match last {
             Place::Register(register) => self.bytes.push(0xc0 | reg | register & 7),
-            Place::Memory(base, offset) => {
-                self.bytes.push(0x80 | reg | base as u8 & 7);
-                self.bytes.extend(offset.to_le_bytes());
-            }
+            Place::Memory(base, offset) => self.address(reg, base, offset, unit),
             Place::Constant(bits) => {
                 let next = self.constants.len();
                 let number = *self.numbers.entry(bits).or_insert(next);
@@ -289,6 +331,19 @@ impl Assembler {
         self.bytes.extend(immediate);
     }
 
+    /// An operand at a distance from a base: none, or one byte of units, or four bytes.
+    fn address(&mut self, reg: u8, base: Base, offset: i32, unit: i32) {
+        let base = base as u8 & 7;
+        match i8::try_from(offset / unit) {
+            Ok(0) if offset == 0 => self.bytes.push(reg | base),
+            Ok(units) if offset % unit == 0 => self.bytes.extend([0x40 | reg | base, units as u8]),
+            _ => {
+                self.bytes.push(0x80 | reg | base);
+                self.bytes.extend(offset.to_le_bytes());
+            }
+        }
+    }
+
     /// An operand behind the code; gives where its distance stands.
     fn distance(&mut self, reg: u8) -> usize {
         self.bytes.push(0x05 | reg);
@@ -303,6 +358,23 @@ impl Assembler {
             self.rows.push(row);
             self.rows.len() - 1
         }))
+    }
+
+    /// A table behind the code; gives its distance from the first.
+    pub fn table(&mut self, table: Vec<u64>) -> i32 {
+        let known = self.tables.iter().position(|known| *known == table);
+        let number = known.unwrap_or_else(|| {
+            self.tables.push(table);
+            self.tables.len() - 1
+        });
+        8 * self.tables[..number].iter().map(Vec::len).sum::<usize>() as i32
+    }
+
+    /// Lets r11 be the address of the first table.
+    pub fn reach_tables(&mut self) {
+        self.plain(&[0x4c, 0x8d, 0x1d]); // lea r11, [rip + distance]
+        self.wanted_tables = Some(self.bytes.len());
+        self.plain(&[0; 4]);
     }
 
     /// Instructions without vectors, as bytes.
@@ -350,6 +422,11 @@ impl Assembler {
             self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
         }
         self.bytes.extend(self.rows.iter().flatten().flat_map(|bits| bits.to_le_bytes()));
+        if let Some(at) = self.wanted_tables {
+            let distance = i32::try_from(self.bytes.len() - (at + 4)).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        }
+        self.bytes.extend(self.tables.iter().flatten().flat_map(|bits| bits.to_le_bytes()));
         self.bytes
     }
 }
@@ -370,16 +447,24 @@ mod tests {
     #[test]
     fn instructions_have_the_bytes_of_the_manual() {
         let look_up = [
-            [0xc4, 0x63, 0x7d, 0x39, 0xd3, 1].as_slice(),
-            &[0xc4, 0x41, 0xf9, 0x7e, 0xd2],
-            &[0xc4, 0x43, 0xf9, 0x16, 0xd3, 1],
-            &[0xc4, 0x21, 0x7b, 0x10, 0x8c, 0xd6, 0x40, 0, 0, 0],
-            &[0xc4, 0x21, 0x31, 0x16, 0x8c, 0xde, 0x40, 0, 0, 0],
-            &[0xc4, 0xc1, 0xf9, 0x7e, 0xda],
-            &[0xc4, 0xc3, 0xf9, 0x16, 0xdb, 1],
-            &[0xc4, 0xa1, 0x7b, 0x10, 0x9c, 0xd6, 0x40, 0, 0, 0],
-            &[0xc4, 0xa1, 0x61, 0x16, 0x9c, 0xde, 0x40, 0, 0, 0],
+            [0x4c, 0x8b, 0x97, 0, 1, 0, 0].as_slice(),
+            &[0xc4, 0x21, 0x7b, 0x10, 0x4c, 0x96, 0x40],
+            &[0x4c, 0x8b, 0x97, 8, 1, 0, 0],
+            &[0xc4, 0x21, 0x31, 0x16, 0x4c, 0x96, 0x40],
+            &[0x4c, 0x8b, 0x97, 16, 1, 0, 0],
+            &[0xc4, 0xa1, 0x7b, 0x10, 0x5c, 0x96, 0x40],
+            &[0x4c, 0x8b, 0x97, 24, 1, 0, 0],
+            &[0xc4, 0xa1, 0x61, 0x16, 0x5c, 0x96, 0x40],
             &[0xc4, 0x63, 0x35, 0x18, 0xcb, 1],
+        ]
+        .concat();
+        let look_up_two = [
+            [0x4c, 0x8b, 0x97, 0, 1, 0, 0].as_slice(),
+            &[0xc4, 0x81, 0x79, 0x28, 0x5c, 0xd3, 0x40],
+            &[0x4c, 0x8b, 0x97, 8, 1, 0, 0],
+            &[0xc4, 0x81, 0x79, 0x28, 0x64, 0xd3, 0x40],
+            &[0xc5, 0x61, 0x14, 0xcc],
+            &[0xc5, 0xe1, 0x15, 0xe4],
         ]
         .concat();
         // vaddpd zmm17, zmm2, zmm30
@@ -394,15 +479,34 @@ mod tests {
             |c| c.vector(FMA_231, 9, 1, Place::Memory(Base::Before, 0x100), None),
             &[0xc4, 0x42, 0xf5, 0xb8, 0x88, 0, 1, 0, 0],
         );
+        // vaddpd ymm9, ymm1, [r8]; vmovapd [rcx-0x20], ymm1; vaddpd zmm1, zmm2, [r8+0x1fc0]
+        check(
+            Vectors::Avx2,
+            |c| c.vector(ADD, 9, 1, Place::Memory(Base::Before, 0), None),
+            &[0xc4, 0x41, 0x75, 0x58, 0x08],
+        );
+        check(
+            Vectors::Avx2,
+            |c| c.vector(STORE, 1, 0, Place::Memory(Base::Statuses, -0x20), None),
+            &[0xc5, 0xfd, 0x29, 0x49, 0xe0],
+        );
+        check(
+            Vectors::Avx512,
+            |c| c.vector(ADD, 1, 2, Place::Memory(Base::Before, 0x1fc0), None),
+            &[0x62, 0xd1, 0xed, 0x48, 0x58, 0x48, 0x7f],
+        );
         // vblendmpd zmm1{k3}, zmm2, zmm4
         check(
             Vectors::Avx512,
             |c| c.masked(BLEND, 1, 2, Place::Register(4), None, 3),
             &[0x62, 0xf2, 0xed, 0x4b, 0x65, 0xcc],
         );
-        // vextracti128 xmm3, ymm10, 1; vmovq r10, xmm10; vpextrq r11, xmm10, 1; vmovsd xmm9, [rsi+r10*8+0x40];
-        // vmovhpd xmm9, xmm9, [rsi+r11*8+0x40]; …; vinsertf128 ymm9, ymm9, xmm3, 1
-        check(Vectors::Avx2, |c| c.look_up(&[(9, 0x40)], 10, 3), &look_up);
+        // mov r10, [rdi+0x100]; vmovsd xmm9, [rsi+r10*4+0x40]; mov r10, [rdi+0x108]; vmovhpd xmm9, xmm9, [rsi+r10*4+0x40];
+        // …; vinsertf128 ymm9, ymm9, xmm3, 1
+        check(Vectors::Avx2, |c| c.look_up(9, (Base::Block, 0x100), 4, 0x40, 3), &look_up);
+        // mov r10, [rdi+0x100]; vmovapd xmm3, [r11+r10*8+0x40]; mov r10, [rdi+0x108]; vmovapd xmm4, [r11+r10*8+0x40];
+        // vunpcklpd xmm9, xmm3, xmm4; vunpckhpd xmm4, xmm3, xmm4
+        check(Vectors::Avx, |c| c.look_up_two([9, 4], (Base::Block, 0x100), 0x40, 3), &look_up_two);
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
         check(Vectors::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9
@@ -424,7 +528,7 @@ mod tests {
             &[0xc4, 0xe3, 0x6d, 0x4b, 0xcb, 0x40],
         );
         // kandnb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x42, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x42, 0xcb]);
         // vcvtqq2pd zmm1, zmm2
         check(
             Vectors::Avx512,
@@ -432,6 +536,6 @@ mod tests {
             &[0x62, 0xf1, 0xfe, 0x48, 0xe6, 0xca],
         );
         // korb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc4, 0xe1, 0x6d, 0x45, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x45, 0xcb]);
     }
 }

@@ -1,6 +1,6 @@
 //! The same program for many instances at once, in vectors: a straight line with a loop around it, and the bits of a
-//! single instance in every lane. The wide vectors of x86-64 have an encoder of their own here; pairs, which any processor
-//! has, are Cranelift's.
+//! single instance in every lane. The vectors of x86-64 have an encoder of their own here, of two lanes too; pairs of any
+//! processor are Cranelift's.
 //!
 //! In: a step, expanded or not. Out: [`Lanes`]. Several vectors go side by side, operation by operation, because one alone waits
 //! for itself. What no step changes is computed before the loop; what only the last step leaves behind (outputs) is
@@ -38,6 +38,8 @@ use std::sync::Arc;
 pub enum Width {
     /// Two lanes: any processor that there is machine code for.
     Pairs,
+    /// Two lanes: AVX and FMA.
+    Avx,
     /// Four lanes: AVX2 and FMA.
     Avx2,
     /// Eight lanes: AVX-512 F and DQ.
@@ -46,7 +48,7 @@ pub enum Width {
 
 impl Width {
     /// All of them, ascending.
-    pub const ALL: [Width; 3] = [Width::Pairs, Width::Avx2, Width::Avx512];
+    pub const ALL: [Width; 4] = [Width::Pairs, Width::Avx, Width::Avx2, Width::Avx512];
 
     /// The widest of this processor.
     pub fn here() -> Option<Width> {
@@ -75,6 +77,7 @@ impl Width {
     pub fn vectors(self) -> usize {
         match self {
             Width::Pairs => 2,
+            Width::Avx => 4,
             Width::Avx2 | Width::Avx512 => 3,
         }
     }
@@ -83,6 +86,7 @@ impl Width {
     pub fn name(self) -> &'static str {
         match self {
             Width::Pairs => "pairs",
+            Width::Avx => "AVX",
             Width::Avx2 => "AVX2",
             Width::Avx512 => "AVX-512",
         }
@@ -92,6 +96,7 @@ impl Width {
     fn own(self) -> Option<Vectors> {
         match self {
             Width::Pairs => None,
+            Width::Avx => Some(Vectors::Avx),
             Width::Avx2 => Some(Vectors::Avx2),
             Width::Avx512 => Some(Vectors::Avx512),
         }
@@ -102,6 +107,7 @@ impl Vectors {
     #[cfg(all(target_arch = "x86_64", unix))]
     fn are_here(self) -> bool {
         match self {
+            Vectors::Avx => std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx512 => {
                 std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")
@@ -153,7 +159,7 @@ pub fn compile(
     }
     let own: &[Unary] = match width {
         Width::Avx512 => &[Unary::Exp],
-        Width::Avx2 | Width::Pairs => &[],
+        Width::Avx2 | Width::Avx | Width::Pairs => &[],
     };
     // Expanding works on the pool that every model begins with; what needs none may run with any.
     let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
@@ -161,7 +167,7 @@ pub fn compile(
     let func = expanded.as_ref().unwrap_or(func);
     let (code, alignment, scratch) = match width.own() {
         Some(own) => {
-            let (code, scratch) = generate(func, layout, own, vectors)?;
+            let (code, scratch) = generate(func, layout, own, vectors, elementary)?;
             (code, 64, scratch)
         }
         None => {
@@ -184,9 +190,15 @@ fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, wi
     Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
 }
 
-/// The code, and the numbers it needs behind the block.
-fn generate(func: &Func, layout: &Layout, width: Vectors, vectors: usize) -> Result<(Vec<u8>, usize), Unsupported> {
-    let nodes = select(func, width)?;
+/// The code, and the numbers it needs behind the block. `pooled`: the pool begins with the tables of the elementary functions.
+fn generate(
+    func: &Func,
+    layout: &Layout,
+    width: Vectors,
+    vectors: usize,
+    pooled: bool,
+) -> Result<(Vec<u8>, usize), Unsupported> {
+    let nodes = select(func, width, pooled)?;
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let loaded: HashSet<Slot> = func.loads().into_iter().collect();
     let carried: Vec<(Slot, Node)> = nodes.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
@@ -220,6 +232,9 @@ fn generate(func: &Func, layout: &Layout, width: Vectors, vectors: usize) -> Res
         code.plain(&[0x48, 0x85, 0xd2]); // test rdx, rdx
         code.jump(&[0x0f, 0x84]) // jz
     };
+    if width != Vectors::Avx512 {
+        code.reach_tables();
+    }
     let mut most = 0;
     let store_once = |node: Node| {
         once.iter().position(|known| *known == node).map(|index| Home { base: Base::Block, begin: once_at, index })
@@ -257,7 +272,7 @@ fn generate(func: &Func, layout: &Layout, width: Vectors, vectors: usize) -> Res
         }
         body.write(&to_area, &rest);
         if let Some(failed) = nodes.failed {
-            to_final.extend(body.test(failed));
+            to_final.push(body.test(failed));
         }
         most = most.max(body.spilled());
         code.plain(&[0x48, 0xff, 0xc0]); // inc rax
@@ -302,16 +317,25 @@ fn varying(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
     varies
 }
 
-/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first,
-/// so that what is computed is soon used.
+/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first, of
+/// these the one that needs most registers, so that few others wait meanwhile (Sethi and Ullman, 1970).
 fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
+    let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
+    // Registers that a node takes while it is computed, if nothing is shared.
+    let mut need: Vec<usize> = Vec::with_capacity(nodes.nodes.len());
+    for (index, node) in nodes.nodes.iter().enumerate() {
+        let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
+        of.sort_unstable_by(|a, b| b.cmp(a));
+        let most = of.iter().enumerate().map(|(before, need)| need + before).max();
+        need.push(if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) });
+    }
     let mut done = vec![false; nodes.nodes.len()];
     let mut out = Vec::new();
     for root in roots {
         let mut open = vec![(*root, false)];
         while let Some((node, ready)) = open.pop() {
             let what = nodes.nodes[node.index()];
-            if done[node.index()] || !wanted[node.index()] || matches!(what, What::Load(_) | What::Constant(_)) {
+            if done[node.index()] || is_read(node) {
                 continue;
             }
             if ready {
@@ -321,7 +345,8 @@ fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
             }
             open.push((node, true));
             // The last pushed is done first.
-            let operands: Vec<Node> = what.operands().collect();
+            let mut operands: Vec<Node> = what.operands().collect();
+            operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
             open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
         }
     }
@@ -336,7 +361,7 @@ fn needed_once(nodes: &Nodes, orders: &[&[Node]], failed: Option<Node>, varies: 
     let mut seen = HashSet::new();
     read.chain(stored)
         .filter(|node| !varies[node.index()])
-        .filter(|node| !matches!(nodes.nodes[node.index()], What::Load(_) | What::Constant(_)))
+        .filter(|node| !nodes.nodes[node.index()].is_leaf())
         .filter(|node| seen.insert(*node))
         .collect()
 }

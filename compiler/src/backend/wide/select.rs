@@ -34,6 +34,55 @@ pub enum Signs {
     NegatedLess = 6,
 }
 
+/// Of a comparison of reals, by its number in the manual.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Predicate {
+    Equal = 0,
+    NotEqual = 4,
+    Less = 0x11,
+    LessEqual = 0x12,
+    NotLess = 0x15,
+    NotLessEqual = 0x16,
+    NotGreaterEqual = 0x19,
+    NotGreater = 0x1a,
+    GreaterEqual = 0x1d,
+    Greater = 0x1e,
+}
+
+impl Predicate {
+    /// What holds where it does not, of NaN too.
+    fn not(self) -> Predicate {
+        match self {
+            Predicate::Equal => Predicate::NotEqual,
+            Predicate::NotEqual => Predicate::Equal,
+            Predicate::Less => Predicate::NotLess,
+            Predicate::LessEqual => Predicate::NotLessEqual,
+            Predicate::NotLess => Predicate::Less,
+            Predicate::NotLessEqual => Predicate::LessEqual,
+            Predicate::NotGreaterEqual => Predicate::GreaterEqual,
+            Predicate::NotGreater => Predicate::Greater,
+            Predicate::GreaterEqual => Predicate::NotGreaterEqual,
+            Predicate::Greater => Predicate::NotGreater,
+        }
+    }
+
+    /// The same with its operands exchanged.
+    pub fn turned(self) -> Predicate {
+        match self {
+            Predicate::Equal => Predicate::Equal,
+            Predicate::NotEqual => Predicate::NotEqual,
+            Predicate::Less => Predicate::Greater,
+            Predicate::LessEqual => Predicate::GreaterEqual,
+            Predicate::NotLess => Predicate::NotGreater,
+            Predicate::NotLessEqual => Predicate::NotGreaterEqual,
+            Predicate::NotGreaterEqual => Predicate::NotLessEqual,
+            Predicate::NotGreater => Predicate::NotLess,
+            Predicate::GreaterEqual => Predicate::LessEqual,
+            Predicate::Greater => Predicate::Less,
+        }
+    }
+}
+
 /// What a node computes. A mask is a mask register, or without those a vector of all ones or zeros a lane.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum What {
@@ -54,8 +103,8 @@ pub enum What {
     },
     /// Left, right, or right with the sign, by a constant.
     Shift(Direction, Node, u8),
-    /// Comparison of reals: LT, LE or EQ of the manual, quiet.
-    Compare(u8, Node, Node),
+    /// Comparison of reals, quiet.
+    Compare(Predicate, Node, Node),
     /// Comparison of integers: equal (0) or less (1).
     CompareInt(u8, Node, Node),
     /// A mask: whether two integers have a bit in common. AVX-512 only.
@@ -72,10 +121,13 @@ pub enum What {
     /// Entries of the table at `base`, at indices that lie inside.
     Gather {
         base: u32,
+        len: u32,
         index: Node,
     },
-    /// Entries of sixteen, by the low four bits of an integer. AVX-512 only.
-    Permute(Sixteen, Node),
+    /// Half a table: the same in every vector. AVX-512 only.
+    Row(Sixteen, bool),
+    /// Entries of sixteen, in two rows, by the low four bits of an integer. AVX-512 only.
+    Permute(Node, Node, Node),
 }
 
 /// A quarter of a table for exponentials: i begins with 16 times the number.
@@ -88,8 +140,8 @@ pub enum Sixteen {
 }
 
 impl Sixteen {
-    /// Its two vectors, by the bits of their entries.
-    pub fn rows(self) -> [[u64; 8]; 2] {
+    /// Its first or second half, by the bits of the entries.
+    pub fn row(self, second: bool) -> [u64; 8] {
         let (Sixteen::Power(quarter) | Sixteen::Tail(quarter)) = self;
         let entry = |place: usize| {
             let i = 16 * usize::from(quarter) + place;
@@ -98,7 +150,7 @@ impl Sixteen {
                 Sixteen::Tail(_) => math::POOL[tables::EXP_TAIL as usize + i].to_bits(),
             }
         };
-        [0, 8].map(|row| std::array::from_fn(|place| entry(row + place)))
+        std::array::from_fn(|place| entry(8 * usize::from(second) + place))
     }
 }
 
@@ -114,23 +166,31 @@ impl What {
     /// Operands from left to right.
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
-            What::Load(_) | What::Constant(_) | What::Mask(_) => [None; 3],
-            What::One(_, _, a)
-            | What::Shift(_, a, _)
-            | What::MaskNot(a)
-            | What::Gather { index: a, .. }
-            | What::Permute(_, a) => [Some(a), None, None],
+            What::Load(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
+            What::One(_, _, a) | What::Shift(_, a, _) | What::MaskNot(a) | What::Gather { index: a, .. } => {
+                [Some(a), None, None]
+            }
             What::Two(_, _, a, b)
             | What::Compare(_, a, b)
             | What::CompareInt(_, a, b)
             | What::TestBits(a, b)
             | What::MaskAnd(a, b)
             | What::MaskOr(a, b) => [Some(a), Some(b), None],
-            What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) => {
+            What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) | What::Permute(a, b, c) => {
                 [Some(a), Some(b), Some(c)]
             }
         };
         all.into_iter().flatten()
+    }
+
+    /// Whether it lies in memory from the beginning.
+    pub fn is_leaf(self) -> bool {
+        matches!(self, What::Load(_)) || self.is_shared()
+    }
+
+    /// Whether it is the same in every vector, and lies in memory from the beginning.
+    pub fn is_shared(self) -> bool {
+        matches!(self, What::Constant(_) | What::Row(..))
     }
 
     /// Whether it lies in a mask register.
@@ -151,6 +211,7 @@ impl What {
             | What::Shift(..)
             | What::Select(..)
             | What::Gather { .. }
+            | What::Row(..)
             | What::Permute(..) => false,
         }
     }
@@ -165,13 +226,17 @@ pub struct Nodes {
     pub status: Option<Node>,
     /// A mask without which the status is 0.
     pub failed: Option<Node>,
+    /// Whether the pool begins with the tables of the elementary functions.
+    pub pooled: bool,
 }
 
 const SIGN: u64 = 1 << 63;
 
+/// `pooled`: the pool begins with the tables of the elementary functions.
+///
 /// # Errors
 /// If a width has no instructions for an operation.
-pub fn select(func: &Func, width: Vectors) -> Result<Nodes, Unsupported> {
+pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupported> {
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
@@ -194,7 +259,7 @@ pub fn select(func: &Func, width: Vectors) -> Result<Nodes, Unsupported> {
         }
     });
     let stores = func.stores.iter().map(|(slot, value)| (*slot, at(*value))).collect();
-    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes })
+    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
 }
 
 struct Selection {
@@ -219,9 +284,20 @@ impl Selection {
     }
 
     fn not(&mut self, mask: Node) -> What {
-        match self.width {
-            Vectors::Avx512 => What::MaskNot(mask),
-            Vectors::Avx2 => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
+        match (self.nodes[mask.index()], self.width) {
+            (What::Compare(predicate, a, b), _) => What::Compare(predicate.not(), a, b),
+            (_, Vectors::Avx512) => What::MaskNot(mask),
+            (_, Vectors::Avx | Vectors::Avx2) => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
+        }
+    }
+
+    /// `a` where a mask is set, `b` elsewhere. Without mask registers a mask has all bits or none.
+    fn choose(&mut self, when: Node, a: Node, b: Node) -> What {
+        let zero = What::Constant(0);
+        match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
+            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => What::Two(i::AND_NOT, false, when, b),
+            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => What::Two(i::AND, true, when, a),
+            _ => What::Select(when, a, b),
         }
     }
 
@@ -241,7 +317,7 @@ impl Selection {
             Op::Load(slot) => What::Load(slot),
             Op::Pool { base, len, index } => {
                 let index = self.inside(func, index, len, of);
-                What::Gather { base, index }
+                What::Gather { base, len, index }
             }
             Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
             Op::Add(a, b) => What::Two(i::ADD, true, at(a), at(b)),
@@ -273,9 +349,9 @@ impl Selection {
                 return Ok(self.exp(at(x), is_minus_square(x, |value| func.op(value))));
             }
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
-            Op::Less(a, b) => What::Compare(0x11, at(a), at(b)),
-            Op::LessEqual(a, b) => What::Compare(0x12, at(a), at(b)),
-            Op::Equal(a, b) => What::Compare(0, at(a), at(b)),
+            Op::Less(a, b) => What::Compare(Predicate::Less, at(a), at(b)),
+            Op::LessEqual(a, b) => What::Compare(Predicate::LessEqual, at(a), at(b)),
+            Op::Equal(a, b) => What::Compare(Predicate::Equal, at(a), at(b)),
             Op::And(a, b) if wide => What::MaskAnd(at(a), at(b)),
             Op::Or(a, b) if wide => What::MaskOr(at(a), at(b)),
             Op::And(a, b) => What::Two(i::AND, true, at(a), at(b)),
@@ -286,7 +362,8 @@ impl Selection {
                 // a < b ? a : b and a > b ? a : b, of NaN and zeros too.
                 (Op::Less(x, y), Type::Real) if (x, y) == (a, b) => What::Two(i::MIN, false, at(a), at(b)),
                 (Op::Less(x, y), Type::Real) if (x, y) == (b, a) => What::Two(i::MAX, false, at(a), at(b)),
-                _ => What::Select(at(when), at(a), at(b)),
+                (Op::Not(not), _) => self.choose(at(not), at(b), at(a)),
+                _ => self.choose(at(when), at(a), at(b)),
             },
             Op::IntAdd(a, b) => What::Two(i::INT_ADD, true, at(a), at(b)),
             Op::IntSub(a, b) => What::Two(i::INT_SUB, false, at(a), at(b)),
@@ -312,10 +389,10 @@ impl Selection {
                 // What is too large or NaN becomes the least integer: right for what is too small only.
                 let raw = self.add(What::One(i::TO_INT, None, at(a)));
                 let limit = self.constant(9223372036854775808f64.to_bits());
-                let large = self.add(What::Compare(0x12, limit, at(a)));
+                let large = self.add(What::Compare(Predicate::LessEqual, limit, at(a)));
                 let most = self.constant(i64::MAX as u64);
                 let held = self.add(What::Select(large, most, raw));
-                let number = self.add(What::Compare(0, at(a), at(a)));
+                let number = self.add(What::Compare(Predicate::Equal, at(a), at(a)));
                 What::Select(number, held, self.constant(0))
             }
             Op::ToInt(_) => return Err(self.missing("conversion to integers")),
@@ -360,7 +437,10 @@ impl Selection {
 
     /// Entries of a table of 64 by the low six bits of an integer.
     fn sixty_four(&mut self, quarter: fn(u8) -> Sixteen, index: Node) -> Node {
-        let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| self.add(What::Permute(quarter(number), index)));
+        let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| {
+            let [first, second] = [false, true].map(|second| self.add(What::Row(quarter(number), second)));
+            self.add(What::Permute(first, second, index))
+        });
         let [sixteen, thirty_two] = [16, 32].map(|bit| {
             let bit = self.constant(bit);
             self.add(What::TestBits(index, bit))
