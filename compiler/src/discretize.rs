@@ -127,6 +127,9 @@ fn widened((low, high): (f64, f64)) -> (f64, f64) {
     (low - tolerance, high + tolerance)
 }
 
+/// Most slopes between which a rate may choose for each to have an exponential of its own.
+const MOST_CHOSEN: usize = 4;
+
 /// dx/dt = f(t, x) with everything else frozen.
 struct Model<'a> {
     program: &'a Program,
@@ -316,7 +319,7 @@ impl<'a> Model<'a> {
             let slot = layout.derivatives.slot(*k);
             let f = Real::new(self.build, self.build.borrow_mut().read(slot, &env));
             let own = gradients.get(&slot).and_then(|gradient| derive::entry(gradient, direction as u32));
-            (f, own.map(|a| Real::new(self.build, a)))
+            (f, own.map(|a| Real::new(self.build, self.chosen(a, 8))))
         };
         states.iter().enumerate().map(of).collect()
     }
@@ -331,20 +334,84 @@ impl<'a> Model<'a> {
         let constants = [1.0, 0.5].map(|phi| self.h.constant(phi));
         let Some(a) = a else { return constants };
         let op = self.build.borrow().get(a.value);
-        if let Op::Real(bits) = op
-            && f64::from_bits(bits) >= 0.0
-        {
-            return constants;
+        match op {
+            Op::Real(bits) if f64::from_bits(bits) >= 0.0 => constants,
+            // Of a choice between slopes that no state changes both are known once for all rounds.
+            Op::Select(condition, yes, no) if !self.is_given(a.value) && self.is_chosen(a.value) => {
+                let [yes, no] = [yes, no].map(|side| self.phis(Some(a.same(side))));
+                let condition = Truth::new(self.build, condition);
+                [0, 1].map(|k| condition.choose(yes[k], no[k]))
+            }
+            _ => relaxation::phis(self.h * self.falling(a)),
         }
-        // Of a choice between two that no state changes both are known once for all rounds.
-        if let Op::Select(condition, yes, no) = op
-            && [yes, no].iter().all(|side| self.is_given(*side))
-        {
-            let [yes, no] = [yes, no].map(|side| self.phis(Some(a.same(side))));
-            let condition = Truth::new(self.build, condition);
-            return [0, 1].map(|k| condition.choose(yes[k], no[k]));
+    }
+
+    /// Whether a value is one of a few that no state changes.
+    fn is_chosen(&self, value: Value) -> bool {
+        let (mut open, mut seen, mut given) = (vec![value], HashSet::new(), 0);
+        while let Some(value) = open.pop() {
+            if !seen.insert(value) {
+                continue;
+            }
+            let op = self.build.borrow().get(value);
+            match op {
+                _ if self.is_given(value) => given += 1,
+                Op::Select(_, yes, no) => open.extend([yes, no]),
+                _ => return false,
+            }
+            if given > MOST_CHOSEN || seen.len() > 3 * MOST_CHOSEN {
+                return false;
+            }
         }
-        relaxation::phis(self.h * self.falling(a))
+        true
+    }
+
+    /// The same with its choices outermost, where only these depend on states: (if c then 1 else 0) · x − y → if c then
+    /// x − y else −y. 0 · x is 0, as it is in a derivative.
+    fn chosen(&self, value: Value, deepest: u32) -> Value {
+        let op = self.build.borrow().get(value);
+        if deepest == 0 || self.is_given(value) {
+            return value;
+        }
+        let (a, b) = match op {
+            Op::Select(condition, yes, no) => {
+                let [yes, no] = [yes, no].map(|side| self.chosen(side, deepest - 1));
+                return self.build.borrow_mut().select(condition, yes, no);
+            }
+            Op::Neg(a) => (a, a),
+            Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) => (a, b),
+            _ => return value,
+        };
+        // One operand is a choice, the other given.
+        let (choice, other) = if self.is_given(a) { (b, a) } else { (a, b) };
+        if choice != other && !self.is_given(other) {
+            return value;
+        }
+        let choices = self.chosen(choice, deepest - 1);
+        if !self.is_chosen(choices) {
+            return value;
+        }
+        self.for_each_choice(choices, &|side| {
+            let of = |operand: Value| if operand == choice { side } else { operand };
+            let mut build = self.build.borrow_mut();
+            let zero = |value: Value, build: &Build| build.constant(value) == Some(0.0);
+            match op.map(of) {
+                Op::Mul(a, b) if zero(a, &build) || zero(b, &build) => build.real(0.0),
+                op => build.op(op),
+            }
+        })
+    }
+
+    /// A choice with `f` applied to what is chosen.
+    fn for_each_choice(&self, value: Value, f: &dyn Fn(Value) -> Value) -> Value {
+        let op = self.build.borrow().get(value);
+        match op {
+            Op::Select(condition, yes, no) if !self.is_given(value) => {
+                let [yes, no] = [yes, no].map(|side| self.for_each_choice(side, f));
+                self.build.borrow_mut().select(condition, yes, no)
+            }
+            _ => f(value),
+        }
     }
 
     /// Whether a value depends on no state.

@@ -47,7 +47,7 @@ mod tests {
         build.store(Slot(4), phi);
         build.store(Slot(5), phi2);
         let func = expand(&build.finish());
-        let mut at = |q: f64| {
+        let at = |q: f64| {
             let mut block = [0.0, 0.0, 0.0, q, 0.0, 0.0];
             run_once(&func, &mut block, &POOL);
             [block[4], block[5]]
