@@ -6,7 +6,7 @@
 use crate::components::components;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// States that are stepped together.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -25,26 +25,22 @@ pub fn groups(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Group> {
     let rows = depends(func, rates, states);
     let edge = |v: usize, k: usize| rows[v].get(k).map(|(w, _): &(u32, bool)| *w as usize);
     let mut level = vec![0usize; states.len()];
-    let mut groups: Vec<(usize, Group)> = Vec::new();
+    let mut groups: BTreeMap<(usize, bool), Vec<usize>> = BTreeMap::new();
     for component in components(states.len(), edge) {
         let needed = component.iter().flat_map(|v| &rows[*v]).map(|(w, _)| *w as usize);
-        let own = needed.filter(|w| !component.contains(w)).map(|w| level[w] + 1).max().unwrap_or(0);
+        let own = needed.filter(|w| component.binary_search(w).is_err()).map(|w| level[w] + 1).max().unwrap_or(0);
         component.iter().for_each(|v| level[*v] = own);
         let once = match component[..] {
             [v] => rows[v].iter().all(|(w, affine)| *w as usize != v || *affine),
             _ => false,
         };
-        match groups.iter_mut().find(|(level, group)| *level == own && group.once == once) {
-            Some((_, group)) => group.states.extend(component),
-            None => groups.push((own, Group { states: component, once })),
-        }
+        groups.entry((own, once)).or_default().extend(component);
     }
-    groups.sort_by_key(|(level, _)| *level);
-    let sorted = |(_, mut group): (usize, Group)| {
-        group.states.sort_unstable();
-        group
+    let group = |((_, once), mut states): ((usize, bool), Vec<usize>)| {
+        states.sort_unstable();
+        Group { states, once }
     };
-    groups.into_iter().map(sorted).collect()
+    groups.into_iter().map(group).collect()
 }
 
 /// For each rate, what it depends on.

@@ -7,7 +7,7 @@
 use crate::coupled;
 use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
-use crate::ir::build::{Build, Env, prune};
+use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared, Truth};
 use crate::ir::{Func, Op, Value, Write};
 use crate::math::relaxation;
@@ -16,7 +16,7 @@ use abi::Slot;
 use abi::description::{Guard, Segment};
 use abi::plan::Method;
 use std::cell::RefCell;
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashMap, HashSet};
 
 /// One fixed step by `method`, of the length in [`Slot::STEP`].
 ///
@@ -169,8 +169,13 @@ impl<'a> Model<'a> {
 
     /// Slots at a part `c` of the step, where the states are x.
     fn env(&self, c: f64, x: &[Real<'a>]) -> Env {
+        self.env_of(c, x.iter().copied().enumerate())
+    }
+
+    /// The same where only some states are read.
+    fn env_of(&self, c: f64, x: impl Iterator<Item = (usize, Real<'a>)>) -> Env {
         let states = self.program.description.layout.states;
-        let mut env: Env = x.iter().enumerate().map(|(k, x)| (states.slot(k), x.value)).collect();
+        let mut env: Env = x.map(|(k, x)| (states.slot(k), x.value)).collect();
         let t = if c == 0.0 { self.t } else { self.t + c * self.h };
         env.insert(Slot::TIME, t.value);
         self.delays(c, &mut env);
@@ -260,10 +265,11 @@ impl<'a> Model<'a> {
         let layout = &self.program.description.layout;
         let slots = |segment: Segment| -> Vec<Slot> { (0..self.x.len()).map(|k| segment.slot(k)).collect() };
         let groups = coupled::groups(&self.program.derivatives, &slots(layout.derivatives), &slots(layout.states));
+        let stored: HashMap<Slot, Value> = self.program.derivatives.stores.iter().copied().collect();
         let (mut next, mut middle) = (self.x.clone(), self.x.clone());
         for group in groups {
             let states = &group.states;
-            let rates = self.rates_of(states);
+            let rates = self.rates_of(states, &stored);
             let rounds = if group.once { 1 } else { 4 };
             for round in 0..rounds {
                 let (c, at) = if round == 0 && !group.once { (0.0, &self.x) } else { (0.5, &middle) };
@@ -300,19 +306,31 @@ impl<'a> Model<'a> {
         a.above(0.0).choose(r, f)
     }
 
-    /// The function that gives the rates of these states alone.
-    fn rates_of(&self, states: &[usize]) -> Func {
-        let derivatives = self.program.description.layout.derivatives;
-        let wanted: HashSet<Slot> = states.iter().map(|k| derivatives.slot(*k)).collect();
-        let mut rates = self.program.derivatives.clone();
-        rates.stores.retain(|(slot, _)| wanted.contains(slot));
-        prune(&rates)
+    /// The function that gives the rates of these states alone, made of what they need and nothing else.
+    fn rates_of(&self, states: &[usize], stored: &HashMap<Slot, Value>) -> Func {
+        let func = &self.program.derivatives;
+        let slots = states.iter().map(|k| self.program.description.layout.derivatives.slot(*k));
+        let stores: Vec<(Slot, Value)> = slots.filter_map(|slot| Some((slot, *stored.get(&slot)?))).collect();
+        let mut needed = BTreeSet::new();
+        let mut open: Vec<Value> = stores.iter().map(|(_, value)| *value).collect();
+        while let Some(value) = open.pop() {
+            if needed.insert(value) {
+                func.op(value).each_operand(|operand| open.push(operand));
+            }
+        }
+        let number: HashMap<Value, Value> =
+            needed.iter().enumerate().map(|(number, value)| (*value, Value(number as u32))).collect();
+        let ops = needed.iter().map(|value| func.op(*value).map(|operand| number[&operand])).collect();
+        let stores = stores.into_iter().map(|(slot, value)| (slot, number[&value])).collect();
+        Func { name: func.name.clone(), ops, stores, ..Func::default() }
     }
 
     /// For each of these states f, and ∂f/∂x of itself alone; none where it does not depend on itself.
     fn relaxation(&self, rates: &Func, c: f64, x: &[Real<'a>], states: &[usize]) -> Vec<(Real<'a>, Option<Real<'a>>)> {
         let layout = &self.program.description.layout;
-        let mut env = self.env(c, x);
+        let read = |slot: Slot| layout.states.contains(slot).then(|| slot.index() - layout.states.start as usize);
+        let read: Vec<usize> = rates.loads().into_iter().filter_map(read).collect();
+        let mut env = self.env_of(c, read.into_iter().map(|k| (k, x[k])));
         let slots: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
         let gradients = derive::inline(self.build, rates, &mut env, &slots);
         let of = |(direction, k): (usize, &usize)| {
