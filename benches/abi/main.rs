@@ -3,7 +3,8 @@
 //!
 //! The C (`models.c`, `gcc -O3 -march=native`) gets the same inputs, new ones at every call, and does the same step: by
 //! `expo`, in the form in which one writes it for one model alone. First both go through the same course, whose states
-//! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C.
+//! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The C
+//! watches nothing: a last column has our step without guards too.
 //! A word behind the command takes only models whose names begin with it.
 
 #[path = "../../src/project.rs"]
@@ -21,6 +22,7 @@ use abi::description::Kind;
 use abi::plan::Method;
 use abi::table::Entry;
 use abi::{Description, Function, Instance, Slot};
+use compiler::program::Program;
 use compiler::{Changes, NoSources, Sources};
 use std::ffi::{CStr, c_char};
 use std::hint::black_box;
@@ -91,28 +93,34 @@ fn main() {
     let mut loaded = compiler::load("library.fric", &whole, &NoSources);
     let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
     println!("one step a call by `expo`, new inputs at each; below 1 is faster than C through a pointer");
-    println!("{:<24} {:>9} {:>9} {:>7}", "", "C", "ours", "ratio");
-    let (mut ratios, mut left_out) = (Vec::new(), Vec::new());
+    println!("{:<24} {:>9} {:>9} {:>7} {:>12}", "", "C", "ours", "ratio", "unguarded");
+    let (mut ratios, mut unguarded, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
     for name in names.iter().filter(|name| name.starts_with(&chosen)) {
         if let Some((_, why)) = LEFT_OUT.iter().find(|(left_out, _)| left_out == name) {
             left_out.push(format!("{name}: {why}"));
             continue;
         }
         let hand = hand(name).unwrap_or_else(|| panic!("`models.c` has no {name}"));
-        let [c, ours] = compare(name, &mut loaded, hand);
-        println!("{name:<24} {c:6.1} ns {ours:6.1} ns {:7.3}", ours / c);
+        let [c, ours, bare] = compare(name, &mut loaded, hand);
+        println!("{name:<24} {c:6.1} ns {ours:6.1} ns {:7.3} {:12.3}", ours / c, bare / c);
         ratios.push((ours / c, name));
+        unguarded.push((bare / c, name));
     }
     left_out.iter().for_each(|what| println!("left out: {what}"));
-    #[allow(clippy::disallowed_methods, reason = "for people only")]
-    let mean = (ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64).exp();
-    let above = ratios.iter().filter(|(ratio, _)| *ratio > 1.0).count();
-    let (worst, name) = ratios.iter().max_by(|a, b| a.0.total_cmp(&b.0)).expect("at least one model");
-    println!("{} models: geometric mean {mean:.3}, worst {worst:.3} ({name}), {above} above 1", ratios.len());
+    for (what, ratios) in [("guarded", ratios), ("unguarded", unguarded)] {
+        #[allow(clippy::disallowed_methods, reason = "for people only")]
+        let mean = (ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64).exp();
+        let above = ratios.iter().filter(|(ratio, _)| *ratio > 1.0).count();
+        let (worst, name) = ratios.iter().max_by(|a, b| a.0.total_cmp(&b.0)).expect("at least one model");
+        println!(
+            "{} models, {what}: geometric mean {mean:.3}, worst {worst:.3} ({name}), {above} above 1",
+            ratios.len()
+        );
+    }
 }
 
-/// Nanoseconds a call in C and of ours, medians.
-fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 2] {
+/// Nanoseconds a call in C, of ours, and of ours without guards, medians.
+fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 3] {
     // A sampled model is called at its own pace.
     let h = match name {
         "DriveTorqueSampled" => 0.5e-3,
@@ -121,11 +129,12 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 2] {
     let built = compiler::build(loaded, &NoSources, name, &Changes::default(), &mut Vec::new());
     let mut program = built.unwrap_or_else(|found| panic!("{name}: {found:?}")).program;
     program.size_rings(h);
-    let (code, notes) = compiler::code(&compiler::functions(&program, Method::Expo), &program.description, false);
-    assert!(notes.is_empty(), "{notes:?}");
-    let entry = code.entry(Function::Step).expect("it is machine code");
-    let mut ours = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    let description = program.description;
+    let mut ours = Running::new(&program);
+    program.description.guards.clear();
+    let mut bare = Running::new(&program);
+    let description = ours.instance.description().clone();
+    let entry = ours.entry;
+    let ours = &mut ours.instance;
     let slots = |names: Vec<String>| -> Vec<Slot> { names.iter().map(|path| slot(&description, name, path)).collect() };
     let inputs = slots(words(hand.inputs));
     let layout = &description.layout;
@@ -141,10 +150,12 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 2] {
     }
     let course = course(&words(hand.inputs));
     let row = |k: usize| &course[k % COURSE * inputs.len()..][..inputs.len()];
-    ours.block_mut()[layout.inputs.range()].copy_from_slice(row(0));
-    assert_eq!(ours.start(h), 0, "{name} starts");
+    for instance in [&mut *ours, &mut bare.instance] {
+        instance.block_mut()[layout.inputs.range()].copy_from_slice(row(0));
+        assert_eq!(instance.start(h), 0, "{name} starts");
+    }
     let params: Vec<f64> = slots(words(hand.params)).into_iter().map(|slot| ours.get(slot)).collect();
-    let states: Vec<State> = words(hand.states).iter().map(|path| state(&description, name, path, &ours)).collect();
+    let states: Vec<State> = words(hand.states).iter().map(|path| state(&description, name, path, ours)).collect();
     let begin = |state: &State| match state {
         State::Slot(slot) => ours.get(*slot),
         State::Own(begin) => *begin,
@@ -182,7 +193,23 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 2] {
             );
         }
     }
-    timed(name, hand, entry, &mut ours, &mut x, &params, &mut out, (&course, &inputs, &outputs), h)
+    let ours = [(entry, ours), (bare.entry, &mut bare.instance)];
+    timed(name, hand, ours, &mut x, &params, &mut out, (&course, &inputs, &outputs), h)
+}
+
+/// A model and its step.
+struct Running {
+    instance: Instance,
+    entry: Entry,
+}
+
+impl Running {
+    fn new(program: &Program) -> Running {
+        let (code, notes) = compiler::code(&compiler::functions(program, Method::Expo), &program.description, false);
+        assert!(notes.is_empty(), "{notes:?}");
+        let entry = code.entry(Function::Step).expect("it is machine code");
+        Running { instance: Instance::new(Arc::new(program.description.clone()), code, &program.params), entry }
+    }
 }
 
 /// Medians of interleaved rounds, ns a call.
@@ -190,23 +217,21 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 2] {
 fn timed(
     name: &str,
     hand: &Hand,
-    entry: Entry,
-    ours: &mut Instance,
+    ours: [(Entry, &mut Instance); 2],
     x: &mut [f64],
     params: &[f64],
     out: &mut [f64],
     (course, inputs, outputs): (&[f64], &[Slot], &[Slot]),
     h: f64,
-) -> [f64; 2] {
-    let description = ours.description().clone();
+) -> [f64; 3] {
+    let description = ours[0].1.description().clone();
     let first = description.layout.inputs.start as usize;
     let n = inputs.len();
     let mut u = vec![0.0; n];
-    let block = ours.block_mut().as_mut_ptr();
-    let mut times = [const { Vec::new() }; 2];
+    let ours = ours.map(|(entry, instance)| (black_box(entry), instance.block_mut().as_mut_ptr()));
+    let mut times = [const { Vec::new() }; 3];
     let (mut sum, mut at) = (0.0, 0);
     let step = black_box(hand.step);
-    let entry = black_box(entry);
     for _ in 0..ROUNDS {
         let rows = || (at..at + CALLS).map(|k| &course[k % COURSE * n..][..n]);
         let begun = Instant::now();
@@ -221,21 +246,23 @@ fn timed(
             }
         }
         times[0].push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
-        let begun = Instant::now();
-        for row in rows() {
-            // SAFETY: block and pool are those of the model, and its slots lie in the block.
-            unsafe {
-                for (k, from) in row.iter().enumerate() {
-                    *block.add(first + k) = *from;
-                }
-                let status = entry(block, description.pool.as_ptr(), 1);
-                assert_eq!(status, 0, "{name}");
-                for from in outputs {
-                    sum += *block.add(from.index());
+        for ((entry, block), times) in ours.iter().zip(&mut times[1..]) {
+            let begun = Instant::now();
+            for row in rows() {
+                // SAFETY: block and pool are those of the model, and its slots lie in the block.
+                unsafe {
+                    for (k, from) in row.iter().enumerate() {
+                        *block.add(first + k) = *from;
+                    }
+                    let status = entry(*block, description.pool.as_ptr(), 1);
+                    assert_eq!(status, 0, "{name}");
+                    for from in outputs {
+                        sum += *block.add(from.index());
+                    }
                 }
             }
+            times.push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
         }
-        times[1].push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
         at += CALLS;
     }
     black_box(sum);

@@ -3,6 +3,7 @@
 //! In: a flat [`System`]. Out: diagnostics only; `lower` follows the same graph on demand. The graph is over single
 //! quantities, one for each phase; states, held outputs and `next` break circles.
 
+use crate::components::components;
 use crate::delays;
 use crate::source::Files;
 use crate::system::*;
@@ -108,55 +109,15 @@ fn graph(system: &System, phase: Phase) -> Graph {
     (0..2 * n).map(edges).collect()
 }
 
-/// Strongly connected components with a circle in them, each sorted (Tarjan, without recursion).
+/// Strongly connected components with a circle in them, each sorted.
 fn circles(graph: &Graph) -> Vec<Vec<VarId>> {
-    const NONE: u32 = u32::MAX;
-    let n = graph.len();
-    let (mut number, mut low, mut on_stack) = (vec![NONE; n], vec![0u32; n], vec![false; n]);
-    let (mut stack, mut next, mut out) = (Vec::new(), 0u32, Vec::new());
-    for root in 0..n {
-        if number[root] != NONE {
-            continue;
-        }
-        let mut work = vec![(root, 0usize)];
-        while let Some((v, edge)) = work.pop() {
-            if edge == 0 {
-                number[v] = next;
-                low[v] = next;
-                next += 1;
-                stack.push(v);
-                on_stack[v] = true;
-            } else {
-                let done = graph[v][edge - 1].0.0 as usize;
-                if on_stack[done] {
-                    low[v] = low[v].min(low[done]);
-                }
-            }
-            if let Some((w, _)) = graph[v].get(edge) {
-                work.push((v, edge + 1));
-                if number[w.0 as usize] == NONE {
-                    work.push((w.0 as usize, 0));
-                }
-                continue;
-            }
-            if low[v] == number[v] {
-                let mut component = Vec::new();
-                loop {
-                    let w = stack.pop().expect("the component ends with its root");
-                    on_stack[w] = false;
-                    component.push(VarId(w as u32));
-                    if w == v {
-                        break;
-                    }
-                }
-                let itself = graph[v].iter().any(|(w, _)| w.0 as usize == v);
-                if component.len() > 1 || itself {
-                    component.sort_unstable();
-                    out.push(component);
-                }
-            }
-        }
-    }
+    let edge = |v: usize, k: usize| graph[v].get(k).map(|(w, _): &(VarId, ExprId)| w.0 as usize);
+    let circle = |component: &Vec<usize>| {
+        let first = component[0];
+        component.len() > 1 || graph[first].iter().any(|(w, _)| w.0 as usize == first)
+    };
+    let numbered = |component: Vec<usize>| component.into_iter().map(|v| VarId(v as u32)).collect();
+    let mut out: Vec<Vec<VarId>> = components(graph.len(), edge).into_iter().filter(circle).map(numbered).collect();
     out.sort();
     out
 }

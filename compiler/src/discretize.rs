@@ -4,15 +4,19 @@
 //! blocks that are due, the transitions and the outputs, and watches the guards, in this order. Inputs, sampled
 //! states and regimes are frozen while the states advance.
 
+use crate::coupled;
 use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared, Truth};
-use crate::ir::{Func, Unary, Value, Write};
+use crate::ir::{Func, Op, Value, Write};
+use crate::math::relaxation;
 use crate::program::Program;
 use abi::Slot;
-use abi::description::Guard;
+use abi::description::{Guard, Segment};
 use abi::plan::Method;
+use std::cell::RefCell;
+use std::collections::{BTreeSet, HashMap, HashSet};
 
 /// One fixed step by `method`, of the length in [`Slot::STEP`].
 ///
@@ -104,7 +108,9 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
         first = build.borrow_mut().select(bad.value, this, first);
     }
     // One test decides; which guard it is matters only then, and code may find it out apart from the step.
-    let finite = fine?.is(0.0);
+    let fine = fine?;
+    // The sum is 0 or NaN, and of these two this asks with one test.
+    let finite = fine.constant(0.0).not_above(fine);
     let any = outside.map_or(!finite, |outside| outside | !finite);
     let none = number(0);
     Some(build.borrow_mut().select(any.value, first, none))
@@ -121,6 +127,9 @@ fn widened((low, high): (f64, f64)) -> (f64, f64) {
     (low - tolerance, high + tolerance)
 }
 
+/// Most slopes between which a rate may choose for each to have an exponential of its own.
+const MOST_CHOSEN: usize = 4;
+
 /// dx/dt = f(t, x) with everything else frozen.
 struct Model<'a> {
     program: &'a Program,
@@ -131,6 +140,8 @@ struct Model<'a> {
     t: Real<'a>,
     /// States at its beginning.
     x: Vec<Real<'a>>,
+    /// Of the values built so far: which depend on no state.
+    given: RefCell<Vec<bool>>,
 }
 
 impl<'a> Model<'a> {
@@ -138,7 +149,7 @@ impl<'a> Model<'a> {
         let load = |slot| Real::new(build, build.borrow_mut().load(slot));
         let states = program.description.layout.states;
         let x = states.range().map(|slot| load(Slot(slot as u32))).collect();
-        Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x }
+        Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x, given: RefCell::default() }
     }
 
     /// The states after a step.
@@ -158,8 +169,13 @@ impl<'a> Model<'a> {
 
     /// Slots at a part `c` of the step, where the states are x.
     fn env(&self, c: f64, x: &[Real<'a>]) -> Env {
+        self.env_of(c, x.iter().copied().enumerate())
+    }
+
+    /// The same where only some states are read.
+    fn env_of(&self, c: f64, x: impl Iterator<Item = (usize, Real<'a>)>) -> Env {
         let states = self.program.description.layout.states;
-        let mut env: Env = x.iter().enumerate().map(|(k, x)| (states.slot(k), x.value)).collect();
+        let mut env: Env = x.map(|(k, x)| (states.slot(k), x.value)).collect();
         let t = if c == 0.0 { self.t } else { self.t + c * self.h };
         env.insert(Slot::TIME, t.value);
         self.delays(c, &mut env);
@@ -242,56 +258,192 @@ impl<'a> Model<'a> {
     ///
     ///   x' = x + h φ(h a) f,  X = x + h φ2(h a) f              f, a = min(∂f/∂x, 0) at (t, x)
     ///   three times: r = f + a (x − X), and r in place of f    f, a at (t + h/2, X)
+    ///
+    /// Whoever depends on others comes behind them. Of a rate that is affine in its state r is the same wherever it is
+    /// evaluated, so once is enough.
     fn expo(&self) -> Vec<Real<'a>> {
-        let h = self.h;
-        let (f, a) = self.relaxation(0.0, &self.x);
-        let mean = |f: &[Real<'a>], a: &[Option<Real<'a>>]| -> Vec<Real<'a>> {
-            let one = |(k, f): (usize, &Real<'a>)| self.x[k] + h * self.phi2(a[k]) * *f;
-            f.iter().enumerate().map(one).collect()
-        };
-        let mut middle = mean(&f, &a);
-        let mut last = (f, a);
+        let layout = &self.program.description.layout;
+        let slots = |segment: Segment| -> Vec<Slot> { (0..self.x.len()).map(|k| segment.slot(k)).collect() };
+        let groups = coupled::groups(&self.program.derivatives, &slots(layout.derivatives), &slots(layout.states));
+        let stored: HashMap<Slot, Value> = self.program.derivatives.stores.iter().copied().collect();
+        let (mut next, mut middle) = (self.x.clone(), self.x.clone());
+        for group in groups {
+            let states = &group.states;
+            let rates = self.rates_of(states, &stored);
+            let rounds = if group.once { 1 } else { 4 };
+            for round in 0..rounds {
+                let (c, at) = if round == 0 && !group.once { (0.0, &self.x) } else { (0.5, &middle) };
+                let mut moved = Vec::with_capacity(states.len());
+                for (k, (f, a)) in states.iter().zip(self.relaxation(&rates, c, at, states)) {
+                    let x = self.x[*k];
+                    let [phi, phi2] = self.phis(a);
+                    let r = match a {
+                        Some(a) if group.once => self.once(f, a),
+                        Some(a) if round > 0 => f + self.falling(a) * (x - middle[*k]),
+                        _ => f,
+                    };
+                    moved.push((*k, [phi, phi2].map(|phi| x + self.h * phi * r)));
+                }
+                // Whoever depends on them sees the X at which the last of their rates were taken.
+                let last = round == 3;
+                for (k, [end, mean]) in moved {
+                    next[k] = end;
+                    middle[k] = if last { middle[k] } else { mean };
+                }
+            }
+        }
+        next
+    }
+
+    /// What iterating makes of a rate `f` at x that is affine, with the slope `a`: itself, unless it grows away from its
+    /// rest point, X = x + h r/2 of r = f + a (X − x).
+    fn once(&self, f: Real<'a>, a: Real<'a>) -> Real<'a> {
+        let half = 0.5 * self.h;
+        let mut r = f;
         for _ in 0..3 {
-            let (f, a) = self.relaxation(0.5, &middle);
-            let toward = |k: usize| a[k].map_or(f[k], |a| f[k] + a * (self.x[k] - middle[k]));
-            let r: Vec<Real> = (0..self.x.len()).map(toward).collect();
-            middle = mean(&r, &a);
-            last = (r, a);
+            r = f + a * (half * r);
         }
-        let (r, a) = last;
-        (0..self.x.len()).map(|k| self.x[k] + h * self.phi(a[k]) * r[k]).collect()
+        a.above(0.0).choose(r, f)
     }
 
-    /// f, and for each state min(∂f/∂x, 0) of itself alone; none where it does not depend on itself.
-    fn relaxation(&self, c: f64, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Option<Real<'a>>>) {
-        let (f, rows) = self.f_and_gradient(c, x);
-        let own = |(k, row): (usize, &Gradient)| {
-            let a = Real::new(self.build, derive::entry(row, k as u32)?);
-            Some(a.below(0.0).choose(a, 0.0))
+    /// The function that gives the rates of these states alone, made of what they need and nothing else.
+    fn rates_of(&self, states: &[usize], stored: &HashMap<Slot, Value>) -> Func {
+        let func = &self.program.derivatives;
+        let slots = states.iter().map(|k| self.program.description.layout.derivatives.slot(*k));
+        let stores: Vec<(Slot, Value)> = slots.filter_map(|slot| Some((slot, *stored.get(&slot)?))).collect();
+        let mut needed = BTreeSet::new();
+        let mut open: Vec<Value> = stores.iter().map(|(_, value)| *value).collect();
+        while let Some(value) = open.pop() {
+            if needed.insert(value) {
+                func.op(value).each_operand(|operand| open.push(operand));
+            }
+        }
+        let number: HashMap<Value, Value> =
+            needed.iter().enumerate().map(|(number, value)| (*value, Value(number as u32))).collect();
+        let ops = needed.iter().map(|value| func.op(*value).map(|operand| number[&operand])).collect();
+        let stores = stores.into_iter().map(|(slot, value)| (slot, number[&value])).collect();
+        Func { name: func.name.clone(), ops, stores, ..Func::default() }
+    }
+
+    /// For each of these states f, and ∂f/∂x of itself alone; none where it does not depend on itself.
+    fn relaxation(&self, rates: &Func, c: f64, x: &[Real<'a>], states: &[usize]) -> Vec<(Real<'a>, Option<Real<'a>>)> {
+        let layout = &self.program.description.layout;
+        let read = |slot: Slot| layout.states.contains(slot).then(|| slot.index() - layout.states.start as usize);
+        let read: Vec<usize> = rates.loads().into_iter().filter_map(read).collect();
+        let mut env = self.env_of(c, read.into_iter().map(|k| (k, x[k])));
+        let slots: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
+        let gradients = derive::inline(self.build, rates, &mut env, &slots);
+        let of = |(direction, k): (usize, &usize)| {
+            let slot = layout.derivatives.slot(*k);
+            let f = Real::new(self.build, self.build.borrow_mut().read(slot, &env));
+            let own = gradients.get(&slot).and_then(|gradient| derive::entry(gradient, direction as u32));
+            (f, own.map(|a| Real::new(self.build, self.chosen(a, 8))))
         };
-        let a = rows.iter().enumerate().map(own).collect();
-        (f, a)
+        states.iter().enumerate().map(of).collect()
     }
 
-    /// φ(q) = (e^q − 1)/q of q = h a; φ(0) = 1
-    fn phi(&self, a: Option<Real<'a>>) -> Real<'a> {
-        let Some(a) = a else { return self.h.constant(1.0) };
-        let q = self.h * a;
-        q.is(0.0).choose(1.0, q.of(Unary::Expm1) / q)
+    /// min(a, 0)
+    fn falling(&self, a: Real<'a>) -> Real<'a> {
+        a.below(0.0).choose(a, 0.0)
     }
 
-    /// φ2(q) = (e^q − 1 − q)/q²; near 0 by its series, 1/2 + q/6 + q²/24 + …
-    fn phi2(&self, a: Option<Real<'a>>) -> Real<'a> {
-        let Some(a) = a else { return self.h.constant(0.5) };
-        let q = self.h * a;
-        let mut series = q.constant(0.0);
-        // Ten terms: for |q| < 1/8 what is left out is less than 2^-58 of it.
-        let mut factorial = (2..=11).map(f64::from).product::<f64>();
-        for k in (2..=11).rev() {
-            series = series * q + 1.0 / factorial;
-            factorial /= f64::from(k);
+    /// φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² of q = h min(a, 0); φ(0) = 1, φ2(0) = 1/2.
+    fn phis(&self, a: Option<Real<'a>>) -> [Real<'a>; 2] {
+        let constants = [1.0, 0.5].map(|phi| self.h.constant(phi));
+        let Some(a) = a else { return constants };
+        let op = self.build.borrow().get(a.value);
+        match op {
+            Op::Real(bits) if f64::from_bits(bits) >= 0.0 => constants,
+            // Of a choice between slopes that no state changes both are known once for all rounds.
+            Op::Select(condition, yes, no) if !self.is_given(a.value) && self.is_chosen(a.value) => {
+                let [yes, no] = [yes, no].map(|side| self.phis(Some(a.same(side))));
+                let condition = Truth::new(self.build, condition);
+                [0, 1].map(|k| condition.choose(yes[k], no[k]))
+            }
+            _ => relaxation::phis(self.h * self.falling(a)),
         }
-        q.above(-0.125).choose(series, (q.of(Unary::Expm1) / q - 1.0) / q)
+    }
+
+    /// Whether a value is one of a few that no state changes.
+    fn is_chosen(&self, value: Value) -> bool {
+        let (mut open, mut seen, mut given) = (vec![value], HashSet::new(), 0);
+        while let Some(value) = open.pop() {
+            if !seen.insert(value) {
+                continue;
+            }
+            let op = self.build.borrow().get(value);
+            match op {
+                _ if self.is_given(value) => given += 1,
+                Op::Select(_, yes, no) => open.extend([yes, no]),
+                _ => return false,
+            }
+            if given > MOST_CHOSEN || seen.len() > 3 * MOST_CHOSEN {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// The same with its choices outermost, where only these depend on states: (if c then 1 else 0) · x − y → if c then
+    /// x − y else −y. 0 · x is 0, as it is in a derivative.
+    fn chosen(&self, value: Value, deepest: u32) -> Value {
+        let op = self.build.borrow().get(value);
+        if deepest == 0 || self.is_given(value) {
+            return value;
+        }
+        let (a, b) = match op {
+            Op::Select(condition, yes, no) => {
+                let [yes, no] = [yes, no].map(|side| self.chosen(side, deepest - 1));
+                return self.build.borrow_mut().select(condition, yes, no);
+            }
+            Op::Neg(a) => (a, a),
+            Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) => (a, b),
+            _ => return value,
+        };
+        // One operand is a choice, the other given.
+        let (choice, other) = if self.is_given(a) { (b, a) } else { (a, b) };
+        if choice != other && !self.is_given(other) {
+            return value;
+        }
+        let choices = self.chosen(choice, deepest - 1);
+        if !self.is_chosen(choices) {
+            return value;
+        }
+        self.for_each_choice(choices, &|side| {
+            let of = |operand: Value| if operand == choice { side } else { operand };
+            let mut build = self.build.borrow_mut();
+            let zero = |value: Value, build: &Build| build.constant(value) == Some(0.0);
+            match op.map(of) {
+                Op::Mul(a, b) if zero(a, &build) || zero(b, &build) => build.real(0.0),
+                op => build.op(op),
+            }
+        })
+    }
+
+    /// A choice with `f` applied to what is chosen.
+    fn for_each_choice(&self, value: Value, f: &dyn Fn(Value) -> Value) -> Value {
+        let op = self.build.borrow().get(value);
+        match op {
+            Op::Select(condition, yes, no) if !self.is_given(value) => {
+                let [yes, no] = [yes, no].map(|side| self.for_each_choice(side, f));
+                self.build.borrow_mut().select(condition, yes, no)
+            }
+            _ => f(value),
+        }
+    }
+
+    /// Whether a value depends on no state.
+    fn is_given(&self, value: Value) -> bool {
+        let states = self.program.description.layout.states;
+        let build = self.build.borrow();
+        let mut given = self.given.borrow_mut();
+        while given.len() < build.len() {
+            let op = build.get(Value(given.len() as u32));
+            let mut all = !matches!(op, Op::Load(slot) if states.contains(slot));
+            op.each_operand(|operand| all &= given[operand.index()]);
+            given.push(all);
+        }
+        given[value.index()]
     }
 
     /// Order 2, L-stable, whatever J is; one factorisation. γ = 1 − 1/√2, J = ∂f/∂x at (t, x).
@@ -322,6 +474,7 @@ mod tests {
     use super::*;
     use crate::backend::interp::Interpreter;
     use crate::backend::jit::compile;
+    use crate::ir::Unary;
     use crate::math::{POOL, expand};
     use abi::description::{Automaton, Tick};
     use abi::unit::Unit;

@@ -4,11 +4,13 @@
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
+pub mod components;
 pub mod ir;
 pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod coupled;
 pub mod elimination;
 pub mod discretize;
 pub mod rosenbrock;

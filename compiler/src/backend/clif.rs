@@ -1,6 +1,7 @@
 //! A function of ours as a function of Cranelift: a loop around the straight line.
 //!
 //! ```text
+//! single: for a count of 1: all of it in a straight line, by regime where there are regimes, and store; return the status
 //! entry:  load every slot that is read; compute what no iteration changes
 //! loop:   the rest, on the slots that are both read and written, which stay in registers; if they are many, in the block
 //!         again while there are iterations left and the status is 0
@@ -11,13 +12,14 @@
 //! out.
 //! Each operation becomes one instruction or a fixed few. There are no calls, no symbols and no traps.
 
+use super::regimes::{Apart, Automaton, Case, apart};
 use crate::ir::{Func, Op, Type, Value, Write, verify};
 use abi::Slot;
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
 use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, Signature, types};
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// Numbers that a loop is given for each of its iterations: loads from `first` on read these. One slot's lie side by side,
 /// those of the next slot `lanes` numbers on.
@@ -51,18 +53,56 @@ pub fn emit(
         target.signature.params.push(AbiParam::new(types::I64));
     }
     let mut b = FunctionBuilder::new(target, context);
-    let [entry, prepare, body, more, failed, exit, nothing] = [(); 7].map(|()| b.create_block());
+    let [entry, nothing] = [(); 2].map(|()| b.create_block());
     b.append_block_params_for_function_params(entry);
     b.switch_to_block(entry);
     let &[block, pool, count, ref gone_ahead @ ..] = b.block_params(entry) else { unreachable!("three parameters") };
     let gone_ahead = gone_ahead.first().copied();
-    b.ins().brif(count, prepare, &[], nothing, &[]);
-
-    b.switch_to_block(prepare);
-    let facts = Facts::of_rest(func, ahead);
-    let mut emitter = Emitter { ahead, ..Emitter::new(func, &facts, block, pool) };
-    let ops = || (0..func.ops.len()).map(|i| Value(i as u32));
     let (watch, late) = Watch::of(func);
+    let facts = Facts::of_rest(func, ahead);
+    // Nothing changes from one iteration to the next: one is enough.
+    let same = func.writes.is_empty() && facts.varies.iter().all(|varies| !varies);
+    let alone = ahead.is_none() && func.ops.len() <= STRAIGHT;
+    if alone {
+        let [single, several] = [(); 2].map(|()| b.create_block());
+        if same {
+            b.ins().brif(count, single, &[], several, &[]);
+        } else {
+            let one = b.ins().icmp_imm_s(IntCC::Equal, count, 1);
+            b.ins().brif(one, single, &[], several, &[]);
+        }
+        b.switch_to_block(single);
+        once(&apart(func, &late), watch, &late, (block, pool), &mut b);
+        b.switch_to_block(several);
+    }
+    if alone && same {
+        b.ins().jump(nothing, &[]);
+    } else {
+        let prepare = b.create_block();
+        b.ins().brif(count, prepare, &[], nothing, &[]);
+        b.switch_to_block(prepare);
+        let count = if same { b.ins().iconst(types::I64, 1) } else { count };
+        let emitter = Emitter { ahead, ..Emitter::new(func, &facts, block, pool) };
+        again(emitter, (watch, &late), count, gone_ahead, &mut b);
+    }
+    b.switch_to_block(nothing);
+    let zero = b.ins().iconst(types::I64, 0);
+    b.ins().return_(&[zero]);
+    b.seal_all_blocks();
+    b.finalize(isa.frontend_config());
+}
+
+/// Writes the loop, from where `b` stands to its return.
+fn again(
+    mut emitter: Emitter,
+    (watch, late): (Watch, &[bool]),
+    count: clif::Value,
+    gone_ahead: Option<clif::Value>,
+    b: &mut FunctionBuilder,
+) {
+    let (func, facts, block) = (emitter.func, emitter.facts, emitter.block);
+    let [body, more, failed, exit] = [(); 4].map(|()| b.create_block());
+    let ops = || (0..func.ops.len()).map(|i| Value(i as u32));
     // The slots that an iteration hands to the next: in registers, or, if they are many, where the next one loads them.
     let handed: Vec<(Value, Value)> = emitter.carried();
     let (carried, in_block) =
@@ -75,10 +115,8 @@ pub fn emit(
         facts.varies[value.index()] && !in_register
     };
     let list: Vec<Value> = ops().filter(|value| !late[value.index()] && !in_loop(&emitter, *value)).collect();
-    emitter.list(&list, &mut b);
-    let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, &mut b))).collect();
-    // Nothing changes from one iteration to the next: one is enough.
-    let count = if handed.is_empty() && func.writes.is_empty() { b.ins().iconst(types::I64, 1) } else { count };
+    emitter.list(&list, b);
+    let first: Vec<BlockArg> = carried.iter().map(|(load, _)| BlockArg::Value(emitter.get(*load, b))).collect();
     let first: Vec<BlockArg> =
         first.into_iter().chain([count].into_iter().chain(gone_ahead).map(BlockArg::Value)).collect();
     b.ins().jump(body, &first);
@@ -92,19 +130,19 @@ pub fn emit(
     }
     b.switch_to_block(body);
     let list: Vec<Value> = ops().filter(|value| !late[value.index()] && in_loop(&emitter, *value)).collect();
-    emitter.list(&list, &mut b);
-    emitter.writes(&func.writes, &mut b);
+    emitter.list(&list, b);
+    emitter.writes(&func.writes, b);
     let left = b.ins().iadd_imm_s(left, -1);
     match watch {
         Watch::Nothing => {
             b.ins().jump(more, &[]);
         }
         Watch::Status(status) => {
-            let status = emitter.get(status, &mut b);
+            let status = emitter.get(status, b);
             b.ins().brif(status, failed, &[], more, &[]);
         }
         Watch::Failed { when, is, .. } => {
-            let when = emitter.get(when, &mut b);
+            let when = emitter.get(when, b);
             let (yes, no) = if is { (failed, more) } else { (more, failed) };
             b.ins().brif(when, yes, &[], no, &[]);
         }
@@ -112,10 +150,10 @@ pub fn emit(
     b.switch_to_block(more);
     for (load, store) in in_block {
         let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
-        let value = emitter.get(*store, &mut b);
+        let value = emitter.get(*store, b);
         b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
     }
-    let next: Vec<BlockArg> = carried.iter().map(|(_, store)| BlockArg::Value(emitter.get(*store, &mut b))).collect();
+    let next: Vec<BlockArg> = carried.iter().map(|(_, store)| BlockArg::Value(emitter.get(*store, b))).collect();
     let instant = emitter.instant.map(|instant| b.ins().iadd_imm_s(instant, 8));
     let next: Vec<BlockArg> = next.into_iter().chain([left].into_iter().chain(instant).map(BlockArg::Value)).collect();
     let zero = b.ins().iconst(types::I64, 0);
@@ -124,28 +162,83 @@ pub fn emit(
     b.set_cold_block(failed);
     b.switch_to_block(failed);
     for value in ops().filter(|value| late[value.index()]) {
-        emitter.operation(value, &mut b);
+        emitter.operation(value, b);
     }
     let status = match watch {
         Watch::Nothing => zero,
-        Watch::Status(status) => emitter.get(status, &mut b),
-        Watch::Failed { detail, .. } => emitter.get(detail, &mut b),
+        Watch::Status(status) => emitter.get(status, b),
+        Watch::Failed { detail, .. } => emitter.get(detail, b),
     };
     b.ins().brif(status, exit, &[BlockArg::Value(status)], more, &[]);
 
     let status = b.append_block_param(exit, types::I64);
     b.switch_to_block(exit);
     for (slot, value) in &func.stores {
-        let value = emitter.get(*value, &mut b);
+        let value = emitter.get(*value, b);
         b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
     }
     b.ins().return_(&[status]);
+}
 
-    b.switch_to_block(nothing);
+/// Most operations of a function of which a single iteration has code of its own.
+const STRAIGHT: usize = 2000;
+
+/// Writes one iteration without a loop, from where `b` stands to its return.
+fn once(
+    apart: &Apart,
+    watch: Watch,
+    late: &[bool],
+    (block, pool): (clif::Value, clif::Value),
+    b: &mut FunctionBuilder,
+) {
+    let func = &apart.func;
+    let facts = Facts::of(func);
+    let mut emitter = Emitter::new(func, &facts, block, pool);
+    emitter.list(&apart.before, b);
+    for automaton in &apart.automata {
+        emitter.automaton(automaton, b);
+    }
+    emitter.list(&apart.behind, b);
+    emitter.writes(&func.writes, b);
+    for (slot, value) in &func.stores {
+        let value = emitter.get(*value, b);
+        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
+    }
+    let [fine, failed] = [(); 2].map(|()| b.create_block());
+    match watch {
+        Watch::Nothing => {
+            b.ins().jump(fine, &[]);
+        }
+        Watch::Status(status) => {
+            let status = emitter.get(status, b);
+            b.ins().brif(status, failed, &[], fine, &[]);
+        }
+        Watch::Failed { when, is, .. } => {
+            let (yes, no) = if is { (failed, fine) } else { (fine, failed) };
+            emitter.branch(when, yes, no, b);
+        }
+    }
+    b.switch_to_block(fine);
     let zero = b.ins().iconst(types::I64, 0);
     b.ins().return_(&[zero]);
-    b.seal_all_blocks();
-    b.finalize(isa.frontend_config());
+    b.set_cold_block(failed);
+    b.switch_to_block(failed);
+    // What is stored is read from there, so that nothing holds it until here.
+    for (slot, value) in &func.stores {
+        if !matches!(func.op(*value), Op::Load(_)) {
+            let stored = b.ins().load(types::F64, MemFlagsData::trusted(), block, offset(slot.0));
+            emitter.values[value.index()] = Some(stored);
+        }
+    }
+    for (i, _) in late.iter().enumerate().filter(|(_, late)| **late) {
+        emitter.operation(Value(i as u32), b);
+    }
+    let status = match watch {
+        Watch::Nothing => b.ins().iconst(types::I64, 0),
+        Watch::Status(status) => emitter.get(status, b),
+        Watch::Failed { detail, .. } => emitter.get(detail, b),
+    };
+    b.ins().return_(&[status]);
 }
 
 /// Most slots that are handed from one iteration to the next in registers, as far as these reach. More only travel through
@@ -203,15 +296,20 @@ struct Sides {
     members: Vec<Vec<Value>>,
     /// The two sides of a choice that is taken apart.
     of_choice: HashMap<Value, [usize; 2]>,
+    /// Choices that stand behind each other and ask the same are taken apart together: those of the first of them.
+    together: HashMap<Value, Vec<Value>>,
 }
 
 /// Operations, by their cost, from which on a side is long.
 const LONG_SIDE: u32 = 4;
+/// Questions of one choice that are asked one after the other, at most.
+const MOST_QUESTIONS: usize = 32;
 /// Choices within choices, at most.
 const DEEPEST: usize = 24;
 
 impl Sides {
-    fn of(func: &Func, list: &[Value]) -> Sides {
+    /// Of a list from which the rest of the function, or only `outputs` if these are given, is computed.
+    fn of(func: &Func, list: &[Value], outputs: Option<&[Value]>) -> Sides {
         // A side has its choice, and which of its operands it is; 0 is no side.
         struct Side {
             choice: Value,
@@ -236,29 +334,54 @@ impl Sides {
                 *side = Some(0);
             }
         };
-        func.results().for_each(&mut elsewhere);
-        for (i, op) in func.ops.iter().enumerate() {
-            if !listed.contains_key(&Value(i as u32)) {
-                op.each_operand(&mut elsewhere);
+        if let Some(outputs) = outputs {
+            outputs.iter().copied().for_each(&mut elsewhere);
+        } else {
+            func.results().for_each(&mut elsewhere);
+            for (i, op) in func.ops.iter().enumerate() {
+                if !listed.contains_key(&Value(i as u32)) {
+                    op.each_operand(&mut elsewhere);
+                }
             }
         }
+        let (together, mut followers) = (together(func, list), HashSet::new());
+        followers.extend(together.values().flat_map(|choices| &choices[1..]).copied());
         for value in list.iter().rev() {
-            let own = side_of[value].unwrap_or(0);
-            sides[own].cost += cost(func.op(*value));
+            if followers.contains(value) {
+                continue;
+            }
+            let choices = together.get(value).map_or(std::slice::from_ref(value), |choices| choices);
+            let uses = choices.iter().filter_map(|choice| side_of[choice]);
+            let own = uses.reduce(|a, b| common(&sides, a, b)).unwrap_or(0);
+            for choice in choices {
+                side_of.insert(*choice, Some(own));
+                sides[own].cost += cost(func.op(*choice));
+            }
             let mut used = |operand: Value, at: usize, sides: &[Side]| {
                 if let Some(known) = side_of.get_mut(&operand) {
                     *known = Some(known.map_or(at, |known| common(sides, known, at)));
                 }
             };
             match func.op(*value) {
-                Op::Select(when, yes, no) if yes != no && when != yes && when != no && sides[own].depth < DEEPEST => {
+                Op::Select(when, yes, no)
+                    if sides[own].depth < DEEPEST && (choices.len() > 1 || yes != no && when != yes && when != no) =>
+                {
                     let depth = sides[own].depth + 1;
                     let first = sides.len();
                     sides.extend([(); 2].map(|()| Side { choice: *value, within: own, depth, cost: 0 }));
                     of_choice.insert(*value, [first, first + 1]);
                     used(when, own, &sides);
-                    used(yes, first, &sides);
-                    used(no, first + 1, &sides);
+                    for choice in choices {
+                        let Op::Select(_, yes, no) = func.op(*choice) else { unreachable!("it is a choice") };
+                        used(yes, first, &sides);
+                        used(no, first + 1, &sides);
+                    }
+                }
+                Op::Select(when, ..) if choices.len() > 1 => {
+                    used(when, own, &sides);
+                    for choice in choices {
+                        func.op(*choice).each_operand(|operand| used(operand, own, &sides));
+                    }
                 }
                 op => op.each_operand(|operand| used(operand, own, &sides)),
             }
@@ -269,7 +392,12 @@ impl Sides {
             sides[within].cost += cost;
         }
         let long = |side: usize| sides[side].cost >= LONG_SIDE;
-        of_choice.retain(|_, pair| pair.iter().any(|side| long(*side)));
+        // What asks several questions is taken apart in any case: a jump for each costs less than to put them together.
+        let compound = |choice: Value| match func.op(choice) {
+            Op::Select(when, ..) => matches!(func.op(when), Op::And(..) | Op::Or(..)),
+            _ => false,
+        };
+        of_choice.retain(|choice, pair| compound(*choice) || pair.iter().any(|side| long(*side)));
         let kept = |mut side: usize| {
             while side != 0 && !of_choice.contains_key(&sides[side].choice) {
                 side = sides[side].within;
@@ -280,8 +408,35 @@ impl Sides {
         for value in list {
             members[kept(side_of[value].unwrap_or(0))].push(*value);
         }
-        Sides { members, of_choice }
+        Sides { members, of_choice, together }
     }
+}
+
+/// Choices of a list that stand behind each other and ask the same, if none chooses another: by the first of them.
+fn together(func: &Func, list: &[Value]) -> HashMap<Value, Vec<Value>> {
+    let mut together: HashMap<Value, Vec<Value>> = HashMap::new();
+    let mut run: Vec<Value> = Vec::new();
+    let mut asked = None;
+    for value in list {
+        let now = match func.op(*value) {
+            Op::Select(when, yes, no) if when != yes && when != no => {
+                let apart = ![yes, no].iter().any(|side| run.contains(side));
+                (apart || run.is_empty()).then_some(when)
+            }
+            _ => None,
+        };
+        if now.is_none() || now != asked {
+            run.clear();
+        }
+        asked = now;
+        if now.is_some() {
+            run.push(*value);
+            if run.len() > 1 {
+                together.insert(run[0], run.clone());
+            }
+        }
+    }
+    together
 }
 
 /// Rough cost in cycles of a processor that is busy.
@@ -418,28 +573,116 @@ impl<'a> Emitter<'a> {
 
     /// Writes operations of which each stands behind its operands.
     fn list(&mut self, list: &[Value], b: &mut FunctionBuilder) {
-        let sides = Sides::of(self.func, list);
+        let sides = Sides::of(self.func, list, None);
         self.side(0, &sides, b);
+    }
+
+    /// Writes what depends on one regime: of the numbers its slot may hold only what is left for that number.
+    fn automaton(&mut self, automaton: &Automaton, b: &mut FunctionBuilder) {
+        let behind = b.create_block();
+        let held = b.ins().load(types::I64, MemFlagsData::trusted(), self.block, offset(automaton.slot.0));
+        for (bits, case) in &automaton.cases {
+            let [this, others] = [(); 2].map(|()| b.create_block());
+            let bits = b.ins().iconst(types::I64, *bits as i64);
+            let is = b.ins().icmp(IntCC::Equal, held, bits);
+            b.ins().brif(is, this, &[], others, &[]);
+            b.switch_to_block(this);
+            self.case(case, behind, b);
+            b.switch_to_block(others);
+        }
+        self.case(&automaton.general, behind, b);
+        b.switch_to_block(behind);
+        for output in &automaton.outputs {
+            self.values[output.index()] = Some(b.append_block_param(behind, self.facts.type_of(*output)));
+        }
+    }
+
+    /// Writes one case and goes on behind it; nothing of it is there then.
+    fn case(&mut self, case: &Case, behind: clif::Block, b: &mut FunctionBuilder) {
+        let sides = Sides::of(self.func, &case.list, Some(&case.outputs));
+        self.side(0, &sides, b);
+        let outputs: Vec<BlockArg> = case.outputs.iter().map(|output| BlockArg::Value(self.get(*output, b))).collect();
+        b.ins().jump(behind, &outputs);
+        case.list.iter().for_each(|value| self.values[value.index()] = None);
+    }
+
+    /// Goes on at `yes` or at `no`: for what is put together from a few questions, one after the other.
+    fn branch(&self, when: Value, yes: clif::Block, no: clif::Block, b: &mut FunctionBuilder) {
+        let mut questions = 0;
+        let mut open = vec![when];
+        while let Some(value) = open.pop().filter(|_| questions <= MOST_QUESTIONS) {
+            questions += 1;
+            open.extend(self.parts(value).into_iter().flatten());
+        }
+        if questions <= MOST_QUESTIONS {
+            self.ask(when, yes, no, b);
+        } else {
+            let when = self.get(when, b);
+            b.ins().brif(when, yes, &[], no, &[]);
+        }
+    }
+
+    /// What a truth is put together from, if that is at hand.
+    fn parts(&self, value: Value) -> Option<[Value; 2]> {
+        let there = |value: Value| matches!(self.func.op(value), Op::Bool(_)) || self.values[value.index()].is_some();
+        match self.func.op(value) {
+            Op::And(a, b) | Op::Or(a, b) => Some([a, b]),
+            Op::Not(a) => Some([a, a]),
+            _ => None,
+        }
+        .filter(|parts| parts.iter().all(|part| there(*part)))
+    }
+
+    fn ask(&self, when: Value, yes: clif::Block, no: clif::Block, b: &mut FunctionBuilder) {
+        let Some([first, second]) = self.parts(when) else {
+            let when = self.get(when, b);
+            b.ins().brif(when, yes, &[], no, &[]);
+            return;
+        };
+        if let Op::Not(_) = self.func.op(when) {
+            return self.ask(first, no, yes, b);
+        }
+        let next = b.create_block();
+        match self.func.op(when) {
+            Op::And(..) => self.ask(first, next, no, b),
+            _ => self.ask(first, yes, next, b),
+        }
+        b.switch_to_block(next);
+        self.ask(second, yes, no, b);
     }
 
     /// Writes the operations of one side of a choice, or of none (0).
     fn side(&mut self, number: usize, sides: &Sides, b: &mut FunctionBuilder) {
+        let mut done = 0;
         for value in &sides.members[number] {
+            // Choices that were written together with the one before.
+            if done > 0 {
+                done -= 1;
+                continue;
+            }
             let Some([first, second]) = sides.of_choice.get(value) else {
                 self.operation(*value, b);
                 continue;
             };
-            let Op::Select(when, yes, no) = self.func.op(*value) else { unreachable!("it is a choice") };
-            let when = self.get(when, b);
+            let choices = sides.together.get(value).map_or(std::slice::from_ref(value), |choices| choices);
+            done = choices.len() - 1;
+            let select = |choice: &Value| match self.func.op(*choice) {
+                Op::Select(when, yes, no) => (when, [yes, no]),
+                _ => unreachable!("it is a choice"),
+            };
+            let results: Vec<[Value; 2]> = choices.iter().map(|choice| select(choice).1).collect();
             let [chosen, other, behind] = [(); 3].map(|()| b.create_block());
-            b.ins().brif(when, chosen, &[], other, &[]);
-            for (block, side, result) in [(chosen, first, yes), (other, second, no)] {
+            self.branch(select(value).0, chosen, other, b);
+            for (block, side, which) in [(chosen, first, 0), (other, second, 1)] {
                 b.switch_to_block(block);
                 self.side(*side, sides, b);
-                let result = self.get(result, b);
-                b.ins().jump(behind, &[BlockArg::Value(result)]);
+                let results: Vec<BlockArg> =
+                    results.iter().map(|pair| BlockArg::Value(self.get(pair[which], b))).collect();
+                b.ins().jump(behind, &results);
             }
-            self.values[value.index()] = Some(b.append_block_param(behind, self.facts.type_of(*value)));
+            for choice in choices {
+                self.values[choice.index()] = Some(b.append_block_param(behind, self.facts.type_of(*choice)));
+            }
             b.switch_to_block(behind);
         }
     }

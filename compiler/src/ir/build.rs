@@ -4,7 +4,7 @@
 //! [`evaluate`] that defines the operations, so that folding changes no result.
 
 use super::eval::evaluate;
-use super::verify::result;
+use super::verify::{result, types};
 use super::{Binary, Func, Op, Type, Unary, Value, Write};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap};
@@ -31,6 +31,21 @@ impl Build {
     /// An empty function of this name.
     pub fn new(name: &str) -> Build {
         Build { name: name.into(), ..Build::default() }
+    }
+
+    /// What `func` computes, each operation at its number, to which more can be added; without its results.
+    pub fn of(func: &Func) -> Build {
+        let mut build = Build { ops: func.ops.clone(), ..Build::new(&func.name) };
+        build.types = types(func).expect("the function is sound");
+        for (i, op) in func.ops.iter().enumerate() {
+            build.known.entry(*op).or_insert(Value(i as u32));
+        }
+        build
+    }
+
+    /// All operations, those that nothing needs included.
+    pub fn into_ops(self) -> Vec<Op> {
+        self.ops
     }
 
     /// Lets reads of the pool at a constant place fold: `pool` is a beginning of the pool the function will run with.
@@ -80,11 +95,37 @@ impl Build {
             Rewrite::Op(simpler) => return self.op(simpler),
             Rewrite::None => {}
         }
+        if let Some(value) = self.told_apart(op) {
+            return value;
+        }
         let op = self.ordered(op);
         if let Some(constant) = self.fold(op) {
             return self.share(constant);
         }
         self.share(op)
+    }
+
+    /// (if c then 1 else x) = 2 → not c and x = 2, and so on: which regime it is follows from what chose it.
+    fn told_apart(&mut self, op: Op) -> Option<Value> {
+        let Op::Equal(a, b) = op else { return None };
+        let (choice, number) = if self.constant(b).is_some() { (a, b) } else { (b, a) };
+        self.constant(number)?;
+        let Op::Select(condition, yes, no) = self.get(choice) else { return None };
+        if self.constant(yes).is_none() && self.constant(no).is_none() {
+            return None;
+        }
+        let [yes, no] = [yes, no].map(|side| self.op(Op::Equal(side, number)));
+        match (self.get(yes), self.get(no)) {
+            (Op::Bool(false), _) => {
+                let not = self.op(Op::Not(condition));
+                Some(self.op(Op::And(not, no)))
+            }
+            (_, Op::Bool(true)) => {
+                let not = self.op(Op::Not(condition));
+                Some(self.op(Op::Or(not, yes)))
+            }
+            _ => Some(self.op(Op::Select(condition, yes, no))),
+        }
     }
 
     fn share(&mut self, op: Op) -> Value {
@@ -720,6 +761,19 @@ mod tests {
             both.finish().to_string(),
             "both:\n  v0 = load 3\n  v1 = 2.0\n  v2 = mul v0 v1\n  v3 = mul v1 v2\n  store 3 = v3\n"
         );
+    }
+
+    #[test]
+    fn which_constant_was_chosen_is_asked_of_the_choice() {
+        let listing = built(|b, x, y| {
+            let [one, two] = [1.0, 2.0].map(|number| b.real(number));
+            let less = b.less(x, y);
+            let chosen = b.select(less, one, x);
+            b.equal(chosen, two)
+        });
+        let expected = "v0 = load 3; v1 = load 4; v2 = 1.0; v3 = 2.0; v4 = less v0 v1; v5 = equal v0 v3; v6 = not v4; \
+                        v7 = and v5 v6; v8 = 0.0; v9 = select v7 v2 v8; store 9 = v9";
+        assert_eq!(listing, expected);
     }
 
     #[test]

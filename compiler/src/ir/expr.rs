@@ -197,6 +197,15 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less(other, self.value))
     }
 
+    /// self ≤ other; false of NaN.
+    pub fn not_above<T>(self, other: T) -> Truth<'a>
+    where
+        Real<'a>: From<(T, &'a Shared)>,
+    {
+        let other = self.other(other);
+        self.truth(|b| b.less_equal(self.value, other))
+    }
+
     /// Whether it is neither infinite nor NaN.
     pub fn finite(self) -> Truth<'a> {
         self.truth(|b| b.finite(self.value))

@@ -8,6 +8,7 @@
 
 pub mod tables;
 pub mod exponential;
+pub mod relaxation;
 mod logarithm;
 mod trigonometric;
 #[cfg(test)]
