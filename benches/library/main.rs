@@ -75,7 +75,7 @@ enum State {
 }
 
 fn main() {
-    let library = gcc::built("abi/models.c");
+    let library = gcc::built("library/models.c");
     // SAFETY: the table is in the source; it ends with an entry without a name.
     let hands = unsafe { library.get::<*const Hand>(b"models") }.expect("the source has a table");
     let hand = |name: &str| {
