@@ -222,7 +222,8 @@ pub trait Bus {
     /// The next thing that came, if any.
     fn receive(&mut self) -> Option<Received>;
 
-    /// Waits until something can be received or the clock shows `until_ns`; says whether something came.
+    /// Waits until something can be received or the clock shows `until_ns`; says whether something came. On a line of text that
+    /// may be an answer, or a part of a frame, of which [`receive`](Bus::receive) makes nothing yet.
     fn wait(&mut self, until_ns: u64) -> bool;
 
     /// How it is.
