@@ -34,10 +34,6 @@ pub const MOST_BEFORE_SURFACE: f64 = 0.9;
 /// and so often in a row without anybody looking.
 pub const MOST_OVERRUNS: f64 = 3.0;
 
-/// Where the length of a step times the mean eigenvalue is larger, or the square of the one times the mean square of the
-/// other is larger than the square of this, the stiff method suits.
-pub const STIFF: f64 = 0.5;
-
 /// Parts of the next stop below which nobody but the run itself decides on a step.
 pub const LEAST_STEP: f64 = 32.0 * f64::EPSILON;
 

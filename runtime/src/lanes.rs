@@ -41,6 +41,7 @@ pub fn run<T>(
     let mut all: Vec<Option<Lane<T>>> = (0..batch.width()).map(|_| None).collect();
     // Which lanes without a run do what no run does.
     let mut astray = vec![true; batch.width()];
+    let mut pool = None;
     let (mut calm, mut total, mut more) = (0, 0, true);
     loop {
         let stride = (calm / PART).clamp(1, MOST);
@@ -62,8 +63,9 @@ pub fn run<T>(
             }
         }
         let next = all.iter().flatten().map(|lane| lane.until).min().expect("there is one");
-        let pool = all[model].as_mut().expect("there is one").course.instance().description().pool.clone();
-        let done = batch.advance(&pool, (next - total).min(stride));
+        let course = &mut all[model].as_mut().expect("there is one").course;
+        let pool = pool.get_or_insert_with(|| course.instance().description().pool.clone());
+        let done = batch.advance(pool, (next - total).min(stride));
         total += done;
         let mut looked = false;
         for (number, place) in all.iter_mut().enumerate() {

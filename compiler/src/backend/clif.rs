@@ -252,12 +252,27 @@ pub enum Watch {
     Nothing,
     /// A status that is not 0.
     Status(Value),
-    /// Whether a truth `is` so; the status then is `detail`.
-    #[allow(missing_docs)]
-    Failed { when: Value, is: bool, detail: Value },
+    /// A truth; the status then is a detail.
+    Failed {
+        /// The truth,
+        when: Value,
+        /// as it is then.
+        is: bool,
+        /// The status.
+        detail: Value,
+    },
 }
 
 impl Watch {
+    /// What is asked after each iteration, and what only then, if that says so.
+    pub fn asked(self) -> (Option<Value>, Option<Value>) {
+        match self {
+            Watch::Nothing => (None, None),
+            Watch::Status(status) => (Some(status), None),
+            Watch::Failed { when, detail, .. } => (Some(when), Some(detail)),
+        }
+    }
+
     /// How to watch the status of `func`, and which operations only its detail needs.
     pub fn of(func: &Func) -> (Watch, Vec<bool>) {
         let mut late = vec![false; func.ops.len()];
@@ -355,7 +370,7 @@ impl Sides {
             let own = uses.reduce(|a, b| common(&sides, a, b)).unwrap_or(0);
             for choice in choices {
                 side_of.insert(*choice, Some(own));
-                sides[own].cost += cost(func.op(*choice));
+                sides[own].cost += func.op(*choice).effort();
             }
             let mut used = |operand: Value, at: usize, sides: &[Side]| {
                 if let Some(known) = side_of.get_mut(&operand) {
@@ -437,16 +452,6 @@ fn together(func: &Func, list: &[Value]) -> HashMap<Value, Vec<Value>> {
         }
     }
     together
-}
-
-/// Rough cost in cycles of a processor that is busy.
-fn cost(op: Op) -> u32 {
-    match op {
-        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
-        Op::Div(..) | Op::Sqrt(_) => 6,
-        Op::Pool { .. } | Op::Ring { .. } => 2,
-        _ => 1,
-    }
 }
 
 /// What is known of the values of a function.

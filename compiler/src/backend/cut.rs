@@ -122,11 +122,7 @@ impl<'a> Line<'a> {
         let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
         // What a failed guard tells of the block is read before the block changes.
         let read = values(func).filter(|value| kept[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
-        let (tested, detail) = match watch {
-            Watch::Nothing => (None, None),
-            Watch::Status(status) => (Some(status), None),
-            Watch::Failed { when, detail, .. } => (Some(when), Some(detail)),
-        };
+        let (tested, detail) = watch.asked();
         for root in rest.into_iter().map(|(_, value)| value).chain(written).chain(tested).chain(read) {
             order.visit(root, None);
         }
@@ -229,11 +225,7 @@ impl<'a> Line<'a> {
 
     /// What is asked after an iteration.
     fn outcomes(&self) -> impl Iterator<Item = Value> {
-        let (first, second) = match self.watch {
-            Watch::Nothing => (None, None),
-            Watch::Status(status) => (Some(status), None),
-            Watch::Failed { when, detail, .. } => (Some(when), Some(detail)),
-        };
+        let (first, second) = self.watch.asked();
         first.into_iter().chain(second)
     }
 

@@ -210,6 +210,16 @@ impl Write {
 }
 
 impl Op {
+    /// What it takes of a processor's time, in instructions of one cycle; only its order of size matters.
+    pub fn effort(self) -> u32 {
+        match self {
+            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
+            Op::Div(..) | Op::Sqrt(_) => 5,
+            Op::Pool { .. } | Op::Ring { .. } => 2,
+            _ => 1,
+        }
+    }
+
     /// The same operation on the operands that `f` gives for its own, asked from left to right.
     pub fn map(self, mut f: impl FnMut(Value) -> Value) -> Op {
         match self {

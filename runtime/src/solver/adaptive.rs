@@ -19,7 +19,7 @@ use crate::outcome::{Cause, Chatter, Continue, Stop, Work};
 use abi::description::{Guard, Kind};
 use abi::pace::{
     BEFORE_SURFACE, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_BEFORE_SURFACE,
-    MOST_REFUSED, NEARLY, SAFETY, STIFF, inverse_fifth_root,
+    MOST_REFUSED, NEARLY, SAFETY, inverse_fifth_root,
 };
 use abi::plan::Experiment;
 use abi::{Function, Instance, Slot};
@@ -42,6 +42,10 @@ const MOST_IN_PLACE: u64 = 20_000;
 
 /// So often a step is made again to end before a surface without anything coming of it.
 const MOST_AIMS: u8 = 4;
+
+/// Where the length of a step times the mean eigenvalue is larger, or the square of the one times the mean square of the
+/// other is larger than the square of this, the stiff method suits.
+const STIFF: f64 = 0.5;
 
 /// Tries between two looks at the caller.
 const WATCHED: u64 = 64;

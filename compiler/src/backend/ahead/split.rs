@@ -43,16 +43,6 @@ fn least_effort(handed: usize) -> u32 {
     24 + 4 * handed as u32
 }
 
-/// What an operation takes of the processor's time, in instructions of one cycle; only its order of size matters.
-fn effort(op: Op) -> u32 {
-    match op {
-        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
-        Op::Div(..) | Op::Sqrt(_) => 5,
-        Op::Pool { .. } | Op::Ring { .. } => 2,
-        _ => 1,
-    }
-}
-
 /// The parts of a step on blocks of `size` slots, if what depends on time alone is worth it.
 pub fn split(func: &Func, size: usize) -> Option<Split> {
     if !keeps_time(func) {
@@ -82,7 +72,7 @@ pub fn split(func: &Func, size: usize) -> Option<Split> {
     let in_instants = marked(marks(&handed), &|i| !kept_once(i));
     let ops = |marks: &[bool]| (0..func.ops.len()).filter(|i| marks[*i]).map(|i| Value(i as u32)).collect::<Vec<_>>();
     let spared: u32 =
-        ops(&in_instants).into_iter().filter(|at| on[at.index()] == On::Time).map(|at| effort(func.op(at))).sum();
+        ops(&in_instants).into_iter().filter(|at| on[at.index()] == On::Time).map(|at| func.op(at).effort()).sum();
     if handed.is_empty() || spared < least_effort(handed.len()) {
         return None;
     }
@@ -183,7 +173,7 @@ fn handed(func: &Func, on: &[On], types: &[Type]) -> Vec<Value> {
             continue;
         }
         // A truth is not kept in a number, and what is as quickly computed as loaded stays where it is.
-        let mut quick = effort(op) <= 1;
+        let mut quick = op.effort() <= 1;
         op.each_operand(|operand| {
             let far = on[operand.index()] == On::Time && !matches!(func.op(operand), Op::Load(_));
             quick &= !far;

@@ -329,25 +329,39 @@ fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
         let most = of.iter().enumerate().map(|(before, need)| need + before).max();
         need.push(if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) });
     }
-    let mut done = vec![false; nodes.nodes.len()];
+    let operands = |node: Node| {
+        let mut operands: Vec<Node> = nodes.nodes[node.index()].operands().collect();
+        operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
+        operands
+    };
+    behind_operands(roots, nodes.nodes.len(), Node::index, is_read, operands)
+}
+
+/// What roots need, each behind its operands and once, each root's own in one piece; `index` tells nodes apart, of which there
+/// are `count`, what `is_read` stands nowhere, and `operands` come in the order in which they are wanted.
+fn behind_operands<N: Copy>(
+    roots: &[N],
+    count: usize,
+    index: impl Fn(N) -> usize,
+    is_read: impl Fn(N) -> bool,
+    operands: impl Fn(N) -> Vec<N>,
+) -> Vec<N> {
+    let mut done = vec![false; count];
     let mut out = Vec::new();
     for root in roots {
         let mut open = vec![(*root, false)];
         while let Some((node, ready)) = open.pop() {
-            let what = nodes.nodes[node.index()];
-            if done[node.index()] || is_read(node) {
+            if done[index(node)] || is_read(node) {
                 continue;
             }
             if ready {
-                done[node.index()] = true;
+                done[index(node)] = true;
                 out.push(node);
                 continue;
             }
             open.push((node, true));
             // The last pushed is done first.
-            let mut operands: Vec<Node> = what.operands().collect();
-            operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
-            open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
+            open.extend(operands(node).into_iter().rev().map(|operand| (operand, false)));
         }
     }
     out

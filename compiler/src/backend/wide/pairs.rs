@@ -7,6 +7,7 @@
 
 use super::super::clif::signature;
 use super::super::target::Unsupported;
+use super::behind_operands;
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
@@ -245,25 +246,8 @@ fn operands(func: &Func, value: Value) -> Vec<Value> {
 /// What roots need of the operations that are wanted: each root's own in one piece, operands first, so that what is computed
 /// is soon used.
 fn order(func: &Func, roots: &[Value], wanted: &[bool]) -> Vec<Value> {
-    let mut done = vec![false; func.ops.len()];
-    let mut out = Vec::new();
-    for root in roots {
-        let mut open = vec![(*root, false)];
-        while let Some((value, ready)) = open.pop() {
-            if done[value.index()] || !wanted[value.index()] || is_leaf(func.op(value)) {
-                continue;
-            }
-            if ready {
-                done[value.index()] = true;
-                out.push(value);
-                continue;
-            }
-            open.push((value, true));
-            // The last pushed is done first.
-            open.extend(operands(func, value).into_iter().rev().map(|operand| (operand, false)));
-        }
-    }
-    out
+    let is_read = |value: Value| !wanted[value.index()] || is_leaf(func.op(value));
+    behind_operands(roots, func.ops.len(), Value::index, is_read, |value| operands(func, value))
 }
 
 /// A straight line being written.
