@@ -85,6 +85,10 @@ pub fn advance(program: &Program, method: Method) -> Func {
     build.finish()
 }
 
+/// Guards that are put together before they meet others, so that many do not wait for each other one by one, and those of
+/// parts of one kind are computed alike.
+const TOGETHER: usize = 8;
+
 /// The status: 0, or the number of the first guard whose quantity is not finite or out of its range by more than 1e-6
 /// of the range's width or, of a range open on one side, of its bound.
 fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
@@ -92,20 +96,22 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let mut outside: Option<Truth> = None;
     let number = |n: i64| build.borrow_mut().int(n);
     let mut first = number(0);
-    for (k, guard) in guards.iter().enumerate().rev() {
-        let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
-        // Of something infinite or NaN this is NaN, and so is the sum.
-        fine = Some(fine.map_or_else(|| 0.0 * x, |sum| x.fma(0.0, sum)));
-        let (low, high) = widened(guard.range);
-        let mut bad = !x.finite();
-        for (bounded, beyond) in [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))] {
-            if bounded {
-                bad = bad | beyond;
-                outside = Some(outside.map_or(beyond, |any| any | beyond));
-            }
+    for (group, guards) in guards.chunks(TOGETHER).enumerate().rev() {
+        let (mut sum, mut beyond): (Option<Real>, Option<Truth>) = (None, None);
+        for (k, guard) in guards.iter().enumerate().rev() {
+            let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
+            // Of something infinite or NaN this is NaN, and so is the sum.
+            sum = Some(sum.map_or_else(|| 0.0 * x, |sum| x.fma(0.0, sum)));
+            let (low, high) = widened(guard.range);
+            let bounds = [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))];
+            let out = bounds.into_iter().filter(|(bounded, _)| *bounded).map(|(_, out)| out).reduce(|a, b| a | b);
+            beyond = either(beyond, out);
+            let bad = out.map_or(!x.finite(), |out| !x.finite() | out);
+            let this = number((group * TOGETHER + k) as i64 + 1);
+            first = build.borrow_mut().select(bad.value, this, first);
         }
-        let this = number(k as i64 + 1);
-        first = build.borrow_mut().select(bad.value, this, first);
+        fine = fine.zip(sum).map(|(all, sum)| all + sum).or(sum);
+        outside = either(outside, beyond);
     }
     // One test decides; which guard it is matters only then, and code may find it out apart from the step.
     let fine = fine?;
@@ -114,6 +120,14 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let any = outside.map_or(!finite, |outside| outside | !finite);
     let none = number(0);
     Some(build.borrow_mut().select(any.value, first, none))
+}
+
+/// Both that are there, or the one that is.
+fn either<'a>(a: Option<Truth<'a>>, b: Option<Truth<'a>>) -> Option<Truth<'a>> {
+    match (a, b) {
+        (Some(a), Some(b)) => Some(a | b),
+        (a, b) => a.or(b),
+    }
 }
 
 /// A range and its tolerance.

@@ -140,7 +140,7 @@ fn pieces_agree() {
         let (func, pool, layout, blocks) = of_chance(&mut random);
         let least = 1 + random.below(8);
         let facts = Facts::of(&func);
-        let lengths = Lengths { whole: 0, least, most: least + random.below(9), words: u32::MAX };
+        let lengths = Lengths { whole: 0, least, most: least + random.below(9), words: u32::MAX, fewest: 2 };
         let all = cut(&func, &facts, lengths).expect("there is room");
         let again = cut(&func, &facts, Lengths { words: all.words.saturating_sub(1), ..lengths });
         let words = again.map_or(all.words, |cut| cut.words);
@@ -153,6 +153,88 @@ fn pieces_agree() {
     }
     println!("{pieces} pieces, {crossing} values that cross");
     assert!(pieces > 10_000 && crossing > 10_000);
+}
+
+/// So many copies of a function by chance, each on slots of its own, which lie in equal distances, and on some that all share
+/// or that are a neighbour's; what some of them compute is added up, and the first status that is not 0 is the status.
+fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
+    let one = random::layout();
+    let len = 20 + random.below(60);
+    let part = random::func(random, len);
+    let segments = |layout: &Layout| {
+        [layout.params, layout.inputs, layout.states, layout.memory, layout.regimes, layout.outputs, layout.due]
+    };
+    let sizes = segments(&one).map(|segment| segment.len);
+    let all = sizes.map(|len| len * copies as u32);
+    let layout = Layout::new([all[0], all[1], all[2], all[3], all[4], all[5], 0, 0, 0, all[6]]);
+    let side_by_side = random.below(2) == 0;
+    let of_copy = |slot: Slot, copy: usize| {
+        let k = segments(&one).iter().position(|segment| segment.contains(slot));
+        k.map_or(slot, |k| {
+            let place = slot.0 - segments(&one)[k].start;
+            let place = if side_by_side { place * copies as u32 + copy as u32 } else { copy as u32 * sizes[k] + place };
+            segments(&layout)[k].slot(place as usize)
+        })
+    };
+    let shared: Vec<Slot> = part.loads().into_iter().filter(|_| random.below(4) == 0).collect();
+    let neighbours: Vec<Slot> = part.loads().into_iter().filter(|_| random.below(6) == 0).collect();
+    let clock = |slot: Slot| slot.0 < Slot::FIXED;
+    let mut build = Build::new("copies");
+    let (mut sum, mut status) = (build.real(0.0), build.int(0));
+    let (added, zero) = (random.below(part.ops.len()), build.int(0));
+    let types = crate::ir::verify::types(&part).unwrap();
+    for copy in 0..copies {
+        let mut values: Vec<Value> = Vec::new();
+        for op in &part.ops {
+            let of = |slot: Slot| match slot {
+                slot if shared.contains(&slot) => of_copy(slot, 0),
+                slot if neighbours.contains(&slot) => of_copy(slot, (copy + 1) % copies),
+                slot => of_copy(slot, copy),
+            };
+            let op = match *op {
+                Op::Load(slot) => Op::Load(of(slot)),
+                Op::Ring { .. } => Op::Load(Slot::TIME),
+                op => op.map(|operand| values[operand.index()]),
+            };
+            values.push(build.op(op));
+        }
+        for (slot, value) in part.stores.iter().filter(|(slot, _)| copy == 0 || !clock(*slot)) {
+            build.store(of_copy(*slot, copy), values[value.index()]);
+        }
+        if let crate::ir::Type::Real = types[added] {
+            sum = build.add(sum, values[added]);
+        }
+        if let Some(value) = part.status {
+            let fine = build.op(Op::IntEqual(status, zero));
+            status = build.select(fine, values[value.index()], status);
+        }
+    }
+    build.store(layout.outputs.slot(0), sum);
+    build.status(status);
+    (build.finish(), layout)
+}
+
+/// What is repeated gives in a loop what it gives one by one.
+#[test]
+fn repeats_agree() {
+    let (mut loops, mut rows, mut stores) = (0, 0, 0);
+    for seed in 0..1000 {
+        let mut random = Random(seed);
+        let of = 2 + random.below(7);
+        let (func, layout) = copies(&mut random, of);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let blocks: Vec<Vec<f64>> = (0..4).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
+        let (least, most) = (1 + random.below(30), 31 + random.below(30));
+        let lengths = Lengths { whole: 0, least, most, words: u32::MAX, fewest: 2 + random.below(2) };
+        let cut = cut(&func, &Facts::of(&func), lengths).expect("there is room");
+        loops += cut.pieces.iter().filter(|piece| !piece.rows.is_empty()).count();
+        rows += cut.pieces.iter().map(|piece| piece.rows.len()).sum::<usize>();
+        stores += cut.pieces.iter().map(|piece| piece.row_stores.len()).sum::<usize>();
+        let count = 1 + random.below(5) as u64;
+        check_cut(&func, &layout, &blocks, &pool, count, lengths, &format!("seed {seed}, {of} copies, {lengths:?}"));
+    }
+    println!("{loops} loops of {rows} rows, which store {stores} themselves");
+    assert!(loops > 1000 && rows > 5000 && stores > 500);
 }
 
 /// The loop in the code does what as many single calls do, and stops where they stop.

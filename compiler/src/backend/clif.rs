@@ -582,6 +582,12 @@ impl<'a> Emitter<'a> {
         self.side(0, &sides, b);
     }
 
+    /// Writes operations of which each stands behind its operands, and of which only the outputs are read elsewhere.
+    pub fn only(&mut self, list: &[Value], outputs: &[Value], b: &mut FunctionBuilder) {
+        let sides = Sides::of(self.func, list, Some(outputs));
+        self.side(0, &sides, b);
+    }
+
     /// Writes what depends on one regime: of the numbers its slot may hold only what is left for that number.
     fn automaton(&mut self, automaton: &Automaton, b: &mut FunctionBuilder) {
         let behind = b.create_block();
@@ -604,8 +610,7 @@ impl<'a> Emitter<'a> {
 
     /// Writes one case and goes on behind it; nothing of it is there then.
     fn case(&mut self, case: &Case, behind: clif::Block, b: &mut FunctionBuilder) {
-        let sides = Sides::of(self.func, &case.list, Some(&case.outputs));
-        self.side(0, &sides, b);
+        self.only(&case.list, &case.outputs, b);
         let outputs: Vec<BlockArg> = case.outputs.iter().map(|output| BlockArg::Value(self.get(*output, b))).collect();
         b.ins().jump(behind, &outputs);
         case.list.iter().for_each(|value| self.values[value.index()] = None);

@@ -1,7 +1,8 @@
 //! Cuts a long line into pieces, since the time to find registers grows faster than a function does.
 //!
 //! In: a sound, expanded function. Out: a [`Cut`]: which operations each piece computes, which values it leaves for later
-//! pieces and where, and when each slot may be stored. It knows nothing of processors.
+//! pieces and where, and when each slot may be stored. What [repeats](super::repeats) itself is one piece, a loop. It knows
+//! nothing of processors.
 //!
 //! ```text
 //! before  what no iteration changes, once a call
@@ -12,9 +13,10 @@
 //! first, and of the places to cut that come into question it is the one that the fewest values cross.
 
 use super::clif::{Facts, Watch};
+use super::repeats::{Repeats, equal_distances, repeats};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::ops::Range;
 
 /// How long functions and their pieces are, in operations.
@@ -28,11 +30,13 @@ pub struct Lengths {
     pub most: usize,
     /// Words of the scratch area at most.
     pub words: u32,
+    /// Repetitions from which on they are a loop.
+    pub fewest: usize,
 }
 
 impl Lengths {
     /// Pieces for which registers are found quickly, and an area that is part of what a thread in real time touches ahead.
-    pub const USUAL: Lengths = Lengths { whole: 2000, least: 600, most: 1200, words: 32_768 };
+    pub const USUAL: Lengths = Lengths { whole: 2000, least: 600, most: 1200, words: 32_768, fewest: 8 };
 }
 
 /// Consecutive operations, compiled together.
@@ -44,11 +48,25 @@ pub struct Piece {
     pub stores: Vec<(Slot, Value)>,
     /// What it writes to rings after that.
     pub writes: Vec<Write>,
+    /// It is a loop over rows of operations; then it has nothing of the above.
+    pub rows: Vec<usize>,
+    /// Rows whose values each repetition stores at its end: the slot of the first, the distance to the next, the row.
+    pub row_stores: Vec<(Slot, i64, usize)>,
+}
+
+impl Piece {
+    /// What it computes, of a loop in all its repetitions.
+    fn values<'a>(&'a self, repeats: &'a Repeats) -> impl Iterator<Item = Value> + 'a {
+        let rows = self.rows.iter().flat_map(|row| &repeats.rows[*row].members);
+        self.ops.iter().chain(rows).copied()
+    }
 }
 
 /// A function in pieces.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Cut {
+    /// Rows of operations that are repeated.
+    pub repeats: Repeats,
     /// In the order in which they run.
     pub pieces: Vec<Piece>,
     /// Of the pieces: those that run in each iteration. What stands before runs once, what stands behind if a guard failed.
@@ -137,20 +155,44 @@ impl<'a> Line<'a> {
     }
 
     fn cut(&self, lengths: Lengths) -> Cut {
-        let parts = [&self.before, &self.each, &self.failed].map(|ops| self.parts(ops, lengths));
+        let lists = [&self.before[..], &self.each, &self.failed];
+        let results = self.func.results().chain(self.outcomes());
+        let repeats = repeats(self.func, lists, results, lengths.fewest);
+        let [mut pieces, mut each, mut failed] = lists.map(|ops| self.pieces(ops, &repeats, lengths));
         // There is a last piece of each iteration, which stores what is left.
-        let [before, each, failed] = [parts[0].len(), parts[1].len().max(1), parts[2].len()];
-        let mut pieces = vec![Piece::default(); before + each + failed];
-        let each = before..before + each;
-        for (begin, parts) in [0, each.start, each.end].into_iter().zip(parts) {
-            for (piece, ops) in pieces[begin..].iter_mut().zip(parts) {
-                piece.ops = ops;
-            }
+        if each.last().is_none_or(|piece| !piece.rows.is_empty()) {
+            each.push(Piece::default());
         }
-        self.store(&mut pieces, &each);
-        let homes = self.homes(&pieces, &each);
-        let words = homes.values().max().map_or(0, |last| last + 1);
-        Cut { pieces, each, homes, words }
+        let range = pieces.len()..pieces.len() + each.len();
+        pieces.append(&mut each);
+        pieces.append(&mut failed);
+        self.store(&mut pieces, &range, &repeats);
+        let (homes, words) = self.homes(&pieces, &range, &repeats);
+        Cut { repeats, pieces, each: range, homes, words }
+    }
+
+    /// The operations in pieces: what is not repeated in parts, what is in loops, in turn.
+    fn pieces(&self, ops: &[Value], repeats: &Repeats, lengths: Lengths) -> Vec<Piece> {
+        let mut order = ops.to_vec();
+        order.sort_by_key(|value| repeats.level(*value));
+        let mut pieces = Vec::new();
+        for level in order.chunk_by(|a, b| repeats.level(*a) == repeats.level(*b)) {
+            if repeats.row(level[0]).is_none() {
+                pieces.extend(self.parts(level, lengths).into_iter().map(|ops| Piece { ops, ..Piece::default() }));
+                continue;
+            }
+            let mut loops: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+            for row in level.iter().filter_map(|value| repeats.row(*value)) {
+                loops.entry(repeats.rows[row].members.len()).or_default().push(row);
+            }
+            pieces.extend(loops.into_values().map(|mut rows| {
+                // Operands stand first.
+                rows.sort_unstable_by_key(|row| repeats.rows[*row].members[0]);
+                rows.dedup();
+                Piece { rows, ..Piece::default() }
+            }));
+        }
+        pieces
     }
 
     /// The operations in parts, cut where the fewest values cross.
@@ -189,16 +231,14 @@ impl<'a> Line<'a> {
     }
 
     /// Puts each store into the first piece of an iteration at whose end its value is there and its slot is read no more.
-    fn store(&self, pieces: &mut [Piece], each: &Range<usize>) {
+    fn store(&self, pieces: &mut [Piece], each: &Range<usize>, repeats: &Repeats) {
         let last = each.end - 1;
         let mut made: HashMap<Value, usize> = HashMap::new();
         let mut read: HashMap<Slot, usize> = HashMap::new();
         for (number, piece) in pieces.iter().enumerate().take(each.end) {
-            for value in &piece.ops {
-                made.insert(*value, number);
-                for slot in reads(self.func, self.func.op(*value)).chain([*value]).filter_map(|read| self.slot(read)) {
-                    read.insert(slot, number);
-                }
+            for value in piece.values(repeats) {
+                made.insert(value, number);
+                read.extend(self.slots_read(value).map(|slot| (slot, number)));
             }
         }
         // What is only moved, and what is written to rings, is taken at the very end.
@@ -207,12 +247,63 @@ impl<'a> Line<'a> {
         for slot in moved.chain(written).chain(self.outcomes()).filter_map(|value| self.slot(value)) {
             read.insert(slot, last);
         }
+        let mut slots: HashMap<Value, Vec<Slot>> = HashMap::new();
         for (slot, value) in &self.func.stores {
+            slots.entry(*value).or_default().push(*slot);
+        }
+        for number in each.clone() {
+            let row_stores: Vec<(Slot, i64, usize)> = (pieces[number].rows.iter())
+                .filter_map(|row| self.row_store(&pieces[number], number, *row, &slots, &read, repeats))
+                .collect();
+            for (_, _, row) in &row_stores {
+                repeats.rows[*row].members.iter().for_each(|member| drop(slots.remove(member)));
+            }
+            pieces[number].row_stores = row_stores;
+        }
+        for (slot, value) in self.func.stores.iter().filter(|(_, value)| slots.contains_key(value)) {
             let ready = if self.slot(*value).is_some() { last } else { made.get(value).copied().unwrap_or(0) };
             let number = ready.max(read.get(slot).copied().unwrap_or(0)).max(each.start);
+            // A loop stores only rows.
+            let number = (number..each.end).find(|number| pieces[*number].rows.is_empty()).expect("the last is none");
             pieces[number].stores.push((*slot, *value));
         }
         pieces[last].writes.clone_from(&self.func.writes);
+    }
+
+    /// The store of a row by its own loop, if each of its values goes to one slot, these lie in equal distances, and what a
+    /// repetition stores is read by no other and not later.
+    fn row_store(
+        &self,
+        piece: &Piece,
+        number: usize,
+        row: usize,
+        slots: &HashMap<Value, Vec<Slot>>,
+        read: &HashMap<Slot, usize>,
+        repeats: &Repeats,
+    ) -> Option<(Slot, i64, usize)> {
+        let slot = |member: &Value| match slots.get(member).map(Vec::as_slice) {
+            Some([slot]) => Some(i64::from(slot.0)),
+            _ => None,
+        };
+        let (first, distance) = equal_distances(repeats.rows[row].members.iter().map(slot))?;
+        let repetition = |slot: Slot| {
+            let on = (i64::from(slot.0) - first) / distance;
+            let hit = first + on * distance == i64::from(slot.0) && on >= 0;
+            usize::try_from(on).ok().filter(|on| hit && *on < repeats.rows[row].members.len())
+        };
+        let later = read.iter().any(|(slot, last)| *last > number && repetition(*slot).is_some());
+        let by_another = piece.rows.iter().any(|row| {
+            let members = repeats.rows[*row].members.iter().enumerate();
+            members.into_iter().any(|(k, member)| {
+                self.slots_read(*member).filter_map(repetition).any(|repetition| repetition != k)
+            })
+        });
+        (!later && !by_another).then(|| (Slot(first as u32), distance, row))
+    }
+
+    /// The slots that an operation reads, or that a value is loaded from.
+    fn slots_read(&self, value: Value) -> impl Iterator<Item = Slot> {
+        reads(self.func, self.func.op(value)).chain([value]).filter_map(|read| self.slot(read))
     }
 
     /// The slot that a value is loaded from.
@@ -229,15 +320,16 @@ impl<'a> Line<'a> {
         first.into_iter().chain(second)
     }
 
-    /// A word for each value that something reads outside its piece; a word is used again when nothing reads it any more.
-    fn homes(&self, pieces: &[Piece], each: &Range<usize>) -> HashMap<Value, u32> {
+    /// A word for each value that something reads outside its piece, and how many these are; those of rows lie side by side.
+    /// A word is used again when nothing reads it any more.
+    fn homes(&self, pieces: &[Piece], each: &Range<usize>, repeats: &Repeats) -> (HashMap<Value, u32>, u32) {
         let mut made: HashMap<Value, usize> = HashMap::new();
         let mut last: HashMap<Value, usize> = HashMap::new();
         for (number, piece) in pieces.iter().enumerate() {
-            made.extend(piece.ops.iter().map(|value| (*value, number)));
+            made.extend(piece.values(repeats).map(|value| (value, number)));
             let stored = piece.stores.iter().map(|(_, value)| *value);
             let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
-            let read = piece.ops.iter().flat_map(|value| reads(self.func, self.func.op(*value)));
+            let read = piece.values(repeats).flat_map(|value| reads(self.func, self.func.op(value)));
             for value in read.chain(stored).chain(written) {
                 match made.get(&value) {
                     // What was made before the loop is read again in the next iteration.
@@ -252,11 +344,19 @@ impl<'a> Line<'a> {
         for value in self.outcomes().filter(|value| made.contains_key(value)) {
             last.insert(value, pieces.len());
         }
-        let mut homes = HashMap::new();
-        let (mut free, mut words) = (Vec::new(), 0);
+        let (mut homes, mut words) = (HashMap::new(), 0);
+        let arrays = repeats.rows.iter().map(|row| &row.members).chain(&repeats.arrays);
+        for array in arrays.filter(|array| array.iter().any(|value| last.contains_key(value))) {
+            homes.extend(array.iter().zip(words..).map(|(value, word)| (*value, word)));
+            words += array.len() as u32;
+        }
+        let mut free = Vec::new();
         let mut ending: Vec<Vec<u32>> = vec![Vec::new(); pieces.len() + 1];
         for (number, piece) in pieces.iter().enumerate() {
             for (value, last) in piece.ops.iter().filter_map(|value| Some((*value, *last.get(value)?))) {
+                if homes.contains_key(&value) {
+                    continue;
+                }
                 let home = free.pop().unwrap_or_else(|| {
                     words += 1;
                     words - 1
@@ -266,7 +366,7 @@ impl<'a> Line<'a> {
             }
             free.append(&mut ending[number]);
         }
-        homes
+        (homes, words)
     }
 }
 

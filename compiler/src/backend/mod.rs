@@ -5,6 +5,7 @@
 pub mod interp;
 mod regimes;
 mod clif;
+mod repeats;
 mod cut;
 mod pieces;
 pub mod target;

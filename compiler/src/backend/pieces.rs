@@ -5,10 +5,12 @@
 //! loop:   pieces of an iteration; again while there are iterations left and the status is 0
 //! failed: pieces that say which guard it was
 //! ```
-//! The scratch area lies on the stack. A piece is called by its number; whoever lays out the code puts in the distance.
+//! A piece that repeats its operations is a loop of its own: what its repetitions take and leave lies in equal distances, so
+//! that one address for each distance walks along. The scratch area lies on the stack. A piece is called by its number; whoever lays out the code puts in the distance.
 
 use super::clif::{Emitter, Facts, Watch, offset, signature};
-use super::cut::{self, Cut};
+use super::cut::{self, Cut, Piece};
+use super::repeats::{Row, Source};
 use crate::ir::{Func, Op, Value};
 use cranelift_codegen::ir::{
     self as clif, AbiParam, BlockArg, ExtFuncData, InstBuilder, MemFlagsData, Signature, StackSlotData, StackSlotKind,
@@ -16,6 +18,7 @@ use cranelift_codegen::ir::{
 };
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
+use std::collections::HashSet;
 use std::ops::Range;
 
 /// The signature of a piece: block, pool, scratch area.
@@ -150,11 +153,106 @@ pub fn emit_piece(
         b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
     }
     emitter.writes(&piece.writes, &mut b);
+    if !piece.rows.is_empty() {
+        touched.extend(repeat(&mut emitter, piece, cut, scratch, &mut b));
+    }
     b.ins().return_(&[]);
     b.seal_all_blocks();
     b.finalize(isa.frontend_config());
     *values = emitter.values;
     touched.into_iter().for_each(|value| values[value.index()] = None);
+}
+
+/// Addresses in equal distances, one for each repetition.
+struct Walk {
+    /// The block or the scratch area.
+    whole: clif::Value,
+    /// In numbers.
+    distance: i64,
+    /// That of the current repetition, to which the place of the first is added.
+    now: Option<clif::Value>,
+}
+
+/// The walk in such distances, if need be a new one.
+fn walk(walks: &mut Vec<Walk>, whole: clif::Value, distance: i64) -> usize {
+    let known = walks.iter().position(|walk| walk.whole == whole && walk.distance == distance);
+    known.unwrap_or_else(|| {
+        walks.push(Walk { whole, distance, now: None });
+        walks.len() - 1
+    })
+}
+
+/// Writes the loop of a piece; gives the values that it holds. Each repetition is written as the first.
+fn repeat(
+    emitter: &mut Emitter,
+    piece: &Piece,
+    cut: &Cut,
+    scratch: clif::Value,
+    b: &mut FunctionBuilder,
+) -> Vec<Value> {
+    let flags = MemFlagsData::trusted();
+    let (func, block) = (emitter.func, emitter.block);
+    let rows: Vec<&Row> = piece.rows.iter().map(|row| &cut.repeats.rows[*row]).collect();
+    let firsts: HashSet<Value> = rows.iter().map(|row| row.members[0]).collect();
+    let home = |value: Value| cut.homes[&value];
+    let mut walks: Vec<Walk> = Vec::new();
+    // What is read: where, and what it is in the first repetition.
+    let mut inputs: Vec<(usize, u32, Value)> = Vec::new();
+    let mut touched: Vec<Value> = Vec::new();
+    for row in &rows {
+        let mut operands: Vec<Value> = cut::reads(func, func.op(row.members[0])).collect();
+        if let Op::Load(_) = func.op(row.members[0]) {
+            operands.push(row.members[0]);
+        }
+        for (operand, source) in operands.into_iter().zip(&row.sources) {
+            match *source {
+                Source::Same(value) => touched.extend(fetch(emitter, value, cut, scratch, b)),
+                Source::Slots(first, distance) => inputs.push((walk(&mut walks, block, distance), first.0, operand)),
+                Source::Words(first, _) if firsts.contains(&first) => {}
+                Source::Words(first, second) => {
+                    let distance = i64::from(home(second)) - i64::from(home(first));
+                    inputs.push((walk(&mut walks, scratch, distance), home(first), operand));
+                }
+            }
+        }
+    }
+    inputs.sort_unstable_by_key(|(_, _, value)| *value);
+    inputs.dedup();
+    let kept: Vec<Value> = rows.iter().map(|row| row.members[0]).filter(|value| cut.homes.contains_key(value)).collect();
+    let kept: Vec<_> = kept.into_iter().map(|value| (walk(&mut walks, scratch, 1), home(value), value)).collect();
+    let stores = piece.row_stores.iter().map(|(first, distance, row)| {
+        (walk(&mut walks, block, *distance), first.0, cut.repeats.rows[*row].members[0])
+    });
+    let outputs: Vec<(usize, u32, Value)> = kept.into_iter().chain(stores).collect();
+
+    let [body, behind] = [(); 2].map(|()| b.create_block());
+    let count = b.ins().iconst(types::I64, rows[0].members.len() as i64);
+    let first: Vec<BlockArg> = walks.iter().map(|walk| walk.whole).chain([count]).map(BlockArg::Value).collect();
+    b.ins().jump(body, &first);
+    for walk in &mut walks {
+        walk.now = Some(b.append_block_param(body, types::I64));
+    }
+    let left = b.append_block_param(body, types::I64);
+    b.switch_to_block(body);
+    let now = |of: usize| walks[of].now.expect("the loop has begun");
+    for (walk, first, value) in &inputs {
+        let loaded = b.ins().load(emitter.facts.type_of(*value), flags, now(*walk), offset(*first));
+        emitter.values[value.index()] = Some(loaded);
+    }
+    let read: HashSet<Value> = inputs.iter().map(|(_, _, value)| *value).collect();
+    let list: Vec<Value> = rows.iter().map(|row| row.members[0]).filter(|value| !read.contains(value)).collect();
+    let left_behind: Vec<Value> = outputs.iter().map(|(_, _, value)| *value).collect();
+    emitter.only(&list, &left_behind, b);
+    for (walk, first, value) in &outputs {
+        let value = emitter.get(*value, b);
+        b.ins().store(flags, value, now(*walk), offset(*first));
+    }
+    let left = b.ins().iadd_imm_s(left, -1);
+    let next: Vec<clif::Value> = (0..walks.len()).map(|k| b.ins().iadd_imm_s(now(k), 8 * walks[k].distance)).collect();
+    let next: Vec<BlockArg> = next.into_iter().chain([left]).map(BlockArg::Value).collect();
+    b.ins().brif(left, body, &next, behind, &[]);
+    b.switch_to_block(behind);
+    touched.into_iter().chain(read).chain(list).collect()
 }
 
 /// Takes a value of another piece from where it lies, or loads what each piece loads itself; gives it if it did.
