@@ -16,7 +16,7 @@ use super::clif::{Facts, Watch};
 use super::repeats::{Repeats, equal_distances, repeats};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::ops::Range;
 
 /// How long functions and their pieces are, in operations.
@@ -233,11 +233,11 @@ impl<'a> Line<'a> {
     /// Puts each store into the first piece of an iteration at whose end its value is there and its slot is read no more.
     fn store(&self, pieces: &mut [Piece], each: &Range<usize>, repeats: &Repeats) {
         let last = each.end - 1;
-        let mut made: HashMap<Value, usize> = HashMap::new();
+        let mut made: Vec<Option<usize>> = vec![None; self.func.ops.len()];
         let mut read: HashMap<Slot, usize> = HashMap::new();
         for (number, piece) in pieces.iter().enumerate().take(each.end) {
             for value in piece.values(repeats) {
-                made.insert(value, number);
+                made[value.index()] = Some(number);
                 read.extend(self.slots_read(value).map(|slot| (slot, number)));
             }
         }
@@ -261,7 +261,7 @@ impl<'a> Line<'a> {
             pieces[number].row_stores = row_stores;
         }
         for (slot, value) in self.func.stores.iter().filter(|(_, value)| slots.contains_key(value)) {
-            let ready = if self.slot(*value).is_some() { last } else { made.get(value).copied().unwrap_or(0) };
+            let ready = if self.slot(*value).is_some() { last } else { made[value.index()].unwrap_or(0) };
             let number = ready.max(read.get(slot).copied().unwrap_or(0)).max(each.start);
             // A loop stores only rows.
             let number = (number..each.end).find(|number| pieces[*number].rows.is_empty()).expect("the last is none");
@@ -323,48 +323,56 @@ impl<'a> Line<'a> {
     /// A word for each value that something reads outside its piece, and how many these are; those of rows lie side by side.
     /// A word is used again when nothing reads it any more.
     fn homes(&self, pieces: &[Piece], each: &Range<usize>, repeats: &Repeats) -> (HashMap<Value, u32>, u32) {
-        let mut made: HashMap<Value, usize> = HashMap::new();
-        let mut last: HashMap<Value, usize> = HashMap::new();
+        let mut made: Vec<Option<usize>> = vec![None; self.func.ops.len()];
+        let mut last: Vec<Option<usize>> = vec![None; self.func.ops.len()];
         for (number, piece) in pieces.iter().enumerate() {
-            made.extend(piece.values(repeats).map(|value| (value, number)));
+            piece.values(repeats).for_each(|value| made[value.index()] = Some(number));
             let stored = piece.stores.iter().map(|(_, value)| *value);
             let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
             let read = piece.values(repeats).flat_map(|value| reads(self.func, self.func.op(value)));
             for value in read.chain(stored).chain(written) {
-                match made.get(&value) {
+                let ends = match made[value.index()] {
                     // What was made before the loop is read again in the next iteration.
-                    Some(made) if *made < each.start && number >= each.start => last.insert(value, pieces.len()),
-                    Some(made) if *made < number => {
-                        last.insert(value, number.max(last.get(&value).copied().unwrap_or(0)))
-                    }
-                    _ => None,
+                    Some(made) if made < each.start && number >= each.start => pieces.len(),
+                    Some(made) if made < number => number,
+                    _ => continue,
                 };
+                last[value.index()] = last[value.index()].max(Some(ends));
             }
         }
-        for value in self.outcomes().filter(|value| made.contains_key(value)) {
-            last.insert(value, pieces.len());
+        for value in self.outcomes().filter(|value| made[value.index()].is_some()) {
+            last[value.index()] = Some(pieces.len());
         }
-        let (mut homes, mut words) = (HashMap::new(), 0);
-        let arrays = repeats.rows.iter().map(|row| &row.members).chain(&repeats.arrays);
-        for array in arrays.filter(|array| array.iter().any(|value| last.contains_key(value))) {
-            homes.extend(array.iter().zip(words..).map(|(value, word)| (*value, word)));
-            words += array.len() as u32;
+        // By the piece with which they begin: values whose words lie side by side, and the last piece that reads one.
+        let mut arrays: Vec<Vec<(&[Value], usize)>> = vec![Vec::new(); pieces.len()];
+        for array in repeats.rows.iter().map(|row| &row.members).chain(&repeats.arrays) {
+            let begins = array.iter().filter_map(|value| made[value.index()]).min();
+            let ends = array.iter().filter_map(|value| last[value.index()]).max();
+            if let (Some(begins), Some(ends)) = (begins, ends) {
+                arrays[begins].push((array, ends));
+            }
         }
-        let mut free = Vec::new();
-        let mut ending: Vec<Vec<u32>> = vec![Vec::new(); pieces.len() + 1];
+        let single: HashSet<Value> = repeats.arrays.iter().flatten().copied().collect();
+        let single = |value: &Value| !single.contains(value);
+        let mut homes = HashMap::new();
+        // Words that are free again, by how many of them lie side by side.
+        let mut free: HashMap<usize, Vec<u32>> = HashMap::new();
+        let mut words = 0;
+        let mut ending: Vec<Vec<(usize, u32)>> = vec![Vec::new(); pieces.len() + 1];
         for (number, piece) in pieces.iter().enumerate() {
-            for (value, last) in piece.ops.iter().filter_map(|value| Some((*value, *last.get(value)?))) {
-                if homes.contains_key(&value) {
-                    continue;
-                }
-                let home = free.pop().unwrap_or_else(|| {
-                    words += 1;
-                    words - 1
+            let alone = piece.ops.iter().filter(|value| single(value));
+            let alone = alone.filter_map(|value| Some((std::slice::from_ref(value), last[value.index()]?)));
+            for (values, last) in std::mem::take(&mut arrays[number]).into_iter().chain(alone) {
+                let home = free.get_mut(&values.len()).and_then(Vec::pop).unwrap_or_else(|| {
+                    words += values.len() as u32;
+                    words - values.len() as u32
                 });
-                homes.insert(value, home);
-                ending[last].push(home);
+                homes.extend(values.iter().copied().zip(home..));
+                ending[last].push((values.len(), home));
             }
-            free.append(&mut ending[number]);
+            for (len, home) in std::mem::take(&mut ending[number]) {
+                free.entry(len).or_default().push(home);
+            }
         }
         (homes, words)
     }

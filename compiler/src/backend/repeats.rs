@@ -41,23 +41,23 @@ pub struct Repeats {
     pub rows: Vec<Row>,
     /// Values that are not repeated, whose words must lie side by side.
     pub arrays: Vec<Vec<Value>>,
-    /// The row of a value and its place there.
-    places: HashMap<Value, (usize, usize)>,
-    /// The levels of values that are not repeated.
-    levels: HashMap<Value, usize>,
+    /// By value: its row and its place there.
+    places: Vec<Option<(usize, usize)>>,
+    /// By value: the level of what is not repeated.
+    levels: Vec<usize>,
 }
 
 impl Repeats {
     /// The row of a value that is repeated.
     pub fn row(&self, value: Value) -> Option<usize> {
-        self.places.get(&value).map(|(row, _)| *row)
+        self.places[value.index()].map(|(row, _)| row)
     }
 
     /// On which level a value is computed.
     pub fn level(&self, value: Value) -> usize {
         match self.row(value) {
             Some(row) => self.rows[row].level,
-            None => self.levels.get(&value).copied().unwrap_or(0),
+            None => self.levels[value.index()],
         }
     }
 }
@@ -108,7 +108,9 @@ impl<'a> Search<'a> {
             op.each_operand(|operand| deepest = deepest.max(depth[operand.index()] + 1));
             depth.push(deepest);
         }
-        Search { func, list, values, shape, depth, operands: Vec::new(), repeats: Repeats::default() }
+        let (places, levels) = (vec![None; list.len()], vec![0; list.len()]);
+        let repeats = Repeats { places, levels, ..Repeats::default() };
+        Search { func, list, values, shape, depth, operands: Vec::new(), repeats }
     }
 
     fn of_list(&self, value: Value) -> Option<usize> {
@@ -157,7 +159,7 @@ impl<'a> Search<'a> {
             }
             let row = self.operands.len();
             for (k, member) in members.iter().enumerate() {
-                self.repeats.places.insert(*member, (row, k));
+                self.repeats.places[member.index()] = Some((row, k));
             }
             let operands = self.aligned(&members);
             for of_all in &operands {
@@ -200,8 +202,8 @@ impl<'a> Search<'a> {
         }
         // By where they lie: as far on as between the two members before, or, of the second member, as near as can be.
         let strain = |before: &[Value], value: Value| {
-            let at = |value: Value| match (self.repeats.places.get(&value), self.func.op(value)) {
-                (Some((_, place)), _) => *place as i64,
+            let at = |value: Value| match (self.repeats.places[value.index()], self.func.op(value)) {
+                (Some((_, place)), _) => place as i64,
                 (None, Op::Load(slot)) => i64::from(slot.0),
                 (None, _) => i64::from(value.0),
             };
@@ -217,7 +219,7 @@ impl<'a> Search<'a> {
     fn sources(&mut self) {
         let mut order: Vec<usize> = (0..self.repeats.rows.len()).collect();
         order.sort_by_key(|row| self.depth[self.repeats.rows[*row].members[0].index()]);
-        let mut of_array: HashMap<Value, (usize, usize)> = HashMap::new();
+        let mut of_array = vec![None; self.list.len()];
         // A loop knows an operand by what it is in the first repetition.
         let mut known: HashMap<(usize, Value), Source> = HashMap::new();
         for row in order {
@@ -240,7 +242,7 @@ impl<'a> Search<'a> {
                 self.repeats.rows[row].sources = sources;
             } else {
                 for member in std::mem::take(&mut self.repeats.rows[row].members) {
-                    self.repeats.places.remove(&member);
+                    self.repeats.places[member.index()] = None;
                 }
             }
         }
@@ -256,7 +258,7 @@ impl<'a> Search<'a> {
         Some(Source::Slots(Slot(u32::try_from(first).ok()?), distance))
     }
 
-    fn source(&mut self, of_all: &[Value], of_array: &mut HashMap<Value, (usize, usize)>) -> Option<Source> {
+    fn source(&mut self, of_all: &[Value], of_array: &mut [Option<(usize, usize)>]) -> Option<Source> {
         let [first, second] = [of_all[0], of_all[1]];
         if of_all.iter().all(|value| *value == first) {
             return Some(Source::Same(first));
@@ -265,21 +267,23 @@ impl<'a> Search<'a> {
             return self.slots(of_all);
         }
         let words = Source::Words(first, second);
-        let within = |places: &HashMap<Value, (usize, usize)>| {
-            let (whole, _) = *places.get(&first)?;
-            let place = |value: &Value| places.get(value).filter(|(of, _)| *of == whole).map(|(_, k)| *k as i64);
+        let within = |places: &[Option<(usize, usize)>]| {
+            let (whole, _) = places[first.index()]?;
+            let place = |value: &Value| places[value.index()].filter(|(of, _)| *of == whole).map(|(_, k)| k as i64);
             equal_distances(of_all.iter().map(place)).map(|_| words)
         };
         if let Some(words) = within(&self.repeats.places).or_else(|| within(of_array)) {
             return Some(words);
         }
         let free = |value: &Value| {
-            self.of_list(*value).is_some() && self.repeats.row(*value).is_none() && !of_array.contains_key(value)
+            self.of_list(*value).is_some() && self.repeats.row(*value).is_none() && of_array[value.index()].is_none()
         };
         if !of_all.iter().all(free) || !distinct(of_all) {
             return None;
         }
-        of_array.extend(of_all.iter().enumerate().map(|(k, value)| (*value, (self.repeats.arrays.len(), k))));
+        for (k, value) in of_all.iter().enumerate() {
+            of_array[value.index()] = Some((self.repeats.arrays.len(), k));
+        }
         self.repeats.arrays.push(of_all.to_vec());
         Some(words)
     }
@@ -296,7 +300,7 @@ impl<'a> Search<'a> {
             let Some(row) = self.repeats.row(value) else {
                 let operands = reads(self.func, self.func.op(value)).filter_map(below);
                 let level = operands.map(|(level, row)| level + usize::from(row.is_some())).max().unwrap_or(0);
-                self.repeats.levels.insert(value, level);
+                self.repeats.levels[value.index()] = level;
                 continue;
             };
             if self.repeats.rows[row].members[0] != value {
@@ -366,4 +370,41 @@ pub fn equal_distances(numbers: impl Iterator<Item = Option<i64>>) -> Option<(i6
         last = number;
     }
     (distance != 0).then_some((first, distance))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::build::Build;
+
+    /// Four parts, each with a stiffness, a state and an output, that pull at one mass.
+    #[test]
+    fn parts_of_one_shape_are_rows() {
+        let mut build = Build::new("step");
+        let (v, mut sum) = (build.load(Slot(3)), build.real(0.0));
+        let mut forces = Vec::new();
+        for k in 0..4 {
+            let [stiffness, z] = [10 + 2 * k, 20 + k].map(|slot| build.load(Slot(slot)));
+            // Built later, the product would take them the other way round.
+            let force = if k == 2 { build.mul(z, stiffness) } else { build.mul(stiffness, z) };
+            let moved = build.fma(force, v, z);
+            build.store(Slot(20 + k), moved);
+            sum = build.add(sum, force);
+            forces.push(force);
+        }
+        build.store(Slot(30), sum);
+        let func = build.finish();
+        let all: Vec<Value> = (0..func.ops.len()).map(|i| Value(i as u32)).collect();
+        let each: Vec<Value> =
+            all.into_iter().filter(|value| !matches!(func.op(*value), Op::Load(_) | Op::Real(_))).collect();
+        let found = repeats(&func, [&[], &each, &[]], func.results(), 4);
+        let [moved, force] = &found.rows[..] else { panic!("{:?}", found.rows) };
+        let (first, second) = (force.members[0], force.members[1]);
+        assert_eq!(force.sources, [Source::Slots(Slot(10), 2), Source::Slots(Slot(20), 1)]);
+        let of_moved = [Source::Same(v), Source::Words(first, second), Source::Slots(Slot(20), 1)];
+        assert_eq!((&moved.sources[..], moved.level, force.level), (&of_moved[..], 1, 1));
+        let (_, sum) = *func.stores.last().unwrap();
+        assert_eq!((found.row(sum), found.level(sum)), (None, 2));
+        assert_eq!(repeats(&func, [&[], &each, &[]], func.results(), 5).rows, []);
+    }
 }
