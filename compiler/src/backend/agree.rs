@@ -156,7 +156,7 @@ fn pieces_agree() {
 }
 
 /// So many copies of a function by chance, each on slots of its own, which lie in equal distances, and on some that all share
-/// or that are a neighbour's; what some of them compute is added up, and the first status that is not 0 is the status.
+/// or that are a neighbour's, half of their constants their own; what some of them compute is added up, and the first status that is not 0 is the status.
 fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
     let one = random::layout();
     let len = 20 + random.below(60);
@@ -194,6 +194,7 @@ fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
             let op = match *op {
                 Op::Load(slot) => Op::Load(of(slot)),
                 Op::Ring { .. } => Op::Load(Slot::TIME),
+                Op::Real(bits) if bits % 2 == 0 => Op::Real((f64::from_bits(bits) * (1.0 + copy as f64)).to_bits()),
                 op => op.map(|operand| values[operand.index()]),
             };
             values.push(build.op(op));
@@ -217,7 +218,7 @@ fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
 /// What is repeated gives in a loop what it gives one by one.
 #[test]
 fn repeats_agree() {
-    let (mut loops, mut rows, mut stores) = (0, 0, 0);
+    let (mut loops, mut rows, mut stores, mut tables) = (0, 0, 0, 0);
     for seed in 0..1000 {
         let mut random = Random(seed);
         let of = 2 + random.below(7);
@@ -230,11 +231,12 @@ fn repeats_agree() {
         loops += cut.pieces.iter().filter(|piece| !piece.rows.is_empty()).count();
         rows += cut.pieces.iter().map(|piece| piece.rows.len()).sum::<usize>();
         stores += cut.pieces.iter().map(|piece| piece.row_stores.len()).sum::<usize>();
+        tables += cut.repeats.tables.len();
         let count = 1 + random.below(5) as u64;
         check_cut(&func, &layout, &blocks, &pool, count, lengths, &format!("seed {seed}, {of} copies, {lengths:?}"));
     }
-    println!("{loops} loops of {rows} rows, which store {stores} themselves");
-    assert!(loops > 1000 && rows > 5000 && stores > 500);
+    println!("{loops} loops of {rows} rows, which store {stores} themselves; {tables} tables of constants");
+    assert!(loops > 1000 && rows > 5000 && stores > 500 && tables > 300);
 }
 
 /// The loop in the code does what as many single calls do, and stops where they stop.

@@ -511,6 +511,8 @@ pub struct Emitter<'a> {
     pub facts: &'a Facts,
     /// The values that are there, constants apart.
     pub values: Vec<Option<clif::Value>>,
+    /// Operands that are another value than their operation says: by operation, and by their number there.
+    pub instead: HashMap<(Value, usize), clif::Value>,
     /// Where the block is.
     pub block: clif::Value,
     /// Where the pool is.
@@ -534,7 +536,7 @@ impl<'a> Emitter<'a> {
         block: clif::Value,
         pool: clif::Value,
     ) -> Emitter<'a> {
-        Emitter { func, facts, values, block, pool, ahead: None, instant: None }
+        Emitter { func, facts, values, instead: HashMap::new(), block, pool, ahead: None, instant: None }
     }
 
     /// Numbers from the iteration's first that went ahead to that of the slot, if it is one of these.
@@ -574,6 +576,11 @@ impl<'a> Emitter<'a> {
             Op::Bool(truth) => b.ins().iconst(types::I8, i64::from(truth)),
             _ => self.values[value.index()].expect("operands come first"),
         }
+    }
+
+    /// The `n`-th operand of an operation, which says that it is `operand`.
+    fn operand(&self, of: Value, n: usize, operand: Value, b: &mut FunctionBuilder) -> clif::Value {
+        self.instead.get(&(of, n)).copied().unwrap_or_else(|| self.get(operand, b))
     }
 
     /// Writes operations of which each stands behind its operands.
@@ -680,14 +687,13 @@ impl<'a> Emitter<'a> {
                 Op::Select(when, yes, no) => (when, [yes, no]),
                 _ => unreachable!("it is a choice"),
             };
-            let results: Vec<[Value; 2]> = choices.iter().map(|choice| select(choice).1).collect();
             let [chosen, other, behind] = [(); 3].map(|()| b.create_block());
             self.branch(select(value).0, chosen, other, b);
             for (block, side, which) in [(chosen, first, 0), (other, second, 1)] {
                 b.switch_to_block(block);
                 self.side(*side, sides, b);
-                let results: Vec<BlockArg> =
-                    results.iter().map(|pair| BlockArg::Value(self.get(pair[which], b))).collect();
+                let result = |choice: &Value| self.operand(*choice, 1 + which, select(choice).1[which], b);
+                let results: Vec<BlockArg> = choices.iter().map(result).map(BlockArg::Value).collect();
                 b.ins().jump(behind, &results);
             }
             for choice in choices {
@@ -725,7 +731,7 @@ impl<'a> Emitter<'a> {
             return;
         }
         op.each_operand(|operand| {
-            operands[n] = Some(self.get(operand, b));
+            operands[n] = Some(self.operand(value, n, operand, b));
             n += 1;
         });
         // What stands last can be taken from memory.

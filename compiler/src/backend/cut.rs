@@ -73,6 +73,8 @@ pub struct Cut {
     pub each: Range<usize>,
     /// Where a value lies between pieces, as words from the beginning of the scratch area.
     pub homes: HashMap<Value, u32>,
+    /// Where the tables of what is repeated lie, likewise; the first piece writes them.
+    pub tables: Vec<u32>,
     /// Words of the scratch area.
     pub words: u32,
 }
@@ -163,12 +165,20 @@ impl<'a> Line<'a> {
         if each.last().is_none_or(|piece| !piece.rows.is_empty()) {
             each.push(Piece::default());
         }
+        if !repeats.tables.is_empty() && pieces.first().is_none_or(|piece| !piece.rows.is_empty()) {
+            pieces.insert(0, Piece::default());
+        }
         let range = pieces.len()..pieces.len() + each.len();
         pieces.append(&mut each);
         pieces.append(&mut failed);
         self.store(&mut pieces, &range, &repeats);
-        let (homes, words) = self.homes(&pieces, &range, &repeats);
-        Cut { repeats, pieces, each: range, homes, words }
+        let (homes, mut words) = self.homes(&pieces, &range, &repeats);
+        let lie = |table: &Vec<Value>| {
+            words += table.len() as u32;
+            words - table.len() as u32
+        };
+        let tables = repeats.tables.iter().map(lie).collect();
+        Cut { repeats, pieces, each: range, homes, tables, words }
     }
 
     /// The operations in pieces: what is not repeated in parts, what is in loops, in turn.

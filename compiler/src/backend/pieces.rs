@@ -134,6 +134,12 @@ pub fn emit_piece(
     values.resize(func.ops.len(), None);
     let mut emitter = Emitter::with(func, facts, std::mem::take(values), block, pool);
     let mut touched: Vec<Value> = Vec::new();
+    for (table, home) in cut.repeats.tables.iter().zip(&cut.tables).filter(|_| number == 0) {
+        for (value, word) in table.iter().zip(*home..) {
+            let value = emitter.get(*value, &mut b);
+            b.ins().store(MemFlagsData::trusted(), value, scratch, offset(word));
+        }
+    }
     for value in &piece.ops {
         for read in cut::reads(func, func.op(*value)) {
             touched.extend(fetch(&mut emitter, read, cut, scratch, &mut b));
@@ -196,18 +202,22 @@ fn repeat(
     let firsts: HashSet<Value> = rows.iter().map(|row| row.members[0]).collect();
     let home = |value: Value| cut.homes[&value];
     let mut walks: Vec<Walk> = Vec::new();
-    // What is read: where, and what it is in the first repetition.
+    // What is read: where, and what it is in the first repetition; constants, which operand of what they are.
     let mut inputs: Vec<(usize, u32, Value)> = Vec::new();
+    let mut constants: Vec<(usize, u32, (Value, usize))> = Vec::new();
     let mut touched: Vec<Value> = Vec::new();
     for row in &rows {
         let mut operands: Vec<Value> = cut::reads(func, func.op(row.members[0])).collect();
         if let Op::Load(_) = func.op(row.members[0]) {
             operands.push(row.members[0]);
         }
-        for (operand, source) in operands.into_iter().zip(&row.sources) {
+        for (n, (operand, source)) in operands.into_iter().zip(&row.sources).enumerate() {
             match *source {
                 Source::Same(value) => touched.extend(fetch(emitter, value, cut, scratch, b)),
                 Source::Slots(first, distance) => inputs.push((walk(&mut walks, block, distance), first.0, operand)),
+                Source::Table(table) => {
+                    constants.push((walk(&mut walks, scratch, 1), cut.tables[table], (row.members[0], n)));
+                }
                 Source::Words(first, _) if firsts.contains(&first) => {}
                 Source::Words(first, second) => {
                     let distance = i64::from(home(second)) - i64::from(home(first));
@@ -238,6 +248,10 @@ fn repeat(
     for (walk, first, value) in &inputs {
         let loaded = b.ins().load(emitter.facts.type_of(*value), flags, now(*walk), offset(*first));
         emitter.values[value.index()] = Some(loaded);
+    }
+    for (walk, first, operand) in constants {
+        let loaded = b.ins().load(types::F64, flags, now(walk), offset(first));
+        emitter.instead.insert(operand, loaded);
     }
     let read: HashSet<Value> = inputs.iter().map(|(_, _, value)| *value).collect();
     let list: Vec<Value> = rows.iter().map(|row| row.members[0]).filter(|value| !read.contains(value)).collect();

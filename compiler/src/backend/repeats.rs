@@ -2,7 +2,7 @@
 //!
 //! In: a sound, expanded function, and which of its operations are computed together. Out: [`Repeats`]: rows of operations
 //! that differ only in what they take, and where it lies: numbers in equal distances, so that a loop finds them. What has
-//! one shape is found from the results down; what does not lie in equal distances is left out. It knows nothing of
+//! one shape is found from the results down; what does not lie in equal distances is left out. Constants that differ are put into tables. It knows nothing of
 //! processors.
 
 use super::cut::reads;
@@ -32,6 +32,8 @@ pub enum Source {
     Slots(Slot, i64),
     /// Values whose words lie in equal distances: those of the first and of the second repetition.
     Words(Value, Value),
+    /// Constants, of the table of this number.
+    Table(usize),
 }
 
 /// What is repeated.
@@ -41,6 +43,8 @@ pub struct Repeats {
     pub rows: Vec<Row>,
     /// Values that are not repeated, whose words must lie side by side.
     pub arrays: Vec<Vec<Value>>,
+    /// Constants that repetitions take, each its own.
+    pub tables: Vec<Vec<Value>>,
     /// By value: its row and its place there.
     places: Vec<Option<(usize, usize)>>,
     /// By value: the level of what is not repeated.
@@ -78,7 +82,9 @@ struct Search<'a> {
     list: Vec<Option<usize>>,
     /// All listed values, operands first.
     values: Vec<Value>,
-    /// A number that values of one shape have in common, whatever slots they are made of.
+    /// A number that values of one shape have in common, whatever slots they are made of, and one for which their real
+    /// constants may differ too.
+    exact: Vec<u64>,
     shape: Vec<u64>,
     /// Operations from a value down to a leaf, at most.
     depth: Vec<u32>,
@@ -96,21 +102,29 @@ impl<'a> Search<'a> {
         let mut values: Vec<Value> = lists.into_iter().flatten().copied().collect();
         values.sort_unstable();
         let hasher = BuildHasherDefault::<DefaultHasher>::default();
-        let (mut shape, mut depth) = (Vec::with_capacity(list.len()), Vec::with_capacity(list.len()));
+        let [mut exact, mut shape] = [(); 2].map(|()| Vec::with_capacity(list.len()));
+        let mut depth = Vec::with_capacity(list.len());
         for (op, list) in func.ops.iter().zip(&list) {
-            let mut operands = Vec::new();
-            op.each_operand(|operand| operands.push(shape[operand.index()]));
-            if let Some(exchangeable) = exchangeable(*op) {
-                operands[..exchangeable].sort_unstable();
-            }
-            shape.push(hasher.hash_one((kind(*op), operands, list)));
+            let hash = |kind: Op, known: &[u64]| {
+                let mut operands = Vec::new();
+                op.each_operand(|operand| operands.push(known[operand.index()]));
+                if let Some(exchangeable) = exchangeable(*op) {
+                    operands[..exchangeable].sort_unstable();
+                }
+                hasher.hash_one((kind, operands, list))
+            };
+            exact.push(hash(kind(*op), &exact));
+            shape.push(match op {
+                Op::Real(_) => hash(Op::Real(0), &shape),
+                op => hash(kind(*op), &shape),
+            });
             let mut deepest = 0;
             op.each_operand(|operand| deepest = deepest.max(depth[operand.index()] + 1));
             depth.push(deepest);
         }
         let (places, levels) = (vec![None; list.len()], vec![0; list.len()]);
         let repeats = Repeats { places, levels, ..Repeats::default() };
-        Search { func, list, values, shape, depth, operands: Vec::new(), repeats }
+        Search { func, list, values, exact, shape, depth, operands: Vec::new(), repeats }
     }
 
     fn of_list(&self, value: Value) -> Option<usize> {
@@ -134,9 +148,17 @@ impl<'a> Search<'a> {
         for value in self.values.iter().filter(|value| alike[&self.shape[value.index()]] < fewest) {
             reads(self.func, self.func.op(*value)).for_each(|operand| top[operand.index()] = true);
         }
-        let mut families: HashMap<u64, Vec<Value>> = HashMap::new();
-        for value in self.values.iter().filter(|value| top[value.index()]) {
-            families.entry(self.shape[value.index()]).or_default().push(*value);
+        // Those of equal constants are a family of their own if they are enough.
+        let top: Vec<Value> = self.values.iter().copied().filter(|value| top[value.index()]).collect();
+        let mut equal: HashMap<u64, usize> = HashMap::new();
+        for value in &top {
+            *equal.entry(self.exact[value.index()]).or_default() += 1;
+        }
+        let mut families: HashMap<(u64, Option<u64>), Vec<Value>> = HashMap::new();
+        for value in top {
+            let (shape, exact) = (self.shape[value.index()], self.exact[value.index()]);
+            let own = (equal[&exact] >= fewest).then_some(exact);
+            families.entry((shape, own)).or_default().push(value);
         }
         let mut families: Vec<Vec<Value>> = families.into_values().filter(|family| family.len() >= fewest).collect();
         let depth = |family: &Vec<Value>| self.depth[family[0].index()];
@@ -191,7 +213,12 @@ impl<'a> Search<'a> {
 
     /// Whether the two operands of the next member fit those of the members before better the other way round.
     fn exchanged(&self, [first, second]: [&[Value]; 2], [a, b]: [Value; 2]) -> bool {
+        let equal = |before: &[Value], value: Value| self.exact[before[0].index()] == self.exact[value.index()];
         let fits = |before: &[Value], value: Value| self.alike(before[0], value);
+        let equal = [equal(first, a) && equal(second, b), equal(first, b) && equal(second, a)];
+        if equal[0] != equal[1] {
+            return equal[1];
+        }
         let [straight, crossed] = [fits(first, a) && fits(second, b), fits(first, b) && fits(second, a)];
         if straight != crossed {
             return crossed;
@@ -225,7 +252,10 @@ impl<'a> Search<'a> {
         for row in order {
             let members = &self.repeats.rows[row].members;
             let count = members.len();
-            let mut known = |operand: Value, source: Source| *known.entry((count, operand)).or_insert(source) == source;
+            let mut known = |operand: Value, source: Source| {
+                let constant = matches!(self.func.op(operand), Op::Real(_));
+                constant || *known.entry((count, operand)).or_insert(source) == source
+            };
             // A load is its own operand.
             let loads = matches!(self.func.op(members[0]), Op::Load(_)).then(|| members.clone());
             let operands = std::mem::take(&mut self.operands[row]);
@@ -262,6 +292,13 @@ impl<'a> Search<'a> {
         let [first, second] = [of_all[0], of_all[1]];
         if of_all.iter().all(|value| *value == first) {
             return Some(Source::Same(first));
+        }
+        if of_all.iter().all(|value| matches!(self.func.op(*value), Op::Real(_))) {
+            let known = self.repeats.tables.iter().position(|table| table == of_all);
+            return Some(Source::Table(known.unwrap_or_else(|| {
+                self.repeats.tables.push(of_all.to_vec());
+                self.repeats.tables.len() - 1
+            })));
         }
         if of_all.iter().all(|value| self.of_list(*value).is_none()) {
             return self.slots(of_all);
