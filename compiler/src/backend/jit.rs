@@ -43,7 +43,8 @@ pub(super) fn cut_at(
     // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and
     // every table in the pool, the index of a table is held inside it, and code without calls does not unwind.
     let machine = unsafe { Machine::new(entries, layout.size(), pool_len, Arc::new(memory)) };
-    let step = funcs.iter().find(|(function, _)| *function == Function::Step);
+    // A step in pieces goes ahead no faster: its instants would be one long line again.
+    let step = funcs.iter().find(|(function, func)| *function == Function::Step && func.ops.len() <= lengths.whole);
     let machine = match step.and_then(|(_, step)| ahead::compile(step, layout, pool_len)) {
         // SAFETY: it is the step again, in two parts.
         Some(ahead) => unsafe { machine.with_ahead(ahead) },
