@@ -304,11 +304,11 @@ impl<'a> Line<'a> {
         let later = read.iter().any(|(slot, last)| *last > number && repetition(*slot).is_some());
         let by_another = piece.rows.iter().any(|row| {
             let members = repeats.rows[*row].members.iter().enumerate();
-            members.into_iter().any(|(k, member)| {
-                self.slots_read(*member).filter_map(repetition).any(|repetition| repetition != k)
-            })
+            members
+                .into_iter()
+                .any(|(k, member)| self.slots_read(*member).filter_map(repetition).any(|repetition| repetition != k))
         });
-        (!later && !by_another).then(|| (Slot(first as u32), distance, row))
+        (!later && !by_another).then_some((Slot(first as u32), distance, row))
     }
 
     /// The slots that an operation reads, or that a value is loaded from.

@@ -6,7 +6,8 @@
 //! failed: pieces that say which guard it was
 //! ```
 //! A piece that repeats its operations is a loop of its own: what its repetitions take and leave lies in equal distances, so
-//! that one address for each distance walks along. The scratch area lies on the stack. A piece is called by its number; whoever lays out the code puts in the distance.
+//! that one address for each distance walks along. The scratch area lies on the stack. A piece is called by its number;
+//! whoever lays out the code puts in the distance.
 
 use super::clif::{Emitter, Facts, Watch, offset, signature};
 use super::cut::{self, Cut, Piece};
@@ -228,11 +229,13 @@ fn repeat(
     }
     inputs.sort_unstable_by_key(|(_, _, value)| *value);
     inputs.dedup();
-    let kept: Vec<Value> = rows.iter().map(|row| row.members[0]).filter(|value| cut.homes.contains_key(value)).collect();
+    let kept: Vec<Value> =
+        rows.iter().map(|row| row.members[0]).filter(|value| cut.homes.contains_key(value)).collect();
     let kept: Vec<_> = kept.into_iter().map(|value| (walk(&mut walks, scratch, 1), home(value), value)).collect();
-    let stores = piece.row_stores.iter().map(|(first, distance, row)| {
-        (walk(&mut walks, block, *distance), first.0, cut.repeats.rows[*row].members[0])
-    });
+    let stores = piece
+        .row_stores
+        .iter()
+        .map(|(first, distance, row)| (walk(&mut walks, block, *distance), first.0, cut.repeats.rows[*row].members[0]));
     let outputs: Vec<(usize, u32, Value)> = kept.into_iter().chain(stores).collect();
 
     let [body, behind] = [(); 2].map(|()| b.create_block());

@@ -2,8 +2,8 @@
 //!
 //! In: a sound, expanded function, and which of its operations are computed together. Out: [`Repeats`]: rows of operations
 //! that differ only in what they take, and where it lies: numbers in equal distances, so that a loop finds them. What has
-//! one shape is found from the results down; what does not lie in equal distances is left out. Constants that differ are put into tables. It knows nothing of
-//! processors.
+//! one shape is found from the results down; constants that differ are put into tables; what else does not lie in equal
+//! distances is left out. It knows nothing of processors.
 
 use super::cut::reads;
 use crate::ir::{Func, Op, Value};
@@ -345,7 +345,8 @@ impl<'a> Search<'a> {
             }
             let mut level = 1;
             for of_all in &self.operands[row] {
-                let together = self.repeats.row(of_all[0]).is_some_and(|other| self.repeats.rows[other].members == *of_all);
+                let together =
+                    self.repeats.row(of_all[0]).is_some_and(|other| self.repeats.rows[other].members == *of_all);
                 for (below, row) in of_all.iter().filter_map(|operand| below(*operand)) {
                     level = level.max(match row {
                         None => below + 1,
