@@ -71,6 +71,9 @@ struct Watched {
 
 /// Ticks in which a value that is not credible is replaced by the one before.
 const ODD: u32 = 3;
+/// Where what is late is only counted, they are as many as take so long, ns: a simulated drive that waited for a processor
+/// answers many a SYNC at once, and what it tells then is not one movement at the pace of the rig.
+const ODD_NS: u64 = 1_000_000_000;
 /// Ticks after which a drive's signal is lost where the rig names no time.
 const TIMEOUT: u32 = 3;
 /// The least such time where what is late is only counted, ns.
@@ -139,6 +142,8 @@ pub struct Control {
     supervisor: Supervisor,
     coupling: Coupling,
     watched: Vec<Watched>,
+    /// Ticks in a row in which a reading may be not credible.
+    odd: u32,
     /// For each input: which signal, and the slot it goes to.
     inputs: Vec<(usize, Slot)>,
     /// For each output: the slot of the request.
@@ -264,6 +269,7 @@ impl Control {
             supervisor,
             coupling,
             watched,
+            odd: if options.count_overruns { ODD.max(ticks(ODD_NS)) } else { ODD },
             inputs,
             outputs: rig.outputs.iter().map(|output| output.slot).collect(),
             stops: rig.stops.iter().map(|stop| stop.slot).collect(),
@@ -387,7 +393,7 @@ impl Control {
             if watched.timeout.is_some_and(|timeout| reading.age >= timeout) {
                 self.supervisor.trip(Cause::Lost(i));
             }
-            if watched.odd >= ODD {
+            if watched.odd >= self.odd {
                 self.supervisor.trip(Cause::Implausible(i));
             }
         }
@@ -410,7 +416,7 @@ impl Control {
             let span = period * f64::from(told.ticks) + (f64::from(told.late_ns) - f64::from(late_ns)) * 1e-9;
             let agrees = span < 0.5 * period || ((position.last - from) / span - speed.last).abs() <= pair.most;
             pair.odd = if agrees { 0 } else { pair.odd + 1 };
-            if pair.odd >= ODD {
+            if pair.odd >= self.odd {
                 self.supervisor.trip(Cause::Implausible(pair.position));
             }
         }
@@ -648,9 +654,13 @@ mod tests {
 
     impl Way {
         fn new(change: impl FnOnce(&mut Rig)) -> Way {
+            Way::of(change, Options::default())
+        }
+
+        fn of(change: impl FnOnce(&mut Rig), options: Options) -> Way {
             let (mut rig, model) = bench::rig();
             change(&mut rig);
-            let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..Options::default() };
+            let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..options };
             let mut control = Control::new(&rig, model, None, &[], options).unwrap();
             assert!(control.supervisor_mut().arm());
             let readings = control.signals().map(|_| Reading { value: 0.0, age: FRESH }).collect();
@@ -727,6 +737,20 @@ mod tests {
             assert!((torque - held * f64::from(cycle + 1)).abs() < 1e-12 || cause.is_some(), "the old speed counts");
             assert_eq!(way.control.supervisor().cause().map(|_| ()), cause, "cycle {cycle}");
         }
+        assert!(matches!(way.control.supervisor().cause(), Some(Cause::Implausible(_))));
+    }
+
+    #[test]
+    fn where_what_is_late_is_only_counted_a_second_of_odd_readings_is_borne() {
+        let mut way = Way::of(|_| (), Options { count_overruns: true, ..Options::default() });
+        way.set(What::Speed, 1.0);
+        way.cycle(1, &[]);
+        way.set(What::Speed, f64::NAN);
+        for cycle in 1..1000 {
+            way.cycle(1, &[]);
+            assert_eq!(way.control.supervisor().cause(), None, "cycle {cycle}");
+        }
+        way.cycle(1, &[]);
         assert!(matches!(way.control.supervisor().cause(), Some(Cause::Implausible(_))));
     }
 
