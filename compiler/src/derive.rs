@@ -18,6 +18,17 @@ pub type Gradient = Vec<(u32, Value)>;
 /// Inlines `func` on `env`, as [`Build::inline`] does, and gives for each slot it stores the derivatives of what it
 /// stores along `directions`: direction k is the slot `directions[k]`, all others being constant.
 pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -> HashMap<Slot, Gradient> {
+    inline_given(build, func, env, directions, &HashMap::new())
+}
+
+/// The same where some values of `func` are given, and constant.
+pub fn inline_given(
+    build: &Shared,
+    func: &Func,
+    env: &mut Env,
+    directions: &[Slot],
+    given: &HashMap<Value, Value>,
+) -> HashMap<Slot, Gradient> {
     let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
     let live = func.live();
     let none = Value(u32::MAX);
@@ -30,6 +41,10 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
             if let Some(k) = direction.get(slot) {
                 gradients[i] = vec![(*k, build.borrow_mut().real(1.0))];
             }
+            continue;
+        }
+        if let Some(value) = given.get(&Value(i as u32)) {
+            values[i] = *value;
             continue;
         }
         let op = op.map(|operand| values[operand.index()]);
