@@ -244,13 +244,12 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
             match function {
                 // of y and x: (x dy − y dx)/(x² + y²)
                 Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
-                // a^b: b a^(b−1) da + a^b log a db. At a = 0 the first is 1 for b = 1 and else 0, also where it is
+                // a^b: b a^b/a da + a^b log a db. For b = 1 the first is 1; at a = 0 it is else 0, also where it is
                 // infinite, and the second is 0: nothing but numbers travels on.
                 Binary::Pow => {
-                    let less = |b: Real<'a>| at(build.borrow_mut().binary(Binary::Pow, a.value, b.value));
                     let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
-                    let at_zero = || b.is(1.0).choose(1.0, 0.0);
-                    both(&|| a.is(0.0).choose(at_zero(), b * less(b - 1.0)), &|| a.above(0.0).choose(y * log(), 0.0))
+                    let slope = || b.is(1.0).choose(1.0, a.is(0.0).choose(0.0, b * (y / a)));
+                    both(&slope, &|| a.above(0.0).choose(y * log(), 0.0))
                 }
                 // At the origin the direction is undefined: 0.
                 Binary::Hypot => {
