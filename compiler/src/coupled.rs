@@ -5,6 +5,7 @@
 
 use crate::components::components;
 use crate::ir::{Func, Op, Value};
+use crate::questions::asks;
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap};
 
@@ -13,34 +14,72 @@ use std::collections::{BTreeMap, HashMap};
 pub struct Group {
     /// Their numbers, ascending.
     pub states: Vec<usize>,
-    /// Each rate is affine in its own state, whichever branch is taken, and free of the others here: one evaluation is exact.
-    pub once: bool,
+    /// What their rates are like.
+    pub shape: Shape,
 }
 
-/// What a value depends on: numbers of states, ascending, and whether it is affine in that state, the others given.
-type Depends = Vec<(u32, bool)>;
+/// What a rate is like along its own state.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+pub enum Shape {
+    /// Affine, and free of the other states of the group: one evaluation is exact.
+    Straight,
+    /// That, but for choices that the state makes: one evaluation is exact once it is known what they are.
+    Broken,
+    /// All else: it is iterated.
+    Bent,
+}
 
-/// The groups of the states, whose rates `func` stores to the slots of `rates`.
-pub fn groups(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Group> {
+/// How a value depends on a state, the other states and the answers to all questions given.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+struct Depend {
+    /// Its number.
+    state: u32,
+    /// The degree: 0 for what it changes in jumps only, 1 for affine, 2 for all else.
+    degree: u8,
+    /// Whether something on the way asks a question of the state.
+    asks: bool,
+}
+
+/// What a value depends on, numbers of states ascending.
+type Depends = Vec<Depend>;
+
+/// What of the states depends on what.
+pub struct Coupling {
+    /// The groups, each behind those that its rates depend on.
+    pub groups: Vec<Group>,
+    /// For each state whether it can die away: its rate depends on it, and not in jumps only.
+    pub fades: Vec<bool>,
+}
+
+/// How the states are coupled whose rates `func` stores to the slots of `rates`.
+pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
     let rows = depends(func, rates, states);
-    let edge = |v: usize, k: usize| rows[v].get(k).map(|(w, _): &(u32, bool)| *w as usize);
+    let edge = |v: usize, k: usize| rows[v].get(k).map(|on: &Depend| on.state as usize);
     let mut level = vec![0usize; states.len()];
-    let mut groups: BTreeMap<(usize, bool), Vec<usize>> = BTreeMap::new();
+    let mut groups: BTreeMap<(usize, Shape), Vec<usize>> = BTreeMap::new();
+    let mut fades = vec![true; states.len()];
     for component in components(states.len(), edge) {
-        let needed = component.iter().flat_map(|v| &rows[*v]).map(|(w, _)| *w as usize);
+        let needed = component.iter().flat_map(|v| &rows[*v]).map(|on| on.state as usize);
         let own = needed.filter(|w| component.binary_search(w).is_err()).map(|w| level[w] + 1).max().unwrap_or(0);
         component.iter().for_each(|v| level[*v] = own);
-        let once = match component[..] {
-            [v] => rows[v].iter().all(|(w, affine)| *w as usize != v || *affine),
-            _ => false,
+        let shape = if let [v] = component[..] {
+            let on_itself = rows[v].iter().find(|on| on.state as usize == v);
+            fades[v] = on_itself.is_some_and(|on| on.degree > 0);
+            match on_itself {
+                Some(Depend { degree: 2.., .. }) => Shape::Bent,
+                Some(on) if on.asks => Shape::Broken,
+                _ => Shape::Straight,
+            }
+        } else {
+            Shape::Bent
         };
-        groups.entry((own, once)).or_default().extend(component);
+        groups.entry((own, shape)).or_default().extend(component);
     }
-    let group = |((_, once), mut states): ((usize, bool), Vec<usize>)| {
+    let group = |((_, shape), mut states): ((usize, Shape), Vec<usize>)| {
         states.sort_unstable();
-        Group { states, once }
+        Group { states, shape }
     };
-    groups.into_iter().map(group).collect()
+    Coupling { groups: groups.into_iter().map(group).collect(), fades }
 }
 
 /// For each rate, what it depends on.
@@ -57,17 +96,25 @@ fn depends(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Depends> {
     for (i, op) in func.ops.iter().enumerate() {
         let at = |value: Value| &of[value.index()];
         let mine = match *op {
-            Op::Load(slot) => number.get(&slot).map(|k| (*k, true)).into_iter().collect(),
+            Op::Load(slot) => {
+                number.get(&slot).map(|k| Depend { state: *k, degree: 1, asks: false }).into_iter().collect()
+            }
             Op::Add(a, b) | Op::Sub(a, b) => either(at(a), at(b)),
             Op::Neg(a) => at(a).clone(),
+            // A kink where it has a degree.
+            Op::Abs(a) => at(a).iter().map(|on| Depend { asks: on.asks || on.degree > 0, ..*on }).collect(),
             Op::Mul(a, b) => product(at(a), at(b)),
             Op::Fma(a, b, c) => either(&product(at(a), at(b)), at(c)),
-            Op::Div(a, b) => either(at(a), &bent(at(b))),
-            // Which branch is taken is free of the state, or the whole is not affine in it.
-            Op::Select(condition, a, b) => either(&bent(at(condition)), &either(at(a), at(b))),
+            Op::Div(a, b) => product(at(a), &bent(at(b))),
+            // The condition is a truth: its degree is 0.
+            Op::Select(condition, a, b) => either(at(condition), &either(at(a), at(b))),
             op => {
                 let mut all = Depends::new();
-                op.each_operand(|operand| all = either(&all, &bent(at(operand))));
+                let answer = asks(op);
+                op.each_operand(|operand| {
+                    let operand = if answer { asked(at(operand)) } else { bent(at(operand)) };
+                    all = either(&all, &operand);
+                });
                 all
             }
         };
@@ -83,34 +130,41 @@ fn depends(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Depends> {
     rates.iter().map(|slot| stored.get(slot).map_or_else(Depends::new, |value| of[value.index()].clone())).collect()
 }
 
-/// Not affine in anything.
+/// Of a function: of what is affine it is not.
 fn bent(of: &Depends) -> Depends {
-    of.iter().map(|(k, _)| (*k, false)).collect()
+    of.iter().map(|on| Depend { degree: if on.degree == 0 { 0 } else { 2 }, ..*on }).collect()
 }
 
-/// Of a sum: affine where each is.
+/// Of an answer.
+fn asked(of: &Depends) -> Depends {
+    of.iter().map(|on| Depend { degree: 0, asks: true, ..*on }).collect()
+}
+
+/// Of a sum.
 fn either(a: &Depends, b: &Depends) -> Depends {
-    joined(a, b, |a, b| a && b)
+    joined(a, b, u8::max)
 }
 
 /// Of a product: not affine in what both depend on.
 fn product(a: &Depends, b: &Depends) -> Depends {
-    joined(a, b, |_, _| false)
+    joined(a, b, |a, b| (a + b).min(2))
 }
 
-/// What is in either of the two; what is in both as `both` says.
-fn joined(a: &Depends, b: &Depends, both: impl Fn(bool, bool) -> bool) -> Depends {
+/// What is in either of the two; of what is in both the degree is as `both` says.
+fn joined(a: &Depends, b: &Depends, both: impl Fn(u8, u8) -> u8) -> Depends {
     let (mut i, mut j) = (0, 0);
     let mut out = Depends::with_capacity(a.len().max(b.len()));
     while i < a.len() && j < b.len() {
-        let ((x, of_a), (y, of_b)) = (a[i], b[j]);
-        out.push(match x.cmp(&y) {
-            std::cmp::Ordering::Less => (x, of_a),
-            std::cmp::Ordering::Equal => (x, both(of_a, of_b)),
-            std::cmp::Ordering::Greater => (y, of_b),
+        let (x, y) = (a[i], b[j]);
+        out.push(match x.state.cmp(&y.state) {
+            std::cmp::Ordering::Less => x,
+            std::cmp::Ordering::Equal => {
+                Depend { state: x.state, degree: both(x.degree, y.degree), asks: x.asks || y.asks }
+            }
+            std::cmp::Ordering::Greater => y,
         });
-        i += usize::from(x <= y);
-        j += usize::from(y <= x);
+        i += usize::from(x.state <= y.state);
+        j += usize::from(y.state <= x.state);
     }
     out.extend_from_slice(&a[i..]);
     out.extend_from_slice(&b[j..]);
@@ -119,13 +173,13 @@ fn joined(a: &Depends, b: &Depends, both: impl Fn(bool, bool) -> bool) -> Depend
 
 #[cfg(test)]
 mod tests {
+    use super::Shape::{Bent, Broken, Straight};
     use super::*;
     use crate::ir::build::Build;
     use crate::ir::expr::{Real, Shared};
     use abi::Layout;
 
-    #[track_caller]
-    fn check<const N: usize>(f: impl for<'a> Fn([Real<'a>; N]) -> [Real<'a>; N], expected: &[(&[usize], bool)]) {
+    fn of<const N: usize>(f: impl for<'a> Fn([Real<'a>; N]) -> [Real<'a>; N]) -> Coupling {
         let layout = Layout::new([0, 0, N as u32, 0, 0, 0, N as u32, 0, 0, 0]);
         let slots = |segment: abi::description::Segment| -> Vec<Slot> { (0..N).map(|k| segment.slot(k)).collect() };
         let (states, rates) = (slots(layout.states), slots(layout.derivatives));
@@ -134,30 +188,54 @@ mod tests {
         let found = f(x).map(|rate| rate.value);
         let mut build = build.into_inner();
         found.into_iter().zip(&rates).for_each(|(rate, slot)| build.store(*slot, rate));
-        let groups = groups(&build.finish(), &rates, &states);
-        let found: Vec<(&[usize], bool)> = groups.iter().map(|group| (&group.states[..], group.once)).collect();
+        coupling(&build.finish(), &rates, &states)
+    }
+
+    #[track_caller]
+    fn check<const N: usize>(f: impl for<'a> Fn([Real<'a>; N]) -> [Real<'a>; N], expected: &[(&[usize], Shape)]) {
+        let groups = of(f).groups;
+        let found: Vec<(&[usize], Shape)> = groups.iter().map(|group| (&group.states[..], group.shape)).collect();
         assert_eq!(found, expected);
     }
 
     #[test]
     fn what_relaxes_toward_others_comes_behind_them() {
         // A filter of a filter of 1.
-        check(|[x, y]| [(y - x) * 3.0, (1.0 - y) / 2.0], &[(&[1], true), (&[0], true)]);
+        check(|[x, y]| [(y - x) * 3.0, (1.0 - y) / 2.0], &[(&[1], Straight), (&[0], Straight)]);
         // Two that do not know of each other.
-        check(|[x, y]| [1.0 - x, 2.0 - y], &[(&[0, 1], true)]);
+        check(|[x, y]| [1.0 - x, 2.0 - y], &[(&[0, 1], Straight)]);
     }
 
     #[test]
     fn what_goes_in_a_circle_is_iterated() {
-        check(|[x, v, z]| [v, -x, v.abs() * (1.0 - z)], &[(&[0, 1], false), (&[2], true)]);
+        check(|[x, v, z]| [v, -x, v.abs() * (1.0 - z)], &[(&[0, 1], Bent), (&[2], Straight)]);
     }
 
     #[test]
     fn a_rate_that_bends_is_iterated() {
-        check(|[x]| [-(x * x)], &[(&[0], false)]);
-        check(|[x]| [1.0 / x], &[(&[0], false)]);
+        check(|[x]| [-(x * x)], &[(&[0], Bent)]);
+        check(|[x]| [1.0 / x], &[(&[0], Bent)]);
+        check(|[x]| [x.above(0.0).choose(-(x * x), 1.0)], &[(&[0], Bent)]);
+        check(|[x]| [x.bits().real_of_bits()], &[(&[0], Straight)]);
+        check(|[x]| [(x.bits() | 1).real_of_bits()], &[(&[0], Bent)]);
+    }
+
+    #[test]
+    fn a_rate_that_breaks_is_affine_in_each_of_its_branches() {
         // Each branch is free of x, but not which one it is.
-        check(|[x]| [x.above(0.0).choose(-1.0, 1.0)], &[(&[0], false)]);
-        check(|[x, y]| [y.above(0.0).choose(-x, 1.0), y.constant(1.0)], &[(&[1], true), (&[0], true)]);
+        check(|[x]| [x.above(0.0).choose(-1.0, 1.0)], &[(&[0], Broken)]);
+        check(|[x]| [(x * x).above(2.0).choose(-1.0, x)], &[(&[0], Broken)]);
+        check(|[x]| [-x.abs()], &[(&[0], Broken)]);
+        check(|[x]| [x * x.above(0.0).choose(-1.0, 1.0)], &[(&[0], Broken)]);
+        check(|[x]| [x.floor().of(crate::ir::Unary::Exp) - x], &[(&[0], Broken)]);
+        check(|[x, y]| [y.above(0.0).choose(-x, 1.0), y.constant(1.0)], &[(&[1], Straight), (&[0], Straight)]);
+    }
+
+    #[test]
+    fn what_its_rate_does_not_know_cannot_die_away() {
+        let all = of(|[x, v, w, z]| [v, -x, x.above(0.0).choose(1.0, w.abs()), w - z]);
+        assert_eq!(all.fades, [true; 4]);
+        let none = of(|[x, v, w, z]| [v, v.above(0.0).choose(-1.0, 1.0), w.constant(0.0), x.above(z).choose(x, w)]);
+        assert_eq!(none.fades, [false; 4]);
     }
 }

@@ -18,6 +18,17 @@ pub type Gradient = Vec<(u32, Value)>;
 /// Inlines `func` on `env`, as [`Build::inline`] does, and gives for each slot it stores the derivatives of what it
 /// stores along `directions`: direction k is the slot `directions[k]`, all others being constant.
 pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -> HashMap<Slot, Gradient> {
+    inline_given(build, func, env, directions, &HashMap::new())
+}
+
+/// The same where some values of `func` are given, and constant.
+pub fn inline_given(
+    build: &Shared,
+    func: &Func,
+    env: &mut Env,
+    directions: &[Slot],
+    given: &HashMap<Value, Value>,
+) -> HashMap<Slot, Gradient> {
     let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
     let live = func.live();
     let none = Value(u32::MAX);
@@ -30,6 +41,10 @@ pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -
             if let Some(k) = direction.get(slot) {
                 gradients[i] = vec![(*k, build.borrow_mut().real(1.0))];
             }
+            continue;
+        }
+        if let Some(value) = given.get(&Value(i as u32)) {
+            values[i] = *value;
             continue;
         }
         let op = op.map(|operand| values[operand.index()]);
@@ -229,13 +244,12 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
             match function {
                 // of y and x: (x dy − y dx)/(x² + y²)
                 Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
-                // a^b: b a^(b−1) da + a^b log a db. At a = 0 the first is 1 for b = 1 and else 0, also where it is
+                // a^b: b a^b/a da + a^b log a db. For b = 1 the first is 1; at a = 0 it is else 0, also where it is
                 // infinite, and the second is 0: nothing but numbers travels on.
                 Binary::Pow => {
-                    let less = |b: Real<'a>| at(build.borrow_mut().binary(Binary::Pow, a.value, b.value));
                     let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
-                    let at_zero = || b.is(1.0).choose(1.0, 0.0);
-                    both(&|| a.is(0.0).choose(at_zero(), b * less(b - 1.0)), &|| a.above(0.0).choose(y * log(), 0.0))
+                    let slope = || b.is(1.0).choose(1.0, a.is(0.0).choose(0.0, b * (y / a)));
+                    both(&slope, &|| a.above(0.0).choose(y * log(), 0.0))
                 }
                 // At the origin the direction is undefined: 0.
                 Binary::Hypot => {

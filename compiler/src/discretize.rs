@@ -4,7 +4,7 @@
 //! blocks that are due, the transitions and the outputs, and watches the guards, in this order. Inputs, sampled
 //! states and regimes are frozen while the states advance.
 
-use crate::coupled;
+use crate::coupled::{self, Coupling, Shape};
 use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
@@ -12,6 +12,7 @@ use crate::ir::expr::{Real, Shared, Truth};
 use crate::ir::{Func, Op, Value, Write};
 use crate::math::relaxation;
 use crate::program::Program;
+use crate::questions::Asking;
 use abi::Slot;
 use abi::description::{Guard, Segment};
 use abi::plan::Method;
@@ -31,7 +32,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let mut env = Env::new();
     for (k, x) in next.into_iter().enumerate() {
         // What is left of something that has died away would only slow the processor down.
-        let settled = x.abs().below(1e-30).choose(0.0, x);
+        let settled = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
         env.insert(layout.states.slot(k), settled.value);
     }
     let count = model.load(Slot::COUNT) + 1.0;
@@ -154,6 +155,8 @@ struct Model<'a> {
     t: Real<'a>,
     /// States at its beginning.
     x: Vec<Real<'a>>,
+    /// What of them depends on what.
+    coupling: Coupling,
     /// Of the values built so far: which depend on no state.
     given: RefCell<Vec<bool>>,
 }
@@ -161,9 +164,12 @@ struct Model<'a> {
 impl<'a> Model<'a> {
     fn new(program: &'a Program, build: &'a Shared) -> Model<'a> {
         let load = |slot| Real::new(build, build.borrow_mut().load(slot));
-        let states = program.description.layout.states;
-        let x = states.range().map(|slot| load(Slot(slot as u32))).collect();
-        Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x, given: RefCell::default() }
+        let layout = &program.description.layout;
+        let slots =
+            |segment: Segment| -> Vec<Slot> { (0..layout.states.len as usize).map(|k| segment.slot(k)).collect() };
+        let coupling = coupled::coupling(&program.derivatives, &slots(layout.derivatives), &slots(layout.states));
+        let x = layout.states.range().map(|slot| load(Slot(slot as u32))).collect();
+        Model { program, build, h: load(Slot::STEP), t: load(Slot::TIME), x, coupling, given: RefCell::default() }
     }
 
     /// The states after a step.
@@ -194,6 +200,14 @@ impl<'a> Model<'a> {
         env.insert(Slot::TIME, t.value);
         self.delays(c, &mut env);
         env
+    }
+
+    /// The same for a function that reads only some states.
+    fn env_for(&self, func: &Func, c: f64, x: &[Real<'a>]) -> Env {
+        let states = self.program.description.layout.states;
+        let read = |slot: &Slot| states.contains(*slot).then(|| slot.index() - states.start as usize);
+        let read: Vec<usize> = func.loads().iter().filter_map(read).collect();
+        self.env_of(c, read.into_iter().map(|k| (k, x[k])))
     }
 
     /// Puts what is delayed in place at a part `c` of the step. Samples are those at the ends of the steps before.
@@ -274,39 +288,139 @@ impl<'a> Model<'a> {
     ///   three times: r = f + a (x − X), and r in place of f    f, a at (t + h/2, X)
     ///
     /// Whoever depends on others comes behind them. Of a rate that is affine in its state r is the same wherever it is
-    /// evaluated, so once is enough.
+    /// evaluated, so once is enough: at (t + h/2, x). Of one that is affine but for choices that the state makes these are
+    /// made where the state will be, roughly, in the middle of the step, x + h f/(2 − h a), and all else is as before.
     fn expo(&self) -> Vec<Real<'a>> {
         let layout = &self.program.description.layout;
-        let slots = |segment: Segment| -> Vec<Slot> { (0..self.x.len()).map(|k| segment.slot(k)).collect() };
-        let groups = coupled::groups(&self.program.derivatives, &slots(layout.derivatives), &slots(layout.states));
         let stored: HashMap<Slot, Value> = self.program.derivatives.stores.iter().copied().collect();
         let (mut next, mut middle) = (self.x.clone(), self.x.clone());
-        for group in groups {
+        for group in &self.coupling.groups {
             let states = &group.states;
             let rates = self.rates_of(states, &stored);
-            let rounds = if group.once { 1 } else { 4 };
-            for round in 0..rounds {
-                let (c, at) = if round == 0 && !group.once { (0.0, &self.x) } else { (0.5, &middle) };
-                let mut moved = Vec::with_capacity(states.len());
-                for (k, (f, a)) in states.iter().zip(self.relaxation(&rates, c, at, states)) {
-                    let x = self.x[*k];
-                    let [phi, phi2] = self.phis(a);
-                    let r = match a {
-                        Some(a) if group.once => self.once(f, a),
-                        Some(a) if round > 0 => f + self.falling(a) * (x - middle[*k]),
-                        _ => f,
-                    };
-                    moved.push((*k, [phi, phi2].map(|phi| x + self.h * phi * r)));
+            match group.shape {
+                Shape::Straight => self.at_once(&rates, &HashMap::new(), states, &mut next, &mut middle),
+                Shape::Broken => {
+                    let own: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
+                    let asking = Asking::of(&rates, &own);
+                    let answers = self.answers(&asking, states, &middle);
+                    self.at_once(&asking.rates, &answers, states, &mut next, &mut middle);
                 }
-                // Whoever depends on them sees the X at which the last of their rates were taken.
-                let last = round == 3;
-                for (k, [end, mean]) in moved {
-                    next[k] = end;
-                    middle[k] = if last { middle[k] } else { mean };
-                }
+                Shape::Bent => self.iterated(&rates, states, &mut next, &mut middle),
             }
         }
         next
+    }
+
+    /// Steps states whose rates are affine in them, once what they ask of them is answered.
+    fn at_once(
+        &self,
+        rates: &Func,
+        answers: &HashMap<Value, Value>,
+        states: &[usize],
+        next: &mut [Real<'a>],
+        middle: &mut [Real<'a>],
+    ) {
+        for (k, (f, a)) in states.iter().zip(self.relaxation(rates, answers, 0.5, middle, states)) {
+            [next[*k], middle[*k]] = self.relaxed(self.x[*k], f, a);
+        }
+    }
+
+    /// What the rates will ask of their states, answered about the middle of the step.
+    fn answers(&self, asking: &Asking, states: &[usize], middle: &[Real<'a>]) -> HashMap<Value, Value> {
+        let mut there = middle.to_vec();
+        for (k, (f, a)) in states.iter().zip(self.relaxation(&asking.rates, &HashMap::new(), 0.5, middle, states)) {
+            there[*k] = self.x[*k] + self.part(a) * f;
+        }
+        let env = self.env_for(&asking.rates, 0.5, &there);
+        asking.answers(&mut self.build.borrow_mut(), &env)
+    }
+
+    /// h/(2 − min(h a, 0)): h/2 of the slope 0, and never beyond the rest point of a steep one.
+    fn part(&self, a: Option<Real<'a>>) -> Real<'a> {
+        match (self.sloping(a), self.apart(a)) {
+            (None, _) => 0.5 * self.h,
+            (_, Some((condition, [yes, no]))) => condition.choose(self.part(Some(yes)), self.part(Some(no))),
+            (Some(a), None) => self.h / (2.0 - self.falling(self.h * a)),
+        }
+    }
+
+    /// Where a state is at the end of the step, and its mean, of the rate f at x that is affine with the slope `a`.
+    fn relaxed(&self, x: Real<'a>, f: Real<'a>, a: Option<Real<'a>>) -> [Real<'a>; 2] {
+        match (self.sloping(a), self.apart(a)) {
+            (None, _) => [1.0, 0.5].map(|part| self.added(x, part * self.h, f)),
+            (_, Some((condition, sides))) => {
+                let [yes, no] = [true, false].map(|truth| {
+                    let a = sides[usize::from(!truth)];
+                    self.relaxed(x, self.given_that(f, condition, truth), Some(a))
+                });
+                [0, 1].map(|k| condition.choose(yes[k], no[k]))
+            }
+            (Some(a), None) => {
+                let r = self.once(f, a);
+                self.phis(Some(a)).map(|phi| x + self.h * phi * r)
+            }
+        }
+    }
+
+    /// x + h f, and x where f is 0.
+    fn added(&self, x: Real<'a>, h: Real<'a>, f: Real<'a>) -> Real<'a> {
+        let op = self.build.borrow().get(f.value);
+        let zero = |value: Value| self.build.borrow().constant(value) == Some(0.0);
+        match op {
+            _ if zero(f.value) => x,
+            Op::Select(condition, yes, no) if zero(yes) || zero(no) => {
+                let [yes, no] = [yes, no].map(|side| self.added(x, h, f.same(side)));
+                Truth::new(self.build, condition).choose(yes, no)
+            }
+            _ => x + h * f,
+        }
+    }
+
+    /// A slope that is not 0 in any case.
+    fn sloping(&self, a: Option<Real<'a>>) -> Option<Real<'a>> {
+        a.filter(|a| self.build.borrow().constant(a.value) != Some(0.0))
+    }
+
+    /// The two sides of a choice between slopes that no state changes, or of whether there is one: what belongs to each of
+    /// them is known once for all rounds, or computed only where it is chosen.
+    fn apart(&self, a: Option<Real<'a>>) -> Option<(Truth<'a>, [Real<'a>; 2])> {
+        let a = a?;
+        let op = self.build.borrow().get(a.value);
+        let Op::Select(condition, yes, no) = op else { return None };
+        let sides = [yes, no].map(|side| a.same(side));
+        let level = sides.iter().any(|side| self.sloping(Some(*side)).is_none());
+        let chosen = !self.is_given(a.value) && self.is_chosen(a.value);
+        (level || chosen).then(|| (Truth::new(self.build, condition), sides))
+    }
+
+    /// A value where a condition is as told.
+    fn given_that(&self, value: Real<'a>, condition: Truth<'a>, truth: bool) -> Real<'a> {
+        match self.build.borrow().get(value.value) {
+            Op::Select(asked, yes, no) if asked == condition.value => value.same(if truth { yes } else { no }),
+            _ => value,
+        }
+    }
+
+    /// Rate and slope anew at each X.
+    fn iterated(&self, rates: &Func, states: &[usize], next: &mut [Real<'a>], middle: &mut [Real<'a>]) {
+        for round in 0..4 {
+            let (c, at) = if round == 0 { (0.0, &self.x[..]) } else { (0.5, &*middle) };
+            let mut moved = Vec::with_capacity(states.len());
+            for (k, (f, a)) in states.iter().zip(self.relaxation(rates, &HashMap::new(), c, at, states)) {
+                let x = self.x[*k];
+                let r = match a {
+                    Some(a) if round > 0 => f + self.falling(a) * (x - middle[*k]),
+                    _ => f,
+                };
+                moved.push((*k, self.phis(a).map(|phi| x + self.h * phi * r)));
+            }
+            // Whoever depends on them sees the X at which the last of their rates were taken.
+            let last = round == 3;
+            for (k, [end, mean]) in moved {
+                next[k] = end;
+                middle[k] = if last { middle[k] } else { mean };
+            }
+        }
     }
 
     /// What iterating makes of a rate `f` at x that is affine, with the slope `a`: itself, unless it grows away from its
@@ -340,13 +454,18 @@ impl<'a> Model<'a> {
     }
 
     /// For each of these states f, and ∂f/∂x of itself alone; none where it does not depend on itself.
-    fn relaxation(&self, rates: &Func, c: f64, x: &[Real<'a>], states: &[usize]) -> Vec<(Real<'a>, Option<Real<'a>>)> {
+    fn relaxation(
+        &self,
+        rates: &Func,
+        answers: &HashMap<Value, Value>,
+        c: f64,
+        x: &[Real<'a>],
+        states: &[usize],
+    ) -> Vec<(Real<'a>, Option<Real<'a>>)> {
         let layout = &self.program.description.layout;
-        let read = |slot: Slot| layout.states.contains(slot).then(|| slot.index() - layout.states.start as usize);
-        let read: Vec<usize> = rates.loads().into_iter().filter_map(read).collect();
-        let mut env = self.env_of(c, read.into_iter().map(|k| (k, x[k])));
+        let mut env = self.env_for(rates, c, x);
         let slots: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
-        let gradients = derive::inline(self.build, rates, &mut env, &slots);
+        let gradients = derive::inline_given(self.build, rates, &mut env, &slots, answers);
         let of = |(direction, k): (usize, &usize)| {
             let slot = layout.derivatives.slot(*k);
             let f = Real::new(self.build, self.build.borrow_mut().read(slot, &env));
@@ -361,20 +480,17 @@ impl<'a> Model<'a> {
         a.below(0.0).choose(a, 0.0)
     }
 
-    /// φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² of q = h min(a, 0); φ(0) = 1, φ2(0) = 1/2.
+    /// φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² of q = min(h a, 0); φ(0) = 1, φ2(0) = 1/2.
     fn phis(&self, a: Option<Real<'a>>) -> [Real<'a>; 2] {
-        let constants = [1.0, 0.5].map(|phi| self.h.constant(phi));
-        let Some(a) = a else { return constants };
-        let op = self.build.borrow().get(a.value);
-        match op {
-            Op::Real(bits) if f64::from_bits(bits) >= 0.0 => constants,
-            // Of a choice between slopes that no state changes both are known once for all rounds.
-            Op::Select(condition, yes, no) if !self.is_given(a.value) && self.is_chosen(a.value) => {
-                let [yes, no] = [yes, no].map(|side| self.phis(Some(a.same(side))));
-                let condition = Truth::new(self.build, condition);
+        match (self.sloping(a), self.apart(a)) {
+            (Some(a), None) if self.build.borrow().constant(a.value).is_none_or(|a| a < 0.0) => {
+                relaxation::phis(self.falling(self.h * a))
+            }
+            (Some(_), Some((condition, [yes, no]))) => {
+                let [yes, no] = [yes, no].map(|side| self.phis(Some(side)));
                 [0, 1].map(|k| condition.choose(yes[k], no[k]))
             }
-            _ => relaxation::phis(self.h * self.falling(a)),
+            _ => [1.0, 0.5].map(|phi| self.h.constant(phi)),
         }
     }
 
@@ -399,7 +515,7 @@ impl<'a> Model<'a> {
     }
 
     /// The same with its choices outermost, where only these depend on states: (if c then 1 else 0) · x − y → if c then
-    /// x − y else −y. 0 · x is 0, as it is in a derivative.
+    /// x − y else −y. 0 · x and 0/x are 0, as in a derivative.
     fn chosen(&self, value: Value, deepest: u32) -> Value {
         let op = self.build.borrow().get(value);
         if deepest == 0 || self.is_given(value) {
@@ -408,7 +524,7 @@ impl<'a> Model<'a> {
         let (a, b) = match op {
             Op::Select(condition, yes, no) => {
                 let [yes, no] = [yes, no].map(|side| self.chosen(side, deepest - 1));
-                return self.build.borrow_mut().select(condition, yes, no);
+                return self.choice(condition, yes, no);
             }
             Op::Neg(a) => (a, a),
             Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) => (a, b),
@@ -429,6 +545,7 @@ impl<'a> Model<'a> {
             let zero = |value: Value, build: &Build| build.constant(value) == Some(0.0);
             match op.map(of) {
                 Op::Mul(a, b) if zero(a, &build) || zero(b, &build) => build.real(0.0),
+                Op::Div(a, _) if zero(a, &build) => build.real(0.0),
                 op => build.op(op),
             }
         })
@@ -440,9 +557,21 @@ impl<'a> Model<'a> {
         match op {
             Op::Select(condition, yes, no) if !self.is_given(value) => {
                 let [yes, no] = [yes, no].map(|side| self.for_each_choice(side, f));
-                self.build.borrow_mut().select(condition, yes, no)
+                self.choice(condition, yes, no)
             }
             _ => f(value),
+        }
+    }
+
+    /// If c then a else if d then a else b → if c or d then a else b.
+    fn choice(&self, condition: Value, yes: Value, no: Value) -> Value {
+        let mut build = self.build.borrow_mut();
+        match build.get(no) {
+            Op::Select(other, same, no) if same == yes => {
+                let either = build.or(condition, other);
+                build.select(either, yes, no)
+            }
+            _ => build.select(condition, yes, no),
         }
     }
 
@@ -588,6 +717,53 @@ mod tests {
             run.advance(1);
             let exact = 0.04 + 0.96 * core_math::exp(-50.0 * h);
             assert!((run.x(0) - exact).abs() < 1e-14, "h = {h}: {} and not {exact}", run.x(0));
+        }
+    }
+
+    /// A stop that pushes back beyond 0.3 with k (x − 0.3): order 2, wherever in a step its edge lies.
+    #[test]
+    fn expo_sees_choices_of_a_state_in_the_middle_of_the_step() {
+        let program = |k: f64| {
+            program(1, move |t, x| {
+                let beyond = x[0] - 0.3;
+                (vec![t.of(Unary::Cos) - beyond.above(0.0).choose(k * beyond, 0.0)], x[0])
+            })
+        };
+        let mean = |n: u64, of: &dyn Fn(u64, f64) -> f64| {
+            let mut run = Run::new(&program(20.0), Method::Expo, 10.0 / n as f64, &[0.0]);
+            let errors = (0..32).map(|k| {
+                run.advance(n / 32);
+                of(k, run.x(0))
+            });
+            errors.sum::<f64>() / 32.0
+        };
+        let exact = RefCell::new(Vec::new());
+        mean(1 << 18, &|_, x| {
+            exact.borrow_mut().push(x);
+            0.0
+        });
+        let error = |n| mean(n, &|k, x| (x - exact.borrow()[k as usize]).abs());
+        let (coarse, fine) = (error(1 << 8), error(1 << 12));
+        let order = (coarse / fine).log2() / 4.0;
+        assert!((1.8..2.3).contains(&order), "order {order}, errors {coarse} and {fine}");
+        // However stiff it is, nothing passes, and what is drawn back leaves at once.
+        let mut run = Run::new(&program(1e9), Method::Expo, 0.01, &[0.0]);
+        let course: Vec<f64> = (0..628).map(|_| (run.advance(1), run.x(0)).1).collect();
+        let most = course.iter().copied().fold(0.0, f64::max);
+        assert!(most > 0.3 && most < 0.3 + 1e-8, "{most}");
+        assert!((course[627] - (0.3 - 1.0)).abs() < 0.01, "{}", course[627]);
+    }
+
+    /// Coulomb friction on a mass alone: it goes on within what it travels in one and a half steps.
+    #[test]
+    fn a_state_that_is_drawn_to_a_jump_stays_near_it() {
+        let program = program(1, |_, x| (vec![x[0].above(0.0).choose(-1.0, 1.0)], x[0]));
+        let mut run = Run::new(&program, Method::Expo, 0.1, &[0.96]);
+        run.advance(9);
+        assert!((run.x(0) - 0.06).abs() < 1e-12, "{}", run.x(0));
+        for _ in 0..100 {
+            run.advance(1);
+            assert!(run.x(0).abs() < 0.15, "{}", run.x(0));
         }
     }
 

@@ -10,6 +10,7 @@ pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod questions;
 pub mod coupled;
 pub mod elimination;
 pub mod discretize;

@@ -144,10 +144,10 @@ impl<'a> Real<'a> {
         self.with(|b| b.unary(function, self.value))
     }
 
-    /// Whether it is written as −(a · a): it is then not above 0, or NaN.
-    pub fn is_minus_square(self) -> bool {
+    /// Whether it is not above 0, or NaN, by how it is written: as −(a · a) or min(a, 0).
+    pub fn is_not_positive(self) -> bool {
         let build = self.build.borrow();
-        super::is_minus_square(self.value, |value| build.get(value))
+        super::is_not_positive(self.value, |value| build.get(value))
     }
 
     /// self · b + c, rounded once.

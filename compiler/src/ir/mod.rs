@@ -169,9 +169,13 @@ pub enum Op {
     ToReal(Value),
 }
 
-/// Whether a value is written as −(a · a): it is then not above 0, or NaN. `op`: what gives a value.
-pub fn is_minus_square(value: Value, op: impl Fn(Value) -> Op) -> bool {
-    matches!(op(value), Op::Neg(square) if matches!(op(square), Op::Mul(a, b) if a == b))
+/// Whether a value is not above 0, or NaN, by how it is written: as −(a · a) or min(a, 0). `op`: what gives a value.
+pub fn is_not_positive(value: Value, op: impl Fn(Value) -> Op) -> bool {
+    match op(value) {
+        Op::Neg(square) => matches!(op(square), Op::Mul(a, b) if a == b),
+        Op::Select(below, a, zero) => op(zero) == Op::Real(0) && op(below) == Op::Less(a, zero),
+        _ => false,
+    }
 }
 
 /// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.

@@ -104,15 +104,15 @@ impl<'a> Parts<'a> {
 /// Within 0.52 ulp where the result is normal.
 pub fn exp(x: Real) -> Real {
     let parts = Parts::of(x);
-    // As in Stribeck's curve: the same bits, without what only large results need.
-    if x.is_minus_square() { parts.scaled_below(x) } else { parts.scaled(x, 0) }
+    // As in Stribeck's curve and where a state relaxes: the same bits, without what only large results need.
+    if x.is_not_positive() { parts.scaled_below(x) } else { parts.scaled(x, 0) }
 }
 
-/// The bits of [`exp`] in the fewest operations, where these count and not how long each waits for the one before: of a
-/// minus square the scale is always taken 2^1022 times as large and the rest multiplied last. That rounds once more only
+/// The bits of [`exp`] in the fewest operations, where these count and not how long each waits for the one before: of what
+/// is not above 0 the scale is always taken 2^1022 times as large and the rest multiplied last. That rounds once more only
 /// where the result is too small for all digits, as there.
 pub fn exp_of_lanes(x: Real) -> Real {
-    if !x.is_minus_square() {
+    if !x.is_not_positive() {
         return exp(x);
     }
     // 1022 doublings are a whole number of steps, and so are their bits.
