@@ -144,12 +144,6 @@ impl<'a> Real<'a> {
         self.with(|b| b.unary(function, self.value))
     }
 
-    /// Whether it is written as −(a · a): it is then not above 0, or NaN.
-    pub fn is_minus_square(self) -> bool {
-        let build = self.build.borrow();
-        super::is_minus_square(self.value, |value| build.get(value))
-    }
-
     /// self · b + c, rounded once.
     pub fn fma<B, C>(self, b: B, c: C) -> Real<'a>
     where

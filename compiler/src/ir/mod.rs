@@ -169,9 +169,21 @@ pub enum Op {
     ToReal(Value),
 }
 
-/// Whether a value is written as −(a · a): it is then not above 0, or NaN. `op`: what gives a value.
-pub fn is_minus_square(value: Value, op: impl Fn(Value) -> Op) -> bool {
-    matches!(op(value), Op::Neg(square) if matches!(op(square), Op::Mul(a, b) if a == b))
+/// Whether a value is not above 0, or NaN, by how it is written: as −|a|, −(a · a), −|a|^b … `op`: what gives a value.
+pub fn is_not_positive(value: Value, op: impl Fn(Value) -> Op) -> bool {
+    matches!(op(value), Op::Neg(size) if is_not_negative(size, op))
+}
+
+/// Whether a value is +0, above it or NaN, by how it is written.
+pub fn is_not_negative(value: Value, op: impl Fn(Value) -> Op) -> bool {
+    match op(value) {
+        Op::Abs(_) | Op::Unary(Unary::Exp | Unary::Cosh, _) => true,
+        Op::Mul(a, b) if a == b => true,
+        Op::Real(bits) => bits >> 63 == 0,
+        // Of a base that has no sign the power has none.
+        Op::Binary(Binary::Pow, a, _) => is_not_negative(a, op),
+        _ => false,
+    }
 }
 
 /// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.

@@ -6,7 +6,7 @@
 
 use super::encode::{Instruction, Vectors, instructions as i};
 use crate::backend::target::Unsupported;
-use crate::ir::{Func, Op, Type, Unary, Value, is_minus_square, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
@@ -346,7 +346,7 @@ impl Selection {
             Op::Floor(a) => What::One(i::ROUND, Some(9), at(a)),
             Op::Nearest(a) => What::One(i::ROUND, Some(8), at(a)),
             Op::Unary(Unary::Exp, x) => {
-                return Ok(self.exp(at(x), is_minus_square(x, |value| func.op(value))));
+                return Ok(self.exp(at(x), is_not_positive(x, |value| func.op(value))));
             }
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Less(a, b) => What::Compare(Predicate::Less, at(a), at(b)),
