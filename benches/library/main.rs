@@ -3,8 +3,9 @@
 //!
 //! The C (`models.c`, `gcc -O3 -march=native`) gets the same inputs, new ones at every call, and does the same step: by
 //! `expo`, in the form in which one writes it for one model alone. First both go through the same course, whose states
-//! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The C
-//! watches nothing: a last column has our step without guards too.
+//! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The bar
+//! is this C as it stands, which neither counts nor keeps time nor watches. Two columns tell what that is worth: the same C
+//! with just that, and our step without guards.
 //! A word behind the command takes only models whose names begin with it.
 
 #[path = "../../src/project.rs"]
@@ -58,6 +59,11 @@ struct Hand {
     states: *const c_char,
     outputs: *const c_char,
     step: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64),
+    /// The same that also counts, keeps time and watches. Last its time, the step and its count.
+    checked: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, *mut f64) -> i64,
+    /// Which states it watches, a bit each.
+    watched: u64,
+    number_of_outputs: u64,
 }
 
 fn words(text: *const c_char) -> Vec<String> {
@@ -93,21 +99,25 @@ fn main() {
     let mut loaded = compiler::load("library.fric", &whole, &NoSources);
     let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
     println!("one step a call by `expo`, new inputs at each; below 1 is faster than C through a pointer");
-    println!("{:<24} {:>9} {:>9} {:>7} {:>12}", "", "C", "ours", "ratio", "unguarded");
-    let (mut ratios, mut unguarded, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
+    println!(
+        "{:<22} {:>8} {:>8} {:>8} {:>7} {:>10} {:>10}",
+        "", "C", "checked", "ours", "ratio", "to checked", "unguarded"
+    );
+    let (mut ratios, mut left_out) = ([const { Vec::new() }; 3], Vec::new());
     for name in names.iter().filter(|name| name.starts_with(&chosen)) {
         if let Some((_, why)) = LEFT_OUT.iter().find(|(left_out, _)| left_out == name) {
             left_out.push(format!("{name}: {why}"));
             continue;
         }
         let hand = hand(name).unwrap_or_else(|| panic!("`models.c` has no {name}"));
-        let [c, ours, bare] = compare(name, &mut loaded, hand);
-        println!("{name:<24} {c:6.1} ns {ours:6.1} ns {:7.3} {:12.3}", ours / c, bare / c);
-        ratios.push((ours / c, name));
-        unguarded.push((bare / c, name));
+        let [c, checked, ours, bare] = compare(name, &mut loaded, hand);
+        let of_model = [ours / c, ours / checked, bare / c];
+        let [ratio, to_checked, unguarded] = of_model;
+        println!("{name:<22} {c:5.1} ns {checked:5.1} ns {ours:5.1} ns {ratio:7.3} {to_checked:10.3} {unguarded:10.3}");
+        ratios.iter_mut().zip(of_model).for_each(|(ratios, ratio)| ratios.push((ratio, name)));
     }
     left_out.iter().for_each(|what| println!("left out: {what}"));
-    for (what, ratios) in [("guarded", ratios), ("unguarded", unguarded)] {
+    for (what, ratios) in ["ratio", "to checked", "unguarded"].into_iter().zip(ratios) {
         #[allow(clippy::disallowed_methods, reason = "for people only")]
         let mean = (ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64).exp();
         let above = ratios.iter().filter(|(ratio, _)| *ratio > 1.0).count();
@@ -119,8 +129,8 @@ fn main() {
     }
 }
 
-/// Nanoseconds a call in C, of ours, and of ours without guards, medians.
-fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 3] {
+/// Nanoseconds a call in C, in C that watches too, of ours, and of ours without guards, medians.
+fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 4] {
     // A sampled model is called at its own pace.
     let h = match name {
         "DriveTorqueSampled" => 0.5e-3,
@@ -166,6 +176,14 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 3] {
         assert!(known, "{name} in C lacks state {}", quantity.path);
     }
     let mut out = vec![0.0; outputs.len()];
+    let names = words(hand.states);
+    let own = names.iter().enumerate().filter(|(_, path)| !path.starts_with(['.', '@']));
+    let watched = own.fold(0, |all, (k, _)| all | 1 << k);
+    assert_eq!(
+        (hand.watched, hand.number_of_outputs),
+        (watched, outputs.len() as u64),
+        "{name} in C watches all states of its own and all outputs"
+    );
 
     // The same course.
     let in_block = states.iter().enumerate().filter_map(|(k, state)| match state {
@@ -194,7 +212,7 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 3] {
         }
     }
     let ours = [(entry, ours), (bare.entry, &mut bare.instance)];
-    timed(name, hand, ours, &mut x, &params, &mut out, (&course, &inputs, &outputs), h)
+    timed(hand, ours, &mut x, &params, &mut out, (&course, &inputs, &outputs), h)
 }
 
 /// A model and its step.
@@ -215,7 +233,6 @@ impl Running {
 /// Medians of interleaved rounds, ns a call.
 #[allow(clippy::too_many_arguments, reason = "all that the two calls need")]
 fn timed(
-    name: &str,
     hand: &Hand,
     ours: [(Entry, &mut Instance); 2],
     x: &mut [f64],
@@ -223,53 +240,75 @@ fn timed(
     out: &mut [f64],
     (course, inputs, outputs): (&[f64], &[Slot], &[Slot]),
     h: f64,
-) -> [f64; 3] {
+) -> [f64; 4] {
     let description = ours[0].1.description().clone();
     let first = description.layout.inputs.start as usize;
-    let n = inputs.len();
-    let mut u = vec![0.0; n];
-    let ours = ours.map(|(entry, instance)| (black_box(entry), instance.block_mut().as_mut_ptr()));
-    let mut times = [const { Vec::new() }; 3];
-    let (mut sum, mut at) = (0.0, 0);
-    let step = black_box(hand.step);
+    let pool = description.pool.as_ptr();
+    let mut u = vec![0.0; inputs.len()];
+    let in_c: Vec<usize> = (0..outputs.len()).collect();
+    let in_block: Vec<usize> = outputs.iter().map(|slot| slot.index()).collect();
+    let (mut watched, mut clock) = (x.to_vec(), [0.0, h, 0.0]);
+    let (x, watched, clock) = (x.as_mut_ptr(), watched.as_mut_ptr(), clock.as_mut_ptr());
+    let (params, u, out) = (params.as_ptr(), u.as_mut_ptr(), out.as_mut_ptr());
+    let of_c = Ports { inputs: u, base: out, outputs: &in_c };
+    let ours = ours.map(|(entry, instance)| {
+        let block = instance.block_mut().as_mut_ptr();
+        // SAFETY: the inputs lie in the block.
+        let inputs = unsafe { block.add(first) };
+        (black_box(entry), block, Ports { inputs, base: block, outputs: &in_block })
+    });
+    let (step, checked) = (black_box(hand.step), black_box(hand.checked));
+    let mut times = [const { Vec::new() }; 4];
+    let mut at = 0;
     for _ in 0..ROUNDS {
-        let rows = || (at..at + CALLS).map(|k| &course[k % COURSE * n..][..n]);
-        let begun = Instant::now();
-        for row in rows() {
-            for (to, from) in u.iter_mut().zip(row) {
-                *to = *from;
-            }
-            // SAFETY: as above.
-            unsafe { step(x.as_mut_ptr(), params.as_ptr(), u.as_ptr(), out.as_mut_ptr(), h) };
-            for from in out.iter() {
-                sum += from;
-            }
-        }
-        times[0].push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
-        for ((entry, block), times) in ours.iter().zip(&mut times[1..]) {
-            let begun = Instant::now();
-            for row in rows() {
-                // SAFETY: block and pool are those of the model, and its slots lie in the block.
-                unsafe {
-                    for (k, from) in row.iter().enumerate() {
-                        *block.add(first + k) = *from;
-                    }
-                    let status = entry(*block, description.pool.as_ptr(), 1);
-                    assert_eq!(status, 0, "{name}");
-                    for from in outputs {
-                        sum += *block.add(from.index());
-                    }
-                }
-            }
-            times.push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
+        let rows = || (at..at + CALLS).map(|k| &course[k % COURSE * inputs.len()..][..inputs.len()]);
+        // SAFETY: the arrays are as long as the names that the source gives.
+        times[0].push(round(rows(), &of_c, move || unsafe {
+            step(x, params, u, out, h);
+            0
+        }));
+        // SAFETY: as above, and the clock has its three numbers.
+        times[1].push(round(rows(), &of_c, move || unsafe { checked(watched, params, u, out, clock) }));
+        for ((entry, block, ports), times) in ours.iter().zip(&mut times[2..]) {
+            let (entry, block) = (*entry, *block);
+            // SAFETY: block and pool are those of the model.
+            times.push(round(rows(), ports, move || unsafe { entry(block, pool, 1) as i64 }));
         }
         at += CALLS;
     }
-    black_box(sum);
     times.map(|mut times| {
         times.sort_by(f64::total_cmp);
         times[times.len() / 2]
     })
+}
+
+/// Where a step reads its inputs, one behind the other, and leaves its outputs.
+struct Ports<'a> {
+    inputs: *mut f64,
+    base: *const f64,
+    /// Numbers behind the base.
+    outputs: &'a [usize],
+}
+
+/// Nanoseconds a call over some rows of inputs: all that stands around the call is the same for each kind of step.
+#[inline(never)]
+fn round<'a>(rows: impl Iterator<Item = &'a [f64]>, ports: &Ports, mut call: impl FnMut() -> i64) -> f64 {
+    let mut sum = 0.0;
+    let begun = Instant::now();
+    for row in rows {
+        for (k, from) in row.iter().enumerate() {
+            // SAFETY: a row is as long as the model has inputs.
+            unsafe { *ports.inputs.add(k) = *from };
+        }
+        assert_eq!(call(), 0, "no guard fires");
+        for from in ports.outputs {
+            // SAFETY: these are the model's outputs.
+            sum += unsafe { *ports.base.add(*from) };
+        }
+    }
+    let nanoseconds = begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9;
+    black_box(sum);
+    nanoseconds
 }
 
 fn slot(description: &Description, name: &str, path: &str) -> Slot {

@@ -840,97 +840,117 @@ static void TwoMass(ARGS) {
 #define EIGHT(word) word word word word word word word word
 #define ELEMENTS(name) "el[1]." name " @mode:el[1] el[2]." name " @mode:el[2] el[3]." name " @mode:el[3] el[4]." name " @mode:el[4]"
 
+/* Name; which states are watched, a bit each, and the number of outputs; then the names of all ports. Behind a `.` stands
+ * an input with which a state of our own begins; `@` are counter and regimes. */
+#define MODELS(MODEL) \
+    MODEL(Ambrosio, 0x0u, 1, "v", "Fc v0 v1", "", "F") \
+    MODEL(Asymmetric, 0x0u, 1, "v", "F0 pos.Fc pos.Fs pos.vs pos.Fv neg.Fc neg.Fs neg.vs neg.Fv", "", "F") \
+    MODEL(BengisuAkay, 0x0u, 1, "v", "Fc Fs v0 xi", "", "F") \
+    MODEL(BreakAwayTanh, 0x0u, 1, "v", "Fc Fs v_brk Fv", "", "F") \
+    MODEL(BrownMcPhee, 0x0u, 1, "v Fn", "mud mus vt muv Nt", "", "F") \
+    MODEL(Coulomb, 0x0u, 1, "v", "Fc", "", "F") \
+    MODEL(CoulombViscous, 0x0u, 1, "v", "Fc Fv", "", "F") \
+    MODEL(GearM1, 0x0u, 1, "v", "Kv Kc", "", "F") \
+    MODEL(GearM2, 0x0u, 1, "v", "Kv Kc Kcs vs alpha", "", "F") \
+    MODEL(GearM3, 0x0u, 1, "v F_m F_e", "Kv Kc Kl", "", "F") \
+    MODEL(GearM4, 0x0u, 1, "v F_m F_e", "Kv Kc Kl Kcs Kls vs alpha", "", "F") \
+    MODEL(GearM5, 0x0u, 1, "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes vs alpha", "", "F") \
+    MODEL(GearM6, 0x0u, 1, "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes Keq Kmq vs alpha", "", "F") \
+    MODEL(Karnopp, 0x0u, 3, "v F_ext", "Fc Fs Fv Dv", "", "stuck F v_out") \
+    MODEL(KFMSmooth, 0x0u, 1, "v", "Fc Fs Fv v0 vs", "", "F") \
+    MODEL(HyperbolicAgeing, 0x0u, 1, "rest", "gamma", "", "share") \
+    MODEL(ExponentialAgeing, 0x0u, 1, "rest", "tau n", "", "share") \
+    MODEL(Makkar, 0x0u, 1, "v", "g1 g2 g3 g4 g5 g6", "", "F") \
+    MODEL(PointsFriction, 0x0u, 1, "v", "F0 v1 F1 v2 F2 v3 F3 v4 F4", "", "F") \
+    MODEL(TanhSign, 0x0u, 1, "v v0", "", "", "s") \
+    MODEL(AtanSign, 0x0u, 1, "v v0", "", "", "s") \
+    MODEL(RootSign, 0x0u, 1, "v v0", "", "", "s") \
+    MODEL(ClampSign, 0x0u, 1, "v v0", "", "", "s") \
+    MODEL(Smoothed, 0x0u, 1, "v", "v0 v_min law.Fc law.Fs law.vs law.Fv", "", "F") \
+    MODEL(StribeckGauss, 0x0u, 1, "v", "Fc Fs vs Fv", "", "F") \
+    MODEL(StribeckLorentz, 0x0u, 1, "v", "Fc Fs vs Fv", "", "F") \
+    MODEL(BoPavelescu, 0x0u, 1, "v", "Fc Fs vs shape Fv", "", "F") \
+    MODEL(LoadedStribeck, 0x0u, 1, "v Fn", "muc mus vs", "", "F") \
+    MODEL(BittencourtGunnarsson, 0x0u, 1, "v Fl T", "Fc0 Fcl Fs0 FsT Fsl vs0 vsT vsl Fv0 FvT TV", "", "F") \
+    MODEL(Threlfall, 0x0u, 1, "v", "Fc v1", "", "F") \
+    MODEL(Tustin, 0x0u, 1, "v", "Fc Fs vs Fv", "", "F") \
+    MODEL(Viscous, 0x0u, 1, "v", "Fv", "", "F") \
+    MODEL(ViscousPowers, 0x0u, 1, "v", "Fc Fh v1 Fv Fq", "", "F") \
+    MODEL(TableFriction, 0x0u, 1, "v", "scale", "", "F") \
+    MODEL(LuGre, 0x1u, 1, "v", "sigma0 sigma1 sigma2 Fc Fs vs vd", "z", "F") \
+    MODEL(LoadedLuGre, 0x1u, 1, "v Fn", "sigma0 sigma1 sigma2 muc mus vs vd", "z", "F") \
+    MODEL(LuGreAsymmetric, 0x1u, 1, "v", "sigma0 sigma1 sigma2 Fcp Fsp Fcn Fsn vs vd", "z", "F") \
+    MODEL(LuGreCurve, 0x1u, 1, "v", "sigma0 sigma1 vd g_min v_min curve.Fc curve.Fs curve.vs curve.Fv", "z", "F") \
+    MODEL(LuGreObserver, 0x1u, 1, "v e", "sigma0 sigma1 sigma2 Fc Fs vs k", "z_hat", "F_hat") \
+    MODEL(AdaptiveLuGreObserver, 0x3u, 1, "v e de", "sigma0 sigma1 sigma2 Fc Fs vs k gamma lambda theta_max", "z_hat theta", "F_hat") \
+    MODEL(Dahl, 0x3u, 1, "v", "Fc sigma", "s z", "F") \
+    MODEL(DahlPower, 0x1u, 1, "v", "Fc sigma i", "z", "F") \
+    MODEL(BlimanSorine, 0x7u, 1, "v", "f1 f2 eta eps_f", "s xf xs", "F") \
+    MODEL(BlimanSorine1, 0x3u, 1, "v", "f1 eps_f", "s x", "F") \
+    MODEL(BoucWen, 0x1u, 1, "v", "Fc A beta gamma n", "z", "F") \
+    MODEL(ElastoPlastic, 0x1u, 1, "v", "sigma0 sigma1 sigma2 Fc Fs vs ba vd", "z", "F") \
+    MODEL(GearEfficiency, 0x3u, 1, "v F_l", "mu_a mu_d h", "s z", "F") \
+    MODEL(Gonthier, 0x3u, 2, "v", "sigma0 sigma1 sigma2 Fc Fs vs v_e tau_dw", "sd z", "F_max F") \
+    MODEL(RateState, 0x1u, 1, "v", "Fn mu0 a b v0 D", "theta", "F") \
+    MODEL(PositionDependent, 0x1u, 1, "v", "p a1 phi1 a2 phi2 Fv Fg law.Fc", "x", "F") \
+    MODEL(Armstrong, 0x7u, 2, "v", "kt Fc Fv E_inf vs tau_L gamma", "x t2 Ea @mode @count " EIGHT(EIGHT(" .v .v .v .v")), "F_max F") \
+    MODEL(GMSElement, 0x1u, 1, "v limit", "k C", "f @mode .v", "F") \
+    MODEL(GMS, 0x55u, 1, "v", "Fc Fs vs k0 C Fv", ELEMENTS("f") " .v", "F") \
+    MODEL(MaxwellElement, 0x1u, 1, "v", "k W", "f @mode", "F") \
+    MODEL(MaxwellSlip, 0x55u, 1, "v", "k0 Fc", ELEMENTS("f"), "F") \
+    MODEL(LeuvenModified, 0xabu, 1, "v", "k0 Wh n sigma1 sigma2 Fc Fs vs", "z " ELEMENTS("f"), "F") \
+    MODEL(KFM, 0x1u, 1, "v F_ext", "Fc Fs Fv B v_hold x_hold", "slip @mode", "F") \
+    MODEL(KFMDwell, 0x3u, 2, "v F_ext", "Fc Fs Fv gamma rested B v_hold x_hold", "slip dwell @mode", "F_max F") \
+    MODEL(Sticking, 0x1u, 1, "v F_ext", "peak B v_hold x_hold v_min law.Fc law.Fs law.vs law.Fv", "slip @mode", "F") \
+    MODEL(ResetIntegrator, 0x1u, 1, "v", "sigma0 sigma1 z0 a", "z @mode", "F") \
+    MODEL(BristleMass, 0x3u, 1, "v", "sigma0 sigma1 mb Fc Fs vs Fv", "z s @mode", "F") \
+    MODEL(BristleElement, 0x3u, 1, "x", "sigma delta seed", "b n", "F") \
+    MODEL(Bristles, 0x1ffffffffffu, 1, "v", "Fc delta", "x el[1].b el[1].n el[2].b el[2].n el[3].b el[3].n el[4].b el[4].n el[5].b el[5].n el[6].b el[6].n el[7].b el[7].n el[8].b el[8].n el[9].b el[9].n el[10].b el[10].n el[11].b el[11].n el[12].b el[12].n el[13].b el[13].n el[14].b el[14].n el[15].b el[15].n el[16].b el[16].n el[17].b el[17].n el[18].b el[18].n el[19].b el[19].n el[20].b el[20].n", "F") \
+    MODEL(PID, 0x3u, 1, "r y", "Kp Ti Td N Tt b u_max", "i yf", "u") \
+    MODEL(PIDDiscrete, 0x17u, 1, "r y", "Kp Ti Td N Tt b u_max Ts", "i d y_old @count u", "u") \
+    MODEL(PIDSpeed, 0x1u, 1, "r y v", "Kp Ki Kv", "i", "u") \
+    MODEL(Cascade, 0x1u, 1, "r y v", "Kx Kv Tv v_max u_max", "i", "u") \
+    MODEL(CascadeDiscrete, 0x5u, 1, "r y v", "Kx Kv Tv v_max u_max Ts", "i @count u", "u") \
+    MODEL(FeedForward, 0x0u, 1, "v_d", "share law.Fc law.Fs law.Fv law.vs", "", "u") \
+    MODEL(Dither, 0x0u, 1, "u_in", "A f", "@count", "u") \
+    MODEL(Knocker, 0xdu, 3, "u_in e", "a width period e0", "u_last @count height begun", "height begun u") \
+    MODEL(AdaptiveCoulomb, 0x1u, 1, "e de v_d", "gamma lambda a_max", "a", "u") \
+    MODEL(StictionPush, 0x0u, 1, "e v", "Fs Dv e0", "", "u") \
+    MODEL(Lag, 0x1u, 0, "u", "T", "y", "") \
+    MODEL(KFMClip, 0x2u, 1, "v F_ext", "Fc Fs Fv m h v_rest", "@count F", "F") \
+    MODEL(DisturbanceObserver, 0x1u, 1, "v u", "m T", "q", "F_hat") \
+    MODEL(DisturbanceObserver2, 0x3u, 1, "v u", "m T", "q f", "F_hat") \
+    MODEL(ExtendedStateObserver, 0x7u, 2, "y u", "m w", "z1 z2 z3", "v_hat F_hat") \
+    MODEL(FriedlandPark, 0x1u, 2, "v u", "m k p v1", "w", "Fc_hat F_hat") \
+    MODEL(SpeedObserver, 0x3u, 1, "y", "w", "x_hat v_hat", "v") \
+    MODEL(Axis, 0x3u, 0, "F_motor F_load", "m", "x v", "") \
+    MODEL(DriveTorque, 0x1u, 0, "u", "F_max q D T", "F @count " EIGHT(EIGHT(" . .")), "") \
+    MODEL(DriveTorqueSampled, 0xbu, 1, "u", "F_max q T Ts", "F read @count demand", "demand") \
+    MODEL(Encoder, 0xdu, 2, "x", "count Ts", "y_old @count y v", "y v") \
+    MODEL(TwoMass, 0xfu, 1, "F_motor F_load", "m1 m2 k d gap", "x1 v1 x2 v2", "F_shaft")
+
+/* The same step with what ours does at each call besides: it counts, keeps time, and gives back whether all states and
+ * outputs are finite. Of something infinite or NaN 0 times it is NaN, and so is the sum. `clock`: time, h, count. */
+#define CHECKED(name, watched, outputs, ...)                                                                           \
+    __attribute__((flatten)) static int64_t name##_checked(double *restrict x, const double *restrict p,               \
+                                                           const double *restrict u, double *restrict o,               \
+                                                           double *restrict clock) {                                   \
+        double h = clock[1], sum = 0;                                                                                  \
+        clock[2] += 1;                                                                                                 \
+        clock[0] = clock[2] * h;                                                                                       \
+        name(x, p, u, o, h);                                                                                           \
+        _Pragma("GCC unroll 64") for (int k = 0; k < 64; k++) if ((uint64_t)(watched) >> k & 1) sum += 0 * x[k];       \
+        _Pragma("GCC unroll 64") for (int k = 0; k < (outputs); k++) sum += 0 * o[k];                                  \
+        return __builtin_expect(sum >= 0, 1) ? 0 : 1;                                                                  \
+    }
+MODELS(CHECKED)
+
 struct model {
     const char *name, *inputs, *params, *states, *outputs;
     void (*step)(ARGS);
+    int64_t (*checked)(double *restrict, const double *restrict, const double *restrict, double *restrict, double *restrict);
+    uint64_t watched, number_of_outputs;
 };
 
-/* Behind a `.` stands an input with which a state of our own begins; `@` are counter and regimes. */
-const struct model models[] = {
-    {"Ambrosio", "v", "Fc v0 v1", "", "F", Ambrosio},
-    {"Asymmetric", "v", "F0 pos.Fc pos.Fs pos.vs pos.Fv neg.Fc neg.Fs neg.vs neg.Fv", "", "F", Asymmetric},
-    {"BengisuAkay", "v", "Fc Fs v0 xi", "", "F", BengisuAkay},
-    {"BreakAwayTanh", "v", "Fc Fs v_brk Fv", "", "F", BreakAwayTanh},
-    {"BrownMcPhee", "v Fn", "mud mus vt muv Nt", "", "F", BrownMcPhee},
-    {"Coulomb", "v", "Fc", "", "F", Coulomb},
-    {"CoulombViscous", "v", "Fc Fv", "", "F", CoulombViscous},
-    {"GearM1", "v", "Kv Kc", "", "F", GearM1},
-    {"GearM2", "v", "Kv Kc Kcs vs alpha", "", "F", GearM2},
-    {"GearM3", "v F_m F_e", "Kv Kc Kl", "", "F", GearM3},
-    {"GearM4", "v F_m F_e", "Kv Kc Kl Kcs Kls vs alpha", "", "F", GearM4},
-    {"GearM5", "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes vs alpha", "", "F", GearM5},
-    {"GearM6", "v F_m F_e", "Kv Kc Km Ke Kcs Kms Kes Keq Kmq vs alpha", "", "F", GearM6},
-    {"Karnopp", "v F_ext", "Fc Fs Fv Dv", "", "stuck F v_out", Karnopp},
-    {"KFMSmooth", "v", "Fc Fs Fv v0 vs", "", "F", KFMSmooth},
-    {"HyperbolicAgeing", "rest", "gamma", "", "share", HyperbolicAgeing},
-    {"ExponentialAgeing", "rest", "tau n", "", "share", ExponentialAgeing},
-    {"Makkar", "v", "g1 g2 g3 g4 g5 g6", "", "F", Makkar},
-    {"PointsFriction", "v", "F0 v1 F1 v2 F2 v3 F3 v4 F4", "", "F", PointsFriction},
-    {"TanhSign", "v v0", "", "", "s", TanhSign},
-    {"AtanSign", "v v0", "", "", "s", AtanSign},
-    {"RootSign", "v v0", "", "", "s", RootSign},
-    {"ClampSign", "v v0", "", "", "s", ClampSign},
-    {"Smoothed", "v", "v0 v_min law.Fc law.Fs law.vs law.Fv", "", "F", Smoothed},
-    {"StribeckGauss", "v", "Fc Fs vs Fv", "", "F", StribeckGauss},
-    {"StribeckLorentz", "v", "Fc Fs vs Fv", "", "F", StribeckLorentz},
-    {"BoPavelescu", "v", "Fc Fs vs shape Fv", "", "F", BoPavelescu},
-    {"LoadedStribeck", "v Fn", "muc mus vs", "", "F", LoadedStribeck},
-    {"BittencourtGunnarsson", "v Fl T", "Fc0 Fcl Fs0 FsT Fsl vs0 vsT vsl Fv0 FvT TV", "", "F", BittencourtGunnarsson},
-    {"Threlfall", "v", "Fc v1", "", "F", Threlfall},
-    {"Tustin", "v", "Fc Fs vs Fv", "", "F", Tustin},
-    {"Viscous", "v", "Fv", "", "F", Viscous},
-    {"ViscousPowers", "v", "Fc Fh v1 Fv Fq", "", "F", ViscousPowers},
-    {"TableFriction", "v", "scale", "", "F", TableFriction},
-    {"LuGre", "v", "sigma0 sigma1 sigma2 Fc Fs vs vd", "z", "F", LuGre},
-    {"LoadedLuGre", "v Fn", "sigma0 sigma1 sigma2 muc mus vs vd", "z", "F", LoadedLuGre},
-    {"LuGreAsymmetric", "v", "sigma0 sigma1 sigma2 Fcp Fsp Fcn Fsn vs vd", "z", "F", LuGreAsymmetric},
-    {"LuGreCurve", "v", "sigma0 sigma1 vd g_min v_min curve.Fc curve.Fs curve.vs curve.Fv", "z", "F", LuGreCurve},
-    {"LuGreObserver", "v e", "sigma0 sigma1 sigma2 Fc Fs vs k", "z_hat", "F_hat", LuGreObserver},
-    {"AdaptiveLuGreObserver", "v e de", "sigma0 sigma1 sigma2 Fc Fs vs k gamma lambda theta_max", "z_hat theta", "F_hat", AdaptiveLuGreObserver},
-    {"Dahl", "v", "Fc sigma", "s z", "F", Dahl},
-    {"DahlPower", "v", "Fc sigma i", "z", "F", DahlPower},
-    {"BlimanSorine", "v", "f1 f2 eta eps_f", "s xf xs", "F", BlimanSorine},
-    {"BlimanSorine1", "v", "f1 eps_f", "s x", "F", BlimanSorine1},
-    {"BoucWen", "v", "Fc A beta gamma n", "z", "F", BoucWen},
-    {"ElastoPlastic", "v", "sigma0 sigma1 sigma2 Fc Fs vs ba vd", "z", "F", ElastoPlastic},
-    {"GearEfficiency", "v F_l", "mu_a mu_d h", "s z", "F", GearEfficiency},
-    {"Gonthier", "v", "sigma0 sigma1 sigma2 Fc Fs vs v_e tau_dw", "sd z", "F_max F", Gonthier},
-    {"RateState", "v", "Fn mu0 a b v0 D", "theta", "F", RateState},
-    {"PositionDependent", "v", "p a1 phi1 a2 phi2 Fv Fg law.Fc", "x", "F", PositionDependent},
-    {"Armstrong", "v", "kt Fc Fv E_inf vs tau_L gamma", "x t2 Ea @mode @count " EIGHT(EIGHT(" .v .v .v .v")), "F_max F", Armstrong},
-    {"GMSElement", "v limit", "k C", "f @mode .v", "F", GMSElement},
-    {"GMS", "v", "Fc Fs vs k0 C Fv", ELEMENTS("f") " .v", "F", GMS},
-    {"MaxwellElement", "v", "k W", "f @mode", "F", MaxwellElement},
-    {"MaxwellSlip", "v", "k0 Fc", ELEMENTS("f"), "F", MaxwellSlip},
-    {"LeuvenModified", "v", "k0 Wh n sigma1 sigma2 Fc Fs vs", "z " ELEMENTS("f"), "F", LeuvenModified},
-    {"KFM", "v F_ext", "Fc Fs Fv B v_hold x_hold", "slip @mode", "F", KFM},
-    {"KFMDwell", "v F_ext", "Fc Fs Fv gamma rested B v_hold x_hold", "slip dwell @mode", "F_max F", KFMDwell},
-    {"Sticking", "v F_ext", "peak B v_hold x_hold v_min law.Fc law.Fs law.vs law.Fv", "slip @mode", "F", Sticking},
-    {"ResetIntegrator", "v", "sigma0 sigma1 z0 a", "z @mode", "F", ResetIntegrator},
-    {"BristleMass", "v", "sigma0 sigma1 mb Fc Fs vs Fv", "z s @mode", "F", BristleMass},
-    {"BristleElement", "x", "sigma delta seed", "b n", "F", BristleElement},
-    {"Bristles", "v", "Fc delta", "x el[1].b el[1].n el[2].b el[2].n el[3].b el[3].n el[4].b el[4].n el[5].b el[5].n el[6].b el[6].n el[7].b el[7].n el[8].b el[8].n el[9].b el[9].n el[10].b el[10].n el[11].b el[11].n el[12].b el[12].n el[13].b el[13].n el[14].b el[14].n el[15].b el[15].n el[16].b el[16].n el[17].b el[17].n el[18].b el[18].n el[19].b el[19].n el[20].b el[20].n", "F", Bristles},
-    {"PID", "r y", "Kp Ti Td N Tt b u_max", "i yf", "u", PID},
-    {"PIDDiscrete", "r y", "Kp Ti Td N Tt b u_max Ts", "i d y_old @count u", "u", PIDDiscrete},
-    {"PIDSpeed", "r y v", "Kp Ki Kv", "i", "u", PIDSpeed},
-    {"Cascade", "r y v", "Kx Kv Tv v_max u_max", "i", "u", Cascade},
-    {"CascadeDiscrete", "r y v", "Kx Kv Tv v_max u_max Ts", "i @count u", "u", CascadeDiscrete},
-    {"FeedForward", "v_d", "share law.Fc law.Fs law.Fv law.vs", "", "u", FeedForward},
-    {"Dither", "u_in", "A f", "@count", "u", Dither},
-    {"Knocker", "u_in e", "a width period e0", "u_last @count height begun", "height begun u", Knocker},
-    {"AdaptiveCoulomb", "e de v_d", "gamma lambda a_max", "a", "u", AdaptiveCoulomb},
-    {"StictionPush", "e v", "Fs Dv e0", "", "u", StictionPush},
-    {"Lag", "u", "T", "y", "", Lag},
-    {"KFMClip", "v F_ext", "Fc Fs Fv m h v_rest", "@count F", "F", KFMClip},
-    {"DisturbanceObserver", "v u", "m T", "q", "F_hat", DisturbanceObserver},
-    {"DisturbanceObserver2", "v u", "m T", "q f", "F_hat", DisturbanceObserver2},
-    {"ExtendedStateObserver", "y u", "m w", "z1 z2 z3", "v_hat F_hat", ExtendedStateObserver},
-    {"FriedlandPark", "v u", "m k p v1", "w", "Fc_hat F_hat", FriedlandPark},
-    {"SpeedObserver", "y", "w", "x_hat v_hat", "v", SpeedObserver},
-    {"Axis", "F_motor F_load", "m", "x v", "", Axis},
-    {"DriveTorque", "u", "F_max q D T", "F @count " EIGHT(EIGHT(" . .")), "", DriveTorque},
-    {"DriveTorqueSampled", "u", "F_max q T Ts", "F read @count demand", "demand", DriveTorqueSampled},
-    {"Encoder", "x", "count Ts", "y_old @count y v", "y v", Encoder},
-    {"TwoMass", "F_motor F_load", "m1 m2 k d gap", "x1 v1 x2 v2", "F_shaft", TwoMass},
-    {NULL, NULL, NULL, NULL, NULL, NULL},
-};
+#define ENTRY(name, watched, outputs, ...) {#name, __VA_ARGS__, name, name##_checked, watched, outputs},
+const struct model models[] = {MODELS(ENTRY){NULL, NULL, NULL, NULL, NULL, NULL, NULL, 0, 0}};

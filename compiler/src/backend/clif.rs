@@ -1,7 +1,8 @@
-//! A function of ours as a function of Cranelift: a loop around the straight line.
+//! A function of ours as two of Cranelift: one iteration, and a loop around the straight line.
 //!
 //! ```text
 //! single: for a count of 1: all of it in a straight line, by regime where there are regimes, and store; return the status
+//!
 //! entry:  load every slot that is read; compute what no iteration changes
 //! loop:   the rest, on the slots that are both read and written, which stay in registers; if they are many, in the block
 //!         again while there are iterations left and the status is 0
@@ -10,15 +11,19 @@
 //! Of a choice that takes many operations on one side, only the side that is chosen is computed: see [`Sides`].
 //! A status `if failed then detail else 0` tests `failed` in the loop; what only the detail needs is computed on the way
 //! out.
-//! Each operation becomes one instruction or a fixed few. There are no calls, no symbols and no traps.
+//! Each operation becomes one instruction or a fixed few. There are no symbols, no traps, and no calls but that of the loop
+//! behind what makes a single iteration.
 
-use super::regimes::{Apart, Automaton, Case, apart};
+use super::regimes::{Apart, Automaton, Case, Then, apart};
 use crate::ir::{Func, Op, Type, Value, Write, verify};
 use abi::Slot;
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
-use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, Signature, types};
+use cranelift_codegen::ir::{
+    self as clif, AbiParam, BlockArg, ExtFuncData, InstBuilder, MemFlagsData, Signature, UserExternalName, types,
+};
 use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
+use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
 
 /// Numbers that a loop is given for each of its iterations: loads from `first` on read these. One slot's lie side by side,
@@ -53,36 +58,21 @@ pub fn emit(
         target.signature.params.push(AbiParam::new(types::I64));
     }
     let mut b = FunctionBuilder::new(target, context);
-    let [entry, nothing] = [(); 2].map(|()| b.create_block());
+    let [entry, prepare, nothing] = [(); 3].map(|()| b.create_block());
     b.append_block_params_for_function_params(entry);
     b.switch_to_block(entry);
     let &[block, pool, count, ref gone_ahead @ ..] = b.block_params(entry) else { unreachable!("three parameters") };
     let gone_ahead = gone_ahead.first().copied();
     let (watch, late) = Watch::of(func);
     let facts = Facts::of_rest(func, ahead);
-    // Nothing changes from one iteration to the next: one is enough.
-    let same = func.writes.is_empty() && facts.varies.iter().all(|varies| !varies);
-    let alone = ahead.is_none() && func.ops.len() <= STRAIGHT;
-    if alone {
-        let [single, several] = [(); 2].map(|()| b.create_block());
-        if same {
-            b.ins().brif(count, single, &[], several, &[]);
-        } else {
-            let one = b.ins().icmp_imm_s(IntCC::Equal, count, 1);
-            b.ins().brif(one, single, &[], several, &[]);
-        }
-        b.switch_to_block(single);
-        once(&apart(func, &late), watch, &late, (block, pool), &mut b);
-        b.switch_to_block(several);
-    }
-    if alone && same {
-        b.ins().jump(nothing, &[]);
+    b.ins().brif(count, prepare, &[], nothing, &[]);
+    b.switch_to_block(prepare);
+    let same = facts.stay_the_same(func);
+    if same && ahead.is_none() && func.ops.len() <= STRAIGHT {
+        once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
     } else {
-        let prepare = b.create_block();
-        b.ins().brif(count, prepare, &[], nothing, &[]);
-        b.switch_to_block(prepare);
         let count = if same { b.ins().iconst(types::I64, 1) } else { count };
-        let emitter = Emitter { ahead, ..Emitter::new(func, &facts, block, pool) };
+        let emitter = Emitter { ahead, near: near(isa), ..Emitter::new(func, &facts, block, pool) };
         again(emitter, (watch, &late), count, gone_ahead, &mut b);
     }
     b.switch_to_block(nothing);
@@ -90,6 +80,47 @@ pub fn emit(
     b.ins().return_(&[zero]);
     b.seal_all_blocks();
     b.finalize(isa.frontend_config());
+}
+
+/// Whether a single iteration has a function of its own, so that the loop's registers are none of its business.
+pub fn has_single(func: &Func) -> bool {
+    func.ops.len() <= STRAIGHT && !Facts::of(func).stay_the_same(func)
+}
+
+/// Writes a function that makes a single iteration itself and leaves every other count to the function behind it.
+pub fn emit_single(
+    func: &Func,
+    target: &mut clif::Function,
+    context: &mut FunctionBuilderContext,
+    isa: &dyn TargetIsa,
+) {
+    target.signature = signature(isa);
+    let mut b = FunctionBuilder::new(target, context);
+    let [entry, single, others] = [(); 3].map(|()| b.create_block());
+    b.append_block_params_for_function_params(entry);
+    b.switch_to_block(entry);
+    let &[block, pool, count] = b.block_params(entry) else { unreachable!("three parameters") };
+    let other = b.ins().icmp_imm_s(IntCC::NotEqual, count, 1);
+    b.ins().brif(other, others, &[], single, &[]);
+    b.switch_to_block(single);
+    let (watch, late) = Watch::of(func);
+    once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
+    b.set_cold_block(others);
+    b.switch_to_block(others);
+    let name = UserExternalName { namespace: 0, index: 0 };
+    let name = clif::ExternalName::user(b.func.declare_imported_user_function(name));
+    let signature = b.import_signature(signature(isa));
+    let many = b.import_function(ExtFuncData { name, signature, colocated: true, patchable: false });
+    let call = b.ins().call(many, &[block, pool, count]);
+    let status = b.inst_results(call)[0];
+    b.ins().return_(&[status]);
+    b.seal_all_blocks();
+    b.finalize(isa.frontend_config());
+}
+
+/// Whether constants are best read from behind the code: x86-64 would make each in a general register first.
+fn near(isa: &dyn TargetIsa) -> bool {
+    isa.name() == "x64"
 }
 
 /// Writes the loop, from where `b` stands to its return.
@@ -173,15 +204,14 @@ fn again(
 
     let status = b.append_block_param(exit, types::I64);
     b.switch_to_block(exit);
-    for (slot, value) in &func.stores {
-        let value = emitter.get(*value, b);
-        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
-    }
+    emitter.stores(&func.stores, b);
     b.ins().return_(&[status]);
 }
 
 /// Most operations of a function of which a single iteration has code of its own.
 const STRAIGHT: usize = 2000;
+/// Most operations of a function that is short.
+const SHORT: usize = 80;
 
 /// Writes one iteration without a loop, from where `b` stands to its return.
 fn once(
@@ -189,21 +219,28 @@ fn once(
     watch: Watch,
     late: &[bool],
     (block, pool): (clif::Value, clif::Value),
+    near: bool,
     b: &mut FunctionBuilder,
 ) {
     let func = &apart.func;
     let facts = Facts::of(func);
-    let mut emitter = Emitter::new(func, &facts, block, pool);
+    let short = func.ops.len() <= SHORT;
+    let mut emitter = Emitter { near, short, ..Emitter::new(func, &facts, block, pool) };
     emitter.list(&apart.before, b);
+    // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
+    let before: HashSet<Value> = apart.before.iter().copied().collect();
+    let later = func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32)));
+    let read_later: HashSet<Slot> =
+        later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None }).collect();
+    let (early, last): (Vec<_>, Vec<_>) =
+        func.stores.iter().partition(|(slot, value)| before.contains(value) && !read_later.contains(slot));
+    emitter.stores(&early, b);
     for automaton in &apart.automata {
         emitter.automaton(automaton, b);
     }
     emitter.list(&apart.behind, b);
     emitter.writes(&func.writes, b);
-    for (slot, value) in &func.stores {
-        let value = emitter.get(*value, b);
-        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
-    }
+    emitter.stores(&last, b);
     let [fine, failed] = [(); 2].map(|()| b.create_block());
     match watch {
         Watch::Nothing => {
@@ -297,6 +334,16 @@ impl Watch {
         }
         (Watch::Failed { when, is, detail }, late)
     }
+}
+
+/// The bit of a real's sign.
+const SIGN: u64 = 1 << 63;
+
+/// A real of these bits, read from behind the code.
+fn behind(bits: u64, b: &mut FunctionBuilder) -> clif::Value {
+    let constant = b.func.dfg.constants.insert(u128::from(bits).to_le_bytes().to_vec().into());
+    let both = b.ins().vconst(types::F64X2, constant);
+    b.ins().extractlane(both, 0)
 }
 
 /// Bytes from the beginning of a block or pool to its `index`-th number.
@@ -462,6 +509,10 @@ pub struct Facts {
     pub varies: Vec<bool>,
     /// For tables: whether the number is needed as such and not only its bits.
     as_real: Vec<bool>,
+    /// Whether a fused product takes the value.
+    fused: Vec<bool>,
+    /// Of integers that are known to lie between 0 and some number: that number.
+    most: Vec<Option<i64>>,
 }
 
 impl Facts {
@@ -475,6 +526,7 @@ impl Facts {
         let stored: HashMap<_, _> = func.stores.iter().copied().collect();
         let mut varies = vec![false; func.ops.len()];
         let mut as_real = vec![false; func.ops.len()];
+        let mut fused = vec![false; func.ops.len()];
         for (i, op) in func.ops.iter().enumerate() {
             let mut changes = match op {
                 Op::Load(slot) => stored.contains_key(slot) || ahead.is_some_and(|ahead| ahead.first <= *slot),
@@ -484,13 +536,19 @@ impl Facts {
             op.each_operand(|operand| {
                 changes |= varies[operand.index()];
                 as_real[operand.index()] |= !matches!(op, Op::ToBits(_));
+                fused[operand.index()] |= matches!(op, Op::Fma(..));
             });
             varies[i] = changes;
         }
         for value in func.results() {
             as_real[value.index()] = true;
         }
-        Facts { types: verify::types(func).expect("the function is sound"), varies, as_real }
+        Facts { types: verify::types(func).expect("the function is sound"), varies, as_real, fused, most: most(func) }
+    }
+
+    /// Whether nothing changes from one iteration of `func` to the next: then one is enough.
+    fn stay_the_same(&self, func: &Func) -> bool {
+        func.writes.is_empty() && self.varies.iter().all(|varies| !varies)
     }
 
     /// As Cranelift names it.
@@ -501,6 +559,37 @@ impl Facts {
             Type::Bool => types::I8,
         }
     }
+}
+
+/// Of each integer between 0 and some number that number, where that is seen from how it is computed.
+fn most(func: &Func) -> Vec<Option<i64>> {
+    let mut most: Vec<Option<i64>> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let at = |value: Value| most[value.index()];
+        let number = |value: Value| if let Op::Int(n) = func.op(value) { Some(n) } else { None };
+        most.push(match *op {
+            Op::Int(n) => (n >= 0).then_some(n),
+            Op::IntAnd(a, c) => number(a).or(number(c)).filter(|mask| *mask >= 0),
+            Op::IntAdd(a, c) => at(a).zip(at(c)).and_then(|(a, c)| a.checked_add(c)),
+            Op::Select(when, yes, no) => at(yes).zip(at(no)).map(|(chosen, other)| {
+                // Chosen where it is not above a limit, as in searching a table.
+                let limit = |asked: Value| match func.op(asked) {
+                    Op::Not(above) => match func.op(above) {
+                        Op::IntLess(limit, value) if value == yes => number(limit),
+                        _ => None,
+                    },
+                    _ => None,
+                };
+                let limit = match func.op(when) {
+                    Op::And(a, c) => limit(a).or(limit(c)),
+                    _ => limit(when),
+                };
+                chosen.min(limit.unwrap_or(chosen)).max(other)
+            }),
+            _ => None,
+        });
+    }
+    most
 }
 
 /// Writes operations of a function.
@@ -520,6 +609,16 @@ pub struct Emitter<'a> {
     /// What has gone ahead, and where this iteration's number of its first slot lies.
     ahead: Option<GoneAhead>,
     instant: Option<clif::Value>,
+    /// Whether constants are read from behind the code.
+    near: bool,
+    /// Whether the function is short: calls of it overlap, and what counts is the number of instructions. In a longer one
+    /// what is limited by a constant is chosen by a jump: most often the processor has gone on with the right one before it
+    /// knows the other.
+    short: bool,
+    /// Places of tables and rings that are held inside: of an index and a length, and in which block.
+    places: RefCell<HashMap<(Value, u32), (clif::Block, clif::Value)>>,
+    /// Blocks before choices that are being written: all of them has run.
+    passed: Vec<clif::Block>,
 }
 
 impl<'a> Emitter<'a> {
@@ -536,7 +635,21 @@ impl<'a> Emitter<'a> {
         block: clif::Value,
         pool: clif::Value,
     ) -> Emitter<'a> {
-        Emitter { func, facts, values, instead: HashMap::new(), block, pool, ahead: None, instant: None }
+        let places = RefCell::default();
+        Emitter {
+            func,
+            facts,
+            values,
+            block,
+            pool,
+            ahead: None,
+            instant: None,
+            instead: HashMap::new(),
+            near: false,
+            short: false,
+            places,
+            passed: Vec::new(),
+        }
     }
 
     /// Numbers from the iteration's first that went ahead to that of the slot, if it is one of these.
@@ -555,6 +668,14 @@ impl<'a> Emitter<'a> {
         self.func.ops.iter().enumerate().filter_map(of_load).collect()
     }
 
+    /// Stores to slots.
+    fn stores(&self, stores: &[(Slot, Value)], b: &mut FunctionBuilder) {
+        for (slot, value) in stores {
+            let value = self.get(*value, b);
+            b.ins().store(MemFlagsData::trusted(), value, self.block, offset(slot.0));
+        }
+    }
+
     /// Writes to rings.
     pub fn writes(&self, writes: &[Write], b: &mut FunctionBuilder) {
         for write in writes {
@@ -571,6 +692,7 @@ impl<'a> Emitter<'a> {
                 let entry = (index as u64).min(u64::from(len) - 1) as u32;
                 b.ins().load(types::F64, MemFlagsData::trusted(), self.pool, offset(base + entry))
             }
+            Op::Real(bits) if self.near && bits != 0 => behind(bits, b),
             Op::Real(bits) => b.ins().f64const(f64::from_bits(bits)),
             Op::Int(n) => b.ins().iconst(types::I64, n),
             Op::Bool(truth) => b.ins().iconst(types::I8, i64::from(truth)),
@@ -578,9 +700,30 @@ impl<'a> Emitter<'a> {
         }
     }
 
+    /// The same of an operand that the instruction itself can take from memory.
+    fn folded(&self, value: Value, b: &mut FunctionBuilder) -> clif::Value {
+        match self.func.op(value) {
+            Op::Real(bits) => b.ins().f64const(f64::from_bits(bits)),
+            _ => self.get(value, b),
+        }
+    }
+
     /// The `n`-th operand of an operation, which says that it is `operand`.
     fn operand(&self, of: Value, n: usize, operand: Value, b: &mut FunctionBuilder) -> clif::Value {
         self.instead.get(&(of, n)).copied().unwrap_or_else(|| self.get(operand, b))
+    }
+
+    /// What `op` gives the sign of, if it is that: 1, −1, and 0 · x of x = ±0 and of NaN, which is x itself.
+    fn sign(&self, op: Op) -> Option<Value> {
+        let is = |value: Value, number: f64| self.func.op(value) == Op::Real(number.to_bits());
+        let Op::Select(positive, one, rest) = op else { return None };
+        let (Op::Less(zero, x), Op::Select(negative, minus_one, rest)) = (self.func.op(positive), self.func.op(rest))
+        else {
+            return None;
+        };
+        let (Op::Less(y, other), Op::Mul(a, c)) = (self.func.op(negative), self.func.op(rest)) else { return None };
+        let alike = is(zero, 0.0) && other == zero && y == x && [(zero, x), (x, zero)].contains(&(a, c));
+        (alike && is(one, 1.0) && is(minus_one, -1.0)).then_some(x)
     }
 
     /// Writes operations of which each stands behind its operands.
@@ -617,9 +760,33 @@ impl<'a> Emitter<'a> {
 
     /// Writes one case and goes on behind it; nothing of it is there then.
     fn case(&mut self, case: &Case, behind: clif::Block, b: &mut FunctionBuilder) {
-        self.only(&case.list, &case.outputs, b);
-        let outputs: Vec<BlockArg> = case.outputs.iter().map(|output| BlockArg::Value(self.get(*output, b))).collect();
-        b.ins().jump(behind, &outputs);
+        // What is read by the cases within, or behind.
+        let mut read = Vec::new();
+        case.each(&mut |inner| {
+            if !std::ptr::eq(inner, case) {
+                inner.list.iter().for_each(|value| self.func.op(*value).each_operand(|operand| read.push(operand)));
+            }
+            match &inner.then {
+                Then::Outputs(outputs) => read.extend(outputs),
+                Then::Ask(when, _) => read.push(*when),
+            }
+        });
+        self.only(&case.list, &read, b);
+        match &case.then {
+            Then::Outputs(outputs) => {
+                let outputs: Vec<BlockArg> =
+                    outputs.iter().map(|output| BlockArg::Value(self.get(*output, b))).collect();
+                b.ins().jump(behind, &outputs);
+            }
+            Then::Ask(when, sides) => {
+                let blocks = [(); 2].map(|()| b.create_block());
+                self.branch(*when, blocks[0], blocks[1], b);
+                for (side, block) in sides.iter().zip(blocks) {
+                    b.switch_to_block(block);
+                    self.case(side, behind, b);
+                }
+            }
+        }
         case.list.iter().for_each(|value| self.values[value.index()] = None);
     }
 
@@ -671,6 +838,7 @@ impl<'a> Emitter<'a> {
     /// Writes the operations of one side of a choice, or of none (0).
     fn side(&mut self, number: usize, sides: &Sides, b: &mut FunctionBuilder) {
         let mut done = 0;
+        let passed = self.passed.len();
         for value in &sides.members[number] {
             // Choices that were written together with the one before.
             if done > 0 {
@@ -688,6 +856,7 @@ impl<'a> Emitter<'a> {
                 _ => unreachable!("it is a choice"),
             };
             let [chosen, other, behind] = [(); 3].map(|()| b.create_block());
+            self.passed.extend(b.current_block());
             self.branch(select(value).0, chosen, other, b);
             for (block, side, which) in [(chosen, first, 0), (other, second, 1)] {
                 b.switch_to_block(block);
@@ -701,6 +870,7 @@ impl<'a> Emitter<'a> {
             }
             b.switch_to_block(behind);
         }
+        self.passed.truncate(passed);
     }
 
     /// Writes one operation whose operands are there.
@@ -730,14 +900,51 @@ impl<'a> Emitter<'a> {
             self.values[value.index()] = Some(b.ins().load(types::I64, flags, address, offset));
             return;
         }
+        if self.near
+            && let Some(x) = self.sign(op)
+        {
+            // ±1 with the sign of x, unless x is neither above nor below 0.
+            let x = self.get(x, b);
+            let [sign, one, zero] = [behind(SIGN, b), behind(1f64.to_bits(), b), b.ins().f64const(0.0)];
+            let negative = b.ins().band(x, sign);
+            let unit = b.ins().bor(negative, one);
+            let moves = b.ins().fcmp(FloatCC::OrderedNotEqual, x, zero);
+            self.values[value.index()] = Some(b.ins().select(moves, unit, x));
+            return;
+        }
+        // The same where one of them is a constant, of which the comparison would get one of its own.
+        if let Op::Select(when, yes, no) = op
+            && self.short
+            && let Op::Less(first, second) = self.func.op(when)
+            && [(first, second), (second, first)].contains(&(yes, no))
+        {
+            let chosen = [self.get(yes, b), self.folded(no, b)];
+            let [first, second] = if first == yes { chosen } else { [chosen[1], chosen[0]] };
+            let less = b.ins().fcmp(FloatCC::LessThan, first, second);
+            self.values[value.index()] = Some(b.ins().select(less, chosen[0], chosen[1]));
+            return;
+        }
+        // What stands last can be taken from memory; of what is to be less, what stands first.
+        let from_memory = match op {
+            Op::Add(..) | Op::Mul(..) | Op::Sub(..) | Op::Div(..) | Op::Equal(..) => 1,
+            Op::Less(..) | Op::LessEqual(..) => 0,
+            Op::Fma(..) => 2,
+            _ => operands.len(),
+        };
+        let turned = match op {
+            Op::Add(first, _) | Op::Mul(first, _) | Op::Equal(first, _) => {
+                matches!(self.func.op(first), Op::Real(_))
+            }
+            _ => false,
+        };
         op.each_operand(|operand| {
-            operands[n] = Some(self.operand(value, n, operand, b));
+            let folded = turned || n == from_memory;
+            let instead = self.instead.get(&(value, n)).copied();
+            let known = || if folded { self.folded(operand, b) } else { self.get(operand, b) };
+            operands[n] = Some(instead.unwrap_or_else(known));
             n += 1;
         });
-        // What stands last can be taken from memory.
-        if let Op::Add(first, _) | Op::Mul(first, _) = op
-            && let Op::Real(_) = self.func.op(first)
-        {
+        if turned {
             operands.swap(0, 1);
         }
         let x = |i: usize| operands[i].expect("an operand");
@@ -753,7 +960,16 @@ impl<'a> Emitter<'a> {
             Op::Sub(..) => b.ins().fsub(x(0), x(1)),
             Op::Mul(..) => b.ins().fmul(x(0), x(1)),
             Op::Div(..) => b.ins().fdiv(x(0), x(1)),
+            // A fused product takes the sign along.
+            Op::Neg(_) if self.near && !self.facts.fused[value.index()] => {
+                let sign = behind(SIGN, b);
+                b.ins().bxor(x(0), sign)
+            }
             Op::Neg(_) => b.ins().fneg(x(0)),
+            Op::Abs(_) if self.near => {
+                let size = behind(!SIGN, b);
+                b.ins().band(x(0), size)
+            }
             Op::Abs(_) => b.ins().fabs(x(0)),
             Op::Sqrt(_) => b.ins().sqrt(x(0)),
             Op::Fma(..) => b.ins().fma(x(0), x(1), x(2)),
@@ -795,19 +1011,19 @@ impl<'a> Emitter<'a> {
         index: Value,
         b: &mut FunctionBuilder,
     ) -> (clif::Value, i32) {
-        let masked = |value: Value| match self.func.op(value) {
-            Op::Int(mask) => (0..i64::from(len)).contains(&mask),
-            _ => false,
-        };
-        let inside = match self.func.op(index) {
-            Op::IntAnd(a, c) => masked(a) || masked(c),
-            _ => masked(index),
-        };
-        let mut place = self.get(index, b);
-        if !inside {
+        let here = b.current_block().expect("a block is being written");
+        let known = self.places.borrow().get(&(index, len)).copied();
+        let known = known.filter(|(block, _)| *block == here || self.passed.contains(block));
+        let place = known.map(|(_, place)| place).unwrap_or_else(|| {
+            let place = self.get(index, b);
+            if self.facts.most[index.index()].is_some_and(|most| most < i64::from(len)) {
+                return place;
+            }
             let last = b.ins().iconst(types::I64, i64::from(len) - 1);
-            place = b.ins().umin(place, last);
-        }
+            let place = b.ins().umin(place, last);
+            self.places.borrow_mut().insert((index, len), (here, place));
+            place
+        });
         let bytes = b.ins().ishl_imm_u(place, 3);
         (b.ins().iadd(whole, bytes), offset(base))
     }

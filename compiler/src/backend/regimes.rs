@@ -5,8 +5,9 @@
 //! but is needed elsewhere too, stays one list. It knows nothing of processors.
 
 use crate::ir::build::Build;
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Func, Op, Type, Value};
 use abi::Slot;
+use std::cmp::Reverse;
 use std::collections::{HashMap, HashSet};
 
 /// A function whose operations are taken apart.
@@ -33,18 +34,40 @@ pub struct Automaton {
     pub general: Case,
 }
 
-/// Operations for one regime, each behind its operands, and what the outputs are.
+/// Operations for one regime, each behind its operands, and what comes of them.
 pub struct Case {
     /// What is computed, in order.
     pub list: Vec<Value>,
-    /// For each output of the automaton what it is.
-    pub outputs: Vec<Value>,
+    /// What then is done.
+    pub then: Then,
+}
+
+/// How a case goes on.
+pub enum Then {
+    /// It ends: for each output of the automaton what it is.
+    Outputs(Vec<Value>),
+    /// A truth that much hangs on is asked once; what is left where it is true, and where it is not.
+    Ask(Value, Box<[Case; 2]>),
+}
+
+impl Case {
+    /// The case and all those in it.
+    pub fn each(&self, each: &mut impl FnMut(&Case)) {
+        each(self);
+        if let Then::Ask(_, sides) = &self.then {
+            sides.iter().for_each(|side| side.each(each));
+        }
+    }
 }
 
 /// Most regimes of an automaton that are told apart.
 const MOST: usize = 4;
 /// Fewest operations that are worth a jump.
 const FEWEST: usize = 6;
+/// Most operations of a case that is taken apart by what it asks: they stand twice then.
+const LONGEST: usize = 200;
+/// Questions within questions, at most.
+const DEEPEST: usize = 4;
 
 /// Where an operation stands.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -56,11 +79,12 @@ enum Place {
     Elsewhere,
 }
 
-/// Takes a function apart; `late` are operations that are not wanted.
-pub fn apart(func: &Func, late: &[bool]) -> Apart {
+/// Takes a function apart; `late` are operations that are not wanted, `watched` is the truth that ends the step.
+pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
     let all = || (0..func.ops.len()).map(|i| Value(i as u32));
     let slots = automata(func);
     let mut places = dependent(func, late, &slots);
+    watch_behind(func, watched, &mut places);
     for k in 0..slots.len() {
         let members = places.iter().filter(|place| **place == Place::Within(k)).count();
         if members < FEWEST {
@@ -98,16 +122,18 @@ pub fn apart(func: &Func, late: &[bool]) -> Apart {
     }
     let listed = |place: Place| -> Vec<Value> { all().filter(|value| places[value.index()] == place).collect() };
     let mut build = Build::of(func);
+    let mut there: HashSet<Value> = listed(Place::Before).into_iter().collect();
     let automata = slots.iter().zip(needed).enumerate().filter(|(_, (_, needed))| !needed.is_empty());
     let automata = automata
         .map(|(k, ((load, numbers), needed))| {
             let members = listed(Place::Within(k));
             let mut outputs: Vec<Value> = needed.into_iter().collect();
             outputs.sort_unstable();
-            let case = |bits: &u64| (*bits, case(&mut build, func, &places, (*load, *bits), &members, &outputs));
+            let case = |bits: &u64| (*bits, case(&mut build, &mut there, (*load, *bits), &members, &outputs));
             let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
             let cases = numbers.iter().map(case).collect();
-            Automaton { slot, outputs: outputs.clone(), cases, general: Case { list: members, outputs } }
+            let general = Case { list: members, then: Then::Outputs(outputs.clone()) };
+            Automaton { slot, outputs, cases, general }
         })
         .collect();
     let ops = build.into_ops();
@@ -170,37 +196,138 @@ fn dependent(func: &Func, late: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<
     of
 }
 
-/// What is left of the members where the slot holds this number.
+/// Puts what only watches, on what is stored anyway, behind all regimes: it is the same in each.
+fn watch_behind(func: &Func, watched: Option<Value>, places: &mut [Place]) {
+    let mut stored = vec![false; func.ops.len()];
+    func.stores.iter().for_each(|(_, value)| stored[value.index()] = true);
+    let mut needed = stored.clone();
+    for write in &func.writes {
+        [write.index, write.value].iter().for_each(|value| needed[value.index()] = true);
+    }
+    if let Some(status) = func.status.filter(|_| watched.is_none()) {
+        needed[status.index()] = true;
+    }
+    for i in (0..func.ops.len()).rev().filter(|i| places[*i] != Place::Elsewhere) {
+        if needed[i] {
+            func.ops[i].each_operand(|operand| needed[operand.index()] = true);
+        }
+    }
+    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| !needed[*i]) {
+        let (mut same, mut behind) = (true, false);
+        op.each_operand(|operand| {
+            let operand = operand.index();
+            same &= stored[operand] || !matches!(places[operand], Place::Within(_));
+            behind |= places[operand] == Place::Behind;
+        });
+        if matches!(places[i], Place::Within(_)) && (same || behind) {
+            places[i] = Place::Behind;
+        }
+    }
+}
+
+/// What is left of the members where the slot holds this number; `there` is what stands before.
 fn case(
     build: &mut Build,
-    func: &Func,
-    places: &[Place],
+    there: &mut HashSet<Value>,
     (load, bits): (Value, u64),
     members: &[Value],
     outputs: &[Value],
 ) -> Case {
-    let mut left: HashMap<Value, Value> = HashMap::from([(load, build.op(Op::Real(bits)))]);
-    for member in members {
-        let op = func.op(*member);
+    let held = build.op(Op::Real(bits));
+    let outputs = left(build, members, &[(load, held)], outputs);
+    divided(build, there, outputs, 0)
+}
+
+/// What is left of outputs of a list, of which some values are others.
+fn left(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[Value]) -> Vec<Value> {
+    let mut left: HashMap<Value, Value> = known.iter().copied().collect();
+    for value in list {
+        let op = build.get(*value);
         let now = op.map(|operand| left.get(&operand).copied().unwrap_or(operand));
-        if now != op {
-            left.insert(*member, build.op(now));
+        if now != op && !left.contains_key(value) {
+            left.insert(*value, build.op(now));
         }
     }
-    let outputs: Vec<Value> = outputs.iter().map(|output| left.get(output).copied().unwrap_or(*output)).collect();
-    // What stands before is there.
-    let there = |value: Value| places.get(value.index()).is_some_and(|place| *place == Place::Before);
+    outputs.iter().map(|output| left.get(output).copied().unwrap_or(*output)).collect()
+}
+
+/// What some values need that is not there, in order.
+fn needed(build: &Build, there: &HashSet<Value>, of: &[Value]) -> Vec<Value> {
     let mut list = HashSet::new();
-    let mut open = outputs.clone();
+    let mut open = of.to_vec();
     while let Some(value) = open.pop() {
         let op = build.get(value);
-        if !there(value) && !is_constant(op) && list.insert(value) {
+        if !there.contains(&value) && !is_constant(op) && list.insert(value) {
             op.each_operand(|operand| open.push(operand));
         }
     }
     let mut list: Vec<Value> = list.into_iter().collect();
     list.sort_unstable();
-    Case { list, outputs }
+    list
+}
+
+/// What computes the outputs, taken apart by the truth that is asked most often, if that leaves less to do.
+fn divided(build: &mut Build, there: &mut HashSet<Value>, outputs: Vec<Value>, depth: usize) -> Case {
+    let list = needed(build, there, &outputs);
+    if depth < DEEPEST
+        && (FEWEST..=LONGEST).contains(&list.len())
+        && let Some(asked) = asked_most(build, &list)
+    {
+        let first = needed(build, there, &[asked]);
+        let sides = [true, false].map(|truth| {
+            let known = known(build, asked, truth);
+            left(build, &list, &known, &outputs)
+        });
+        there.extend(&first);
+        let shorter = |build: &Build, there: &HashSet<Value>| {
+            let lengths = sides.each_ref().map(|outputs| needed(build, there, outputs).len());
+            first.len() + lengths.iter().sum::<usize>().div_ceil(2) + 2 < list.len()
+        };
+        let case = shorter(build, there).then(|| {
+            let sides = sides.map(|outputs| divided(build, there, outputs, depth + 1));
+            Case { list: first.clone(), then: Then::Ask(asked, Box::new(sides)) }
+        });
+        first.iter().for_each(|value| _ = there.remove(value));
+        if let Some(case) = case {
+            return case;
+        }
+    }
+    Case { list, then: Then::Outputs(outputs) }
+}
+
+/// The truth that most operations of a list take, if more than one does; of several the first.
+fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
+    let mut asked: HashMap<Value, usize> = HashMap::new();
+    for value in list {
+        let op = build.get(*value);
+        if matches!(op, Op::Not(_)) {
+            continue;
+        }
+        op.each_operand(|operand| {
+            let operand = if let Op::Not(of) = build.get(operand) { of } else { operand };
+            if build.type_of(operand) == Type::Bool {
+                *asked.entry(operand).or_default() += 1;
+            }
+        });
+    }
+    let most = asked.into_iter().filter(|(_, times)| *times > 1);
+    most.max_by_key(|(value, times)| (*times, Reverse(*value))).map(|(value, _)| value)
+}
+
+/// What is known of other truths where one is true or false.
+fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)> {
+    let is = [false, true].map(|truth| build.truth(truth));
+    let mut known = Vec::new();
+    let mut open = vec![(asked, truth)];
+    while let Some((value, truth)) = open.pop() {
+        known.push((value, is[usize::from(truth)]));
+        match (build.get(value), truth) {
+            (Op::And(a, b), true) | (Op::Or(a, b), false) => open.extend([(a, truth), (b, truth)]),
+            (Op::Not(a), truth) => open.push((a, !truth)),
+            _ => {}
+        }
+    }
+    known
 }
 
 #[cfg(test)]
@@ -224,7 +351,7 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let apart = apart(&func, &vec![false; func.ops.len()]);
+        let apart = apart(&func, &vec![false; func.ops.len()], None);
         let [automaton] = &apart.automata[..] else { panic!("one automaton") };
         assert_eq!((automaton.slot, &apart.behind[..]), (Slot(4), &[][..]));
         let shown = |case: &Case| -> Vec<String> {
@@ -235,5 +362,33 @@ mod tests {
         let words = |text: &str| text.split(' ').map(String::from).collect::<Vec<_>>();
         assert_eq!(cases, [(0.0, words("loa loa loa mul fma les sel")), (1.0, words("loa loa mul"))]);
         assert_eq!(shown(&automaton.general).iter().filter(|op| *op == "sel").count(), 3);
+    }
+
+    /// Slot 4 is a regime; at rest, 0, it asks four times whether a force in slot 5 is above one in slot 6.
+    #[test]
+    fn what_is_asked_often_is_asked_once() {
+        let mut build = Build::new("step");
+        let [x, regime, v, w] = [3, 4, 5, 6].map(|slot| build.load(Slot(slot)));
+        let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
+        let (rests, above) = (build.equal(regime, zero), build.less(w, v));
+        let below = build.not(above);
+        let (leaves, stays) = (build.and(rests, above), build.and(rests, below));
+        let mut next = x;
+        for (asked, other) in [(leaves, v), (stays, w), (leaves, w), (stays, v)] {
+            let moved = build.mul(next, other);
+            next = build.select(asked, moved, next);
+        }
+        let changed = build.select(leaves, one, regime);
+        build.store(Slot(3), next);
+        build.store(Slot(4), changed);
+        let func = build.finish();
+        let apart = apart(&func, &vec![false; func.ops.len()], None);
+        let Then::Ask(asked, sides) = &apart.automata[0].cases[0].1.then else { panic!("it asks") };
+        assert!(matches!(apart.func.op(*asked), Op::Less(..)));
+        for side in sides.iter() {
+            let products = side.list.iter().filter(|value| matches!(apart.func.op(**value), Op::Mul(..))).count();
+            let choices = side.list.iter().filter(|value| matches!(apart.func.op(**value), Op::Select(..))).count();
+            assert_eq!((products, choices), (2, 0));
+        }
     }
 }

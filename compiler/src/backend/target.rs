@@ -84,7 +84,7 @@ impl<'a> Coder<'a> {
             Ok(())
         })?;
         for (at, call) in calls {
-            // The loop lies first.
+            // What calls lies first.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
         Ok(all)
@@ -136,7 +136,8 @@ impl<'a> Coder<'a> {
         Ok(text)
     }
 
-    /// Gives the function as Cranelift's own, whole or cut: then the loop first and the pieces in their order.
+    /// Gives the function as Cranelift's own: whole, behind what makes a single iteration, or cut: then the loop first and
+    /// the pieces in their order.
     fn each_part(
         &mut self,
         func: &Func,
@@ -144,6 +145,11 @@ impl<'a> Coder<'a> {
     ) -> Result<(), Unsupported> {
         let Coder { isa, context, builder, lengths } = self;
         if func.ops.len() <= lengths.whole {
+            if clif::has_single(func) {
+                context.clear();
+                clif::emit_single(func, &mut context.func, builder, *isa);
+                part(*isa, context)?;
+            }
             context.clear();
             clif::emit(func, None, &mut context.func, builder, *isa);
             return part(*isa, context);

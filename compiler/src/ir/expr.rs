@@ -144,12 +144,6 @@ impl<'a> Real<'a> {
         self.with(|b| b.unary(function, self.value))
     }
 
-    /// Whether it is not above 0, or NaN, by how it is written: as −(a · a) or min(a, 0).
-    pub fn is_not_positive(self) -> bool {
-        let build = self.build.borrow();
-        super::is_not_positive(self.value, |value| build.get(value))
-    }
-
     /// self · b + c, rounded once.
     pub fn fma<B, C>(self, b: B, c: C) -> Real<'a>
     where

@@ -169,11 +169,24 @@ pub enum Op {
     ToReal(Value),
 }
 
-/// Whether a value is not above 0, or NaN, by how it is written: as −(a · a) or min(a, 0). `op`: what gives a value.
+/// Whether a value is not above 0, or NaN, by how it is written: as −|a|, −(a · a), −|a|^b, min(a, 0) … `op`: what gives a
+/// value.
 pub fn is_not_positive(value: Value, op: impl Fn(Value) -> Op) -> bool {
     match op(value) {
-        Op::Neg(square) => matches!(op(square), Op::Mul(a, b) if a == b),
+        Op::Neg(size) => is_not_negative(size, op),
         Op::Select(below, a, zero) => op(zero) == Op::Real(0) && op(below) == Op::Less(a, zero),
+        _ => false,
+    }
+}
+
+/// Whether a value is +0, above it or NaN, by how it is written.
+pub fn is_not_negative(value: Value, op: impl Fn(Value) -> Op) -> bool {
+    match op(value) {
+        Op::Abs(_) | Op::Unary(Unary::Exp | Unary::Cosh, _) => true,
+        Op::Mul(a, b) if a == b => true,
+        Op::Real(bits) => bits >> 63 == 0,
+        // Of a base that has no sign the power has none.
+        Op::Binary(Binary::Pow, a, _) => is_not_negative(a, op),
         _ => false,
     }
 }

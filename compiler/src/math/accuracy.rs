@@ -252,6 +252,37 @@ fn edges_are_those_of_ieee_754() {
     }
 }
 
+/// A base that is known to have no sign gives the same bits in fewer operations, and so does an exponent of e.
+#[test]
+fn what_is_known_of_an_argument_changes_no_bit() {
+    let (any, of_size) = (
+        of_two(Binary::Pow),
+        code(|b, x, y| {
+            let size = b.abs(x);
+            b.binary(Binary::Pow, size, y)
+        }),
+    );
+    let (exp, below) = (
+        of_one(Unary::Exp),
+        code(|b, x, _| {
+            let size = b.abs(x);
+            let below = b.neg(size);
+            b.unary(Unary::Exp, below)
+        }),
+    );
+    let same = |a: f64, b: f64| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan();
+    let mut random = Random(78);
+    let edges = [0.0, 1.0, 0.5, 2.0, 3.0, 5e-324, 2.2e-308, 707.5, 745.5, 1e300, f64::INFINITY, f64::NAN];
+    let mut sizes = edges.to_vec();
+    sizes.extend((0..300).map(|_| Range::Powers(-1074, 1024).sample(&mut random).abs()));
+    for &x in &sizes {
+        assert!(same(run(&exp, -x, 0.0), run(&below, x, 0.0)), "exp(-{x:?})");
+        for y in sizes.iter().flat_map(|y| [*y, -*y]) {
+            assert!(same(run(&any, x, y), run(&of_size, x, y)), "pow({x:?}, {y:?})");
+        }
+    }
+}
+
 /// Odd functions are odd to the last bit, even ones even: friction does not prefer a direction.
 #[test]
 fn symmetry_is_exact() {

@@ -103,18 +103,18 @@ impl<'a> Parts<'a> {
 
 /// Within 0.52 ulp where the result is normal.
 pub fn exp(x: Real) -> Real {
-    let parts = Parts::of(x);
-    // As in Stribeck's curve and where a state relaxes: the same bits, without what only large results need.
-    if x.is_not_positive() { parts.scaled_below(x) } else { parts.scaled(x, 0) }
+    Parts::of(x).scaled(x, 0)
 }
 
-/// The bits of [`exp`] in the fewest operations, where these count and not how long each waits for the one before: of what
-/// is not above 0 the scale is always taken 2^1022 times as large and the rest multiplied last. That rounds once more only
-/// where the result is too small for all digits, as there.
-pub fn exp_of_lanes(x: Real) -> Real {
-    if !x.is_not_positive() {
-        return exp(x);
-    }
+/// The same bits of an x that is not above 0, or NaN, as in Stribeck's curve, without what only large results need.
+pub fn exp_below(x: Real) -> Real {
+    Parts::of(x).scaled_below(x)
+}
+
+/// The bits of [`exp_below`] in the fewest operations, where these count and not how long each waits for the one before:
+/// the scale is always taken 2^1022 times as large and the rest multiplied last. That rounds once more only where the
+/// result is too small for all digits, as there.
+pub fn exp_below_of_lanes(x: Real) -> Real {
     // 1022 doublings are a whole number of steps, and so are their bits.
     let round = ROUND + 1022.0 * f64::from(tables::EXP_LEN);
     let rounded = x.fma(STEPS, round);
@@ -156,14 +156,14 @@ pub fn cosh(x: Real) -> Real {
 /// t/(t + 2) with t = e^(2a) − 1 of a = |x|, as high and low parts, the quotient corrected once.
 /// Within 0.6 ulp.
 pub fn tanh(x: Real) -> Real {
-    // From 20 on it is 1.
-    let a = x.abs().at_most(20.0);
+    let a = x.abs();
     let (t, t_low) = Parts::exact(a + a, None).less_one();
     let (sum, sum_low) = two_sum(t, t.constant(2.0));
     let inverse = 1.0 / sum;
     let q = t * inverse;
     let rest = (-q).fma(sum, t) + (-q).fma(sum_low + t_low, t_low);
-    let size = inverse.fma(rest, q);
+    // From 20 on it is 1.
+    let size = a.above(20.0).choose(1.0, inverse.fma(rest, q));
     let odd = x.below(0.0).choose(-size, size);
     a.below(two_to(-28)).choose(x, odd)
 }

@@ -97,8 +97,33 @@ pub fn log1p(x: Real) -> Real {
 
 /// e^(y log x), the logarithm with 68 bits: within 0.52 ulp, and as IEEE 754 defines it at the edges.
 pub fn pow<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
-    let size = x.abs();
-    let (scaled, more) = normal(size);
+    let magnitude = pow_of_size(x.abs(), y);
+    // Below zero y must be whole; an odd y keeps the sign. Infinities are even.
+    let whole = y.floor().is(y);
+    let half = 0.5 * y;
+    let odd = whole & !half.floor().is(half);
+    let negative = x.bits().below(0) & x.is(x) & y.is(y);
+    let signed = (negative & odd).choose(-magnitude, magnitude);
+    let any = (x.below(0.0) & x.above(f64::NEG_INFINITY) & !whole).choose(f64::NAN, signed);
+    x.above(0.0).choose(magnitude, any)
+}
+
+/// The same bits of an x without a sign, or NaN.
+pub fn pow_of_size<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
+    let times = y.abs();
+    let plain = y.is(1.0);
+    let usual = x.above(0.0) & x.below(f64::INFINITY) & times.above(0.0) & times.below(f64::INFINITY) & !plain;
+    // x^1 = x, x^0 = 1 and 1^y = 1, of NaN too. Else x is 0 or infinite, or y is.
+    let one = x.is(1.0) | y.is(0.0);
+    let number = x.is(x) & y.is(y);
+    let falls = y.below(0.0);
+    let grows = x.above(1.0).choose(falls.choose(0.0, f64::INFINITY), falls.choose(f64::INFINITY, 0.0));
+    usual.choose(power(x, y), plain.choose(x, one.choose(1.0, number.choose(grows, f64::NAN))))
+}
+
+/// x^y of an x above 0, both finite.
+fn power<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
+    let (scaled, more) = normal(x);
     let reduced = Reduced::of(scaled);
     let k = reduced.k.real() + more;
     let r = reduced.z.fma(reduced.inverse, -1.0);
@@ -119,22 +144,5 @@ pub fn pow<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
 
     let product = y * log;
     let product_low = y.fma(log_low, y.fma(log, -product));
-    let magnitude = Parts::exact(product, Some(product_low)).scaled(product, 0);
-
-    let (zero, infinite) = (size.is(0.0), size.is(f64::INFINITY));
-    let falls = y.below(0.0);
-    let at_zero = falls.choose(f64::INFINITY, 0.0);
-    let at_infinity = falls.choose(0.0, f64::INFINITY);
-    let magnitude = zero.choose(at_zero, infinite.choose(at_infinity, magnitude));
-    // x^0 = 1 and 1^y = 1, of NaN too; (−1)^±inf = 1.
-    let one = size.is(1.0) | y.is(0.0);
-    let number = x.is(x) & y.is(y);
-    let magnitude = one.choose(1.0, number.choose(magnitude, f64::NAN));
-    // Below zero y must be whole; an odd y keeps the sign. Infinities are even.
-    let whole = y.floor().is(y);
-    let half = 0.5 * y;
-    let odd = whole & !half.floor().is(half);
-    let negative = x.bits().below(0) & number;
-    let signed = (negative & odd).choose(-magnitude, magnitude);
-    (x.below(0.0) & x.above(f64::NEG_INFINITY) & !whole).choose(f64::NAN, signed)
+    Parts::exact(product, Some(product_low)).scaled(product, 0)
 }

@@ -16,7 +16,7 @@ mod accuracy;
 
 use crate::ir::build::Build;
 use crate::ir::expr::{Real, Shared};
-use crate::ir::{Binary, Func, Op, Unary, Value};
+use crate::ir::{Binary, Func, Op, Unary, Value, is_not_negative, is_not_positive};
 pub use tables::POOL;
 
 /// The tables of the elementary functions: the beginning of every pool.
@@ -32,31 +32,40 @@ const fn two_to(n: i32) -> f64 {
 
 /// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
-    expand_by(func, &|function, x| Some(unary(function, x)))
+    expand_by(func, &|function, x, below| {
+        Some(match function {
+            Unary::Exp if below => exponential::exp_below(x),
+            function => unary(function, x),
+        })
+    })
 }
 
 /// The same bits for lanes, of which many go side by side: in the fewest operations. `kept` are functions that a back end has
 /// instructions for: those must give the same bits.
 pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
-    expand_by(func, &|function, x| match function {
+    expand_by(func, &|function, x, below| match function {
         function if kept.contains(&function) => None,
-        Unary::Exp => Some(exponential::exp_of_lanes(x)),
+        Unary::Exp if below => Some(exponential::exp_below_of_lanes(x)),
         function => Some(unary(function, x)),
     })
 }
 
-/// Replaces functions of one argument by what `by` makes of them, if it does.
-fn expand_by(func: &Func, by: &dyn for<'a> Fn(Unary, Real<'a>) -> Option<Real<'a>>) -> Func {
+/// Replaces functions of one argument by what `by` makes of them, if it does; it is told whether the argument is known not
+/// to be above 0.
+fn expand_by(func: &Func, by: &dyn for<'a> Fn(Unary, Real<'a>, bool) -> Option<Real<'a>>) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, live) in func.ops.iter().zip(func.live()) {
         let at = |operand: Value| Real::new(&build, values[operand.index()]);
         let value = match *op {
             _ if !live => Value(u32::MAX),
-            Op::Unary(function, x) => match by(function, at(x)) {
+            Op::Unary(function, x) => match by(function, at(x), is_not_positive(x, |value| func.op(value))) {
                 Some(value) => value.value,
                 None => build.borrow_mut().op(Op::Unary(function, values[x.index()])),
             },
+            Op::Binary(Binary::Pow, x, y) if is_not_negative(x, |value| func.op(value)) => {
+                logarithm::pow_of_size(at(x), at(y)).value
+            }
             Op::Binary(function, x, y) => binary(function, at(x), at(y)).value,
             op => build.borrow_mut().op(op.map(|operand| values[operand.index()])),
         };
