@@ -111,13 +111,14 @@ pub fn pow<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
 /// The same bits of an x without a sign, or NaN.
 pub fn pow_of_size<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     let times = y.abs();
-    let usual = x.above(0.0) & x.below(f64::INFINITY) & times.above(0.0) & times.below(f64::INFINITY);
-    // x^0 = 1 and 1^y = 1, of NaN too. Else x is 0 or infinite, or y is.
+    let plain = y.is(1.0);
+    let usual = x.above(0.0) & x.below(f64::INFINITY) & times.above(0.0) & times.below(f64::INFINITY) & !plain;
+    // x^1 = x, x^0 = 1 and 1^y = 1, of NaN too. Else x is 0 or infinite, or y is.
     let one = x.is(1.0) | y.is(0.0);
     let number = x.is(x) & y.is(y);
     let falls = y.below(0.0);
     let grows = x.above(1.0).choose(falls.choose(0.0, f64::INFINITY), falls.choose(f64::INFINITY, 0.0));
-    usual.choose(power(x, y), one.choose(1.0, number.choose(grows, f64::NAN)))
+    usual.choose(power(x, y), plain.choose(x, one.choose(1.0, number.choose(grows, f64::NAN))))
 }
 
 /// x^y of an x above 0, both finite.
