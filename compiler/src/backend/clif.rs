@@ -44,8 +44,8 @@ pub fn signature(isa: &dyn TargetIsa) -> Signature {
     signature
 }
 
-/// Writes `func`, which is sound and expanded, into the empty `target`; with numbers that have gone ahead it gets the
-/// signature of [`abi::ahead::RestEntry`].
+/// Writes `func`, which is sound and expanded, into the empty `target`: as a loop, or, if nothing changes from one iteration
+/// to the next, as one. With numbers that have gone ahead it gets the signature of [`abi::ahead::RestEntry`].
 pub fn emit(
     func: &Func,
     ahead: Option<GoneAhead>,
@@ -204,10 +204,7 @@ fn again(
 
     let status = b.append_block_param(exit, types::I64);
     b.switch_to_block(exit);
-    for (slot, value) in &func.stores {
-        let value = emitter.get(*value, b);
-        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
-    }
+    emitter.stores(&func.stores, b);
     b.ins().return_(&[status]);
 }
 
@@ -230,15 +227,20 @@ fn once(
     let short = func.ops.len() <= SHORT;
     let mut emitter = Emitter { near, short, ..Emitter::new(func, &facts, block, pool) };
     emitter.list(&apart.before, b);
+    // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
+    let before: HashSet<Value> = apart.before.iter().copied().collect();
+    let later = func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32)));
+    let loads = later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None });
+    let read_later: HashSet<Slot> = loads.chain(apart.automata.iter().map(|automaton| automaton.slot)).collect();
+    let (early, last): (Vec<_>, Vec<_>) =
+        func.stores.iter().partition(|(slot, value)| before.contains(value) && !read_later.contains(slot));
+    emitter.stores(&early, b);
     for automaton in &apart.automata {
         emitter.automaton(automaton, b);
     }
     emitter.list(&apart.behind, b);
     emitter.writes(&func.writes, b);
-    for (slot, value) in &func.stores {
-        let value = emitter.get(*value, b);
-        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
-    }
+    emitter.stores(&last, b);
     let [fine, failed] = [(); 2].map(|()| b.create_block());
     match watch {
         Watch::Nothing => {
@@ -613,7 +615,7 @@ pub struct Emitter<'a> {
     short: bool,
     /// Places of tables and rings that are held inside: of an index and a length, and in which block.
     places: RefCell<HashMap<(Value, u32), (clif::Block, clif::Value)>>,
-    /// Blocks before choices that are being written: all of them has run.
+    /// Blocks that have run before what is being written, those of choices that lie behind it.
     passed: Vec<clif::Block>,
 }
 
@@ -661,6 +663,14 @@ impl<'a> Emitter<'a> {
             _ => None,
         };
         self.func.ops.iter().enumerate().filter_map(of_load).collect()
+    }
+
+    /// Stores to slots.
+    fn stores(&self, stores: &[(Slot, Value)], b: &mut FunctionBuilder) {
+        for (slot, value) in stores {
+            let value = self.get(*value, b);
+            b.ins().store(MemFlagsData::trusted(), value, self.block, offset(slot.0));
+        }
     }
 
     /// Writes to rings.
