@@ -58,6 +58,30 @@ fn layout() -> Layout {
     Layout::new([0, 3, 4, 0, 0, 0, 0, 0, 0, 0])
 }
 
+/// A regime that is set to 0 or 1 whatever it was, and still is asked for what it was.
+#[test]
+fn a_regime_is_read_before_it_is_set() {
+    let layout = Layout::new([0, 2, 1, 0, 1, 0, 0, 0, 0, 0]);
+    let (x, regime) = (layout.states.slot(0), layout.regimes.slot(0));
+    let mut build = Build::new("step");
+    let [v, w] = [0, 1].map(|k| build.load(layout.inputs.slot(k)));
+    let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
+    let (mut next, was) = (build.load(x), build.load(regime));
+    let rests = build.equal(was, zero);
+    for factor in [v, w, v, w] {
+        let product = build.mul(next, factor);
+        let moved = build.add(product, w);
+        next = build.select(rests, moved, next);
+    }
+    let less = build.less(v, w);
+    let set = build.select(less, one, zero);
+    build.store(x, next);
+    build.store(regime, set);
+    let blocks = [[2.0, 3.0, 0.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0], [3.0, 2.0, 1.0]];
+    let blocks = blocks.map(|[v, w, regime]| vec![0.0, 1.0, 0.0, v, w, 5.0, regime]);
+    check(&build.finish(), &layout, &blocks, &[], 1, "a regime that is set");
+}
+
 /// Each operation on reals, on every pair of edge values.
 #[test]
 fn every_operation_on_reals_agrees_at_the_edges() {

@@ -44,8 +44,8 @@ pub fn signature(isa: &dyn TargetIsa) -> Signature {
     signature
 }
 
-/// Writes `func`, which is sound and expanded, into the empty `target`; with numbers that have gone ahead it gets the
-/// signature of [`abi::ahead::RestEntry`].
+/// Writes `func`, which is sound and expanded, into the empty `target`: as a loop, or, if nothing changes from one iteration
+/// to the next, as one. With numbers that have gone ahead it gets the signature of [`abi::ahead::RestEntry`].
 pub fn emit(
     func: &Func,
     ahead: Option<GoneAhead>,
@@ -230,8 +230,8 @@ fn once(
     // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
     let before: HashSet<Value> = apart.before.iter().copied().collect();
     let later = func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32)));
-    let read_later: HashSet<Slot> =
-        later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None }).collect();
+    let loads = later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None });
+    let read_later: HashSet<Slot> = loads.chain(apart.automata.iter().map(|automaton| automaton.slot)).collect();
     let (early, last): (Vec<_>, Vec<_>) =
         func.stores.iter().partition(|(slot, value)| before.contains(value) && !read_later.contains(slot));
     emitter.stores(&early, b);
@@ -617,7 +617,7 @@ pub struct Emitter<'a> {
     short: bool,
     /// Places of tables and rings that are held inside: of an index and a length, and in which block.
     places: RefCell<HashMap<(Value, u32), (clif::Block, clif::Value)>>,
-    /// Blocks before choices that are being written: all of them has run.
+    /// Blocks that have run before what is being written, those of choices that lie behind it.
     passed: Vec<clif::Block>,
 }
 
