@@ -5,7 +5,8 @@
 //! `expo`, in the form in which one writes it for one model alone. First both go through the same course, whose states
 //! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The bar
 //! is this C as it stands, which neither counts nor keeps time nor watches. Two columns tell what that is worth: the same C
-//! with just that, and our step without guards.
+//! with just that, and our step without guards. The last three are of calls whose inputs wait for the outputs of the call
+//! before, as they do where a loop is closed; in all others many calls are under way at once.
 //! A word behind the command takes only models whose names begin with it.
 
 #[path = "../../src/project.rs"]
@@ -100,24 +101,27 @@ fn main() {
     let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
     println!("one step a call by `expo`, new inputs at each; below 1 is faster than C through a pointer");
     println!(
-        "{:<22} {:>8} {:>8} {:>8} {:>7} {:>10} {:>10}",
-        "", "C", "checked", "ours", "ratio", "to checked", "unguarded"
+        "{:<22} {:>8} {:>8} {:>8} {:>7} {:>10} {:>10} {:>9} {:>8} {:>7}",
+        "", "C", "checked", "ours", "ratio", "to checked", "unguarded", "C in turn", "ours", "in turn"
     );
-    let (mut ratios, mut left_out) = ([const { Vec::new() }; 3], Vec::new());
+    let (mut ratios, mut left_out) = ([const { Vec::new() }; 4], Vec::new());
     for name in names.iter().filter(|name| name.starts_with(&chosen)) {
         if let Some((_, why)) = LEFT_OUT.iter().find(|(left_out, _)| left_out == name) {
             left_out.push(format!("{name}: {why}"));
             continue;
         }
         let hand = hand(name).unwrap_or_else(|| panic!("`models.c` has no {name}"));
-        let [c, checked, ours, bare] = compare(name, &mut loaded, hand);
-        let of_model = [ours / c, ours / checked, bare / c];
-        let [ratio, to_checked, unguarded] = of_model;
-        println!("{name:<22} {c:5.1} ns {checked:5.1} ns {ours:5.1} ns {ratio:7.3} {to_checked:10.3} {unguarded:10.3}");
+        let [c, checked, ours, bare, c_in_turn, ours_in_turn] = compare(name, &mut loaded, hand);
+        let of_model = [ours / c, ours / checked, bare / c, ours_in_turn / c_in_turn];
+        let [ratio, to_checked, unguarded, in_turn] = of_model;
+        println!(
+            "{name:<22} {c:5.1} ns {checked:5.1} ns {ours:5.1} ns {ratio:7.3} {to_checked:10.3} {unguarded:10.3} \
+             {c_in_turn:6.1} ns {ours_in_turn:5.1} ns {in_turn:7.3}"
+        );
         ratios.iter_mut().zip(of_model).for_each(|(ratios, ratio)| ratios.push((ratio, name)));
     }
     left_out.iter().for_each(|what| println!("left out: {what}"));
-    for (what, ratios) in ["ratio", "to checked", "unguarded"].into_iter().zip(ratios) {
+    for (what, ratios) in ["ratio", "to checked", "unguarded", "in turn"].into_iter().zip(ratios) {
         #[allow(clippy::disallowed_methods, reason = "for people only")]
         let mean = (ratios.iter().map(|(ratio, _)| ratio.ln()).sum::<f64>() / ratios.len() as f64).exp();
         let above = ratios.iter().filter(|(ratio, _)| *ratio > 1.0).count();
@@ -129,8 +133,9 @@ fn main() {
     }
 }
 
-/// Nanoseconds a call in C, in C that watches too, of ours, and of ours without guards, medians.
-fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 4] {
+/// Nanoseconds a call in C, in C that watches too, of ours, and of ours without guards, and in C and of ours one call behind
+/// the other, medians.
+fn compare(name: &str, loaded: &mut compiler::Loaded, hand: &Hand) -> [f64; 6] {
     // A sampled model is called at its own pace.
     let h = match name {
         "DriveTorqueSampled" => 0.5e-3,
@@ -240,7 +245,7 @@ fn timed(
     out: &mut [f64],
     (course, inputs, outputs): (&[f64], &[Slot], &[Slot]),
     h: f64,
-) -> [f64; 4] {
+) -> [f64; 6] {
     let description = ours[0].1.description().clone();
     let first = description.layout.inputs.start as usize;
     let pool = description.pool.as_ptr();
@@ -258,21 +263,28 @@ fn timed(
         (black_box(entry), block, Ports { inputs, base: block, outputs: &in_block })
     });
     let (step, checked) = (black_box(hand.step), black_box(hand.checked));
-    let mut times = [const { Vec::new() }; 4];
+    let mut times = [const { Vec::new() }; 6];
     let mut at = 0;
     for _ in 0..ROUNDS {
         let rows = || (at..at + CALLS).map(|k| &course[k % COURSE * inputs.len()..][..inputs.len()]);
         // SAFETY: the arrays are as long as the names that the source gives.
-        times[0].push(round(rows(), &of_c, move || unsafe {
+        let plain = || unsafe {
             step(x, params, u, out, h);
             0
-        }));
+        };
         // SAFETY: as above, and the clock has its three numbers.
-        times[1].push(round(rows(), &of_c, move || unsafe { checked(watched, params, u, out, clock) }));
-        for ((entry, block, ports), times) in ours.iter().zip(&mut times[2..]) {
+        let watching = || unsafe { checked(watched, params, u, out, clock) };
+        times[0].push(round::<false>(rows(), &of_c, plain));
+        times[1].push(round::<false>(rows(), &of_c, watching));
+        times[4].push(round::<true>(rows(), &of_c, plain));
+        for (k, (entry, block, ports)) in ours.iter().enumerate() {
             let (entry, block) = (*entry, *block);
             // SAFETY: block and pool are those of the model.
-            times.push(round(rows(), ports, move || unsafe { entry(block, pool, 1) as i64 }));
+            let own = || unsafe { entry(block, pool, 1) as i64 };
+            times[2 + k].push(round::<false>(rows(), ports, own));
+            if k == 0 {
+                times[5].push(round::<true>(rows(), ports, own));
+            }
         }
         at += CALLS;
     }
@@ -290,17 +302,26 @@ struct Ports<'a> {
     outputs: &'a [usize],
 }
 
-/// Nanoseconds a call over some rows of inputs: all that stands around the call is the same for each kind of step.
+/// Nanoseconds a call over some rows of inputs: all that stands around the call is the same for each kind of step. If it
+/// `WAITS`, nothing of a call can begin that needs an input before the call before has left its outputs.
 #[inline(never)]
-fn round<'a>(rows: impl Iterator<Item = &'a [f64]>, ports: &Ports, mut call: impl FnMut() -> i64) -> f64 {
+fn round<'a, const WAITS: bool>(
+    rows: impl Iterator<Item = &'a [f64]>,
+    ports: &Ports,
+    mut call: impl FnMut() -> i64,
+) -> f64 {
     let mut sum = 0.0;
     let begun = Instant::now();
     for row in rows {
         for (k, from) in row.iter().enumerate() {
+            let input = if WAITS { from + 0.0 * sum } else { *from };
             // SAFETY: a row is as long as the model has inputs.
-            unsafe { *ports.inputs.add(k) = *from };
+            unsafe { *ports.inputs.add(k) = input };
         }
         assert_eq!(call(), 0, "no guard fires");
+        if WAITS {
+            sum = 0.0;
+        }
         for from in ports.outputs {
             // SAFETY: these are the model's outputs.
             sum += unsafe { *ports.base.add(*from) };

@@ -66,7 +66,7 @@ impl<'a> Coder<'a> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        self.each_part(func, |isa, context| {
+        self.each_part(func, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -117,7 +117,8 @@ impl<'a> Coder<'a> {
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
-        self.each_part(func, |_, context| {
+        self.each_part(func, |what, _, context| {
+            text += &what;
             text += &context.func.display().to_string();
             Ok(())
         })?;
@@ -127,9 +128,10 @@ impl<'a> Coder<'a> {
     /// The function as assembly, as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
-        self.each_part(func, |isa, context| {
+        self.each_part(func, |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
+            text += &what;
             text += compiled.map_err(|error| refused(func, &error.inner))?.vcode.as_deref().unwrap_or_default();
             Ok(())
         })?;
@@ -137,33 +139,37 @@ impl<'a> Coder<'a> {
     }
 
     /// Gives the function as Cranelift's own: whole, behind what makes a single iteration, or cut: then the loop first and
-    /// the pieces in their order.
+    /// the pieces in their order. Of several parts each has a line that says what it is.
     fn each_part(
         &mut self,
         func: &Func,
-        mut part: impl FnMut(&dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
+        mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
         let Coder { isa, context, builder, lengths } = self;
+        let title = |what: &str| format!("; {what}\n");
         if func.ops.len() <= lengths.whole {
-            if clif::has_single(func) {
+            let several = if clif::has_single(func) {
                 context.clear();
                 clif::emit_single(func, &mut context.func, builder, *isa);
-                part(*isa, context)?;
-            }
+                part(title("one iteration, or go on to more"), *isa, context)?;
+                title("any number of iterations")
+            } else {
+                String::new()
+            };
             context.clear();
             clif::emit(func, None, &mut context.func, builder, *isa);
-            return part(*isa, context);
+            return part(several, *isa, context);
         }
         let facts = Facts::of(func);
         let cut = cut(func, &facts, *lengths).ok_or_else(|| too_large(func))?;
         context.clear();
         pieces::emit_loop(func, &facts, &cut, &mut context.func, builder, *isa);
-        part(*isa, context)?;
+        part(title("the loop around its pieces"), *isa, context)?;
         let mut values = Vec::new();
         for number in 0..cut.pieces.len() {
             context.clear();
             pieces::emit_piece(func, &facts, (&cut, number), &mut values, &mut context.func, builder, *isa);
-            part(*isa, context)?;
+            part(title(&format!("piece {number}")), *isa, context)?;
         }
         Ok(())
     }
