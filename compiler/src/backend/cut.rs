@@ -97,21 +97,6 @@ fn made_anew(func: &Func, value: Value) -> bool {
     }
 }
 
-/// What code for an operation reads: of a table of which only the bits are wanted, that is the index.
-pub fn reads(func: &Func, op: Op) -> impl Iterator<Item = Value> {
-    let mut operands = [None; 3];
-    let mut n = 0;
-    let op = match op {
-        Op::ToBits(table) if let Op::Pool { .. } = func.op(table) => func.op(table),
-        op => op,
-    };
-    op.each_operand(|operand| {
-        operands[n] = Some(operand);
-        n += 1;
-    });
-    operands.into_iter().flatten()
-}
-
 /// The operations of a function in the order in which pieces compute them.
 struct Line<'a> {
     func: &'a Func,
@@ -128,7 +113,7 @@ impl<'a> Line<'a> {
         // Loads that are not made anew, since something reads them after their slot may have been stored.
         let mut kept = vec![false; func.ops.len()];
         for value in values(func).filter(|value| late[value.index()]) {
-            for read in reads(func, func.op(value)) {
+            for read in func.reads(func.op(value)) {
                 kept[read.index()] |= matches!(func.op(read), Op::Load(slot) if stored.contains_key(&slot));
             }
         }
@@ -210,7 +195,7 @@ impl<'a> Line<'a> {
         let place: HashMap<Value, usize> = ops.iter().enumerate().map(|(place, value)| (*value, place)).collect();
         let mut last: Vec<usize> = (0..ops.len()).collect();
         for (user, value) in ops.iter().enumerate() {
-            for read in reads(self.func, self.func.op(*value)) {
+            for read in self.func.reads(self.func.op(*value)) {
                 if let Some(place) = place.get(&read) {
                     last[*place] = user;
                 }
@@ -313,7 +298,7 @@ impl<'a> Line<'a> {
 
     /// The slots that an operation reads, or that a value is loaded from.
     fn slots_read(&self, value: Value) -> impl Iterator<Item = Slot> {
-        reads(self.func, self.func.op(value)).chain([value]).filter_map(|read| self.slot(read))
+        self.func.reads(self.func.op(value)).chain([value]).filter_map(|read| self.slot(read))
     }
 
     /// The slot that a value is loaded from.
@@ -339,7 +324,7 @@ impl<'a> Line<'a> {
             piece.values(repeats).for_each(|value| made[value.index()] = Some(number));
             let stored = piece.stores.iter().map(|(_, value)| *value);
             let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
-            let read = piece.values(repeats).flat_map(|value| reads(self.func, self.func.op(value)));
+            let read = piece.values(repeats).flat_map(|value| self.func.reads(self.func.op(value)));
             for value in read.chain(stored).chain(written) {
                 let ends = match made[value.index()] {
                     // What was made before the loop is read again in the next iteration.
@@ -405,7 +390,7 @@ impl Order<'_> {
             if self.groups[value.index()].is_some() {
                 continue;
             }
-            let operands = reads(self.func, self.func.op(value));
+            let operands = self.func.reads(self.func.op(value));
             if ready {
                 let behind = operands.filter_map(|operand| self.groups[operand.index()]).max().unwrap_or(0);
                 let group = group.unwrap_or(behind);

@@ -4,6 +4,7 @@
 
 pub mod interp;
 mod regimes;
+mod sides;
 mod clif;
 mod repeats;
 mod cut;

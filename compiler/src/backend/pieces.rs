@@ -10,7 +10,7 @@
 //! whoever lays out the code puts in the distance.
 
 use super::clif::{Emitter, Facts, Watch, offset, signature};
-use super::cut::{self, Cut, Piece};
+use super::cut::{Cut, Piece};
 use super::repeats::{Row, Source};
 use crate::ir::{Func, Op, Value};
 use cranelift_codegen::ir::{
@@ -142,7 +142,7 @@ pub fn emit_piece(
         }
     }
     for value in &piece.ops {
-        for read in cut::reads(func, func.op(*value)) {
+        for read in func.reads(func.op(*value)) {
             touched.extend(fetch(&mut emitter, read, cut, scratch, &mut b));
         }
         emitter.operation(*value, &mut b);
@@ -208,7 +208,7 @@ fn repeat(
     let mut constants: Vec<(usize, u32, (Value, usize))> = Vec::new();
     let mut touched: Vec<Value> = Vec::new();
     for row in &rows {
-        let mut operands: Vec<Value> = cut::reads(func, func.op(row.members[0])).collect();
+        let mut operands: Vec<Value> = func.reads(func.op(row.members[0])).collect();
         if let Op::Load(_) = func.op(row.members[0]) {
             operands.push(row.members[0]);
         }

@@ -5,7 +5,6 @@
 //! one shape is found from the results down; constants that differ are put into tables; what else does not lie in equal
 //! distances is left out. It knows nothing of processors.
 
-use super::cut::reads;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::HashMap;
@@ -146,7 +145,7 @@ impl<'a> Search<'a> {
         let mut top = vec![false; self.func.ops.len()];
         results.for_each(|value| top[value.index()] = true);
         for value in self.values.iter().filter(|value| alike[&self.shape[value.index()]] < fewest) {
-            reads(self.func, self.func.op(*value)).for_each(|operand| top[operand.index()] = true);
+            self.func.reads(self.func.op(*value)).for_each(|operand| top[operand.index()] = true);
         }
         // Those of equal constants are a family of their own if they are enough.
         let top: Vec<Value> = self.values.iter().copied().filter(|value| top[value.index()]).collect();
@@ -197,7 +196,7 @@ impl<'a> Search<'a> {
 
     /// What operations of one kind take, operand by operand; operands that may be exchanged so that they fit the first's.
     fn aligned(&self, members: &[Value]) -> Vec<Vec<Value>> {
-        let of = |member: Value| -> Vec<Value> { reads(self.func, self.func.op(member)).collect() };
+        let of = |member: Value| -> Vec<Value> { self.func.reads(self.func.op(member)).collect() };
         let first = of(members[0]);
         let mut all: Vec<Vec<Value>> = first.iter().map(|operand| vec![*operand]).collect();
         let exchangeable = exchangeable(self.func.op(members[0])).is_some();
@@ -335,7 +334,7 @@ impl<'a> Search<'a> {
                 (self.of_list(operand) == list).then(|| (self.repeats.level(operand), self.repeats.row(operand)))
             };
             let Some(row) = self.repeats.row(value) else {
-                let operands = reads(self.func, self.func.op(value)).filter_map(below);
+                let operands = self.func.reads(self.func.op(value)).filter_map(below);
                 let level = operands.map(|(level, row)| level + usize::from(row.is_some())).max().unwrap_or(0);
                 self.repeats.levels[value.index()] = level;
                 continue;

@@ -295,6 +295,21 @@ impl Func {
         self.ops[value.index()]
     }
 
+    /// What must be there for an operation: of a table of which only the bits are wanted, that is the index.
+    pub fn reads(&self, op: Op) -> impl Iterator<Item = Value> + use<> {
+        let mut operands = [None; 3];
+        let mut n = 0;
+        let op = match op {
+            Op::ToBits(table) if let Op::Pool { .. } = self.op(table) => self.op(table),
+            op => op,
+        };
+        op.each_operand(|operand| {
+            operands[n] = Some(operand);
+            n += 1;
+        });
+        operands.into_iter().flatten()
+    }
+
     /// The values that leave the function: stored, written, or its status.
     pub fn results(&self) -> impl Iterator<Item = Value> + '_ {
         let written = self.writes.iter().flat_map(|write| [write.index, write.value]);

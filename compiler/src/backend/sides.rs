@@ -1,0 +1,155 @@
+//! Which operations only one side of a choice needs.
+//!
+//! In: a list of operations, each behind its operands. Out: [`Sides`], by which code computes of a choice only the side that is
+//! chosen. It knows nothing of processors.
+
+use crate::ir::{Func, Op, Value};
+use std::collections::{HashMap, HashSet};
+
+/// Which operations of a list only one side of a choice needs: these are written where that side is taken. A choice whose
+/// sides are short stays one operation: it costs less than to foresee the side.
+pub struct Sides {
+    /// The operations of each side, in order; first those of no side.
+    pub members: Vec<Vec<Value>>,
+    /// The two sides of a choice that is taken apart.
+    pub of_choice: HashMap<Value, [usize; 2]>,
+    /// Choices that stand behind each other and ask the same are taken apart together: those of the first of them.
+    pub together: HashMap<Value, Vec<Value>>,
+}
+
+/// Operations, by their cost, from which on a side is long.
+const LONG_SIDE: u32 = 4;
+/// Choices within choices, at most.
+const DEEPEST: usize = 24;
+
+impl Sides {
+    /// Of a list from which the rest of the function, or only `outputs` if these are given, is computed.
+    pub fn of(func: &Func, list: &[Value], outputs: Option<&[Value]>) -> Sides {
+        // A side has its choice, and which of its operands it is; 0 is no side.
+        struct Side {
+            choice: Value,
+            within: usize,
+            depth: usize,
+            cost: u32,
+        }
+        let mut sides = vec![Side { choice: Value(0), within: 0, depth: 0, cost: 0 }];
+        let mut of_choice: HashMap<Value, [usize; 2]> = HashMap::new();
+        // The innermost side that holds all uses so far of a value; none: no use yet.
+        let mut side_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
+        let listed = side_of.clone();
+        let common = |sides: &[Side], mut a: usize, mut b: usize| {
+            while a != b {
+                if sides[a].depth >= sides[b].depth { a = sides[a].within } else { b = sides[b].within }
+            }
+            a
+        };
+        // What is read from elsewhere belongs to no side.
+        let mut elsewhere = |value: Value| {
+            if let Some(side) = side_of.get_mut(&value) {
+                *side = Some(0);
+            }
+        };
+        if let Some(outputs) = outputs {
+            outputs.iter().copied().for_each(&mut elsewhere);
+        } else {
+            func.results().for_each(&mut elsewhere);
+            for (i, op) in func.ops.iter().enumerate() {
+                if !listed.contains_key(&Value(i as u32)) {
+                    op.each_operand(&mut elsewhere);
+                }
+            }
+        }
+        let (together, mut followers) = (together(func, list), HashSet::new());
+        followers.extend(together.values().flat_map(|choices| &choices[1..]).copied());
+        for value in list.iter().rev() {
+            if followers.contains(value) {
+                continue;
+            }
+            let choices = together.get(value).map_or(std::slice::from_ref(value), |choices| choices);
+            let uses = choices.iter().filter_map(|choice| side_of[choice]);
+            let own = uses.reduce(|a, b| common(&sides, a, b)).unwrap_or(0);
+            for choice in choices {
+                side_of.insert(*choice, Some(own));
+                sides[own].cost += func.op(*choice).effort();
+            }
+            let mut used = |operand: Value, at: usize, sides: &[Side]| {
+                if let Some(known) = side_of.get_mut(&operand) {
+                    *known = Some(known.map_or(at, |known| common(sides, known, at)));
+                }
+            };
+            match func.op(*value) {
+                Op::Select(when, yes, no)
+                    if sides[own].depth < DEEPEST && (choices.len() > 1 || yes != no && when != yes && when != no) =>
+                {
+                    let depth = sides[own].depth + 1;
+                    let first = sides.len();
+                    sides.extend([(); 2].map(|()| Side { choice: *value, within: own, depth, cost: 0 }));
+                    of_choice.insert(*value, [first, first + 1]);
+                    used(when, own, &sides);
+                    for choice in choices {
+                        let Op::Select(_, yes, no) = func.op(*choice) else { unreachable!("it is a choice") };
+                        used(yes, first, &sides);
+                        used(no, first + 1, &sides);
+                    }
+                }
+                Op::Select(when, ..) if choices.len() > 1 => {
+                    used(when, own, &sides);
+                    for choice in choices {
+                        func.op(*choice).each_operand(|operand| used(operand, own, &sides));
+                    }
+                }
+                op => op.each_operand(|operand| used(operand, own, &sides)),
+            }
+        }
+        // Short sides are no sides: what they hold belongs to what they lie in. Inner sides stand behind outer ones.
+        for side in (1..sides.len()).rev() {
+            let (within, cost) = (sides[side].within, sides[side].cost);
+            sides[within].cost += cost;
+        }
+        let long = |side: usize| sides[side].cost >= LONG_SIDE;
+        // What asks several questions is taken apart in any case: a jump for each costs less than to put them together.
+        let compound = |choice: Value| match func.op(choice) {
+            Op::Select(when, ..) => matches!(func.op(when), Op::And(..) | Op::Or(..)),
+            _ => false,
+        };
+        of_choice.retain(|choice, pair| compound(*choice) || pair.iter().any(|side| long(*side)));
+        let kept = |mut side: usize| {
+            while side != 0 && !of_choice.contains_key(&sides[side].choice) {
+                side = sides[side].within;
+            }
+            side
+        };
+        let mut members = vec![Vec::new(); sides.len()];
+        for value in list {
+            members[kept(side_of[value].unwrap_or(0))].push(*value);
+        }
+        Sides { members, of_choice, together }
+    }
+}
+
+/// Choices of a list that stand behind each other and ask the same, if none chooses another: by the first of them.
+fn together(func: &Func, list: &[Value]) -> HashMap<Value, Vec<Value>> {
+    let mut together: HashMap<Value, Vec<Value>> = HashMap::new();
+    let mut run: Vec<Value> = Vec::new();
+    let mut asked = None;
+    for value in list {
+        let now = match func.op(*value) {
+            Op::Select(when, yes, no) if when != yes && when != no => {
+                let apart = ![yes, no].iter().any(|side| run.contains(side));
+                (apart || run.is_empty()).then_some(when)
+            }
+            _ => None,
+        };
+        if now.is_none() || now != asked {
+            run.clear();
+        }
+        asked = now;
+        if now.is_some() {
+            run.push(*value);
+            if run.len() > 1 {
+                together.insert(run[0], run.clone());
+            }
+        }
+    }
+    together
+}
