@@ -37,7 +37,7 @@ const COURSE: usize = 4096;
 const COMPARED: usize = 20_000;
 /// Largest difference of a quantity, as a share of the largest value that it has had.
 const TOLERANCE: f64 = 1e-9;
-const ROUNDS: usize = 301;
+const ROUNDS: usize = 151;
 const CALLS: usize = 1000;
 
 /// Models without C, and why.
