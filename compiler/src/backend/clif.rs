@@ -224,14 +224,26 @@ fn once(
     b: &mut FunctionBuilder,
 ) {
     let func = &apart.func;
-    let facts = Facts::of(func);
+    let before: HashSet<Value> = apart.before.iter().copied().collect();
+    let later = || func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32))).map(|(_, op)| *op);
+    // What is read behind: by operations, or by regimes, in which an output may be what is there already.
+    let mut read: Vec<Value> = func.results().collect();
+    later().for_each(|op| op.each_operand(|operand| read.push(operand)));
+    let mut facts = Facts::of(func);
+    for (_, case) in apart.automata.iter().flat_map(|automaton| &automaton.cases) {
+        case.each(&mut |case| match &case.then {
+            Then::Outputs(outputs) => {
+                outputs.iter().for_each(|output| facts.as_real[output.index()] = true);
+                read.extend(outputs);
+            }
+            Then::Ask(when, _) => read.push(*when),
+        });
+    }
     let short = func.ops.len() <= SHORT;
     let mut emitter = Emitter { near, short, ..Emitter::new(func, &facts, block, pool) };
-    emitter.list(&apart.before, b);
+    emitter.only(&apart.before, &read, b);
     // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
-    let before: HashSet<Value> = apart.before.iter().copied().collect();
-    let later = func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32)));
-    let loads = later.filter_map(|(_, op)| if let Op::Load(slot) = op { Some(*slot) } else { None });
+    let loads = later().filter_map(|op| if let Op::Load(slot) = op { Some(slot) } else { None });
     let read_later: HashSet<Slot> = loads.chain(apart.automata.iter().map(|automaton| automaton.slot)).collect();
     let (early, last): (Vec<_>, Vec<_>) =
         func.stores.iter().partition(|(slot, value)| before.contains(value) && !read_later.contains(slot));
