@@ -474,6 +474,51 @@ fn exponentials_in_lanes_agree_with_instances_alone() {
     }
 }
 
+/// What is left of an output in one regime may be there already: inside a side of a choice, or as the bits of a table.
+#[test]
+fn what_a_regime_leaves_may_be_there_already() {
+    let layout = Layout::new([0, 1, 5, 0, 0, 0, 0, 0, 0, 0]);
+    let mut build = Build::new("regimes");
+    let (x, regime) = (build.load(Slot(3)), build.load(Slot(4)));
+    let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
+    let size = build.abs(x);
+    let mut long = size;
+    for _ in 0..8 {
+        long = build.fma(long, size, one);
+    }
+    let small = build.less(x, one);
+    let chosen = build.select(small, long, x);
+    build.store(Slot(5), chosen);
+    let (bits, mask) = (build.op(Op::ToBits(x)), build.int(3));
+    let index = build.op(Op::IntAnd(bits, mask));
+    let entry = build.op(Op::Pool { base: 0, len: 4, index });
+    let bits = build.op(Op::ToBits(entry));
+    let sticks = build.equal(regime, zero);
+    let other = build.fma(x, x, one);
+    let turned = build.select(sticks, x, other);
+    let output = build.abs(turned);
+    build.store(Slot(6), output);
+    let mut more = turned;
+    for _ in 0..6 {
+        more = build.fma(more, turned, x);
+    }
+    build.store(Slot(7), more);
+    let (none, some) = (build.int(0), build.int(1));
+    let added = build.select(sticks, none, some);
+    let sum = build.op(Op::IntAdd(bits, added));
+    let of_table = build.op(Op::FromBits(sum));
+    build.store(Slot(8), of_table);
+    let next = build.select(small, regime, one);
+    build.store(Slot(4), next);
+    let blocks: Vec<Vec<f64>> = [0.0, 1.0, 7.0]
+        .into_iter()
+        .flat_map(|regime| [-0.5, 0.7, 3.0].map(|x| vec![0.0, 0.0, 0.0, x, regime, 0.0, 0.0, 0.0, 0.0]))
+        .collect();
+    for count in [1, 3] {
+        check(&build.clone().finish(), &layout, &blocks, &[1.0, 2.0, 3.0, 4.0], count, "regimes");
+    }
+}
+
 /// More states than registers can hold travel through the block.
 #[test]
 fn many_states_agree() {
