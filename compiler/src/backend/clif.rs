@@ -68,8 +68,8 @@ pub fn emit(
     let facts = Facts::of_rest(func, ahead);
     b.ins().brif(count, prepare, &[], nothing, &[]);
     b.switch_to_block(prepare);
-    let same = facts.stay_the_same(func);
-    if same && ahead.is_none() && func.ops.len() <= STRAIGHT {
+    let same = ahead.is_none() && stays_the_same(func);
+    if same && func.ops.len() <= STRAIGHT {
         once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
     } else {
         let count = if same { b.ins().iconst(types::I64, 1) } else { count };
@@ -85,7 +85,13 @@ pub fn emit(
 
 /// Whether a single iteration has a function of its own, so that the loop's registers are none of its business.
 pub fn has_single(func: &Func) -> bool {
-    func.ops.len() <= STRAIGHT && !Facts::of(func).stay_the_same(func)
+    func.ops.len() <= STRAIGHT && !stays_the_same(func)
+}
+
+/// Whether nothing changes from one iteration to the next: then one is enough.
+pub fn stays_the_same(func: &Func) -> bool {
+    let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    func.writes.is_empty() && func.loads().iter().all(|slot| !stored.contains(slot))
 }
 
 /// Writes a function that makes a single iteration itself and leaves every other count to the function behind it.
@@ -412,11 +418,6 @@ impl Facts {
         Facts { types: verify::types(func).expect("the function is sound"), varies, as_real, fused, most: most(func) }
     }
 
-    /// Whether nothing changes from one iteration of `func` to the next: then one is enough.
-    fn stay_the_same(&self, func: &Func) -> bool {
-        func.writes.is_empty() && self.varies.iter().all(|varies| !varies)
-    }
-
     /// As Cranelift names it.
     pub fn type_of(&self, value: Value) -> clif::Type {
         match self.types[value.index()] {
@@ -525,7 +526,7 @@ impl<'a> Emitter<'a> {
     }
 
     /// Loads of slots that are stored too, with what is stored.
-    pub fn carried(&self) -> Vec<(Value, Value)> {
+    fn carried(&self) -> Vec<(Value, Value)> {
         let stored: HashMap<_, _> = self.func.stores.iter().copied().collect();
         let of_load = |(i, op): (usize, &Op)| match op {
             Op::Load(slot) => stored.get(slot).map(|value| (Value(i as u32), *value)),
@@ -535,7 +536,7 @@ impl<'a> Emitter<'a> {
     }
 
     /// Stores to slots.
-    fn stores(&self, stores: &[(Slot, Value)], b: &mut FunctionBuilder) {
+    pub fn stores(&self, stores: &[(Slot, Value)], b: &mut FunctionBuilder) {
         for (slot, value) in stores {
             let value = self.get(*value, b);
             b.ins().store(MemFlagsData::trusted(), value, self.block, offset(slot.0));

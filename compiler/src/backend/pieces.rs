@@ -9,7 +9,7 @@
 //! that one address for each distance walks along. The scratch area lies on the stack. A piece is called by its number;
 //! whoever lays out the code puts in the distance.
 
-use super::clif::{Emitter, Facts, Watch, offset, signature};
+use super::clif::{Emitter, Facts, Watch, offset, signature, stays_the_same};
 use super::cut::{Cut, Piece};
 use super::repeats::{Row, Source};
 use crate::ir::{Func, Op, Value};
@@ -68,8 +68,7 @@ pub fn emit_loop(
     call(0..cut.each.start, &mut b);
     // Nothing changes from one iteration to the next: one is enough.
     let mut emitter = Emitter::new(func, facts, block, pool);
-    let same = emitter.carried().is_empty() && func.writes.is_empty();
-    let count = if same { b.ins().iconst(types::I64, 1) } else { count };
+    let count = if stays_the_same(func) { b.ins().iconst(types::I64, 1) } else { count };
     b.ins().jump(body, &[BlockArg::Value(count)]);
 
     let left = b.append_block_param(body, types::I64);
@@ -155,10 +154,7 @@ pub fn emit_piece(
     for value in piece.stores.iter().map(|(_, value)| *value).chain(written) {
         touched.extend(fetch(&mut emitter, value, cut, scratch, &mut b));
     }
-    for (slot, value) in &piece.stores {
-        let value = emitter.get(*value, &mut b);
-        b.ins().store(MemFlagsData::trusted(), value, block, offset(slot.0));
-    }
+    emitter.stores(&piece.stores, &mut b);
     emitter.writes(&piece.writes, &mut b);
     if !piece.rows.is_empty() {
         touched.extend(repeat(&mut emitter, piece, cut, scratch, &mut b));
