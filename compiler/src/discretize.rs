@@ -93,7 +93,7 @@ const TOGETHER: usize = 8;
 /// The status: 0, or the number of the first guard whose quantity is not finite or out of its range by more than 1e-6
 /// of the range's width or, of a range open on one side, of its bound.
 fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
-    let mut fine: Option<Real> = None;
+    let mut total: Option<Real> = None;
     let mut outside: Option<Truth> = None;
     let number = |n: i64| build.borrow_mut().int(n);
     let mut first = number(0);
@@ -101,8 +101,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
         let (mut sum, mut beyond): (Option<Real>, Option<Truth>) = (None, None);
         for (k, guard) in guards.iter().enumerate().rev() {
             let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
-            // Of something infinite or NaN this is NaN, and so is the sum.
-            sum = Some(sum.map_or_else(|| 0.0 * x, |sum| x.fma(0.0, sum)));
+            sum = Some(sum.map_or(x, |sum| sum + x));
             let (low, high) = widened(guard.range);
             let bounds = [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))];
             let out = bounds.into_iter().filter(|(bounded, _)| *bounded).map(|(_, out)| out).reduce(|a, b| a | b);
@@ -111,13 +110,14 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
             let this = number((group * TOGETHER + k) as i64 + 1);
             first = build.borrow_mut().select(bad.value, this, first);
         }
-        fine = fine.zip(sum).map(|(all, sum)| all + sum).or(sum);
+        total = total.zip(sum).map(|(all, sum)| all + sum).or(sum);
         outside = either(outside, beyond);
     }
-    // One test decides; which guard it is matters only then, and code may find it out apart from the step.
-    let fine = fine?;
-    // The sum is 0 or NaN, and of these two this asks with one test.
-    let finite = fine.constant(0.0).not_above(fine);
+    // One test decides; which guard it is, and whether it is one (a sum may overflow), matters only then, and code may find
+    // it out apart from the step.
+    let sum = total?;
+    // Of something infinite or NaN the sum is that, and 0 times the sum is 0 or NaN: of these two this asks with one test.
+    let finite = sum.constant(0.0).not_above(0.0 * sum);
     let any = outside.map_or(!finite, |outside| outside | !finite);
     let none = number(0);
     Some(build.borrow_mut().select(any.value, first, none))
