@@ -16,7 +16,7 @@
 
 use super::regimes::{Apart, Automaton, Case, Then, apart};
 use super::sides::Sides;
-use crate::ir::{Func, Op, Type, Value, Write, verify};
+use crate::ir::{Func, Op, Type, Value, Write, sign_of, verify};
 use abi::Slot;
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
 use cranelift_codegen::ir::{
@@ -580,19 +580,6 @@ impl<'a> Emitter<'a> {
         self.instead.get(&(of, n)).copied().unwrap_or_else(|| self.get(operand, b))
     }
 
-    /// What `op` gives the sign of, if it is that: 1, −1, and 0 · x of x = ±0 and of NaN, which is x itself.
-    fn sign(&self, op: Op) -> Option<Value> {
-        let is = |value: Value, number: f64| self.func.op(value) == Op::Real(number.to_bits());
-        let Op::Select(positive, one, rest) = op else { return None };
-        let (Op::Less(zero, x), Op::Select(negative, minus_one, rest)) = (self.func.op(positive), self.func.op(rest))
-        else {
-            return None;
-        };
-        let (Op::Less(y, other), Op::Mul(a, c)) = (self.func.op(negative), self.func.op(rest)) else { return None };
-        let alike = is(zero, 0.0) && other == zero && y == x && [(zero, x), (x, zero)].contains(&(a, c));
-        (alike && is(one, 1.0) && is(minus_one, -1.0)).then_some(x)
-    }
-
     /// Writes operations of which each stands behind its operands.
     fn list(&mut self, list: &[Value], b: &mut FunctionBuilder) {
         let sides = Sides::of(self.func, list, None);
@@ -768,7 +755,7 @@ impl<'a> Emitter<'a> {
             return;
         }
         if self.near
-            && let Some(x) = self.sign(op)
+            && let Some(x) = sign_of(op, |value| self.func.op(value))
         {
             // ±1 with the sign of x, unless x is neither above nor below 0.
             let x = self.get(x, b);

@@ -4,6 +4,7 @@
 
 pub mod interp;
 mod regimes;
+mod ways;
 mod sides;
 mod clif;
 mod repeats;

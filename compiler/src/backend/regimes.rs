@@ -239,7 +239,7 @@ fn case(
 }
 
 /// What is left of outputs of a list, of which some values are others.
-fn left(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[Value]) -> Vec<Value> {
+pub fn left(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[Value]) -> Vec<Value> {
     let mut left: HashMap<Value, Value> = known.iter().copied().collect();
     for value in list {
         let op = build.get(*value);
@@ -252,7 +252,7 @@ fn left(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[
 }
 
 /// What some values need that is not there, in order.
-fn needed(build: &Build, there: &HashSet<Value>, of: &[Value]) -> Vec<Value> {
+pub fn needed(build: &Build, there: &HashSet<Value>, of: &[Value]) -> Vec<Value> {
     let mut list = HashSet::new();
     let mut open = of.to_vec();
     while let Some(value) = open.pop() {
@@ -315,7 +315,7 @@ fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
 }
 
 /// What is known of other truths where one is true or false.
-fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)> {
+pub fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)> {
     let is = [false, true].map(|truth| build.truth(truth));
     let mut known = Vec::new();
     let mut open = vec![(asked, truth)];

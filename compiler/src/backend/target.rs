@@ -6,13 +6,13 @@
 use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
 use super::pieces;
-use super::wide::pairs;
+use super::wide::{pairs, single};
 use crate::ir::Func;
 use abi::image::{Feature, Target};
 use abi::{Layout, Slot};
 use cranelift_codegen::binemit::Reloc;
 use cranelift_codegen::ir::{self as cranelift, ExternalName};
-use cranelift_codegen::isa::{self, OwnedTargetIsa, TargetIsa};
+use cranelift_codegen::isa::{self, CallConv, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
 use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
@@ -66,6 +66,12 @@ impl<'a> Coder<'a> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
+        if let Some(single) = self.single(func) {
+            begins.push(0);
+            let to_others = single.to_others.into_iter();
+            calls.extend(to_others.map(|at| (at, Call { kind: Reloc::X86CallPCRel4, piece: 0, addend: -4 })));
+            all = Bytes { code: single.code, alignment: 64 };
+        }
         self.each_part(func, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
@@ -138,6 +144,14 @@ impl<'a> Coder<'a> {
         Ok(text)
     }
 
+    /// A single iteration of a short function in our own instructions, where there are such.
+    fn single(&self, func: &Func) -> Option<single::Single> {
+        let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
+        (ours && func.ops.len() <= self.lengths.whole && clif::has_single(func))
+            .then(|| single::single(func).ok())
+            .flatten()
+    }
+
     /// Gives the function as Cranelift's own: whole, behind what makes a single iteration, or cut: then the loop first and
     /// the pieces in their order. Of several parts each has a line that says what it is.
     fn each_part(
@@ -145,10 +159,11 @@ impl<'a> Coder<'a> {
         func: &Func,
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
+        let own = self.single(func).is_some();
         let Coder { isa, context, builder, lengths } = self;
         let title = |what: &str| format!("; {what}\n");
         if func.ops.len() <= lengths.whole {
-            let several = if clif::has_single(func) {
+            let several = if clif::has_single(func) && !own {
                 context.clear();
                 clif::emit_single(func, &mut context.func, builder, *isa);
                 part(title("one iteration, or go on to more"), *isa, context)?;

@@ -191,6 +191,17 @@ pub fn is_not_negative(value: Value, op: impl Fn(Value) -> Op) -> bool {
     }
 }
 
+/// What an operation gives the sign of, if it is that: 1, −1, and 0 · x of x = ±0 and of NaN, which is x itself. `op`: what
+/// gives a value.
+pub fn sign_of(sign: Op, op: impl Fn(Value) -> Op) -> Option<Value> {
+    let is = |value: Value, number: f64| op(value) == Op::Real(number.to_bits());
+    let Op::Select(positive, one, rest) = sign else { return None };
+    let (Op::Less(zero, x), Op::Select(negative, minus_one, rest)) = (op(positive), op(rest)) else { return None };
+    let (Op::Less(y, other), Op::Mul(a, b)) = (op(negative), op(rest)) else { return None };
+    let alike = is(zero, 0.0) && other == zero && y == x && [(zero, x), (x, zero)].contains(&(a, b));
+    (alike && is(one, 1.0) && is(minus_one, -1.0)).then_some(x)
+}
+
 /// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Write {

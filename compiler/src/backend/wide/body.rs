@@ -6,7 +6,7 @@
 //! registers are free.
 
 use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
-use super::select::{Direction, Node, Nodes, Signs, What};
+use super::select::{Direction, Node, Nodes, Predicate, Signs, What};
 use crate::math;
 use std::collections::HashMap;
 use std::ops::Range;
@@ -21,6 +21,12 @@ pub struct Home {
 
 /// One vector of a node; what is the same in every vector has but the first.
 type Copy = usize;
+
+/// What a line leaves in registers.
+#[derive(Clone, Default)]
+pub struct Held {
+    vector_of: Vec<Option<Copy>>,
+}
 
 /// A straight line being written.
 pub struct Body<'a> {
@@ -86,6 +92,20 @@ impl<'a> Body<'a> {
         }
     }
 
+    /// What lies in which registers.
+    pub fn held(&self) -> Held {
+        Held { vector_of: self.vector_of.clone() }
+    }
+
+    /// Begins where another line of single numbers has ended; of what that holds only what this one reads.
+    pub fn resume(&mut self, held: &Held) {
+        for (register, copy) in (0..).zip(&held.vector_of) {
+            if let Some(copy) = copy.filter(|copy| self.uses.contains_key(&Node(*copy as u32))) {
+                self.own(copy, false, register);
+            }
+        }
+    }
+
     /// Keeps a node to the end.
     pub fn keep(&mut self, node: Node) {
         self.uses.entry(node).or_default().push(self.order.len() + 1);
@@ -131,7 +151,7 @@ impl<'a> Body<'a> {
 
     /// A jump that is taken if a mask has a lane; its target is open. It ends the line.
     pub fn test(&mut self, mask: Node) -> usize {
-        self.now = (self.order.len() + 1, 0);
+        self.now = (self.order.len(), 0);
         let all = self.in_register(mask);
         for k in 1..self.vectors {
             self.now.1 = k;
@@ -140,7 +160,7 @@ impl<'a> Body<'a> {
                     let more = self.in_register(mask);
                     self.code.mask(i::MASK_OR, all, all, Place::Register(more));
                 }
-                Vectors::Avx | Vectors::Avx2 => {
+                Vectors::One | Vectors::Avx | Vectors::Avx2 => {
                     let more = self.place(mask);
                     self.code.vector(i::OR, all, all, more, None);
                 }
@@ -149,14 +169,52 @@ impl<'a> Body<'a> {
         }
         match self.width {
             Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
-            Vectors::Avx | Vectors::Avx2 => {
+            Vectors::One | Vectors::Avx | Vectors::Avx2 => {
                 // To r10.
                 let l = u8::from(self.width == Vectors::Avx2);
                 self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
-                self.code.plain(&[0x45, 0x85, 0xd2]);
+                match self.width {
+                    Vectors::One => self.code.plain(&[0x41, 0xf6, 0xc2, 1]), // test r10b, 1
+                    _ => self.code.plain(&[0x45, 0x85, 0xd2]),               // test r10d, r10d
+                }
             }
         }
         self.code.jump(&[0x0f, 0x85])
+    }
+
+    /// Jumps that are taken if a comparison of two numbers that are kept holds; their target is open. [`Predicate::Equal`] and
+    /// what is less or greater are no such questions.
+    pub fn ask(&mut self, predicate: Predicate, a: Node, b: Node) -> Vec<usize> {
+        self.now = (self.order.len(), 0);
+        // The flags are those of what is less and what is greater: what is less is asked the other way round.
+        let (first, last, predicate) = match predicate {
+            Predicate::Less | Predicate::LessEqual | Predicate::NotLess | Predicate::NotLessEqual => {
+                (b, a, predicate.turned())
+            }
+            _ => (a, b, predicate),
+        };
+        let opcodes: &[u8] = match predicate {
+            Predicate::Greater => &[0x87],         // ja
+            Predicate::GreaterEqual => &[0x83],    // jae
+            Predicate::NotGreater => &[0x86],      // jbe
+            Predicate::NotGreaterEqual => &[0x82], // jb
+            Predicate::NotEqual => &[0x85, 0x8a],  // jne, jp
+            _ => unreachable!("it is no such question"),
+        };
+        let first = self.in_register(first);
+        let last = self.place(last);
+        self.code.vector(i::COMPARE_FIRST, first, 0, last, None);
+        self.locked.clear();
+        opcodes.iter().map(|opcode| self.code.jump(&[0x0f, *opcode])).collect()
+    }
+
+    /// Stores what is kept; it ends the line.
+    pub fn store_kept(&mut self, stores: &[(Node, Home)]) {
+        self.now = (self.order.len(), 0);
+        let registers: Vec<u8> = stores.iter().map(|(node, _)| self.in_register(*node)).collect();
+        for ((node, home), register) in stores.iter().zip(registers) {
+            self.store(*node, register, self.at_home(*home, 0));
+        }
     }
 
     fn copy(&self, node: Node) -> Copy {
@@ -218,6 +276,16 @@ impl<'a> Body<'a> {
         self.load(node, register, place);
         self.own(copy, mask, register);
         Place::Register(register)
+    }
+
+    /// The same for an instruction: one of whole vectors does not read a single number from memory.
+    fn place_for(&mut self, instruction: Instruction, node: Node) -> Place {
+        match self.place(node) {
+            Place::Memory(..) if self.width == Vectors::One && instruction.of_one().is_none() => {
+                Place::Register(self.in_register(node))
+            }
+            place => place,
+        }
     }
 
     /// Whether a vector register is free, or holds what lies in memory too and is read later.
@@ -381,8 +449,13 @@ impl<'a> Body<'a> {
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             What::One(instruction, immediate, a) => {
                 let last = self.place(a);
+                // Beside a single number stands what stood beside the operand: nothing else is waited for.
+                let beside = match last {
+                    Place::Register(register) if self.width == Vectors::One => register,
+                    _ => 0,
+                };
                 let to = self.result(node);
-                self.code.vector(instruction, to, 0, last, immediate);
+                self.code.vector(instruction, to, beside, last, immediate);
             }
             What::Fma { signs, a, b, c } => self.fma(node, signs, a, b, c),
             What::Shift(direction, a, n) => {
@@ -413,10 +486,10 @@ impl<'a> Body<'a> {
             What::TestBits(a, b) => self.two(node, i::INT_TEST, true, a, b),
             What::CompareInt(predicate, a, b) => {
                 // a < b is b > a.
-                let first = self.in_register(b);
-                let last = self.place(a);
-                let to = self.result(node);
                 let instruction = if predicate == 0 { i::INT_EQUAL } else { i::INT_GREATER };
+                let first = self.in_register(b);
+                let last = self.place_for(instruction, a);
+                let to = self.result(node);
                 self.code.vector(instruction, to, first, last, None);
             }
             What::Mask(truth) => {
@@ -447,11 +520,11 @@ impl<'a> Body<'a> {
             What::Select(when, a, b) => {
                 let mask = self.in_register(when);
                 let other = self.in_register(b);
-                let chosen = self.place(a);
+                let chosen = self.place_for(i::BLEND_BY_SIGN, a);
                 let to = self.result(node);
                 match self.width {
                     Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Vectors::Avx | Vectors::Avx2 => {
+                    Vectors::One | Vectors::Avx | Vectors::Avx2 => {
                         self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4))
                     }
                 }
@@ -525,7 +598,7 @@ impl<'a> Body<'a> {
     }
 
     fn two(&mut self, node: Node, instruction: Instruction, exchange: bool, a: Node, b: Node) {
-        let (first, last) = match (self.place(a), self.place(b)) {
+        let (first, last) = match (self.place_for(instruction, a), self.place_for(instruction, b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
             (_, last) => (self.in_register(a), last),

@@ -1,4 +1,4 @@
-//! Vector instructions of x86-64 as bytes: VEX with 128 and 256 bits, EVEX with 512 bits.
+//! Vector instructions of x86-64 as bytes: VEX with one number, 128 and 256 bits, EVEX with 512 bits.
 //!
 //! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
 //! is reached relative to the instruction. Knows nothing of programs.
@@ -9,6 +9,8 @@ use std::collections::HashMap;
 /// Which vectors.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Vectors {
+    /// One lane of 64 bits in 16 registers: AVX and FMA.
+    One,
     /// Two lanes of 64 bits in 16 registers: AVX and FMA.
     Avx,
     /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
@@ -21,6 +23,7 @@ impl Vectors {
     /// Lanes of a vector.
     pub fn lanes(self) -> usize {
         match self {
+            Vectors::One => 1,
             Vectors::Avx => 2,
             Vectors::Avx2 => 4,
             Vectors::Avx512 => 8,
@@ -35,7 +38,7 @@ impl Vectors {
     /// Vector registers.
     pub fn registers(self) -> u8 {
         match self {
-            Vectors::Avx | Vectors::Avx2 => 16,
+            Vectors::One | Vectors::Avx | Vectors::Avx2 => 16,
             Vectors::Avx512 => 32,
         }
     }
@@ -73,6 +76,26 @@ pub enum Place {
 /// of the VEX form, opcode.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
+
+impl Instruction {
+    /// The same of the first number alone, which it leaves the others of its second operand beside; none if there is only the
+    /// one of whole vectors.
+    pub fn of_one(self) -> Option<Instruction> {
+        use instructions as i;
+        let Instruction(_, map, w, opcode) = self;
+        let fused = map == 2 && (0x98..=0xbf).contains(&opcode);
+        match self {
+            i::ADD | i::MUL | i::SUB | i::MIN | i::DIV | i::MAX | i::SQRT | i::COMPARE => {
+                Some(Instruction(3, map, w, opcode))
+            }
+            i::ROUND => Some(Instruction(1, map, w, 0x0b)),
+            i::LOAD => Some(i::LOAD_FIRST),
+            i::STORE => Some(i::STORE_FIRST),
+            _ if fused => Some(Instruction(1, map, w, opcode | 1)),
+            _ => None,
+        }
+    }
+}
 
 #[rustfmt::skip]
 #[allow(missing_docs)]
@@ -115,6 +138,9 @@ pub mod instructions {
     pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
     /// Of one number, from memory.
     pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
+    pub const STORE_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x11);
+    /// Sets the flags as of integers without a sign; of NaN as of less and equal.
+    pub const COMPARE_FIRST: Instruction = Instruction(1, 1, [0, 0], 0x2e);
     pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
     pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
@@ -187,6 +213,13 @@ impl Assembler {
             Vectors::Avx512 => {
                 self.evex(what, reg, second, last, mask);
                 self.operand(reg, last, immediate, self.width.bytes());
+            }
+            // From one register to another it moves all.
+            Vectors::One => {
+                let copies = what == instructions::LOAD && matches!(last, Place::Register(_));
+                let what = what.of_one().filter(|_| !copies).unwrap_or(what);
+                self.vex(what, reg, second, last, 0);
+                self.operand(reg, last, immediate, 1);
             }
             Vectors::Avx | Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
@@ -403,7 +436,11 @@ impl Assembler {
     /// The code and, behind it, its constants: to lie at a multiple of 64.
     pub fn finish(mut self) -> Vec<u8> {
         // EVEX spreads one number over the lanes as it reads it.
-        let copies = if self.width == Vectors::Avx512 { 1 } else { self.width.lanes() };
+        let copies = match self.width {
+            Vectors::Avx512 => 1,
+            // Some instructions read two.
+            width => width.lanes().max(2),
+        };
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
         let begin = self.bytes.len();
         for (at, end, number) in std::mem::take(&mut self.wanted) {

@@ -19,6 +19,7 @@ mod body;
 mod encode;
 mod select;
 pub(super) mod pairs;
+pub(super) mod single;
 
 use super::memory::Executable;
 use super::target::{Coder, Unsupported, here};
@@ -107,7 +108,9 @@ impl Vectors {
     #[cfg(all(target_arch = "x86_64", unix))]
     fn are_here(self) -> bool {
         match self {
-            Vectors::Avx => std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma"),
+            Vectors::One | Vectors::Avx => {
+                std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma")
+            }
             Vectors::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx512 => {
                 std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")

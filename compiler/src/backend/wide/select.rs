@@ -6,7 +6,7 @@
 
 use super::encode::{Instruction, Vectors, instructions as i};
 use crate::backend::target::Unsupported;
-use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
@@ -39,6 +39,8 @@ pub enum Signs {
 pub enum Predicate {
     Equal = 0,
     NotEqual = 4,
+    LessOrGreater = 0x0c,
+    NotLessOrGreater = 0x08,
     Less = 0x11,
     LessEqual = 0x12,
     NotLess = 0x15,
@@ -51,10 +53,12 @@ pub enum Predicate {
 
 impl Predicate {
     /// What holds where it does not, of NaN too.
-    fn not(self) -> Predicate {
+    pub fn not(self) -> Predicate {
         match self {
             Predicate::Equal => Predicate::NotEqual,
             Predicate::NotEqual => Predicate::Equal,
+            Predicate::LessOrGreater => Predicate::NotLessOrGreater,
+            Predicate::NotLessOrGreater => Predicate::LessOrGreater,
             Predicate::Less => Predicate::NotLess,
             Predicate::LessEqual => Predicate::NotLessEqual,
             Predicate::NotLess => Predicate::Less,
@@ -66,11 +70,19 @@ impl Predicate {
         }
     }
 
+    /// Whether it asks which of two is less.
+    pub fn is_of_order(self) -> bool {
+        let of_equality =
+            [Predicate::Equal, Predicate::NotEqual, Predicate::LessOrGreater, Predicate::NotLessOrGreater];
+        !of_equality.contains(&self)
+    }
+
     /// The same with its operands exchanged.
     pub fn turned(self) -> Predicate {
         match self {
             Predicate::Equal => Predicate::Equal,
             Predicate::NotEqual => Predicate::NotEqual,
+            Predicate::LessOrGreater | Predicate::NotLessOrGreater => self,
             Predicate::Less => Predicate::Greater,
             Predicate::LessEqual => Predicate::GreaterEqual,
             Predicate::NotLess => Predicate::NotGreater,
@@ -241,16 +253,14 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
     let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
-    let types = verify::types(func).expect("the function is sound");
-    let live = func.live();
-    let mut of: Vec<Node> = Vec::with_capacity(func.ops.len());
-    for (k, op) in func.ops.iter().enumerate() {
-        let node = if live[k] { selection.node(func, *op, types[k], &of)? } else { Node(u32::MAX) };
-        of.push(node);
-    }
+    let of = selection.operations(func, &func.live())?;
     let at = |value: Value| of[value.index()];
     let failed = func.status.map(|status| match func.op(status) {
         Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => at(when),
+        Op::Select(fine, zero, _) if func.op(zero) == Op::Int(0) => {
+            let not = selection.not(at(fine));
+            selection.add(not)
+        }
         _ => {
             let zero = selection.add(What::Constant(0));
             let fine = selection.add(What::CompareInt(0, at(status), zero));
@@ -262,6 +272,17 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
     Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
 }
 
+/// The wanted operations of a function and all they need as nodes, with nothing stored, and for each operation its node.
+///
+/// # Errors
+/// As [`select`].
+pub fn operations(func: &Func, width: Vectors, wanted: &[bool]) -> Result<(Nodes, Vec<Node>), Unsupported> {
+    let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
+    let of = selection.operations(func, wanted)?;
+    let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes: selection.nodes, pooled: false };
+    Ok((nodes, of))
+}
+
 struct Selection {
     width: Vectors,
     nodes: Vec<What>,
@@ -269,6 +290,16 @@ struct Selection {
 }
 
 impl Selection {
+    fn operations(&mut self, func: &Func, wanted: &[bool]) -> Result<Vec<Node>, Unsupported> {
+        let types = verify::types(func).expect("the function is sound");
+        let mut of: Vec<Node> = Vec::with_capacity(func.ops.len());
+        for (k, op) in func.ops.iter().enumerate() {
+            let node = if wanted[k] { self.node(func, *op, types[k], &of)? } else { Node(u32::MAX) };
+            of.push(node);
+        }
+        Ok(of)
+    }
+
     fn add(&mut self, what: What) -> Node {
         if let Some(known) = self.known.get(&what) {
             return *known;
@@ -287,7 +318,7 @@ impl Selection {
         match (self.nodes[mask.index()], self.width) {
             (What::Compare(predicate, a, b), _) => What::Compare(predicate.not(), a, b),
             (_, Vectors::Avx512) => What::MaskNot(mask),
-            (_, Vectors::Avx | Vectors::Avx2) => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
+            _ => What::Two(i::XOR, true, mask, self.constant(u64::MAX)),
         }
     }
 
@@ -295,8 +326,8 @@ impl Selection {
     fn choose(&mut self, when: Node, a: Node, b: Node) -> What {
         let zero = What::Constant(0);
         match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
-            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => What::Two(i::AND_NOT, false, when, b),
-            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => What::Two(i::AND, true, when, a),
+            (Vectors::One | Vectors::Avx | Vectors::Avx2, a, _) if a == zero => What::Two(i::AND_NOT, false, when, b),
+            (Vectors::One | Vectors::Avx | Vectors::Avx2, _, b) if b == zero => What::Two(i::AND, true, when, a),
             _ => What::Select(when, a, b),
         }
     }
@@ -308,6 +339,9 @@ impl Selection {
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[Node]) -> Result<Node, Unsupported> {
         let at = |value: Value| of[value.index()];
         let wide = self.width == Vectors::Avx512;
+        if let Some(x) = sign_of(op, |value| func.op(value)) {
+            return Ok(self.sign(at(x)));
+        }
         let what = match op {
             Op::Real(bits) => What::Constant(bits),
             Op::Int(n) => What::Constant(n as u64),
@@ -315,6 +349,7 @@ impl Selection {
             // Without mask registers a mask is a vector of all ones or zeros a lane.
             Op::Bool(truth) => What::Constant(if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => What::Load(slot),
+            Op::Pool { .. } if self.width == Vectors::One => return Err(self.missing("table")),
             Op::Pool { base, len, index } => {
                 let index = self.inside(func, index, len, of);
                 What::Gather { base, len, index }
@@ -400,6 +435,16 @@ impl Selection {
             Op::ToReal(_) => return Err(self.missing("conversion from integers")),
         };
         Ok(self.add(what))
+    }
+
+    /// ±1 with the sign of x, unless x is neither above nor below 0.
+    fn sign(&mut self, x: Node) -> Node {
+        let [sign, one, zero] = [SIGN, 1f64.to_bits(), 0].map(|bits| self.constant(bits));
+        let negative = self.add(What::Two(i::AND, true, x, sign));
+        let unit = self.add(What::Two(i::OR, true, negative, one));
+        let moves = self.add(What::Compare(Predicate::LessOrGreater, x, zero));
+        let what = self.choose(moves, unit, x);
+        self.add(what)
     }
 
     /// e^x by the algorithm of [`exponential::exp`], to the bit, in fewer instructions: the power of two enters last, by one

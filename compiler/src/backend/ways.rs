@@ -1,0 +1,188 @@
+//! Takes a step apart into ways through it: straight lines, and questions that decide between them.
+//!
+//! In: a sound, expanded function. Out: [`Ways`]: a tree of questions with a line at each end. What is asked is what chooses
+//! what becomes of a state, for most often a processor foresees the answer and goes on, while a choice would wait for it. Where a
+//! regime changes there is no line: that is rare. It knows nothing of processors.
+
+use super::regimes::{known, left, needed};
+use crate::ir::build::Build;
+use crate::ir::{Func, Op, Value};
+use abi::Slot;
+use std::collections::HashSet;
+
+/// The ways through a function.
+pub struct Ways {
+    /// The function; behind its own operations those of single ways.
+    pub func: Func,
+    /// Where all of them begin.
+    pub begin: Way,
+}
+
+/// How it goes on.
+pub enum Way {
+    /// To the end, without a question that matters.
+    Ends {
+        /// What is stored, but for what is there already.
+        stores: Vec<(Slot, Value)>,
+        /// A truth with which it has failed; the status is found out elsewhere.
+        failed: Option<Value>,
+    },
+    /// By a comparison of reals: where it holds, and where it does not.
+    Asks(Value, Box<[Way; 2]>),
+    /// A regime changes: this is left to others.
+    Leaves,
+}
+
+/// Most ends: behind a question, what is the same on both sides stands twice.
+const MOST: usize = 12;
+
+/// All ways; none if they are too many, or if something is asked that is no comparison.
+pub fn ways(func: &Func) -> Option<Ways> {
+    let mut build = Build::of(func);
+    let failed = match func.status {
+        None => None,
+        Some(status) => Some(match build.get(status) {
+            Op::Select(when, _, zero) if build.get(zero) == Op::Int(0) => when,
+            Op::Select(fine, zero, _) if build.get(zero) == Op::Int(0) => build.not(fine),
+            _ => return None,
+        }),
+    };
+    let slots: Vec<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+    let read: HashSet<Slot> = func.loads().into_iter().collect();
+    let wanted: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(failed).collect();
+    let mut seeker = Seeker { build, slots, read, ends: 0 };
+    let begin = seeker.way(wanted, &[])?;
+    Some(Ways { func: Func { ops: seeker.build.into_ops(), ..func.clone() }, begin })
+}
+
+struct Seeker {
+    build: Build,
+    /// Slots that are stored.
+    slots: Vec<Slot>,
+    /// Slots that are read.
+    read: HashSet<Slot>,
+    /// Ends so far.
+    ends: usize,
+}
+
+impl Seeker {
+    /// To what is stored, and what then fails; `held` are the regimes that are known by now, with the bits of their numbers.
+    fn way(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
+        let before = |slot: Slot| held.iter().find(|(held, _)| *held == slot).map(|(_, bits)| *bits);
+        let stored = || self.slots.iter().copied().zip(wanted.iter().copied());
+        let mut regimes = stored().filter_map(|(slot, value)| Some((before(slot)?, self.build.get(value))));
+        if regimes.any(|(before, next)| matches!(next, Op::Real(bits) if bits != before)) {
+            return Some(Way::Leaves);
+        }
+        let list = needed(&self.build, &HashSet::new(), &wanted);
+        let Some(question) = self.question(&list, &wanted, held) else {
+            let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
+                Op::Load(from) => from == *slot,
+                Op::Real(bits) => before(*slot) == Some(bits),
+                _ => false,
+            };
+            let stores = stored().filter(|store| !is_there(store)).collect();
+            self.ends += 1;
+            let failed = wanted.get(self.slots.len()).copied();
+            return (self.ends <= MOST).then_some(Way::Ends { stores, failed });
+        };
+        let asked = question?;
+        let mut side = |truth: bool| {
+            let (mut known, mut held) = (known(&mut self.build, asked, truth), held.to_vec());
+            if let Some((load, slot, number)) = self.regime(asked).filter(|_| truth) {
+                let Op::Real(bits) = self.build.get(number) else { unreachable!("it is a number") };
+                known.push((load, number));
+                held.push((slot, bits));
+            }
+            let wanted = left(&mut self.build, &list, &known, &wanted);
+            self.way(wanted, &held)
+        };
+        let sides = [side(true)?, side(false)?];
+        Some(if matches!(sides, [Way::Leaves, Way::Leaves]) { Way::Leaves } else { Way::Asks(asked, Box::new(sides)) })
+    }
+
+    /// The load, its slot and the number, if it is asked whether a slot that is stored holds a number.
+    fn regime(&self, asked: Value) -> Option<(Value, Slot, Value)> {
+        let Op::Equal(a, b) = self.build.get(asked) else { return None };
+        [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (self.build.get(load), self.build.get(number)) {
+            (Op::Load(slot), Op::Real(_)) if self.slots.contains(&slot) => Some((load, slot, number)),
+            _ => None,
+        })
+    }
+
+    /// What to ask first, regimes before all else; none if there is nothing, and a none within if it is no comparison.
+    fn question(&self, list: &[Value], wanted: &[Value], held: &[(Slot, u64)]) -> Option<Option<Value>> {
+        // Whether a regime changes is asked, whatever that depends on.
+        let regimes = self.slots.iter().zip(wanted).filter(|(slot, _)| held.iter().any(|(held, _)| held == *slot));
+        let changes: Vec<Value> = regimes.map(|(_, value)| *value).collect();
+        let next = self.slots.iter().zip(wanted).filter(|(slot, _)| self.read.contains(slot)).map(|(_, value)| *value);
+        let next: HashSet<Value> =
+            needed(&self.build, &HashSet::new(), &next.collect::<Vec<_>>()).into_iter().collect();
+        let mut waits: HashSet<Value> = HashSet::new();
+        let mut first = None;
+        for value in list {
+            let op = self.build.get(*value);
+            let state = |slot: Slot| self.slots.contains(&slot) && ![Slot::COUNT, Slot::TIME].contains(&slot);
+            let mut wait = matches!(op, Op::Load(slot) if state(slot));
+            op.each_operand(|operand| wait |= waits.contains(&operand));
+            if wait {
+                waits.insert(*value);
+            }
+            let Op::Select(when, yes, no) = op else { continue };
+            if !wait && !changes.contains(value) {
+                continue;
+            }
+            // The less or the greater of two is one instruction.
+            let of_two = matches!(self.build.get(when), Op::Less(a, b) if [(a, b), (b, a)].contains(&(yes, no)));
+            if !next.contains(value) || of_two {
+                continue;
+            }
+            let mut parts = self.parts(when);
+            if let Some(regime) = parts.iter().flatten().find(|part| self.regime(**part).is_some()) {
+                return Some(Some(*regime));
+            }
+            first = first.or(Some(parts.swap_remove(0)));
+        }
+        first
+    }
+
+    /// The comparisons that a truth is put together from, in their order; a none for what is none.
+    fn parts(&self, truth: Value) -> Vec<Option<Value>> {
+        match self.build.get(truth) {
+            Op::And(a, b) | Op::Or(a, b) => [self.parts(a), self.parts(b)].concat(),
+            Op::Not(a) => self.parts(a),
+            Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => vec![Some(truth)],
+            _ => vec![None],
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A spring in slot 3 that moves with slot 5 while slot 4, its regime, is 0, up to 1, where it is held from then on.
+    #[test]
+    fn a_regime_that_stays_is_a_line_and_one_that_changes_is_left() {
+        let mut build = Build::new("step");
+        let [x, regime, v] = [3, 4, 5].map(|slot| build.load(Slot(slot)));
+        let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
+        let moves = build.equal(regime, zero);
+        let moved = build.add(x, v);
+        let next = build.select(moves, moved, x);
+        let far = build.less(one, next);
+        let leaves = build.and(moves, far);
+        let changed = build.select(leaves, one, regime);
+        build.store(Slot(3), next);
+        build.store(Slot(4), changed);
+        let ways = ways(&build.finish()).expect("there are few");
+        let Way::Asks(regime, sides) = &ways.begin else { panic!("it asks") };
+        assert!(matches!(ways.func.op(*regime), Op::Equal(..)));
+        let [Way::Asks(far, of_moving), Way::Ends { stores, failed: None }] = &**sides else { panic!("two regimes") };
+        assert_eq!(stores[..], []);
+        assert!(matches!(ways.func.op(*far), Op::Less(..)));
+        let [Way::Leaves, Way::Ends { stores, failed: None }] = &**of_moving else { panic!("it leaves or stays") };
+        let [(Slot(3), next)] = stores[..] else { panic!("the spring moves") };
+        assert!(matches!(ways.func.op(next), Op::Add(..)));
+    }
+}

@@ -1,0 +1,262 @@
+//! A single step of one instance in registers, without a frame.
+//!
+//! In: an expanded step. Out: [`Single`], for steps of which each way through is short.
+//!
+//! ```text
+//! if the count is not 1: go on to the others
+//! questions, each as soon as what it compares is there; where a regime changes: go on to the others
+//! then, for each end of its own: everything; what the step does not read is stored as soon as it is there
+//! if something fails: go on to the others
+//! what it reads is stored; return 0
+//! ```
+//! The others are code for any count. They do the step again, in full and with its status: what it reads is as it was.
+
+use super::body::{Body, Held, Home};
+use super::encode::{Assembler, Base, Vectors, instructions};
+use super::select::{Node, Nodes, Predicate, What, operations};
+use crate::backend::target::Unsupported;
+use crate::backend::ways::{Way, ways};
+use crate::ir::{Func, Op, Value};
+use abi::Slot;
+use std::collections::{HashMap, HashSet};
+
+/// Code with the signature of [`abi::table::Entry`], but for its jumps to the others.
+pub struct Single {
+    /// To lie at a multiple of 64.
+    pub code: Vec<u8>,
+    /// Where the distances to the others stand, of 32 bits from the end of each.
+    pub to_others: Vec<usize>,
+}
+
+/// Most operations of a function of which this is tried.
+const LARGEST: usize = 250;
+/// Most instructions of a way, both sides of each choice counted: of longer ones a jump over a side is worth more.
+const LONGEST: usize = 100;
+
+/// Most numbers that lie in registers to the end, so that others have room.
+const MOST_KEPT: usize = 12;
+
+/// # Errors
+/// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
+pub fn single(func: &Func) -> Result<Single, Unsupported> {
+    let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
+    if func.ops.len() > LARGEST || !func.writes.is_empty() {
+        return Err(unsuitable("is too long for registers, or writes to a ring"));
+    }
+    let ways = ways(func).ok_or_else(|| unsuitable("has too many ways"))?;
+    let (nodes, of) = operations(&ways.func, Vectors::One, &wanted(&ways.func, &ways.begin))?;
+    let read: HashSet<Slot> = func.loads().into_iter().collect();
+    let homes = (0..).zip(&nodes.nodes).filter_map(|(number, node)| match node {
+        What::Load(slot) => Some((Node(number), home(*slot))),
+        _ => None,
+    });
+    let homes = homes.collect();
+    let mut code = Assembler::new(Vectors::One);
+    code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
+    let to_others = vec![code.jump(&[0x0f, 0x85])]; // jne
+    let mut writer = Writer { code, func: &ways.func, nodes: &nodes, of, homes, read, to_others };
+    writer
+        .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
+        .ok_or_else(|| unsuitable("is too long"))?;
+    Ok(Single { code: writer.code.finish(), to_others: writer.to_others })
+}
+
+/// Where a slot lies.
+fn home(slot: Slot) -> Home {
+    Home { base: Base::Block, begin: 0, index: slot.index() }
+}
+
+/// The operations that some way needs.
+fn wanted(func: &Func, begin: &Way) -> Vec<bool> {
+    let mut wanted = vec![false; func.ops.len()];
+    let mut open = vec![begin];
+    while let Some(way) = open.pop() {
+        match way {
+            Way::Ends { stores, failed } => {
+                let stored = stores.iter().map(|(_, value)| value);
+                stored.chain(failed).for_each(|value| wanted[value.index()] = true);
+            }
+            Way::Asks(asked, sides) => {
+                wanted[asked.index()] = true;
+                open.extend(&**sides);
+            }
+            Way::Leaves => {}
+        }
+    }
+    for i in (0..func.ops.len()).rev() {
+        if wanted[i] {
+            func.ops[i].each_operand(|operand| wanted[operand.index()] = true);
+        }
+    }
+    wanted
+}
+
+struct Writer<'a> {
+    code: Assembler,
+    func: &'a Func,
+    nodes: &'a Nodes,
+    /// Of each operation.
+    of: Vec<Node>,
+    homes: HashMap<Node, Home>,
+    /// What the step reads.
+    read: HashSet<Slot>,
+    to_others: Vec<usize>,
+}
+
+impl Writer<'_> {
+    fn at(&self, value: Value) -> Node {
+        self.of[value.index()]
+    }
+
+    /// Writes one way from where some nodes are there; none if it is too long.
+    fn way(&mut self, way: &Way, there: &[bool], held: &Held) -> Option<()> {
+        match way {
+            Way::Ends { stores, failed } => self.end(stores, *failed, there, held),
+            Way::Asks(asked, sides) => self.question(*asked, sides, there, held),
+            Way::Leaves => {
+                let jump = self.code.jump(&[0xe9]);
+                self.to_others.push(jump);
+                Some(())
+            }
+        }
+    }
+
+    fn question(&mut self, asked: Value, sides: &[Way; 2], there: &[bool], held: &Held) -> Option<()> {
+        let (holds, a, b) = match self.func.op(asked) {
+            Op::Less(a, b) => (Predicate::Less, a, b),
+            Op::LessEqual(a, b) => (Predicate::LessEqual, a, b),
+            Op::Equal(a, b) => (Predicate::Equal, a, b),
+            _ => unreachable!("it is a comparison of reals"),
+        };
+        let compared = [self.at(a), self.at(b)];
+        let order = self.order(&compared, there);
+        let mut there = there.to_vec();
+        order.iter().for_each(|node| there[node.index()] = true);
+        let later = self.later(sides, &there);
+        let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
+        compared.iter().chain(&later).for_each(|node| body.keep(*node));
+        body.resume(held);
+        body.write(&|_| Vec::new(), &[]);
+        // The side that is jumped to is the one that leaves, if one does.
+        let jumps_if = !matches!(sides[0], Way::Leaves) || holds == Predicate::Equal;
+        let jumps = body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]);
+        let (held, spilled) = (body.held(), body.spilled());
+        if spilled > 0 {
+            return None;
+        }
+        let [next, other] = if jumps_if { [0, 1] } else { [1, 0] };
+        self.way(&sides[next], &there, &held)?;
+        if matches!(sides[other], Way::Leaves) {
+            self.to_others.extend(jumps);
+            return Some(());
+        }
+        let here = self.code.here();
+        jumps.into_iter().for_each(|jump| self.code.lead(jump, here));
+        self.way(&sides[other], &there, &held)
+    }
+
+    fn end(&mut self, stores: &[(Slot, Value)], failed: Option<Value>, there: &[bool], held: &Held) -> Option<()> {
+        let stores = stores.iter().map(|(slot, value)| (*slot, self.at(*value)));
+        let (late, early): (Vec<_>, Vec<_>) = stores.partition(|(slot, _)| self.read.contains(slot));
+        let late: Vec<(Node, Home)> = late.into_iter().map(|(slot, node)| (node, home(slot))).collect();
+        let questions = failed.map_or_else(Vec::new, |failed| questions(self.nodes, self.at(failed)));
+        let kept: Vec<Node> =
+            questions.iter().flat_map(Question::operands).chain(late.iter().map(|(node, _)| *node)).collect();
+        if kept.len() > MOST_KEPT {
+            return None;
+        }
+        let early_nodes: Vec<Node> = early.iter().map(|(_, node)| *node).collect();
+        let roots: Vec<Node> = kept.iter().chain(&early_nodes).copied().collect();
+        let order = self.order(&roots, there);
+        if order.len() > LONGEST {
+            return None;
+        }
+        let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
+        kept.iter().for_each(|node| body.keep(*node));
+        early_nodes.iter().filter(|node| there[node.index()]).for_each(|node| body.keep(*node));
+        body.resume(held);
+        let to_block =
+            |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
+        body.write(&to_block, &early_nodes);
+        for question in questions {
+            match question {
+                Question::Compare(predicate, a, b) => self.to_others.extend(body.ask(predicate, a, b)),
+                Question::Mask(mask) => self.to_others.push(body.test(mask)),
+            }
+        }
+        body.store_kept(&late);
+        let fits = body.spilled() == 0;
+        self.code.plain(&[0x31, 0xc0, 0xc3]); // xor eax, eax; ret
+        fits.then_some(())
+    }
+
+    /// What roots need that is not there.
+    fn order(&self, roots: &[Node], there: &[bool]) -> Vec<Node> {
+        let wanted: Vec<bool> = there.iter().map(|there| !there).collect();
+        super::order(self.nodes, roots, &wanted)
+    }
+
+    /// What is there, or lies in memory from the beginning, and one of several ways reads.
+    fn later(&self, ways: &[Way], there: &[bool]) -> Vec<Node> {
+        let mut roots = Vec::new();
+        let mut open: Vec<&Way> = ways.iter().collect();
+        while let Some(way) = open.pop() {
+            match way {
+                Way::Ends { stores, failed } => {
+                    let stored = stores.iter().map(|(_, value)| value);
+                    roots.extend(stored.chain(failed).map(|value| self.at(*value)));
+                }
+                Way::Asks(asked, sides) => {
+                    roots.push(self.at(*asked));
+                    open.extend(&**sides);
+                }
+                Way::Leaves => {}
+            }
+        }
+        let (mut seen, mut later) = (HashSet::new(), Vec::new());
+        while let Some(node) = roots.pop() {
+            if !seen.insert(node) {
+                continue;
+            }
+            if there[node.index()] || self.nodes.nodes[node.index()].is_leaf() {
+                later.push(node);
+            } else {
+                roots.extend(self.nodes.nodes[node.index()].operands());
+            }
+        }
+        later
+    }
+}
+
+/// What ends a step with a status.
+enum Question {
+    /// Whether numbers are in an order.
+    Compare(Predicate, Node, Node),
+    /// Whether a mask is set.
+    Mask(Node),
+}
+
+impl Question {
+    fn operands(&self) -> Vec<Node> {
+        match self {
+            Question::Compare(_, a, b) => vec![*a, *b],
+            Question::Mask(mask) => vec![*mask],
+        }
+    }
+}
+
+/// One of them suffices.
+fn questions(nodes: &Nodes, failed: Node) -> Vec<Question> {
+    let mut open = vec![failed];
+    let mut questions = Vec::new();
+    while let Some(node) = open.pop() {
+        match nodes.nodes[node.index()] {
+            What::Two(instructions::OR, _, a, b) => open.extend([a, b]),
+            What::Compare(predicate, a, b) if predicate.is_of_order() => {
+                questions.push(Question::Compare(predicate, a, b));
+            }
+            _ => questions.push(Question::Mask(node)),
+        }
+    }
+    questions
+}
