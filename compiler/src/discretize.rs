@@ -55,10 +55,8 @@ pub fn step(program: &Program, method: Method) -> Func {
     let status = watch(&build, &program.description.guards, &env);
 
     for delay in &program.description.delays {
+        let index = place_in(delay.ring, count);
         let mut build = build.borrow_mut();
-        let number = build.to_int(count.value);
-        let mask = build.int(i64::from(delay.ring.len) - 1);
-        let index = build.int_and(number, mask);
         let value = build.read(delay.source, &env);
         build.write(Write { base: Slot(delay.ring.start), len: delay.ring.len, index, value });
     }
@@ -84,6 +82,12 @@ pub fn advance(program: &Program, method: Method) -> Func {
     let mut build = build.into_inner();
     next.into_iter().enumerate().for_each(|(k, value)| build.store(states.slot(k), value));
     build.finish()
+}
+
+/// Where a ring, whose length is a power of two, has the sample of this number: a whole one from 0 up to 2⁵².
+fn place_in(ring: Segment, number: Real) -> Value {
+    // Behind 2⁵² numbers lie 1 apart: the last digits are the number.
+    ((number + 4503599627370496.0).bits() & (i64::from(ring.len) - 1)).value
 }
 
 /// Guards that are put together before they meet others, so that many do not wait for each other one by one, and those of
@@ -116,8 +120,9 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     // One test decides; which guard it is, and whether it is one (a sum may overflow), matters only then, and code may find
     // it out apart from the step.
     let sum = total?;
-    // Of something infinite or NaN the sum is that, and 0 times the sum is 0 or NaN: of these two this asks with one test.
-    let finite = sum.constant(0.0).not_above(0.0 * sum);
+    // Of something infinite or NaN the sum is that too, and less itself it is 0 or NaN: of these two this asks with one test.
+    let rest = sum - sum;
+    let finite = rest.not_above(rest);
     let any = outside.map_or(!finite, |outside| outside | !finite);
     let none = number(0);
     Some(build.borrow_mut().select(any.value, first, none))
@@ -214,14 +219,11 @@ impl<'a> Model<'a> {
     fn delays(&self, c: f64, env: &mut Env) {
         let count = self.load(Slot::COUNT);
         for delay in &self.program.description.delays {
-            let (first, len) = (Slot(delay.ring.start), delay.ring.len);
+            let Segment { start, len } = delay.ring;
             assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
             let sample = |number: Real<'a>| {
-                let mut build = self.build.borrow_mut();
-                let number = build.to_int(number.value);
-                let mask = build.int(i64::from(len) - 1);
-                let index = build.int_and(number, mask);
-                self.h.same(build.ring(first, len, index))
+                let index = place_in(delay.ring, number);
+                self.h.same(self.build.borrow_mut().ring(Slot(start), len, index))
             };
             // In steps, back from the newest sample.
             let back = self.load(delay.time) / self.h - c;
@@ -229,7 +231,8 @@ impl<'a> Model<'a> {
             let whole = ago.floor();
             let newer = count - whole;
             let newer = newer.below(0.0).choose(0.0, newer);
-            let older = newer.is(0.0).choose(0.0, newer - 1.0);
+            let older = newer - 1.0;
+            let older = older.below(0.0).choose(0.0, older);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
             if let Some(weight) = delay.weight {
