@@ -121,6 +121,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     // it out apart from the step.
     let sum = total?;
     // Of something infinite or NaN the sum is that too, and less itself it is 0 or NaN: of these two this asks with one test.
+    #[allow(clippy::eq_op, reason = "of what is not finite it is NaN")]
     let rest = sum - sum;
     let finite = rest.not_above(rest);
     let any = outside.map_or(!finite, |outside| outside | !finite);

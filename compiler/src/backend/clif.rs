@@ -582,13 +582,20 @@ impl<'a> Emitter<'a> {
 
     /// Writes operations of which each stands behind its operands.
     fn list(&mut self, list: &[Value], b: &mut FunctionBuilder) {
-        let sides = Sides::of(self.func, list, None);
+        let listed: HashSet<Value> = list.iter().copied().collect();
+        let mut read: Vec<Value> = self.func.results().collect();
+        for (i, op) in self.func.ops.iter().enumerate() {
+            if !listed.contains(&Value(i as u32)) {
+                op.each_operand(|operand| read.push(operand));
+            }
+        }
+        let sides = Sides::of(&self.func.ops, list, &read);
         self.side(0, &sides, b);
     }
 
     /// Writes operations of which each stands behind its operands, and of which only the outputs are read elsewhere.
     pub fn only(&mut self, list: &[Value], outputs: &[Value], b: &mut FunctionBuilder) {
-        let sides = Sides::of(self.func, list, Some(outputs));
+        let sides = Sides::of(&self.func.ops, list, outputs);
         self.side(0, &sides, b);
     }
 

@@ -3,7 +3,7 @@
 //! In: a list of operations, each behind its operands. Out: [`Sides`], by which code computes of a choice only the side that is
 //! chosen. It knows nothing of processors.
 
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Op, Value};
 use std::collections::{HashMap, HashSet};
 
 /// Which operations of a list only one side of a choice needs: these are written where that side is taken. A choice whose
@@ -15,6 +15,8 @@ pub struct Sides {
     pub of_choice: HashMap<Value, [usize; 2]>,
     /// Choices that stand behind each other and ask the same are taken apart together: those of the first of them.
     pub together: HashMap<Value, Vec<Value>>,
+    /// What each side costs, those within it too.
+    pub costs: Vec<u32>,
 }
 
 /// Operations, by their cost, from which on a side is long.
@@ -23,8 +25,9 @@ const LONG_SIDE: u32 = 4;
 const DEEPEST: usize = 24;
 
 impl Sides {
-    /// Of a list from which the rest of the function, or only `outputs` if these are given, is computed.
-    pub fn of(func: &Func, list: &[Value], outputs: Option<&[Value]>) -> Sides {
+    /// Of a list of operations, of which `outputs` are read elsewhere.
+    pub fn of(ops: &[Op], list: &[Value], outputs: &[Value]) -> Sides {
+        let op = |value: Value| ops[value.index()];
         // A side has its choice, and which of its operands it is; 0 is no side.
         struct Side {
             choice: Value,
@@ -36,30 +39,19 @@ impl Sides {
         let mut of_choice: HashMap<Value, [usize; 2]> = HashMap::new();
         // The innermost side that holds all uses so far of a value; none: no use yet.
         let mut side_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
-        let listed = side_of.clone();
         let common = |sides: &[Side], mut a: usize, mut b: usize| {
             while a != b {
                 if sides[a].depth >= sides[b].depth { a = sides[a].within } else { b = sides[b].within }
             }
             a
         };
-        // What is read from elsewhere belongs to no side.
-        let mut elsewhere = |value: Value| {
-            if let Some(side) = side_of.get_mut(&value) {
+        // What is read elsewhere belongs to no side.
+        for output in outputs {
+            if let Some(side) = side_of.get_mut(output) {
                 *side = Some(0);
             }
-        };
-        if let Some(outputs) = outputs {
-            outputs.iter().copied().for_each(&mut elsewhere);
-        } else {
-            func.results().for_each(&mut elsewhere);
-            for (i, op) in func.ops.iter().enumerate() {
-                if !listed.contains_key(&Value(i as u32)) {
-                    op.each_operand(&mut elsewhere);
-                }
-            }
         }
-        let (together, mut followers) = (together(func, list), HashSet::new());
+        let (together, mut followers) = (together(ops, list), HashSet::new());
         followers.extend(together.values().flat_map(|choices| &choices[1..]).copied());
         for value in list.iter().rev() {
             if followers.contains(value) {
@@ -70,14 +62,14 @@ impl Sides {
             let own = uses.reduce(|a, b| common(&sides, a, b)).unwrap_or(0);
             for choice in choices {
                 side_of.insert(*choice, Some(own));
-                sides[own].cost += func.op(*choice).effort();
+                sides[own].cost += op(*choice).effort();
             }
             let mut used = |operand: Value, at: usize, sides: &[Side]| {
                 if let Some(known) = side_of.get_mut(&operand) {
                     *known = Some(known.map_or(at, |known| common(sides, known, at)));
                 }
             };
-            match func.op(*value) {
+            match op(*value) {
                 Op::Select(when, yes, no)
                     if sides[own].depth < DEEPEST && (choices.len() > 1 || yes != no && when != yes && when != no) =>
                 {
@@ -87,7 +79,7 @@ impl Sides {
                     of_choice.insert(*value, [first, first + 1]);
                     used(when, own, &sides);
                     for choice in choices {
-                        let Op::Select(_, yes, no) = func.op(*choice) else { unreachable!("it is a choice") };
+                        let Op::Select(_, yes, no) = op(*choice) else { unreachable!("it is a choice") };
                         used(yes, first, &sides);
                         used(no, first + 1, &sides);
                     }
@@ -95,10 +87,10 @@ impl Sides {
                 Op::Select(when, ..) if choices.len() > 1 => {
                     used(when, own, &sides);
                     for choice in choices {
-                        func.op(*choice).each_operand(|operand| used(operand, own, &sides));
+                        op(*choice).each_operand(|operand| used(operand, own, &sides));
                     }
                 }
-                op => op.each_operand(|operand| used(operand, own, &sides)),
+                other => other.each_operand(|operand| used(operand, own, &sides)),
             }
         }
         // Short sides are no sides: what they hold belongs to what they lie in. Inner sides stand behind outer ones.
@@ -108,8 +100,8 @@ impl Sides {
         }
         let long = |side: usize| sides[side].cost >= LONG_SIDE;
         // What asks several questions is taken apart in any case: a jump for each costs less than to put them together.
-        let compound = |choice: Value| match func.op(choice) {
-            Op::Select(when, ..) => matches!(func.op(when), Op::And(..) | Op::Or(..)),
+        let compound = |choice: Value| match op(choice) {
+            Op::Select(when, ..) => matches!(op(when), Op::And(..) | Op::Or(..)),
             _ => false,
         };
         of_choice.retain(|choice, pair| compound(*choice) || pair.iter().any(|side| long(*side)));
@@ -123,17 +115,18 @@ impl Sides {
         for value in list {
             members[kept(side_of[value].unwrap_or(0))].push(*value);
         }
-        Sides { members, of_choice, together }
+        let costs = sides.into_iter().map(|side| side.cost).collect();
+        Sides { members, of_choice, together, costs }
     }
 }
 
 /// Choices of a list that stand behind each other and ask the same, if none chooses another: by the first of them.
-fn together(func: &Func, list: &[Value]) -> HashMap<Value, Vec<Value>> {
+fn together(ops: &[Op], list: &[Value]) -> HashMap<Value, Vec<Value>> {
     let mut together: HashMap<Value, Vec<Value>> = HashMap::new();
     let mut run: Vec<Value> = Vec::new();
     let mut asked = None;
     for value in list {
-        let now = match func.op(*value) {
+        let now = match ops[value.index()] {
             Op::Select(when, yes, no) if when != yes && when != no => {
                 let apart = ![yes, no].iter().any(|side| run.contains(side));
                 (apart || run.is_empty()).then_some(when)

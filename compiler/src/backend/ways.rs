@@ -5,8 +5,9 @@
 //! regime changes there is no line: that is rare. It knows nothing of processors.
 
 use super::regimes::{known, left, needed};
+use super::sides::Sides;
 use crate::ir::build::Build;
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
 use std::collections::HashSet;
 
@@ -24,6 +25,8 @@ pub enum Way {
     Ends {
         /// What is stored, but for what is there already.
         stores: Vec<(Slot, Value)>,
+        /// What is written to rings.
+        writes: Vec<Write>,
         /// A truth with which it has failed; the status is found out elsewhere.
         failed: Option<Value>,
     },
@@ -33,6 +36,29 @@ pub enum Way {
     Leaves,
 }
 
+impl Way {
+    /// The way and all that it goes on to.
+    pub fn each(&self, each: &mut impl FnMut(&Way)) {
+        each(self);
+        if let Way::Asks(_, sides) = self {
+            sides.iter().for_each(|side| side.each(each));
+        }
+    }
+
+    /// What it asks, or what it ends with.
+    pub fn reads(&self) -> impl Iterator<Item = Value> {
+        let (asked, stores, writes, failed) = match self {
+            Way::Ends { stores, writes, failed } => (None, &stores[..], &writes[..], *failed),
+            Way::Asks(asked, _) => (Some(*asked), &[][..], &[][..], None),
+            Way::Leaves => (None, &[][..], &[][..], None),
+        };
+        let written = writes.iter().flat_map(|write| [write.index, write.value]);
+        asked.into_iter().chain(stores.iter().map(|(_, value)| *value)).chain(written).chain(failed)
+    }
+}
+
+/// Operations, by their cost, from which on a side of a choice is long.
+const LONG: u32 = 12;
 /// Most ends: behind a question, what is the same on both sides stands twice.
 const MOST: usize = 12;
 
@@ -49,24 +75,28 @@ pub fn ways(func: &Func) -> Option<Ways> {
     };
     let slots: Vec<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
-    let wanted: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(failed).collect();
-    let mut seeker = Seeker { build, slots, read, ends: 0 };
+    let stored = func.stores.iter().map(|(_, value)| *value);
+    let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
+    let wanted: Vec<Value> = stored.chain(written).chain(failed).collect();
+    let mut seeker = Seeker { build, slots, rings: &func.writes, read, ends: 0 };
     let begin = seeker.way(wanted, &[])?;
     Some(Ways { func: Func { ops: seeker.build.into_ops(), ..func.clone() }, begin })
 }
 
-struct Seeker {
+struct Seeker<'a> {
     build: Build,
     /// Slots that are stored.
     slots: Vec<Slot>,
+    /// What is written to rings, without a way.
+    rings: &'a [Write],
     /// Slots that are read.
     read: HashSet<Slot>,
     /// Ends so far.
     ends: usize,
 }
 
-impl Seeker {
-    /// To what is stored, and what then fails; `held` are the regimes that are known by now, with the bits of their numbers.
+impl Seeker<'_> {
+    /// To what is stored, what is written to rings, index and value, and what then fails; `held` are the regimes that are known by now, with the bits of their numbers.
     fn way(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
         let before = |slot: Slot| held.iter().find(|(held, _)| *held == slot).map(|(_, bits)| *bits);
         let stored = || self.slots.iter().copied().zip(wanted.iter().copied());
@@ -83,8 +113,11 @@ impl Seeker {
             };
             let stores = stored().filter(|store| !is_there(store)).collect();
             self.ends += 1;
-            let failed = wanted.get(self.slots.len()).copied();
-            return (self.ends <= MOST).then_some(Way::Ends { stores, failed });
+            let (written, failed) = wanted[self.slots.len()..].split_at(2 * self.rings.len());
+            let of_ring = |(ring, written): (&Write, &[Value])| Write { index: written[0], value: written[1], ..*ring };
+            let writes = self.rings.iter().zip(written.chunks(2)).map(of_ring).collect();
+            let failed = failed.first().copied();
+            return (self.ends <= MOST).then_some(Way::Ends { stores, writes, failed });
         };
         let asked = question?;
         let mut side = |truth: bool| {
@@ -118,6 +151,7 @@ impl Seeker {
         let next = self.slots.iter().zip(wanted).filter(|(slot, _)| self.read.contains(slot)).map(|(_, value)| *value);
         let next: HashSet<Value> =
             needed(&self.build, &HashSet::new(), &next.collect::<Vec<_>>()).into_iter().collect();
+        let long = self.long(list, wanted);
         let mut waits: HashSet<Value> = HashSet::new();
         let mut first = None;
         for value in list {
@@ -129,6 +163,12 @@ impl Seeker {
                 waits.insert(*value);
             }
             let Op::Select(when, yes, no) = op else { continue };
+            if long.contains(value)
+                && first.is_none()
+                && let Some(part) = self.parts(when)[0]
+            {
+                first = Some(Some(part));
+            }
             if !wait && !changes.contains(value) {
                 continue;
             }
@@ -144,6 +184,13 @@ impl Seeker {
             first = first.or(Some(parts.swap_remove(0)));
         }
         first
+    }
+
+    /// Choices of which a side takes long: it is worth a jump.
+    fn long(&self, list: &[Value], wanted: &[Value]) -> HashSet<Value> {
+        let sides = Sides::of(self.build.ops(), list, wanted);
+        let is_long = |pair: &[usize; 2]| pair.iter().any(|side| sides.costs[*side] >= LONG);
+        sides.of_choice.iter().filter(|(_, pair)| is_long(pair)).map(|(choice, _)| *choice).collect()
     }
 
     /// The comparisons that a truth is put together from, in their order; a none for what is none.
@@ -178,10 +225,10 @@ mod tests {
         let ways = ways(&build.finish()).expect("there are few");
         let Way::Asks(regime, sides) = &ways.begin else { panic!("it asks") };
         assert!(matches!(ways.func.op(*regime), Op::Equal(..)));
-        let [Way::Asks(far, of_moving), Way::Ends { stores, failed: None }] = &**sides else { panic!("two regimes") };
+        let [Way::Asks(far, of_moving), Way::Ends { stores, failed: None, .. }] = &**sides else { panic!("two regimes") };
         assert_eq!(stores[..], []);
         assert!(matches!(ways.func.op(*far), Op::Less(..)));
-        let [Way::Leaves, Way::Ends { stores, failed: None }] = &**of_moving else { panic!("it leaves or stays") };
+        let [Way::Leaves, Way::Ends { stores, failed: None, .. }] = &**of_moving else { panic!("it leaves or stays") };
         let [(Slot(3), next)] = stores[..] else { panic!("the spring moves") };
         assert!(matches!(ways.func.op(next), Op::Add(..)));
     }

@@ -48,6 +48,11 @@ impl Build {
         self.ops
     }
 
+    /// The operations so far.
+    pub fn ops(&self) -> &[Op] {
+        &self.ops
+    }
+
     /// Lets reads of the pool at a constant place fold: `pool` is a beginning of the pool the function will run with.
     pub fn with_pool(mut self, pool: Arc<[f64]>) -> Build {
         self.pool = pool;

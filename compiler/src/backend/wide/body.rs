@@ -8,6 +8,7 @@
 use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Predicate, Signs, What};
 use crate::math;
+use abi::Slot;
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -52,6 +53,8 @@ pub struct Body<'a> {
     locked: Vec<(bool, u8)>,
     /// The place in the order, and the vector.
     now: (usize, usize),
+    /// What r10 holds, of single numbers.
+    index: Option<Node>,
 }
 
 impl<'a> Body<'a> {
@@ -89,6 +92,7 @@ impl<'a> Body<'a> {
             mask_of: vec![None; 8],
             locked: Vec::new(),
             now: (0, 0),
+            index: None,
         }
     }
 
@@ -171,6 +175,7 @@ impl<'a> Body<'a> {
             Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
             Vectors::One | Vectors::Avx | Vectors::Avx2 => {
                 // To r10.
+                self.index = None;
                 let l = u8::from(self.width == Vectors::Avx2);
                 self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
                 match self.width {
@@ -208,9 +213,15 @@ impl<'a> Body<'a> {
         opcodes.iter().map(|opcode| self.code.jump(&[0x0f, *opcode])).collect()
     }
 
-    /// Stores what is kept; it ends the line.
-    pub fn store_kept(&mut self, stores: &[(Node, Home)]) {
+    /// Stores what is kept, some of it into rings, of which the first slot and the index are given; it ends the line.
+    pub fn store_kept(&mut self, stores: &[(Node, Home)], writes: &[(Slot, Node, Node)]) {
         self.now = (self.order.len(), 0);
+        for (base, index, value) in writes {
+            let register = self.in_register(*value);
+            self.bring_index(*index);
+            self.code.at_index(i::STORE_FIRST, register, Base::Block, 8 * base.0 as i32);
+            self.locked.clear();
+        }
         let registers: Vec<u8> = stores.iter().map(|(node, _)| self.in_register(*node)).collect();
         for ((node, home), register) in stores.iter().zip(registers) {
             self.store(*node, register, self.at_home(*home, 0));
@@ -445,7 +456,7 @@ impl<'a> Body<'a> {
             }
         }
         match what {
-            What::Load(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
+            What::Load(_) | What::Number(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             What::One(instruction, immediate, a) => {
                 let last = self.place(a);
@@ -547,6 +558,11 @@ impl<'a> Body<'a> {
                 self.code.gather(to, from, mask, 8 * base as i32);
                 self.release(index);
             }
+            What::Ring { base, index } => {
+                self.bring_index(index);
+                let to = self.result(node);
+                self.code.at_index(i::LOAD_FIRST, to, Base::Block, 8 * base.0 as i32);
+            }
             What::Gather { index, .. } => {
                 // All tables that are read at the same place, at once.
                 let same = |other: &&Node| matches!(self.what(**other), What::Gather { index: at, .. } if at == index);
@@ -554,6 +570,15 @@ impl<'a> Body<'a> {
                 self.look_up(&all, index);
                 self.release(index);
             }
+        }
+    }
+
+    /// Brings an index to where addresses are made, if it is not there.
+    fn bring_index(&mut self, index: Node) {
+        if self.index != Some(index) {
+            let from = self.in_register(index);
+            self.code.index(from);
+            self.index = Some(index);
         }
     }
 

@@ -280,6 +280,16 @@ impl Assembler {
         self.vector(instructions::SECOND_OF_TWO, second, half, Place::Register(second), None);
     }
 
+    /// The first number of a vector register, an integer, to r10.
+    pub fn index(&mut self, from: u8) {
+        self.bytes.extend([0xc4, 0x41 | (!from >> 3 & 1) << 7, 0xf9, 0x7e, 0xc2 | (from & 7) << 3]);
+    }
+
+    /// Loads or stores one number, so many bytes behind a base, whose place in eights r10 holds.
+    pub fn at_index(&mut self, what: Instruction, register: u8, base: Base, distance: i32) {
+        self.entry(what, register, 0, 0, (base as u8, 8, distance));
+    }
+
     /// A number of a vector in memory, to r10.
     fn number(&mut self, (base, offset): (Base, i32), lane: usize) {
         self.bytes.extend([0x4c | base as u8 >> 3, 0x8b]);
@@ -544,6 +554,18 @@ mod tests {
         // mov r10, [rdi+0x100]; vmovapd xmm3, [r11+r10*8+0x40]; mov r10, [rdi+0x108]; vmovapd xmm4, [r11+r10*8+0x40];
         // vunpcklpd xmm9, xmm3, xmm4; vunpckhpd xmm4, xmm3, xmm4
         check(Vectors::Avx, |c| c.look_up_two([9, 4], (Base::Block, 0x100), 0x40, 3), &look_up_two);
+        // vmovq r10, xmm9; vmovsd xmm12, [rdi+r10*8+0x40]; vmovsd [rdi+r10*8+0x140], xmm1
+        let index = [
+            [0xc4, 0x41, 0xf9, 0x7e, 0xca].as_slice(),
+            &[0xc4, 0x21, 0x7b, 0x10, 0x64, 0xd7, 0x40],
+            &[0xc4, 0xa1, 0x7b, 0x11, 0x8c, 0xd7, 0x40, 1, 0, 0],
+        ];
+        let by_index = |c: &mut Assembler| {
+            c.index(9);
+            c.at_index(LOAD_FIRST, 12, Base::Block, 0x40);
+            c.at_index(STORE_FIRST, 1, Base::Block, 0x140);
+        };
+        check(Vectors::One, by_index, &index.concat());
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
         check(Vectors::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9

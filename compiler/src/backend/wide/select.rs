@@ -6,7 +6,7 @@
 
 use super::encode::{Instruction, Vectors, instructions as i};
 use crate::backend::target::Unsupported;
-use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, Write, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
@@ -136,6 +136,13 @@ pub enum What {
         len: u32,
         index: Node,
     },
+    /// An entry of the ring that begins at this slot, at an index that lies inside. One lane only.
+    Ring {
+        base: Slot,
+        index: Node,
+    },
+    /// A number of the pool. One lane only.
+    Number(u32),
     /// Half a table: the same in every vector. AVX-512 only.
     Row(Sixteen, bool),
     /// Entries of sixteen, in two rows, by the low four bits of an integer. AVX-512 only.
@@ -178,10 +185,12 @@ impl What {
     /// Operands from left to right.
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
-            What::Load(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
-            What::One(_, _, a) | What::Shift(_, a, _) | What::MaskNot(a) | What::Gather { index: a, .. } => {
-                [Some(a), None, None]
-            }
+            What::Load(_) | What::Number(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
+            What::One(_, _, a)
+            | What::Shift(_, a, _)
+            | What::MaskNot(a)
+            | What::Gather { index: a, .. }
+            | What::Ring { index: a, .. } => [Some(a), None, None],
             What::Two(_, _, a, b)
             | What::Compare(_, a, b)
             | What::CompareInt(_, a, b)
@@ -197,7 +206,7 @@ impl What {
 
     /// Whether it lies in memory from the beginning.
     pub fn is_leaf(self) -> bool {
-        matches!(self, What::Load(_)) || self.is_shared()
+        matches!(self, What::Load(_) | What::Number(_)) || self.is_shared()
     }
 
     /// Whether it is the same in every vector, and lies in memory from the beginning.
@@ -223,6 +232,8 @@ impl What {
             | What::Shift(..)
             | What::Select(..)
             | What::Gather { .. }
+            | What::Ring { .. }
+            | What::Number(_)
             | What::Row(..)
             | What::Permute(..) => false,
         }
@@ -272,15 +283,26 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
     Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
 }
 
-/// The wanted operations of a function and all they need as nodes, with nothing stored, and for each operation its node.
+/// Operations as nodes, with nothing stored.
+pub struct Operations {
+    /// The nodes.
+    pub nodes: Nodes,
+    /// Of each operation that is wanted.
+    pub of: Vec<Node>,
+    /// Of each write to a ring its index, held inside.
+    pub indices: Vec<Node>,
+}
+
+/// The wanted operations of a function and what writes to rings need, whose operands are wanted.
 ///
 /// # Errors
 /// As [`select`].
-pub fn operations(func: &Func, width: Vectors, wanted: &[bool]) -> Result<(Nodes, Vec<Node>), Unsupported> {
+pub fn operations(func: &Func, width: Vectors, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
     let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
     let of = selection.operations(func, wanted)?;
+    let indices = writes.iter().map(|write| selection.inside(func, write.index, write.len, &of)).collect();
     let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes: selection.nodes, pooled: false };
-    Ok((nodes, of))
+    Ok(Operations { nodes, of, indices })
 }
 
 struct Selection {
@@ -349,10 +371,18 @@ impl Selection {
             // Without mask registers a mask is a vector of all ones or zeros a lane.
             Op::Bool(truth) => What::Constant(if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => What::Load(slot),
+            Op::Pool { base, len, index } if self.width == Vectors::One && matches!(func.op(index), Op::Int(_)) => {
+                let Op::Int(index) = func.op(index) else { unreachable!("it is a constant") };
+                What::Number(base + (index as u64).min(u64::from(len) - 1) as u32)
+            }
             Op::Pool { .. } if self.width == Vectors::One => return Err(self.missing("table")),
             Op::Pool { base, len, index } => {
                 let index = self.inside(func, index, len, of);
                 What::Gather { base, len, index }
+            }
+            Op::Ring { base, len, index } if self.width == Vectors::One => {
+                let index = self.inside(func, index, len, of);
+                What::Ring { base, index }
             }
             Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
             Op::Add(a, b) => What::Two(i::ADD, true, at(a), at(b)),

@@ -13,10 +13,10 @@
 
 use super::body::{Body, Held, Home};
 use super::encode::{Assembler, Base, Vectors, instructions};
-use super::select::{Node, Nodes, Predicate, What, operations};
+use super::select::{Node, Nodes, Operations, Predicate, What, operations};
 use crate::backend::target::Unsupported;
 use crate::backend::ways::{Way, ways};
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
 use std::collections::{HashMap, HashSet};
 
@@ -40,21 +40,30 @@ const MOST_KEPT: usize = 12;
 /// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
 pub fn single(func: &Func) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
-    if func.ops.len() > LARGEST || !func.writes.is_empty() {
-        return Err(unsuitable("is too long for registers, or writes to a ring"));
+    if func.ops.len() > LARGEST {
+        return Err(unsuitable("is too long"));
     }
     let ways = ways(func).ok_or_else(|| unsuitable("has too many ways"))?;
-    let (nodes, of) = operations(&ways.func, Vectors::One, &wanted(&ways.func, &ways.begin))?;
+    let mut written = Vec::new();
+    ways.begin.each(&mut |way| {
+        if let Way::Ends { writes, .. } = way {
+            written.extend(writes);
+        }
+    });
+    let Operations { nodes, of, indices } =
+        operations(&ways.func, Vectors::One, &wanted(&ways.func, &ways.begin), &written)?;
+    let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
     let homes = (0..).zip(&nodes.nodes).filter_map(|(number, node)| match node {
         What::Load(slot) => Some((Node(number), home(*slot))),
+        What::Number(entry) => Some((Node(number), Home { base: Base::Pool, begin: 0, index: *entry as usize })),
         _ => None,
     });
     let homes = homes.collect();
     let mut code = Assembler::new(Vectors::One);
     code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
     let to_others = vec![code.jump(&[0x0f, 0x85])]; // jne
-    let mut writer = Writer { code, func: &ways.func, nodes: &nodes, of, homes, read, to_others };
+    let mut writer = Writer { code, func: &ways.func, nodes: &nodes, of, indices, homes, read, to_others };
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
@@ -69,20 +78,7 @@ fn home(slot: Slot) -> Home {
 /// The operations that some way needs.
 fn wanted(func: &Func, begin: &Way) -> Vec<bool> {
     let mut wanted = vec![false; func.ops.len()];
-    let mut open = vec![begin];
-    while let Some(way) = open.pop() {
-        match way {
-            Way::Ends { stores, failed } => {
-                let stored = stores.iter().map(|(_, value)| value);
-                stored.chain(failed).for_each(|value| wanted[value.index()] = true);
-            }
-            Way::Asks(asked, sides) => {
-                wanted[asked.index()] = true;
-                open.extend(&**sides);
-            }
-            Way::Leaves => {}
-        }
-    }
+    begin.each(&mut |way| way.reads().for_each(|value| wanted[value.index()] = true));
     for i in (0..func.ops.len()).rev() {
         if wanted[i] {
             func.ops[i].each_operand(|operand| wanted[operand.index()] = true);
@@ -97,6 +93,8 @@ struct Writer<'a> {
     nodes: &'a Nodes,
     /// Of each operation.
     of: Vec<Node>,
+    /// Of each index of a ring of so many slots, held inside.
+    indices: HashMap<(Value, u32), Node>,
     homes: HashMap<Node, Home>,
     /// What the step reads.
     read: HashSet<Slot>,
@@ -108,10 +106,14 @@ impl Writer<'_> {
         self.of[value.index()]
     }
 
+    fn index(&self, write: &Write) -> Node {
+        self.indices[&(write.index, write.len)]
+    }
+
     /// Writes one way from where some nodes are there; none if it is too long.
     fn way(&mut self, way: &Way, there: &[bool], held: &Held) -> Option<()> {
         match way {
-            Way::Ends { stores, failed } => self.end(stores, *failed, there, held),
+            Way::Ends { stores, writes, failed } => self.end(stores, writes, *failed, there, held),
             Way::Asks(asked, sides) => self.question(*asked, sides, there, held),
             Way::Leaves => {
                 let jump = self.code.jump(&[0xe9]);
@@ -155,13 +157,23 @@ impl Writer<'_> {
         self.way(&sides[other], &there, &held)
     }
 
-    fn end(&mut self, stores: &[(Slot, Value)], failed: Option<Value>, there: &[bool], held: &Held) -> Option<()> {
+    fn end(
+        &mut self,
+        stores: &[(Slot, Value)],
+        writes: &[Write],
+        failed: Option<Value>,
+        there: &[bool],
+        held: &Held,
+    ) -> Option<()> {
         let stores = stores.iter().map(|(slot, value)| (*slot, self.at(*value)));
         let (late, early): (Vec<_>, Vec<_>) = stores.partition(|(slot, _)| self.read.contains(slot));
         let late: Vec<(Node, Home)> = late.into_iter().map(|(slot, node)| (node, home(slot))).collect();
+        let writes: Vec<(Slot, Node, Node)> =
+            writes.iter().map(|write| (write.base, self.index(write), self.at(write.value))).collect();
         let questions = failed.map_or_else(Vec::new, |failed| questions(self.nodes, self.at(failed)));
-        let kept: Vec<Node> =
-            questions.iter().flat_map(Question::operands).chain(late.iter().map(|(node, _)| *node)).collect();
+        let asked = questions.iter().flat_map(Question::operands);
+        let written = writes.iter().flat_map(|(_, index, value)| [*index, *value]);
+        let kept: Vec<Node> = asked.chain(written).chain(late.iter().map(|(node, _)| *node)).collect();
         if kept.len() > MOST_KEPT {
             return None;
         }
@@ -184,7 +196,7 @@ impl Writer<'_> {
                 Question::Mask(mask) => self.to_others.push(body.test(mask)),
             }
         }
-        body.store_kept(&late);
+        body.store_kept(&late, &writes);
         let fits = body.spilled() == 0;
         self.code.plain(&[0x31, 0xc0, 0xc3]); // xor eax, eax; ret
         fits.then_some(())
@@ -199,19 +211,13 @@ impl Writer<'_> {
     /// What is there, or lies in memory from the beginning, and one of several ways reads.
     fn later(&self, ways: &[Way], there: &[bool]) -> Vec<Node> {
         let mut roots = Vec::new();
-        let mut open: Vec<&Way> = ways.iter().collect();
-        while let Some(way) = open.pop() {
-            match way {
-                Way::Ends { stores, failed } => {
-                    let stored = stores.iter().map(|(_, value)| value);
-                    roots.extend(stored.chain(failed).map(|value| self.at(*value)));
+        for way in ways {
+            way.each(&mut |way| {
+                roots.extend(way.reads().map(|value| self.at(value)));
+                if let Way::Ends { writes, .. } = way {
+                    roots.extend(writes.iter().map(|write| self.index(write)));
                 }
-                Way::Asks(asked, sides) => {
-                    roots.push(self.at(*asked));
-                    open.extend(&**sides);
-                }
-                Way::Leaves => {}
-            }
+            });
         }
         let (mut seen, mut later) = (HashSet::new(), Vec::new());
         while let Some(node) = roots.pop() {
