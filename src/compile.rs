@@ -79,7 +79,7 @@ pub fn emit(
             let mut coder = Coder::new(isa);
             let mut listings = vec![places(description, method, size_of::<f64>())];
             if emit == Emit::Asm {
-                listings[0] += "; As Cranelift has it before it joins blocks and places constants.\n";
+                listings[0] += "; What is Cranelift's as it has that before it joins blocks and places constants.\n";
             }
             for (function, func) in &functions {
                 let listing = if emit == Emit::Clif { coder.clif(func) } else { coder.assembly(func) };

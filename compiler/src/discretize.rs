@@ -99,13 +99,17 @@ const TOGETHER: usize = 8;
 fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let mut total: Option<Real> = None;
     let mut outside: Option<Truth> = None;
+    // What is watched twice, as a state and as an output that is that state, enters once.
+    let mut summed: HashSet<Value> = HashSet::new();
     let number = |n: i64| build.borrow_mut().int(n);
     let mut first = number(0);
     for (group, guards) in guards.chunks(TOGETHER).enumerate().rev() {
         let (mut sum, mut beyond): (Option<Real>, Option<Truth>) = (None, None);
         for (k, guard) in guards.iter().enumerate().rev() {
             let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
-            sum = Some(sum.map_or(x, |sum| sum + x));
+            if summed.insert(x.value) {
+                sum = Some(sum.map_or(x, |sum| sum + x));
+            }
             let (low, high) = widened(guard.range);
             let bounds = [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))];
             let out = bounds.into_iter().filter(|(bounded, _)| *bounded).map(|(_, out)| out).reduce(|a, b| a | b);

@@ -10,6 +10,7 @@ mod clif;
 mod repeats;
 mod cut;
 mod pieces;
+mod listing;
 pub mod target;
 mod memory;
 pub mod wide;

@@ -5,6 +5,7 @@
 
 use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
+use super::listing::listing;
 use super::pieces;
 use super::wide::{pairs, single};
 use crate::ir::Func;
@@ -122,7 +123,10 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let mut text = String::new();
+        let mut text = match self.single(func) {
+            Some(_) => "; one iteration is not Cranelift's: see the assembly\n".to_string(),
+            None => String::new(),
+        };
         self.each_part(func, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
@@ -131,9 +135,13 @@ impl<'a> Coder<'a> {
         Ok(text)
     }
 
-    /// The function as assembly, as Cranelift writes it.
+    /// The function as assembly; what Cranelift makes as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
+        if let Some(single) = self.single(func) {
+            text += &title(ONE);
+            text += &listing(&single.code, single.len, &single.to_others);
+        }
         self.each_part(func, |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
@@ -161,16 +169,14 @@ impl<'a> Coder<'a> {
     ) -> Result<(), Unsupported> {
         let own = self.single(func).is_some();
         let Coder { isa, context, builder, lengths } = self;
-        let title = |what: &str| format!("; {what}\n");
         if func.ops.len() <= lengths.whole {
-            let several = if clif::has_single(func) && !own {
+            let several = clif::has_single(func);
+            if several && !own {
                 context.clear();
                 clif::emit_single(func, &mut context.func, builder, *isa);
-                part(title("one iteration, or go on to more"), *isa, context)?;
-                title("any number of iterations")
-            } else {
-                String::new()
-            };
+                part(title(ONE), *isa, context)?;
+            }
+            let several = if several { title("any number of iterations") } else { String::new() };
             context.clear();
             clif::emit(func, None, &mut context.func, builder, *isa);
             return part(several, *isa, context);
@@ -189,6 +195,14 @@ impl<'a> Coder<'a> {
         Ok(())
     }
 }
+
+/// A line that says what follows.
+fn title(what: &str) -> String {
+    format!("; {what}\n")
+}
+
+/// What comes first of a function of several parts.
+const ONE: &str = "one iteration, or go on to more";
 
 /// A call of a piece.
 struct Call {

@@ -22,8 +22,10 @@ use std::collections::{HashMap, HashSet};
 
 /// Code with the signature of [`abi::table::Entry`], but for its jumps to the others.
 pub struct Single {
-    /// To lie at a multiple of 64.
+    /// Instructions, and constants behind them: to lie at a multiple of 64.
     pub code: Vec<u8>,
+    /// Bytes of the instructions.
+    pub len: usize,
     /// Where the distances to the others stand, of 32 bits from the end of each.
     pub to_others: Vec<usize>,
 }
@@ -67,7 +69,8 @@ pub fn single(func: &Func) -> Result<Single, Unsupported> {
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
-    Ok(Single { code: writer.code.finish(), to_others: writer.to_others })
+    let len = writer.code.here();
+    Ok(Single { code: writer.code.finish(), len, to_others: writer.to_others })
 }
 
 /// Where a slot lies.
