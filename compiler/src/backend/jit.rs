@@ -106,8 +106,8 @@ mod tests {
         maps.lines().filter_map(range).collect()
     }
 
-    #[test]
-    fn code_is_never_writable_and_is_given_back_with_its_last_clone() {
+    /// Makes code and gives it back; whether it is nowhere then. Tests beside this one may get the same memory for theirs.
+    fn is_given_back() -> bool {
         let layout = Layout::new([0, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("f");
         let x = build.load(Slot(3));
@@ -126,6 +126,11 @@ mod tests {
         drop(machine);
         assert!(executable(), "a clone keeps the code");
         drop(clone);
-        assert!(!executable(), "nobody needs the code any more");
+        !executable()
+    }
+
+    #[test]
+    fn code_is_never_writable_and_is_given_back_with_its_last_clone() {
+        assert!((0..20).any(|_| is_given_back()), "nobody needs the code any more");
     }
 }
