@@ -96,7 +96,8 @@ struct Seeker<'a> {
 }
 
 impl Seeker<'_> {
-    /// To what is stored, what is written to rings, index and value, and what then fails; `held` are the regimes that are known by now, with the bits of their numbers.
+    /// To what is stored, what is written to rings, index and value, and what then fails; `held` are the regimes that are
+    /// known by now, with the bits of their numbers.
     fn way(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
         let before = |slot: Slot| held.iter().find(|(held, _)| *held == slot).map(|(_, bits)| *bits);
         let stored = || self.slots.iter().copied().zip(wanted.iter().copied());
@@ -163,11 +164,8 @@ impl Seeker<'_> {
                 waits.insert(*value);
             }
             let Op::Select(when, yes, no) = op else { continue };
-            if long.contains(value)
-                && first.is_none()
-                && let Some(part) = self.parts(when)[0]
-            {
-                first = Some(Some(part));
+            if long.contains(value) {
+                first = first.or(Some(self.parts(when)[0]));
             }
             if !wait && !changes.contains(value) {
                 continue;
@@ -225,7 +223,9 @@ mod tests {
         let ways = ways(&build.finish()).expect("there are few");
         let Way::Asks(regime, sides) = &ways.begin else { panic!("it asks") };
         assert!(matches!(ways.func.op(*regime), Op::Equal(..)));
-        let [Way::Asks(far, of_moving), Way::Ends { stores, failed: None, .. }] = &**sides else { panic!("two regimes") };
+        let [Way::Asks(far, of_moving), Way::Ends { stores, failed: None, .. }] = &**sides else {
+            panic!("two regimes")
+        };
         assert_eq!(stores[..], []);
         assert!(matches!(ways.func.op(*far), Op::Less(..)));
         let [Way::Leaves, Way::Ends { stores, failed: None, .. }] = &**of_moving else { panic!("it leaves or stays") };
