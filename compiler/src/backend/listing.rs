@@ -51,7 +51,7 @@ fn constant(instruction: &Instruction, code: &[u8]) -> Option<String> {
     let bits = u64::from_le_bytes(code.get(at..at + 8)?.try_into().ok()?);
     Some(match instruction.mnemonic() {
         Mnemonic::Vandpd | Mnemonic::Vandnpd | Mnemonic::Vorpd | Mnemonic::Vxorpd => format!("{bits:#018x}"),
-        _ => f64::from_bits(bits).to_string(),
+        _ => format!("{:?}", f64::from_bits(bits)),
     })
 }
 

@@ -4,8 +4,8 @@
 
 pub mod interp;
 mod regimes;
-mod ways;
 mod sides;
+mod ways;
 mod clif;
 mod repeats;
 mod cut;

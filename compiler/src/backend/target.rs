@@ -67,13 +67,15 @@ impl<'a> Coder<'a> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        if let Some(single) = self.single(func) {
+        let single = self.single(func);
+        let own = single.is_some();
+        if let Some(single) = single {
             begins.push(0);
             let to_others = single.to_others.into_iter();
             calls.extend(to_others.map(|at| (at, Call { kind: Reloc::X86CallPCRel4, piece: 0, addend: -4 })));
             all = Bytes { code: single.code, alignment: 64 };
         }
-        self.each_part(func, |_, isa, context| {
+        self.each_part(func, own, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -123,11 +125,9 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let mut text = match self.single(func) {
-            Some(_) => "; one iteration is not Cranelift's: see the assembly\n".to_string(),
-            None => String::new(),
-        };
-        self.each_part(func, |what, _, context| {
+        let own = self.single(func).is_some();
+        let mut text = if own { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
+        self.each_part(func, own, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
             Ok(())
@@ -138,11 +138,12 @@ impl<'a> Coder<'a> {
     /// The function as assembly; what Cranelift makes as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
-        if let Some(single) = self.single(func) {
+        let single = self.single(func);
+        if let Some(single) = &single {
             text += &title(ONE);
             text += &listing(&single.code, single.len, &single.to_others);
         }
-        self.each_part(func, |what, isa, context| {
+        self.each_part(func, single.is_some(), |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
             text += &what;
@@ -160,14 +161,14 @@ impl<'a> Coder<'a> {
             .flatten()
     }
 
-    /// Gives the function as Cranelift's own: whole, behind what makes a single iteration, or cut: then the loop first and
-    /// the pieces in their order. Of several parts each has a line that says what it is.
+    /// Gives the function as Cranelift's own: whole, behind what makes a single iteration unless that is our `own`, or cut:
+    /// then the loop first and the pieces in their order. Of several parts each has a line that says what it is.
     fn each_part(
         &mut self,
         func: &Func,
+        own: bool,
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
-        let own = self.single(func).is_some();
         let Coder { isa, context, builder, lengths } = self;
         if func.ops.len() <= lengths.whole {
             let several = clif::has_single(func);

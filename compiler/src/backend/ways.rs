@@ -99,26 +99,17 @@ impl Seeker<'_> {
     /// To what is stored, what is written to rings, index and value, and what then fails; `held` are the regimes that are
     /// known by now, with the bits of their numbers.
     fn way(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
-        let before = |slot: Slot| held.iter().find(|(held, _)| *held == slot).map(|(_, bits)| *bits);
-        let stored = || self.slots.iter().copied().zip(wanted.iter().copied());
-        let mut regimes = stored().filter_map(|(slot, value)| Some((before(slot)?, self.build.get(value))));
-        if regimes.any(|(before, next)| matches!(next, Op::Real(bits) if bits != before)) {
+        let changes = |(slot, value): (&Slot, &Value)| match self.build.get(*value) {
+            Op::Real(bits) => held.iter().any(|(held, before)| held == slot && *before != bits),
+            _ => false,
+        };
+        if self.slots.iter().zip(&wanted).any(changes) {
             return Some(Way::Leaves);
         }
         let list = needed(&self.build, &HashSet::new(), &wanted);
         let Some(question) = self.question(&list, &wanted, held) else {
-            let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
-                Op::Load(from) => from == *slot,
-                Op::Real(bits) => before(*slot) == Some(bits),
-                _ => false,
-            };
-            let stores = stored().filter(|store| !is_there(store)).collect();
             self.ends += 1;
-            let (written, failed) = wanted[self.slots.len()..].split_at(2 * self.rings.len());
-            let of_ring = |(ring, written): (&Write, &[Value])| Write { index: written[0], value: written[1], ..*ring };
-            let writes = self.rings.iter().zip(written.chunks(2)).map(of_ring).collect();
-            let failed = failed.first().copied();
-            return (self.ends <= MOST).then_some(Way::Ends { stores, writes, failed });
+            return (self.ends <= MOST).then(|| self.end(&wanted, held));
         };
         let asked = question?;
         let mut side = |truth: bool| {
@@ -133,6 +124,20 @@ impl Seeker<'_> {
         };
         let sides = [side(true)?, side(false)?];
         Some(if matches!(sides, [Way::Leaves, Way::Leaves]) { Way::Leaves } else { Way::Asks(asked, Box::new(sides)) })
+    }
+
+    /// A line to what is wanted.
+    fn end(&self, wanted: &[Value], held: &[(Slot, u64)]) -> Way {
+        let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
+            Op::Load(from) => from == *slot,
+            Op::Real(bits) => held.contains(&(*slot, bits)),
+            _ => false,
+        };
+        let stored = self.slots.iter().copied().zip(wanted.iter().copied());
+        let (written, failed) = wanted[self.slots.len()..].split_at(2 * self.rings.len());
+        let of_ring = |(ring, written): (&Write, &[Value])| Write { index: written[0], value: written[1], ..*ring };
+        let writes = self.rings.iter().zip(written.chunks(2)).map(of_ring).collect();
+        Way::Ends { stores: stored.filter(|store| !is_there(store)).collect(), writes, failed: failed.first().copied() }
     }
 
     /// The load, its slot and the number, if it is asked whether a slot that is stored holds a number.
@@ -152,36 +157,41 @@ impl Seeker<'_> {
         let next = self.slots.iter().zip(wanted).filter(|(slot, _)| self.read.contains(slot)).map(|(_, value)| *value);
         let next: HashSet<Value> =
             needed(&self.build, &HashSet::new(), &next.collect::<Vec<_>>()).into_iter().collect();
-        let long = self.long(list, wanted);
-        let mut waits: HashSet<Value> = HashSet::new();
+        let (long, waits) = (self.long(list, wanted), self.waiting(list));
         let mut first = None;
         for value in list {
+            let Op::Select(when, yes, no) = self.build.get(*value) else { continue };
+            let parts = self.parts(when);
+            if long.contains(value) {
+                first = first.or(Some(parts[0]));
+            }
+            // The less or the greater of two is one instruction.
+            let of_two = matches!(self.build.get(when), Op::Less(a, b) if [(a, b), (b, a)].contains(&(yes, no)));
+            let of_state = waits.contains(value) || changes.contains(value);
+            if !of_state || of_two || !next.contains(value) {
+                continue;
+            }
+            if let Some(regime) = parts.iter().flatten().find(|part| self.regime(**part).is_some()) {
+                return Some(Some(*regime));
+            }
+            first = first.or(Some(parts[0]));
+        }
+        first
+    }
+
+    /// What waits for the step before.
+    fn waiting(&self, list: &[Value]) -> HashSet<Value> {
+        let state = |slot: Slot| self.slots.contains(&slot) && ![Slot::COUNT, Slot::TIME].contains(&slot);
+        let mut waits = HashSet::new();
+        for value in list {
             let op = self.build.get(*value);
-            let state = |slot: Slot| self.slots.contains(&slot) && ![Slot::COUNT, Slot::TIME].contains(&slot);
             let mut wait = matches!(op, Op::Load(slot) if state(slot));
             op.each_operand(|operand| wait |= waits.contains(&operand));
             if wait {
                 waits.insert(*value);
             }
-            let Op::Select(when, yes, no) = op else { continue };
-            if long.contains(value) {
-                first = first.or(Some(self.parts(when)[0]));
-            }
-            if !wait && !changes.contains(value) {
-                continue;
-            }
-            // The less or the greater of two is one instruction.
-            let of_two = matches!(self.build.get(when), Op::Less(a, b) if [(a, b), (b, a)].contains(&(yes, no)));
-            if !next.contains(value) || of_two {
-                continue;
-            }
-            let mut parts = self.parts(when);
-            if let Some(regime) = parts.iter().flatten().find(|part| self.regime(**part).is_some()) {
-                return Some(Some(*regime));
-            }
-            first = first.or(Some(parts.swap_remove(0)));
         }
-        first
+        waits
     }
 
     /// Choices of which a side takes long: it is worth a jump.

@@ -34,7 +34,6 @@ pub struct Single {
 const LARGEST: usize = 250;
 /// Most instructions of a way, both sides of each choice counted: of longer ones a jump over a side is worth more.
 const LONGEST: usize = 100;
-
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
@@ -56,12 +55,12 @@ pub fn single(func: &Func) -> Result<Single, Unsupported> {
         operations(&ways.func, Vectors::One, &wanted(&ways.func, &ways.begin), &written)?;
     let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
-    let homes = (0..).zip(&nodes.nodes).filter_map(|(number, node)| match node {
+    let place = |(number, node): (u32, &What)| match node {
         What::Load(slot) => Some((Node(number), home(*slot))),
         What::Number(entry) => Some((Node(number), Home { base: Base::Pool, begin: 0, index: *entry as usize })),
         _ => None,
-    });
-    let homes = homes.collect();
+    };
+    let homes = (0..).zip(&nodes.nodes).filter_map(place).collect();
     let mut code = Assembler::new(Vectors::One);
     code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
     let to_others = vec![code.jump(&[0x0f, 0x85])]; // jne
