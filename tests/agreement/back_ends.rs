@@ -1,11 +1,12 @@
 //! Cases on every back end: each must give the bits of the interpreter.
 
-use crate::case::{Case, Result};
+use crate::case::{Case, Result, all_of};
 use crate::emulator;
 use abi::Description;
 use abi::image::Target;
 use abi::lanes::Batch;
-use abi::table::{Code, Interpret};
+use abi::table::{Code, Function, Interpret};
+use compiler::backend::target::{self, Coder};
 use compiler::backend::wide::{self, Width};
 use compiler::backend::{blob, c, jit};
 use std::fs;
@@ -19,6 +20,8 @@ pub struct Agreed {
     pub results: Vec<Result>,
     /// The widths of lanes that took part; none where there are no lanes for it.
     pub lanes: Vec<&'static str>,
+    /// Whether a single step is in our own instructions.
+    pub own: bool,
 }
 
 /// Runs cases on every back end, C at this level of optimisation (long lines take gcc long); panics at the first
@@ -31,20 +34,22 @@ pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
         }
     };
     // gcc and the emulator take as long as all the others together.
-    let lanes = std::thread::scope(|scope| {
+    let agreed = std::thread::scope(|scope| {
         let c = scope.spawn(|| compiled_c(cases, level));
         let arm = scope.spawn(|| emulated(cases));
-        let lanes = on_this_processor(cases, &expected);
+        let agreed = on_this_processor(cases, &expected);
         for (back_end, thread) in [("C", c), ("an image for 64-bit Arm", arm)] {
             hold(back_end, thread.join().unwrap_or_else(|why| std::panic::resume_unwind(why)));
         }
-        lanes
+        agreed
     });
-    expected.into_iter().zip(lanes).map(|(results, lanes)| Agreed { results, lanes }).collect()
+    expected.into_iter().zip(agreed).map(|(results, (lanes, own))| Agreed { results, lanes, own }).collect()
 }
 
-/// What needs no other program: lanes, machine code in memory, an image. The widths of lanes that took part in each case.
-fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'static str>> {
+/// What needs no other program: lanes, machine code in memory, an image. The widths of lanes that took part in each case, and
+/// whether single steps are in our own instructions.
+fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<(Vec<&'static str>, bool)> {
+    let coder = Coder::new(target::here().expect("tests run where code is made for"));
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");
     let one = |(case, expected): (&Case, &Vec<Result>)| {
@@ -62,7 +67,9 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'stat
                 true
             })
         };
-        widths.iter().filter(took_part).map(|width| width.name()).collect()
+        let step = case.functions.iter().find(|(function, _)| *function == Function::Step);
+        let own = step.is_some_and(|(_, func)| coder.has_own_single(func));
+        (widths.iter().filter(took_part).map(|width| width.name()).collect(), own)
     };
     cases.iter().zip(expected).map(one).collect()
 }
@@ -115,13 +122,13 @@ fn in_lanes(case: &Case, width: Width) -> Option<Vec<Result>> {
         let mut status = 0;
         for (function, count) in &run.calls {
             if function != in_lanes {
-                status = alone.call(*function, &mut block, pool, *count);
+                status = all_of(status, alone.call(*function, &mut block, pool, *count));
                 continue;
             }
             (0..=last).for_each(|lane| batch.load(lane, &block));
             batch.advance(pool, *count);
             batch.save(last, &mut block);
-            status = batch.status(last);
+            status = all_of(status, batch.status(last));
         }
         out.push((status, block));
     }
@@ -166,11 +173,12 @@ fn compiled_c(cases: &[Case], level: &str) -> Vec<Vec<Result>> {
             for (function, count) in &run.calls {
                 let name = format!("case{k}_{}", function.name());
                 // SAFETY: the file just written has a function of this name and type, which stays in the block.
-                status = unsafe {
+                let of_call = unsafe {
                     type Entry = unsafe extern "C" fn(*mut f64, u64) -> u64;
                     let entry = loaded.get::<Entry>(name.as_bytes()).expect("the function is in the file");
                     entry(block.as_mut_ptr(), *count)
                 };
+                status = all_of(status, of_call);
             }
             (status, block)
         };

@@ -56,7 +56,7 @@ impl Case {
             let mut block = run.start.clone();
             let mut status = 0;
             for (function, count) in &run.calls {
-                status = code.call(*function, &mut block, pool, *count);
+                status = all_of(status, code.call(*function, &mut block, pool, *count));
             }
             (status, block)
         };
@@ -129,6 +129,11 @@ pub fn of_program(name: String, text: &str, program: &Program, method: Method, s
     case
 }
 
+/// A number for the statuses of all calls: those before, and one more.
+pub fn all_of(before: u64, status: u64) -> u64 {
+    before.wrapping_mul(31).wrapping_add(status)
+}
+
 /// From the defaults; twice from parameters and inputs with edge values; from a block that a run has left, with some of
 /// its numbers changed at random, whatever they mean.
 fn runs(case: &Case, step: f64, random: &mut Random) -> Vec<Run> {
@@ -149,7 +154,13 @@ fn runs(case: &Case, step: f64, random: &mut Random) -> Vec<Run> {
         (Function::Rosenbrock, 1),
         (Function::Rosenbrock, 1),
         (Function::Rosenbrock, 1),
+        // A single step has code of its own.
+        (Function::Step, 1),
+        (Function::Step, 1),
+        (Function::Step, 1),
         (Function::Step, steps),
+        (Function::Step, 1),
+        (Function::Step, 1),
     ];
     let from_start = present(begin.into_iter().chain(evaluated).collect());
 

@@ -2,7 +2,7 @@
    In: a file of cases. Out: a file of what the functions returned and left in their blocks.
      cases      u64 count, then each: u64 bytes of the image, image, u64 slots, u64 runs, then each:
                 u64 calls, (u64 function, u64 count)..., slots doubles
-     results    for each run of each case: the last status u64, slots doubles */
+     results    for each run of each case: its statuses as one u64, slots doubles */
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -50,8 +50,8 @@ int main(int argc, char **argv)
         double *block = calloc(slots, sizeof *block);
         if (!block) fail("no memory for a block");
         for (; runs; runs--) {
-            uint64_t calls = number(in), which[16], counts[16];
-            if (calls > 16) fail("too many calls");
+            uint64_t calls = number(in), which[32], counts[32];
+            if (calls > 32) fail("too many calls");
             for (uint64_t k = 0; k < calls; k++) {
                 which[k] = number(in);
                 counts[k] = number(in);
@@ -64,7 +64,7 @@ int main(int argc, char **argv)
                 entry call;
                 unsigned char *address = code + offset;
                 memcpy(&call, &address, sizeof call);
-                status = call(block, pool, counts[k]);
+                status = 31 * status + call(block, pool, counts[k]);
             }
             fwrite(&status, sizeof status, 1, out);
             fwrite(block, sizeof *block, slots, out);

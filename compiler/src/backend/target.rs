@@ -125,7 +125,7 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let own = self.single(func).is_some();
+        let own = self.has_own_single(func);
         let mut text = if own { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
         self.each_part(func, own, |what, _, context| {
             text += &what;
@@ -151,6 +151,11 @@ impl<'a> Coder<'a> {
             Ok(())
         })?;
         Ok(text)
+    }
+
+    /// Whether a single iteration of a function is in our own instructions.
+    pub fn has_own_single(&self, func: &Func) -> bool {
+        self.single(func).is_some()
     }
 
     /// A single iteration of a short function in our own instructions, where there are such.
