@@ -7,6 +7,7 @@ pub use abi::plan::Method;
 use abi::unit::Unit;
 use abi::{Description, Function, Slot};
 use compiler::backend::target::{self, Coder};
+use compiler::backend::unsupported::Unsupported;
 use compiler::backend::wide;
 use compiler::backend::{blob, c, jit};
 pub use compiler::explain::{Explanation, Listed, StepCost};
@@ -56,7 +57,7 @@ pub fn emit(
     let method = method(built, solver);
     let functions = compiler::functions(&built.program, method);
     let description = &built.program.description;
-    let told = |error: target::Unsupported| error.to_string();
+    let told = |error: Unsupported| error.to_string();
     let text = match emit {
         Emit::C => c::source(&functions, description, &built.program.params),
         Emit::Ir => {

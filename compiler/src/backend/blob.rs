@@ -3,7 +3,8 @@
 //! In: the functions of a model. Out: an [`Image`]: their code one behind the other, with nothing left to be resolved.
 //! The code reads its tables through the pointer to the pool that each call is given.
 
-use super::target::{Coder, Unsupported, with};
+use super::target::{Coder, with};
+use super::unsupported::Unsupported;
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
 use abi::image::{Feature, Image, Target};

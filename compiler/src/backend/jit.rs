@@ -15,7 +15,7 @@ use abi::{Function, Layout};
 use cranelift_module::Module;
 use std::sync::Arc;
 
-pub use super::target::Unsupported;
+pub use super::unsupported::Unsupported;
 
 /// Size of the code made.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]

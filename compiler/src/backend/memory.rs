@@ -3,7 +3,8 @@
 //! It is written first and made executable afterwards, never both at once, and is given back when its last owner goes.
 
 use super::clif::signature;
-use super::target::{Unsupported, here};
+use super::target::here;
+use super::unsupported::Unsupported;
 use cranelift_codegen::isa::OwnedTargetIsa;
 use cranelift_jit::{JITBuilder, JITModule};
 use cranelift_module::Module;

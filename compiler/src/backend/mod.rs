@@ -3,6 +3,7 @@
 //! Cranelift is known to `clif`, `pieces`, `target`, `memory`, `jit` and `wide::pairs` only.
 
 pub mod interp;
+pub mod unsupported;
 mod regimes;
 mod sides;
 mod ways;

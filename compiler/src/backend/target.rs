@@ -7,6 +7,7 @@ use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
 use super::listing::listing;
 use super::pieces;
+use super::unsupported::Unsupported;
 use super::wide::{pairs, single};
 use crate::ir::Func;
 use abi::image::{Feature, Target};
@@ -17,20 +18,7 @@ use cranelift_codegen::isa::{self, CallConv, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
 use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
-use std::fmt;
 use std::sync::OnceLock;
-
-/// Why there is no machine code: run the interpreter, and say so.
-#[derive(Clone, PartialEq, Eq, Debug)]
-pub struct Unsupported(pub String);
-
-impl fmt::Display for Unsupported {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for Unsupported {}
 
 /// Makes code, function by function; what it needs on the way is kept for the next.
 pub struct Coder<'a> {

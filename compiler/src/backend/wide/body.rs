@@ -20,6 +20,11 @@ pub struct Home {
     pub index: usize,
 }
 
+/// What the vectors of one node have in memory.
+pub fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Vectors) -> Place {
+    Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
+}
+
 /// One vector of a node; what is the same in every vector has but the first.
 type Copy = usize;
 
@@ -254,7 +259,7 @@ impl<'a> Body<'a> {
     }
 
     fn at_home(&self, home: Home, k: usize) -> Place {
-        super::place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
+        place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
     }
 
     /// The number of a place in memory that nobody needs.

@@ -18,18 +18,21 @@
 mod body;
 mod encode;
 mod select;
+mod order;
 pub(super) mod pairs;
 pub(super) mod single;
 
 use super::memory::Executable;
-use super::target::{Coder, Unsupported, here};
+use super::target::{Coder, here};
+use super::unsupported::Unsupported;
 use crate::ir::verify::{Stage, verify};
 use crate::ir::{Func, Op, Unary};
 use crate::math;
 use abi::lanes::{Lanes, LanesEntry};
 use abi::{Layout, Slot};
-use body::{Body, Home};
-use encode::{Assembler, Base, Place, Vectors, instructions};
+use body::{Body, Home, place_in};
+use encode::{Assembler, Base, Vectors, instructions};
+use order::order;
 use select::{Node, Nodes, What, select};
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -188,11 +191,6 @@ pub fn compile(
     Ok(unsafe { Lanes::new(entry, lanes, layout.size(), scratch, pool_len, name, Arc::new(executable)) })
 }
 
-/// What the vectors of one node have in memory.
-fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Vectors) -> Place {
-    Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
-}
-
 /// The code, and the numbers it needs behind the block. `pooled`: the pool begins with the tables of the elementary functions.
 fn generate(
     func: &Func,
@@ -318,56 +316,6 @@ fn varying(nodes: &Nodes, stored: &HashSet<Slot>) -> Vec<bool> {
         varies.push(own || node.operands().any(|operand| varies[operand.index()]));
     }
     varies
-}
-
-/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first, of
-/// these the one that needs most registers, so that few others wait meanwhile (Sethi and Ullman, 1970).
-fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
-    let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
-    // Registers that a node takes while it is computed, if nothing is shared.
-    let mut need: Vec<usize> = Vec::with_capacity(nodes.nodes.len());
-    for (index, node) in nodes.nodes.iter().enumerate() {
-        let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
-        of.sort_unstable_by(|a, b| b.cmp(a));
-        let most = of.iter().enumerate().map(|(before, need)| need + before).max();
-        need.push(if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) });
-    }
-    let operands = |node: Node| {
-        let mut operands: Vec<Node> = nodes.nodes[node.index()].operands().collect();
-        operands.sort_by_key(|operand| std::cmp::Reverse(need[operand.index()]));
-        operands
-    };
-    behind_operands(roots, nodes.nodes.len(), Node::index, is_read, operands)
-}
-
-/// What roots need, each behind its operands and once, each root's own in one piece; `index` tells nodes apart, of which there
-/// are `count`, what `is_read` stands nowhere, and `operands` come in the order in which they are wanted.
-fn behind_operands<N: Copy>(
-    roots: &[N],
-    count: usize,
-    index: impl Fn(N) -> usize,
-    is_read: impl Fn(N) -> bool,
-    operands: impl Fn(N) -> Vec<N>,
-) -> Vec<N> {
-    let mut done = vec![false; count];
-    let mut out = Vec::new();
-    for root in roots {
-        let mut open = vec![(*root, false)];
-        while let Some((node, ready)) = open.pop() {
-            if done[index(node)] || is_read(node) {
-                continue;
-            }
-            if ready {
-                done[index(node)] = true;
-                out.push(node);
-                continue;
-            }
-            open.push((node, true));
-            // The last pushed is done first.
-            open.extend(operands(node).into_iter().rev().map(|operand| (operand, false)));
-        }
-    }
-    out
 }
 
 /// What no step changes and some step reads, loads and constants apart.

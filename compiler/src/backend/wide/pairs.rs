@@ -6,8 +6,8 @@
 //! are only 16 registers.
 
 use super::super::clif::signature;
-use super::super::target::Unsupported;
-use super::behind_operands;
+use super::super::unsupported::Unsupported;
+use super::order::behind_operands;
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::{Layout, Slot};
 use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};

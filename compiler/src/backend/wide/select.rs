@@ -5,7 +5,7 @@
 //! product, bits and numbers are one.
 
 use super::encode::{Instruction, Vectors, instructions as i};
-use crate::backend::target::Unsupported;
+use crate::backend::unsupported::Unsupported;
 use crate::ir::{Func, Op, Type, Unary, Value, Write, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;

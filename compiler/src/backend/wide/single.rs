@@ -13,8 +13,9 @@
 
 use super::body::{Body, Held, Home};
 use super::encode::{Assembler, Base, Vectors, instructions};
+use super::order::order;
 use super::select::{Node, Nodes, Operations, Predicate, What, operations};
-use crate::backend::target::Unsupported;
+use crate::backend::unsupported::Unsupported;
 use crate::backend::ways::{Way, ways};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
@@ -207,7 +208,7 @@ impl Writer<'_> {
     /// What roots need that is not there.
     fn order(&self, roots: &[Node], there: &[bool]) -> Vec<Node> {
         let wanted: Vec<bool> = there.iter().map(|there| !there).collect();
-        super::order(self.nodes, roots, &wanted)
+        order(self.nodes, roots, &wanted)
     }
 
     /// What is there, or lies in memory from the beginning, and one of several ways reads.
