@@ -45,6 +45,8 @@ pub fn single(func: &Func) -> Result<Single, Unsupported> {
     if func.ops.len() > LARGEST {
         return Err(unsuitable("is too long"));
     }
+    // Whether there are instructions is known before the ways.
+    operations(func, Vectors::One, &func.live(), &func.writes)?;
     let ways = ways(func).ok_or_else(|| unsuitable("has too many ways"))?;
     let mut written = Vec::new();
     ways.begin.each(&mut |way| {
