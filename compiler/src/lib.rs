@@ -27,6 +27,7 @@ pub mod flatten;
 pub mod units;
 pub mod delays;
 pub mod causality;
+pub mod lookup;
 pub mod lower;
 pub mod checks;
 pub mod interval;

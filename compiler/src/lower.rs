@@ -7,6 +7,7 @@ use crate::causality::{Phase, rate_of, value_of};
 use crate::delays;
 use crate::ir::build::{Build, Env};
 use crate::ir::{Binary, Func, Type, Unary, Value};
+use crate::lookup::Lookup;
 use crate::program::Program;
 use crate::system::*;
 use crate::units::Types;
@@ -46,7 +47,7 @@ pub struct Lowered {
 /// Lowers a system.
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let mut pool = [&crate::math::POOL, crate::rosenbrock::constants()].concat();
-    let tables = place_tables(system, &mut pool);
+    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
     let mut plan = Plan::new(system, types, wanted, tables);
     plan.description.pool = Arc::from(pool);
     let emit = |name: &str, phase: Phase| Emit::new(&plan, name, phase);
@@ -114,7 +115,7 @@ fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
 /// is NaN.
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = place_tables(system, &mut pool);
+    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);
     evaluate_in(&plan, exprs)
@@ -124,7 +125,7 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
 /// whose last slots their values are.
 pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = place_tables(system, &mut pool);
+    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "formulas", Phase::Start);
@@ -154,46 +155,6 @@ fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     block.split_off(Slot::FIXED as usize)
 }
 
-/// Start of each table in the pool.
-fn place_tables(system: &System, pool: &mut Vec<f64>) -> Vec<u32> {
-    let mut starts = Vec::new();
-    for table in &system.tables {
-        starts.push(pool.len() as u32);
-        pool.extend(&table.x);
-        pool.extend(&table.y);
-        if table.smooth {
-            pool.extend(monotone_slopes(&table.x, &table.y));
-        }
-    }
-    starts
-}
-
-/// Slopes at the points such that cubics between them are monotone where the points are.
-/// Source: Fritsch, Butland, SIAM J. Sci. Stat. Comput. 5 (1984), eq. 6, with one-sided ends.
-fn monotone_slopes(x: &[f64], y: &[f64]) -> Vec<f64> {
-    let n = x.len();
-    let secant = |k: usize| (y[k + 1] - y[k]) / (x[k + 1] - x[k]);
-    (0..n)
-        .map(|k| {
-            if n == 1 {
-                0.0
-            } else if k == 0 {
-                secant(0)
-            } else if k == n - 1 {
-                secant(n - 2)
-            } else {
-                let (a, b) = (secant(k - 1), secant(k));
-                if a * b <= 0.0 {
-                    return 0.0;
-                }
-                let (h, g) = (x[k] - x[k - 1], x[k + 1] - x[k]);
-                let alpha = (h + 2.0 * g) / (3.0 * (h + g));
-                a * b / (alpha * b + (1.0 - alpha) * a)
-            }
-        })
-        .collect()
-}
-
 /// What lies where.
 struct Plan<'a> {
     system: &'a System,
@@ -214,7 +175,7 @@ struct Plan<'a> {
     observed: Vec<Slot>,
     /// Expressions that are looked at while the model runs.
     wanted: Vec<ExprId>,
-    tables: Vec<u32>,
+    tables: Vec<Lookup>,
 }
 
 #[derive(Clone, Copy)]
@@ -224,7 +185,7 @@ enum Output {
 }
 
 impl<'a> Plan<'a> {
-    fn new(system: &'a System, types: &'a Types, wanted: &[Wanted], tables: Vec<u32>) -> Plan<'a> {
+    fn new(system: &'a System, types: &'a Types, wanted: &[Wanted], tables: Vec<Lookup>) -> Plan<'a> {
         let independent = independent_params(system);
         let by = |test: &dyn Fn(&Var) -> bool| -> Vec<VarId> {
             system.var_ids().filter(|id| test(system.var(*id))).collect()
@@ -1064,7 +1025,7 @@ impl<'a> Emit<'a> {
             Node::Crossing(k) => self.crossing(k as usize),
             Node::Table(k, x) => {
                 let x = self.quantity(x);
-                self.table(k as usize, x)
+                self.plan.tables[k as usize].at(x, &mut self.build)
             }
             Node::Binary(op, a, b) => {
                 let boolean = self.plan.types.boolean[a.0 as usize];
@@ -1318,66 +1279,5 @@ impl<'a> Emit<'a> {
         let top = build.to_real(top);
         let unit = build.real(1.0 / 9_007_199_254_740_992.0);
         build.mul(top, unit)
-    }
-
-    /// A table at x: binary search by selects, then one line or cubic; the ends are held.
-    fn table(&mut self, k: usize, x: Value) -> Value {
-        let (table, start) = (&self.plan.system.tables[k], self.plan.tables[k]);
-        let n = table.x.len() as u32;
-        let build = &mut self.build;
-        let (x_at, y_at, slope_at) = (start, start + n, start + 2 * n);
-        if n == 1 {
-            let zero = build.int(0);
-            return build.pool(y_at, 1, zero);
-        }
-        // The largest k in 0..=n−2 with x[k] ≤ x, or 0.
-        let last = i64::from(n) - 2;
-        let mut low = build.int(0);
-        let mut step = (last + 1).max(1) as u64;
-        step = step.next_power_of_two() / if step.is_power_of_two() { 1 } else { 2 };
-        let most = build.int(last);
-        while step > 0 {
-            let stride = build.int(step as i64);
-            let probe = build.int_add(low, stride);
-            let beyond = build.int_less(most, probe);
-            let at = build.pool(x_at, n, probe);
-            let below = build.less_equal(at, x);
-            let inside = build.not(beyond);
-            let goes = build.and(inside, below);
-            low = build.select(goes, probe, low);
-            step /= 2;
-        }
-        let one = build.int(1);
-        let high = build.int_add(low, one);
-        let (x0, x1) = (build.pool(x_at, n, low), build.pool(x_at, n, high));
-        let (y0, y1) = (build.pool(y_at, n, low), build.pool(y_at, n, high));
-        let held = build.clamp(x, x0, x1);
-        let (offset, width) = (build.sub(held, x0), build.sub(x1, x0));
-        let s = build.div(offset, width);
-        let rise = build.sub(y1, y0);
-        if !table.smooth {
-            let end = build.less_equal(x1, held);
-            let part = build.mul(s, rise);
-            let value = build.add(y0, part);
-            return build.select(end, y1, value);
-        }
-        // Hermite: y0 + s (m0 + s (3 Δ − 2 m0 − m1 + s (m0 + m1 − 2 Δ))), slopes m scaled by the width.
-        let (m0, m1) = (build.pool(slope_at, n, low), build.pool(slope_at, n, high));
-        let (m0, m1) = (build.mul(m0, width), build.mul(m1, width));
-        let (two, three) = (build.real(2.0), build.real(3.0));
-        let sum = build.add(m0, m1);
-        let twice = build.mul(two, rise);
-        let cubic = build.sub(sum, twice);
-        let thrice = build.mul(three, rise);
-        let square = build.sub(thrice, sum);
-        let square = build.sub(square, m0);
-        let inner = build.mul(s, cubic);
-        let inner = build.add(square, inner);
-        let inner = build.mul(s, inner);
-        let inner = build.add(m0, inner);
-        let inner = build.mul(s, inner);
-        let value = build.add(y0, inner);
-        let end = build.less_equal(x1, held);
-        build.select(end, y1, value)
     }
 }

@@ -438,6 +438,7 @@ fn most(func: &Func) -> Vec<Option<i64>> {
             Op::Int(n) => (n >= 0).then_some(n),
             Op::IntAnd(a, c) => number(a).or(number(c)).filter(|mask| *mask >= 0),
             Op::IntAdd(a, c) => at(a).zip(at(c)).and_then(|(a, c)| a.checked_add(c)),
+            Op::ShiftLeft(a, n) => at(a).filter(|a| a.leading_zeros() > u32::from(n) + 1).map(|a| a << n),
             Op::Select(when, yes, no) => at(yes).zip(at(no)).map(|(chosen, other)| {
                 // Chosen where it is not above a limit, as in searching a table.
                 let limit = |asked: Value| match func.op(asked) {

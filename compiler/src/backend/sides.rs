@@ -104,7 +104,16 @@ impl Sides {
             Op::Select(when, ..) => matches!(op(when), Op::And(..) | Op::Or(..)),
             _ => false,
         };
-        of_choice.retain(|choice, pair| compound(*choice) || pair.iter().any(|side| long(*side)));
+        // So is each question by which a place in a table is found: most often it is where it was, and nothing waits for it.
+        let seeks = |choice: Value| match op(choice) {
+            Op::Select(_, yes, no) => match (op(yes), op(no)) {
+                (Op::Int(_), Op::Int(_)) => true,
+                (Op::IntAdd(from, _), _) => from == no,
+                _ => false,
+            },
+            _ => false,
+        };
+        of_choice.retain(|choice, pair| compound(*choice) || seeks(*choice) || pair.iter().any(|side| long(*side)));
         let kept = |mut side: usize| {
             while side != 0 && !of_choice.contains_key(&sides[side].choice) {
                 side = sides[side].within;
