@@ -232,12 +232,10 @@ impl<'a> Model<'a> {
             };
             // In steps, back from the newest sample.
             let back = self.load(delay.time) / self.h - c;
-            let ago = back.below(0.0).choose(0.0, back);
+            let ago = back.at_least(0.0);
             let whole = ago.floor();
-            let newer = count - whole;
-            let newer = newer.below(0.0).choose(0.0, newer);
-            let older = newer - 1.0;
-            let older = older.below(0.0).choose(0.0, older);
+            let newer = (count - whole).at_least(0.0);
+            let older = (newer - 1.0).at_least(0.0);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
             if let Some(weight) = delay.weight {

@@ -26,8 +26,13 @@ const LINE: u8 = 2;
 const CUBIC: u8 = 3;
 
 impl Lookup {
+    /// Puts tables behind what is in the pool, in their order.
+    pub fn place_all(tables: &[Table], pool: &mut Vec<f64>) -> Vec<Lookup> {
+        tables.iter().map(|table| Lookup::place(table, pool)).collect()
+    }
+
     /// Puts a table, which has at least one point, behind what is in the pool.
-    pub fn place(table: &Table, pool: &mut Vec<f64>) -> Lookup {
+    fn place(table: &Table, pool: &mut Vec<f64>) -> Lookup {
         let Table { x, y, smooth, .. } = table;
         let n = x.len();
         let intervals = n - 1;

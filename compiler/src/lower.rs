@@ -47,7 +47,7 @@ pub struct Lowered {
 /// Lowers a system.
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let mut pool = [&crate::math::POOL, crate::rosenbrock::constants()].concat();
-    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
+    let tables = Lookup::place_all(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, wanted, tables);
     plan.description.pool = Arc::from(pool);
     let emit = |name: &str, phase: Phase| Emit::new(&plan, name, phase);
@@ -115,7 +115,7 @@ fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
 /// is NaN.
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
+    let tables = Lookup::place_all(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);
     evaluate_in(&plan, exprs)
@@ -125,7 +125,7 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
 /// whose last slots their values are.
 pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
     let mut pool = crate::math::POOL.to_vec();
-    let tables = system.tables.iter().map(|table| Lookup::place(table, &mut pool)).collect();
+    let tables = Lookup::place_all(&system.tables, &mut pool);
     let mut plan = Plan::new(system, types, &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "formulas", Phase::Start);

@@ -333,11 +333,7 @@ impl Watch {
     pub fn of(func: &Func) -> (Watch, Vec<bool>) {
         let mut late = vec![false; func.ops.len()];
         let Some(status) = func.status else { return (Watch::Nothing, late) };
-        let (when, is, detail) = match func.op(status) {
-            Op::Select(when, detail, zero) if func.op(zero) == Op::Int(0) => (when, true, detail),
-            Op::Select(when, zero, detail) if func.op(zero) == Op::Int(0) => (when, false, detail),
-            _ => return (Watch::Status(status), late),
-        };
+        let Some((when, is, detail)) = func.failure() else { return (Watch::Status(status), late) };
         let mut needed = vec![false; func.ops.len()];
         needed[when.index()] = true;
         for value in func.results().filter(|value| Some(*value) != func.status) {
@@ -439,21 +435,7 @@ fn most(func: &Func) -> Vec<Option<i64>> {
             Op::IntAnd(a, c) => number(a).or(number(c)).filter(|mask| *mask >= 0),
             Op::IntAdd(a, c) => at(a).zip(at(c)).and_then(|(a, c)| a.checked_add(c)),
             Op::ShiftLeft(a, n) => at(a).filter(|a| a.leading_zeros() > u32::from(n) + 1).map(|a| a << n),
-            Op::Select(when, yes, no) => at(yes).zip(at(no)).map(|(chosen, other)| {
-                // Chosen where it is not above a limit, as in searching a table.
-                let limit = |asked: Value| match func.op(asked) {
-                    Op::Not(above) => match func.op(above) {
-                        Op::IntLess(limit, value) if value == yes => number(limit),
-                        _ => None,
-                    },
-                    _ => None,
-                };
-                let limit = match func.op(when) {
-                    Op::And(a, c) => limit(a).or(limit(c)),
-                    _ => limit(when),
-                };
-                chosen.min(limit.unwrap_or(chosen)).max(other)
-            }),
+            Op::Select(_, yes, no) => at(yes).zip(at(no)).map(|(yes, no)| yes.max(no)),
             _ => None,
         });
     }

@@ -65,13 +65,11 @@ const MOST: usize = 12;
 /// All ways; none if they are too many, or if something is asked that is no comparison.
 pub fn ways(func: &Func) -> Option<Ways> {
     let mut build = Build::of(func);
-    let failed = match func.status {
-        None => None,
-        Some(status) => Some(match build.get(status) {
-            Op::Select(when, _, zero) if build.get(zero) == Op::Int(0) => when,
-            Op::Select(fine, zero, _) if build.get(zero) == Op::Int(0) => build.not(fine),
-            _ => return None,
-        }),
+    let failed = match (func.status, func.failure()) {
+        (None, _) => None,
+        (Some(_), Some((when, true, _))) => Some(when),
+        (Some(_), Some((fine, false, _))) => Some(build.not(fine)),
+        (Some(_), None) => return None,
     };
     let slots: Vec<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();

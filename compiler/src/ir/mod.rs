@@ -321,6 +321,18 @@ impl Func {
         operands.into_iter().flatten()
     }
 
+    /// The truth that the status hangs on, what it is where something has failed, and the status then; otherwise that is 0.
+    /// None if there is no status, or one that is put together in another way.
+    pub fn failure(&self) -> Option<(Value, bool, Value)> {
+        let Op::Select(when, yes, no) = self.op(self.status?) else { return None };
+        let is_zero = |value: Value| self.op(value) == Op::Int(0);
+        match (is_zero(yes), is_zero(no)) {
+            (_, true) => Some((when, true, yes)),
+            (true, false) => Some((when, false, no)),
+            (false, false) => None,
+        }
+    }
+
     /// The values that leave the function: stored, written, or its status.
     pub fn results(&self) -> impl Iterator<Item = Value> + '_ {
         let written = self.writes.iter().flat_map(|write| [write.index, write.value]);
@@ -329,10 +341,13 @@ impl Func {
 
     /// For each operation, whether a store, a write or the status needs it.
     pub fn live(&self) -> Vec<bool> {
+        self.live_for(self.results())
+    }
+
+    /// The same of what these values need.
+    pub fn live_for(&self, values: impl Iterator<Item = Value>) -> Vec<bool> {
         let mut live = vec![false; self.ops.len()];
-        for value in self.results() {
-            live[value.index()] = true;
-        }
+        values.for_each(|value| live[value.index()] = true);
         for i in (0..self.ops.len()).rev() {
             if live[i] {
                 self.ops[i].each_operand(|operand| live[operand.index()] = true);

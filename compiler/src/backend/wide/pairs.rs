@@ -178,8 +178,8 @@ impl<'a> Plan<'a> {
         let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
         let carried: Vec<(Slot, Value)> =
             func.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
-        let failed = func.status.map(|status| match func.op(status) {
-            Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => when,
+        let failed = func.status.map(|status| match func.failure() {
+            Some((when, true, _)) => when,
             _ => status,
         });
         // A step that hands nothing on is done once, and nothing before it.

@@ -266,13 +266,13 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
     let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
     let of = selection.operations(func, &func.live())?;
     let at = |value: Value| of[value.index()];
-    let failed = func.status.map(|status| match func.op(status) {
-        Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => at(when),
-        Op::Select(fine, zero, _) if func.op(zero) == Op::Int(0) => {
+    let failed = func.status.map(|status| match func.failure() {
+        Some((when, true, _)) => at(when),
+        Some((fine, false, _)) => {
             let not = selection.not(at(fine));
             selection.add(not)
         }
-        _ => {
+        None => {
             let zero = selection.add(What::Constant(0));
             let fine = selection.add(What::CompareInt(0, at(status), zero));
             let not = selection.not(fine);
@@ -371,8 +371,10 @@ impl Selection {
             // Without mask registers a mask is a vector of all ones or zeros a lane.
             Op::Bool(truth) => What::Constant(if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => What::Load(slot),
-            Op::Pool { base, len, index } if self.width == Vectors::One && matches!(func.op(index), Op::Int(_)) => {
-                let Op::Int(index) = func.op(index) else { unreachable!("it is a constant") };
+            Op::Pool { base, len, index }
+                if self.width == Vectors::One
+                    && let Op::Int(index) = func.op(index) =>
+            {
                 What::Number(base + (index as u64).min(u64::from(len) - 1) as u32)
             }
             Op::Pool { .. } if self.width == Vectors::One => return Err(self.missing("table")),

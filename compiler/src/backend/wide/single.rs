@@ -82,14 +82,9 @@ fn home(slot: Slot) -> Home {
 
 /// The operations that some way needs.
 fn wanted(func: &Func, begin: &Way) -> Vec<bool> {
-    let mut wanted = vec![false; func.ops.len()];
-    begin.each(&mut |way| way.reads().for_each(|value| wanted[value.index()] = true));
-    for i in (0..func.ops.len()).rev() {
-        if wanted[i] {
-            func.ops[i].each_operand(|operand| wanted[operand.index()] = true);
-        }
-    }
-    wanted
+    let mut reads = Vec::new();
+    begin.each(&mut |way| reads.extend(way.reads()));
+    func.live_for(reads.into_iter())
 }
 
 struct Writer<'a> {
