@@ -655,6 +655,8 @@ impl<'s, 't> Layout<'s, 't> {
         // For each open bracket, the column behind it, or nothing if it ends its line; and where `if`s stand.
         let mut open: Vec<Option<usize>> = Vec::new();
         let mut ifs: Vec<(usize, usize)> = Vec::new();
+        // An `if` behind an `else` goes on with the one before it: its own `else` stands under that one.
+        let mut before = None;
         let mut indent = 0;
         for (index, line) in self.lines.iter().enumerate() {
             if line.gap {
@@ -696,9 +698,14 @@ impl<'s, 't> Layout<'s, 't> {
                 text.extend(std::iter::repeat_n(' ', blanks));
                 text.push_str(&self.words[at]);
                 column += blanks;
-                match self.source.word(at) {
-                    "if" => ifs.push((open.len(), column)),
-                    "else" => while ifs.pop().is_some_and(|(depth, _)| depth > open.len()) {},
+                let word = self.source.word(at);
+                before = before.filter(|_| word == "if");
+                match word {
+                    "if" => ifs.push((open.len(), before.take().unwrap_or(column))),
+                    "else" => {
+                        let matching = ifs.iter().rposition(|&(depth, _)| depth <= open.len()).unwrap_or(0);
+                        before = ifs.drain(matching..).next().map(|(_, column)| column);
+                    }
                     "(" | "[" => open.push((at + 1 < end).then_some(column + 1)),
                     ")" | "]" => {
                         open.pop();

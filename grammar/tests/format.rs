@@ -50,6 +50,16 @@ fn the_names_of_lints_keep_their_hyphens() {
     );
 }
 
+#[test]
+fn a_chain_of_ifs_stands_in_one_column() {
+    let chain = "model M {\n  let    F = if a < 1 then 1\n             else if (if b then c else d) < 2 then 2\n             \
+                 else if a < 3 then 3\n             else 4\n}\n";
+    becomes(chain, chain);
+    let nested =
+        "model M {\n  let    F = if a then if b then 1\n                       else 2\n             else 3\n}\n";
+    becomes(nested, nested);
+}
+
 /// The tree without places, with canonical units.
 fn shape(text: &str) -> String {
     let parsed = parse(FileId(0), text);
