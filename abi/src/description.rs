@@ -7,7 +7,8 @@ use crate::unit::Unit;
 pub struct Slot(pub u32);
 
 impl Slot {
-    /// Time `t`, in s.
+    /// Time `t`, in s. Code of a model in whose equations it stands keeps it; all else is told by
+    /// [`keep_time`](crate::table::keep_time).
     pub const TIME: Slot = Slot(0);
     /// Fixed step `h`, in s.
     pub const STEP: Slot = Slot(1);

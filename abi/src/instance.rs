@@ -1,7 +1,7 @@
 //! A model that runs: its block of numbers and its code, with every access checked.
 
 use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
-use crate::table::{Code, Function};
+use crate::table::{Code, Function, keep_time};
 use std::sync::Arc;
 
 /// One running copy of a compiled model.
@@ -55,9 +55,14 @@ impl Instance {
         self.call_up_to(function, 1)
     }
 
-    /// Runs one function up to `n` times; returns the first status that is not 0, at which it stops.
+    /// Runs one function up to `n` times; returns the first status that is not 0, at which it stops. Behind fixed steps the
+    /// block tells the time.
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
-        self.code.call(function, &mut self.block, &self.description.pool, n)
+        let status = self.code.call(function, &mut self.block, &self.description.pool, n);
+        if function == Function::Step && n > 0 {
+            keep_time(&mut self.block);
+        }
+        status
     }
 
     /// Puts the model at t = 0 for steps of `h` seconds: initial values and the blocks due at 0, then transitions
@@ -187,5 +192,40 @@ impl Instance {
             self.set(delay.ring.slot((count - k) % len), value);
         }
         old_count == 0 || count as f64 * h >= self.get(delay.time)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::Layout;
+    use crate::table::Interpret;
+
+    /// Counts, and knows no time.
+    struct Counts;
+
+    impl Interpret for Counts {
+        fn call(&self, function: Function, block: &mut [f64], _: &[f64], count: u64) -> u64 {
+            if function == Function::Step {
+                block[Slot::COUNT.index()] += count as f64;
+            }
+            0
+        }
+        fn has(&self, function: Function) -> bool {
+            function != Function::Transitions
+        }
+    }
+
+    #[test]
+    fn time_is_told_behind_steps_whose_code_leaves_it() {
+        let layout = Layout::new([0; 10]);
+        let description = Arc::new(Description { layout, ..Description::default() });
+        let mut instance = Instance::new(description, Code::Interpreted(Arc::new(Counts)), &[]);
+        instance.start(0.25);
+        assert_eq!((instance.advance(3), instance.get(Slot::TIME)), (0, 0.75));
+        instance.set(Slot::TIME, 9.0);
+        instance.call(Function::Outputs);
+        instance.advance(0);
+        assert_eq!(instance.get(Slot::TIME), 9.0, "what makes no step leaves it");
     }
 }

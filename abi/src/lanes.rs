@@ -177,7 +177,7 @@ impl Batch {
     }
 
     /// Advances all lanes by up to `n` fixed steps and returns how many were done: it stops after a step at which the
-    /// status of a lane is not 0.
+    /// status of a lane is not 0. Time is what the code keeps of it: see [`keep_time`](crate::table::keep_time).
     ///
     /// # Panics
     /// If the pool is shorter than the code needs: a mistake of the caller.

@@ -1,6 +1,7 @@
 //! The functions of a compiled model, behind one door, whatever made them.
 
 use crate::ahead::Ahead;
+use crate::description::Slot;
 use std::any::Any;
 use std::sync::Arc;
 
@@ -21,7 +22,8 @@ pub enum Function {
     Tick,
     /// One transition per automaton, events and their resets; remembers for crossings.
     Transitions,
-    /// One fixed step with all that belongs to it: states, count, time, ticks, transitions, outputs, guards.
+    /// One fixed step with all that belongs to it: states, count, time where the model reads it, ticks, transitions, outputs,
+    /// guards.
     Step,
     /// Up to `count` adaptive steps, tried and as far as possible settled: see [`trial`](crate::trial).
     Rosenbrock,
@@ -60,6 +62,11 @@ impl Function {
 /// Machine code of one function: runs it up to `count` times on the block and stops early at the first non-zero
 /// status, which it returns (0: none). `pool` is the description's pool of constants.
 pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
+
+/// Time behind fixed steps, into the block: the count times the step. Their code leaves it where no equation reads it.
+pub fn keep_time(block: &mut [f64]) {
+    block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
+}
 
 /// Code that is interpreted, made late, or written by hand in tests.
 pub trait Interpret: Send + Sync {

@@ -8,6 +8,7 @@ use crate::backend::{interp::Interpreter, jit, target};
 use crate::ir::Func;
 use crate::opt::contract::contract;
 use crate::opt::regroup::regroup;
+use crate::opt::watched::watched;
 use crate::program::Program;
 use crate::{derive, discretize, math, rosenbrock};
 use abi::lanes::Lanes;
@@ -46,7 +47,7 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 /// # Panics
 /// For the adaptive method, which is no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
-    contract(&regroup(&discretize::step(program, method)))
+    watched(&contract(&regroup(&discretize::step(program, method))))
 }
 
 /// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;

@@ -63,7 +63,11 @@ pub fn step(program: &Program, method: Method) -> Func {
 
     let mut build = build.into_inner();
     let stored = [layout.states, layout.memory, layout.regimes, layout.outputs];
-    let kept = |slot: Slot| slot.0 < Slot::FIXED || stored.iter().any(|segment| segment.contains(slot));
+    let timed = program.reads_time();
+    let kept = |slot: Slot| match slot {
+        Slot::TIME => timed,
+        slot => slot == Slot::COUNT || stored.iter().any(|segment| segment.contains(slot)),
+    };
     build.store_env(&env, kept);
     if let Some(status) = status {
         build.status(status);
@@ -107,14 +111,26 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
         let (mut sum, mut beyond): (Option<Real>, Option<Truth>) = (None, None);
         for (k, guard) in guards.iter().enumerate().rev() {
             let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
-            if summed.insert(x.value) {
+            let (low, high) = widened(guard.range);
+            // What lies between two bounds is finite.
+            let between = (low.is_finite() && high.is_finite()).then(|| match low == -high {
+                true => x.abs().not_above(high),
+                false => x.not_below(low) & x.not_above(high),
+            });
+            let out = between.map(|between| !between).or_else(|| match (low.is_finite(), high.is_finite()) {
+                (true, _) => Some(x.below(low)),
+                (_, true) => Some(x.above(high)),
+                (false, false) => None,
+            });
+            if between.is_none() && summed.insert(x.value) {
                 sum = Some(sum.map_or(x, |sum| sum + x));
             }
-            let (low, high) = widened(guard.range);
-            let bounds = [(low.is_finite(), x.below(low)), (high.is_finite(), x.above(high))];
-            let out = bounds.into_iter().filter(|(bounded, _)| *bounded).map(|(_, out)| out).reduce(|a, b| a | b);
             beyond = either(beyond, out);
-            let bad = out.map_or(!x.finite(), |out| !x.finite() | out);
+            let bad = match (between, out) {
+                (Some(between), _) => !between,
+                (None, Some(out)) => !x.finite() | out,
+                (None, None) => !x.finite(),
+            };
             let this = number((group * TOGETHER + k) as i64 + 1);
             first = build.borrow_mut().select(bad.value, this, first);
         }
@@ -123,12 +139,10 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     }
     // One test decides; which guard it is, and whether it is one (a sum may overflow), matters only then, and code may find
     // it out apart from the step.
-    let sum = total?;
     // Of something infinite or NaN the sum is that too, and less itself it is 0 or NaN: of these two this asks with one test.
     #[allow(clippy::eq_op, reason = "of what is not finite it is NaN")]
-    let rest = sum - sum;
-    let finite = rest.not_above(rest);
-    let any = outside.map_or(!finite, |outside| outside | !finite);
+    let rest = total.map(|sum| sum - sum);
+    let any = either(outside, rest.map(|rest| !rest.not_above(rest)))?;
     let none = number(0);
     Some(build.borrow_mut().select(any.value, first, none))
 }
@@ -943,6 +957,31 @@ mod tests {
         assert_eq!(run.advance(100), 3);
         let mut run = Run::new(&program, Method::Euler, 1.0, &[-2.0, 1.0]);
         assert_eq!(run.advance(100), 2);
+    }
+
+    #[test]
+    fn bounds_on_both_sides_hold_what_is_no_number_too() {
+        let guard = |range| Guard { path: String::new(), slot: Slot(0), range, unit: Unit::none() };
+        for (range, far) in [((-2.0, 2.0), -2.1), ((-1.0, 2.0), -1.1), ((-1.0, 2.0), 2.1)] {
+            let mut program = program(1, |_, x| (vec![x[0] * 0.0], x[0]));
+            program.description.guards =
+                vec![Guard { slot: program.description.layout.states.slot(0), ..guard(range) }];
+            let status = |x: f64| Run::new(&program, Method::Euler, 1.0, &[x]).advance(1);
+            for x in [0.0, -0.9, 2.0, 2.000001] {
+                assert_eq!(status(x), 0, "{x} in {range:?}");
+            }
+            for x in [far, f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+                assert_eq!(status(x), 1, "{x} in {range:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn only_a_model_with_time_in_it_keeps_time() {
+        let keeps = |program: &Program| step(program, Method::Rk4).stores.iter().any(|(slot, _)| *slot == Slot::TIME);
+        assert!(!keeps(&program(1, |_, x| (vec![-1.0 * x[0]], x[0]))));
+        assert!(keeps(&program(1, |t, x| (vec![-1.0 * x[0] * t], x[0]))));
+        assert!(keeps(&program(1, |t, x| (vec![-1.0 * x[0]], x[0] + t))), "outputs alone may be asked for, too");
     }
 
     #[test]

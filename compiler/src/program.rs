@@ -1,7 +1,7 @@
 //! A lowered model: straight-line functions over one block, and what it says of itself.
 
 use crate::ir::Func;
-use abi::Description;
+use abi::{Description, Slot};
 
 /// The functions of a model before a fixed step is fused and before any back end sees them.
 #[derive(Clone, Debug, Default)]
@@ -22,4 +22,13 @@ pub struct Program {
     pub transitions: Option<Func>,
     /// Switching surfaces.
     pub roots: Option<Func>,
+}
+
+impl Program {
+    /// Whether time stands in an equation: only then do fixed steps keep it.
+    pub fn reads_time(&self) -> bool {
+        let always = [&self.outputs, &self.derivatives];
+        let own = always.into_iter().chain([&self.tick, &self.transitions, &self.roots].into_iter().flatten());
+        own.flat_map(Func::loads).any(|slot| slot == Slot::TIME)
+    }
 }

@@ -5,6 +5,7 @@ use crate::observe::{Observer, check_finite, check_status};
 use crate::outcome::{Cause, Continue, Stop};
 use crate::show;
 use abi::plan::Experiment;
+use abi::table::keep_time;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
@@ -52,7 +53,7 @@ impl Fixed {
             saved: rest.instance.block().to_vec(),
             batch: 0,
             done: 0,
-            seen: [Slot::TIME].iter().chain(slots).map(one).collect(),
+            seen: [Slot::COUNT].iter().chain(slots).map(one).collect(),
             rest,
         };
         match run.begin(begin) {
@@ -163,6 +164,7 @@ impl Course for Fixed {
         if whole {
             from(0..block.len(), block);
         }
+        keep_time(block);
     }
 
     fn bring(&self, _: &mut dyn FnMut(Range<usize>, &[f64])) {}

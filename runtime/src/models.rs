@@ -2,7 +2,7 @@
 
 use abi::description::{Automaton, Guard, Kind, Quantity, Root, Tick};
 use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Series, Solver};
-use abi::table::Interpret;
+use abi::table::{Interpret, keep_time};
 use abi::unit::Unit;
 use abi::{Code, Description, Function, Instance, Layout, Slot};
 use std::sync::Arc;
@@ -236,7 +236,7 @@ impl Hand {
             *x = x0 + h / 6.0 * sum;
         }
         block[Slot::COUNT.index()] += 1.0;
-        block[Slot::TIME.index()] = block[Slot::COUNT.index()] * h;
+        keep_time(block);
         self.run(Function::Transitions, block);
         self.run(Function::Outputs, block);
         let bad = |(slot, _, range): &(Slot, &str, (f64, f64))| {
@@ -279,7 +279,6 @@ pub fn cheap() -> Instance {
             let (x, y) = (self.0.states.start as usize, self.0.outputs.start as usize);
             for _ in 0..count {
                 block[Slot::COUNT.index()] += 1.0;
-                block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
                 block[x] -= block[Slot::STEP.index()] * block[x];
                 block[y] = 2.0 * block[x];
             }

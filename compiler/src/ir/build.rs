@@ -98,9 +98,13 @@ impl Build {
         match self.rewrite(op) {
             Rewrite::Value(value) => return value,
             Rewrite::Op(simpler) => return self.op(simpler),
+            Rewrite::Product(a, factor) => {
+                let factor = self.real(factor);
+                return self.op(Op::Mul(a, factor));
+            }
             Rewrite::None => {}
         }
-        if let Some(value) = self.told_apart(op) {
+        if let Some(value) = self.told_apart(op).or_else(|| self.turned(op)) {
             return value;
         }
         let op = self.ordered(op);
@@ -131,6 +135,14 @@ impl Build {
             }
             _ => Some(self.op(Op::Select(condition, yes, no))),
         }
+    }
+
+    /// (−c) / x → −(c / x), where that is there.
+    fn turned(&mut self, op: Op) -> Option<Value> {
+        let Op::Div(a, b) = op else { return None };
+        let turned = self.known.get(&Op::Real((-self.constant(a)?).to_bits()))?;
+        let divided = *self.known.get(&Op::Div(*turned, b))?;
+        Some(self.op(Op::Neg(divided)))
     }
 
     fn share(&mut self, op: Op) -> Value {
@@ -225,10 +237,10 @@ impl Build {
             // x / 1 → x;  x / (−1) → −x
             Op::Div(a, b) if is(b, 1.0) => Is(a),
             Op::Div(a, b) if is(b, -1.0) => Rewrite::Op(Op::Neg(a)),
-            // (−a)/(−b) → a/b
+            // (−a)/(−b) → a/b;  x / 2ⁿ → x · 2⁻ⁿ: the same real number, rounded once.
             Op::Div(a, b) => match (neg(a), neg(b)) {
                 (Some(a), Some(b)) => Rewrite::Op(Op::Div(a, b)),
-                _ => None,
+                _ => real(b).and_then(exact_inverse).map_or(None, |inverse| Rewrite::Product(a, inverse)),
             },
             // −(−x) → x
             Op::Neg(a) => neg(a).map_or(None, Is),
@@ -418,6 +430,13 @@ enum Rewrite {
     None,
     Value(Value),
     Op(Op),
+    Product(Value, f64),
+}
+
+/// 1/x where it is exact: of powers of two.
+fn exact_inverse(x: f64) -> Option<f64> {
+    let inverse = 1.0 / x;
+    (x.to_bits() << 12 == 0 && x.is_normal() && inverse.is_normal()).then_some(inverse)
 }
 
 macro_rules! operations {
@@ -748,6 +767,17 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_quotient_and_its_negative_are_one_division() {
+        let listing = built(|b, x, y| {
+            let [one, minus] = [1.0, -1.0].map(|number| b.real(number));
+            let (inverse, negative) = (b.div(one, x), b.div(minus, x));
+            let product = b.mul(inverse, y);
+            b.mul(product, negative)
+        });
+        assert_eq!(listing.matches("div").count(), 1, "{listing}");
     }
 
     #[test]

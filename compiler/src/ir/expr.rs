@@ -200,6 +200,15 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less_equal(self.value, other))
     }
 
+    /// other ≤ self
+    pub fn not_below<T>(self, other: T) -> Truth<'a>
+    where
+        Real<'a>: From<(T, &'a Shared)>,
+    {
+        let other = self.other(other);
+        self.truth(|b| b.less_equal(other, self.value))
+    }
+
     /// Whether it is neither infinite nor NaN.
     pub fn finite(self) -> Truth<'a> {
         self.truth(|b| b.finite(self.value))

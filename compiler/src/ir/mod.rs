@@ -7,6 +7,7 @@ pub mod print;
 pub mod verify;
 pub mod eval;
 pub mod build;
+pub mod left;
 pub mod expr;
 pub mod random;
 
@@ -246,6 +247,11 @@ impl Op {
             Op::Pool { .. } | Op::Ring { .. } => 2,
             _ => 1,
         }
+    }
+
+    /// Whether it is a number or a truth written down.
+    pub fn is_constant(self) -> bool {
+        matches!(self, Op::Real(_) | Op::Int(_) | Op::Bool(_))
     }
 
     /// The same operation on the operands that `f` gives for its own, asked from left to right.

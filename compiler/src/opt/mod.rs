@@ -2,3 +2,4 @@
 
 pub mod regroup;
 pub mod contract;
+pub mod watched;

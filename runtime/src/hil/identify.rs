@@ -212,7 +212,6 @@ impl Interpret for Pulses {
     fn call(&self, function: Function, block: &mut [f64], _: &[f64], count: u64) -> u64 {
         if function == Function::Step {
             block[Slot::COUNT.index()] += count as f64;
-            block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
         }
         let tick = block[Slot::COUNT.index()] as u64;
         for (i, height) in self.heights.iter().enumerate() {

@@ -122,18 +122,19 @@ pub fn split(func: &Func, size: usize) -> Option<Split> {
     })
 }
 
-/// Whether a step adds 1 to its count, and time is then the count times the step: as every fixed step does.
+/// Whether a step adds 1 to its count, and time is then the count times the step where it is read: as every fixed step does.
 fn keeps_time(func: &Func) -> bool {
     let stored = |slot: Slot| func.stores.iter().find(|(known, _)| *known == slot).map(|(_, value)| *value);
     let loads = |value: Value, slot: Slot| func.op(value) == Op::Load(slot);
-    let (Some(count), Some(time), None) = (stored(Slot::COUNT), stored(Slot::TIME), stored(Slot::STEP)) else {
-        return false;
-    };
+    let (Some(count), None) = (stored(Slot::COUNT), stored(Slot::STEP)) else { return false };
     let either = |a: Value, b: Value, holds: &dyn Fn(Value, Value) -> bool| holds(a, b) || holds(b, a);
     let counts = |a: Value, b: Value| loads(a, Slot::COUNT) && func.op(b) == Op::Real(1f64.to_bits());
     let of_count = |a: Value, b: Value| a == count && loads(b, Slot::STEP);
     matches!(func.op(count), Op::Add(a, b) if either(a, b, &counts))
-        && matches!(func.op(time), Op::Mul(a, b) if either(a, b, &of_count))
+        && match stored(Slot::TIME) {
+            Some(time) => matches!(func.op(time), Op::Mul(a, b) if either(a, b, &of_count)),
+            None => !func.loads().contains(&Slot::TIME),
+        }
 }
 
 /// What each operation depends on.
