@@ -929,19 +929,18 @@ static void TwoMass(ARGS) {
     MODEL(Encoder, 0xdu, 2, "x", "count Ts", "y_old @count y v", "y v") \
     MODEL(TwoMass, 0xfu, 1, "F_motor F_load", "m1 m2 k d gap", "x1 v1 x2 v2", "F_shaft")
 
-/* The same step with what ours does at each call besides: it counts, keeps time, and gives back whether all states and
- * outputs are finite. Of something infinite or NaN 0 times it is NaN, and so is the sum. `clock`: time, h, count. */
+/* The same step with what ours does at each call besides: it counts, and gives back whether all states and outputs are
+ * finite. Of something infinite or NaN the sum is that too, and less itself NaN. `clock`: h, count. */
 #define CHECKED(name, watched, outputs, ...)                                                                           \
     __attribute__((flatten)) static int64_t name##_checked(double *restrict x, const double *restrict p,               \
                                                            const double *restrict u, double *restrict o,               \
                                                            double *restrict clock) {                                   \
-        double h = clock[1], sum = 0;                                                                                  \
-        clock[2] += 1;                                                                                                 \
-        clock[0] = clock[2] * h;                                                                                       \
+        double h = clock[0], sum = -0.0;                                                                               \
+        clock[1] += 1;                                                                                                 \
         name(x, p, u, o, h);                                                                                           \
-        _Pragma("GCC unroll 64") for (int k = 0; k < 64; k++) if ((uint64_t)(watched) >> k & 1) sum += 0 * x[k];       \
-        _Pragma("GCC unroll 64") for (int k = 0; k < (outputs); k++) sum += 0 * o[k];                                  \
-        return __builtin_expect(sum >= 0, 1) ? 0 : 1;                                                                  \
+        _Pragma("GCC unroll 64") for (int k = 0; k < 64; k++) if ((uint64_t)(watched) >> k & 1) sum += x[k];           \
+        _Pragma("GCC unroll 64") for (int k = 0; k < (outputs); k++) sum += o[k];                                      \
+        return __builtin_expect(sum - sum == 0, 1) ? 0 : 1;                                                            \
     }
 MODELS(CHECKED)
 

@@ -216,7 +216,7 @@ fn again(
 }
 
 /// Most operations of a function of which a single iteration has code of its own.
-const STRAIGHT: usize = 2000;
+const STRAIGHT: usize = 2500;
 /// Most operations of a function that is short.
 const SHORT: usize = 80;
 
@@ -251,13 +251,36 @@ fn once(
     // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
     let loads = later().filter_map(|op| if let Op::Load(slot) = op { Some(slot) } else { None });
     let read_later: HashSet<Slot> = loads.chain(apart.automata.iter().map(|automaton| automaton.slot)).collect();
-    let (early, last): (Vec<_>, Vec<_>) =
+    let (early, mut last): (Vec<_>, Vec<_>) =
         func.stores.iter().partition(|(slot, value)| before.contains(value) && !read_later.contains(slot));
     emitter.stores(&early, b);
-    for automaton in &apart.automata {
-        emitter.automaton(automaton, b);
+    // So is what is there behind each automaton, and what several of them lead to is computed behind the last of these.
+    let stages = apart.stages();
+    let stored: HashSet<Value> = func.stores.iter().map(|(_, value)| *value).collect();
+    let mut looked_at: Vec<Value> = Vec::new();
+    for (op, _) in func.ops.iter().zip(late).filter(|(_, late)| **late) {
+        op.each_operand(|operand| looked_at.extend(Some(operand).filter(|operand| !stored.contains(operand))));
     }
-    emitter.list(&apart.behind, b);
+    let of_stage = |stage: Option<&usize>| -> Vec<Value> {
+        apart.behind.iter().copied().filter(|value| stages.get(value) == stage).collect()
+    };
+    emitter.list(&of_stage(None), b);
+    for (k, automaton) in apart.automata.iter().enumerate() {
+        let read = apart.read_behind(k);
+        let mut values = read.values;
+        // What becomes of its own states each regime stores itself, if they change.
+        let (own, others): (Vec<_>, Vec<_>) =
+            last.iter().partition(|(slot, value)| automaton.outputs.contains(value) && !read.slots.contains(slot));
+        values.extend(others.iter().map(|(_, value)| *value).chain(watch.asked().0));
+        values.extend(&looked_at);
+        emitter.automaton(automaton, &own, &values, b);
+        emitter.list(&of_stage(Some(&k)), b);
+        let is_there = |value: &Value| stages.get(value).is_none_or(|stage| *stage <= k);
+        let (now, later): (Vec<_>, Vec<_>) =
+            others.iter().partition(|(slot, value)| is_there(value) && !read.slots.contains(slot));
+        emitter.stores(&now, b);
+        last = later;
+    }
     emitter.writes(&func.writes, b);
     emitter.stores(&last, b);
     let [fine, failed] = [(); 2].map(|()| b.create_block());
@@ -442,6 +465,18 @@ fn most(func: &Func) -> Vec<Option<i64>> {
     most
 }
 
+/// Where all cases of an automaton end.
+struct End {
+    /// It goes on there,
+    behind: clif::Block,
+    /// where these outputs are read.
+    outputs: Vec<bool>,
+    /// The slots that get an output, by its number.
+    stores: Vec<(Slot, usize)>,
+    /// The automaton's slot and the bits that it holds, where these are known.
+    held: Option<(Slot, u64)>,
+}
+
 /// Writes operations of a function.
 pub struct Emitter<'a> {
     /// The function.
@@ -582,28 +617,46 @@ impl<'a> Emitter<'a> {
         self.side(0, &sides, b);
     }
 
-    /// Writes what depends on one regime: of the numbers its slot may hold only what is left for that number.
-    fn automaton(&mut self, automaton: &Automaton, b: &mut FunctionBuilder) {
+    /// Writes what depends on one regime: of the numbers its slot may hold only what is left for that number. It stores these
+    /// of its outputs, and those among `read` are there behind it.
+    fn automaton(
+        &mut self,
+        automaton: &Automaton,
+        stores: &[(Slot, Value)],
+        read: &HashSet<Value>,
+        b: &mut FunctionBuilder,
+    ) {
         let behind = b.create_block();
+        let end = |held: Option<u64>| End {
+            behind,
+            outputs: automaton.outputs.iter().map(|output| read.contains(output)).collect(),
+            stores: stores
+                .iter()
+                .map(|(slot, value)| {
+                    (*slot, automaton.outputs.iter().position(|output| output == value).expect("its own"))
+                })
+                .collect(),
+            held: held.map(|bits| (automaton.slot, bits)),
+        };
         let held = b.ins().load(types::I64, MemFlagsData::trusted(), self.block, offset(automaton.slot.0));
         for (bits, case) in &automaton.cases {
             let [this, others] = [(); 2].map(|()| b.create_block());
-            let bits = b.ins().iconst(types::I64, *bits as i64);
-            let is = b.ins().icmp(IntCC::Equal, held, bits);
+            let number = b.ins().iconst(types::I64, *bits as i64);
+            let is = b.ins().icmp(IntCC::Equal, held, number);
             b.ins().brif(is, this, &[], others, &[]);
             b.switch_to_block(this);
-            self.case(case, behind, b);
+            self.case(case, &end(Some(*bits)), b);
             b.switch_to_block(others);
         }
-        self.case(&automaton.general, behind, b);
+        self.case(&automaton.general, &end(None), b);
         b.switch_to_block(behind);
-        for output in &automaton.outputs {
+        for output in automaton.outputs.iter().filter(|output| read.contains(output)) {
             self.values[output.index()] = Some(b.append_block_param(behind, self.facts.type_of(*output)));
         }
     }
 
     /// Writes one case and goes on behind it; nothing of it is there then.
-    fn case(&mut self, case: &Case, behind: clif::Block, b: &mut FunctionBuilder) {
+    fn case(&mut self, case: &Case, end: &End, b: &mut FunctionBuilder) {
         // What is read by the cases within, or behind.
         let mut read = Vec::new();
         case.each(&mut |inner| {
@@ -618,16 +671,23 @@ impl<'a> Emitter<'a> {
         self.only(&case.list, &read, b);
         match &case.then {
             Then::Outputs(outputs) => {
-                let outputs: Vec<BlockArg> =
-                    outputs.iter().map(|output| BlockArg::Value(self.get(*output, b))).collect();
-                b.ins().jump(behind, &outputs);
+                let stores = end.stores.iter().map(|(slot, number)| (*slot, outputs[*number]));
+                let is_there = |(slot, value): &(Slot, Value)| match self.func.op(*value) {
+                    Op::Load(from) => from == *slot,
+                    Op::Real(bits) => end.held == Some((*slot, bits)),
+                    _ => false,
+                };
+                self.stores(&stores.filter(|store| !is_there(store)).collect::<Vec<_>>(), b);
+                let read = outputs.iter().zip(&end.outputs).filter(|(_, read)| **read);
+                let read: Vec<BlockArg> = read.map(|(output, _)| BlockArg::Value(self.get(*output, b))).collect();
+                b.ins().jump(end.behind, &read);
             }
             Then::Ask(when, sides) => {
                 let blocks = [(); 2].map(|()| b.create_block());
                 self.branch(*when, blocks[0], blocks[1], b);
                 for (side, block) in sides.iter().zip(blocks) {
                     b.switch_to_block(block);
-                    self.case(side, behind, b);
+                    self.case(side, end, b);
                 }
             }
         }

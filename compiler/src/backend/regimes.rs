@@ -5,6 +5,7 @@
 //! but is needed elsewhere too, stays one list. It knows nothing of processors.
 
 use crate::ir::build::Build;
+use crate::ir::left::{known, left, needed};
 use crate::ir::{Func, Op, Type, Value};
 use abi::Slot;
 use std::cmp::Reverse;
@@ -20,6 +21,63 @@ pub struct Apart {
     pub automata: Vec<Automaton>,
     /// What depends on several.
     pub behind: Vec<Value>,
+}
+
+impl Apart {
+    /// Behind which automaton, by its number, the values are there that depend on automata.
+    pub fn stages(&self) -> HashMap<Value, usize> {
+        let mut stages = HashMap::new();
+        for (k, automaton) in self.automata.iter().enumerate() {
+            stages.extend(automaton.outputs.iter().map(|output| (*output, k)));
+        }
+        for value in &self.behind {
+            let mut last = None;
+            self.func.op(*value).each_operand(|operand| last = last.max(stages.get(&operand).copied()));
+            stages.extend(last.map(|last| (*value, last)));
+        }
+        stages
+    }
+
+    /// What is read behind the automaton of this number.
+    pub fn read_behind(&self, number: usize) -> Read {
+        let mut read = Read::default();
+        for value in &self.behind {
+            read.operation(self.func.op(*value));
+        }
+        read.values.extend(self.func.writes.iter().flat_map(|write| [write.index, write.value]));
+        for automaton in &self.automata[number + 1..] {
+            read.slots.insert(automaton.slot);
+            let cases = automaton.cases.iter().map(|(_, case)| case).chain([&automaton.general]);
+            cases.for_each(|case| {
+                case.each(&mut |case| {
+                    case.list.iter().for_each(|value| read.operation(self.func.op(*value)));
+                    match &case.then {
+                        Then::Outputs(outputs) => read.values.extend(outputs),
+                        Then::Ask(when, _) => _ = read.values.insert(*when),
+                    }
+                });
+            });
+        }
+        read
+    }
+}
+
+/// What is read somewhere.
+#[derive(Default)]
+pub struct Read {
+    /// Slots of the block.
+    pub slots: HashSet<Slot>,
+    /// Operands.
+    pub values: HashSet<Value>,
+}
+
+impl Read {
+    fn operation(&mut self, op: Op) {
+        if let Op::Load(slot) = op {
+            self.slots.insert(slot);
+        }
+        op.each_operand(|operand| _ = self.values.insert(operand));
+    }
 }
 
 /// What depends on what one slot holds.
@@ -64,6 +122,8 @@ impl Case {
 const MOST: usize = 4;
 /// Fewest operations that are worth a jump.
 const FEWEST: usize = 6;
+/// Fewest operations of a case that is taken apart by what it asks.
+const FEWEST_ASKED: usize = 4;
 /// Most operations of a case that is taken apart by what it asks: they stand twice then.
 const LONGEST: usize = 200;
 /// Questions within questions, at most.
@@ -101,7 +161,7 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
     for value in all().rev() {
         let i = value.index();
         if let (Place::Before, Some(Place::Within(k))) = (places[i], users[i])
-            && !is_constant(func.ops[i])
+            && !func.ops[i].is_constant()
         {
             places[i] = Place::Within(k);
         }
@@ -138,10 +198,6 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
         .collect();
     let ops = build.into_ops();
     Apart { func: Func { ops, ..func.clone() }, before: listed(Place::Before), automata, behind: listed(Place::Behind) }
-}
-
-fn is_constant(op: Op) -> bool {
-    matches!(op, Op::Real(_) | Op::Int(_) | Op::Bool(_))
 }
 
 /// Loads that are only compared with constants and chosen, and these constants, by their bits.
@@ -238,39 +294,11 @@ fn case(
     divided(build, there, outputs, 0)
 }
 
-/// What is left of outputs of a list, of which some values are others.
-pub fn left(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[Value]) -> Vec<Value> {
-    let mut left: HashMap<Value, Value> = known.iter().copied().collect();
-    for value in list {
-        let op = build.get(*value);
-        let now = op.map(|operand| left.get(&operand).copied().unwrap_or(operand));
-        if now != op && !left.contains_key(value) {
-            left.insert(*value, build.op(now));
-        }
-    }
-    outputs.iter().map(|output| left.get(output).copied().unwrap_or(*output)).collect()
-}
-
-/// What some values need that is not there, in order.
-pub fn needed(build: &Build, there: &HashSet<Value>, of: &[Value]) -> Vec<Value> {
-    let mut list = HashSet::new();
-    let mut open = of.to_vec();
-    while let Some(value) = open.pop() {
-        let op = build.get(value);
-        if !there.contains(&value) && !is_constant(op) && list.insert(value) {
-            op.each_operand(|operand| open.push(operand));
-        }
-    }
-    let mut list: Vec<Value> = list.into_iter().collect();
-    list.sort_unstable();
-    list
-}
-
 /// What computes the outputs, taken apart by the truth that is asked most often, if that leaves less to do.
 fn divided(build: &mut Build, there: &mut HashSet<Value>, outputs: Vec<Value>, depth: usize) -> Case {
     let list = needed(build, there, &outputs);
     if depth < DEEPEST
-        && (FEWEST..=LONGEST).contains(&list.len())
+        && (FEWEST_ASKED..=LONGEST).contains(&list.len())
         && let Some(asked) = asked_most(build, &list)
     {
         let first = needed(build, there, &[asked]);
@@ -281,7 +309,9 @@ fn divided(build: &mut Build, there: &mut HashSet<Value>, outputs: Vec<Value>, d
         there.extend(&first);
         let shorter = |build: &Build, there: &HashSet<Value>| {
             let lengths = sides.each_ref().map(|outputs| needed(build, there, outputs).len());
-            first.len() + lengths.iter().sum::<usize>().div_ceil(2) + 2 < list.len()
+            // What is put together from several questions is asked by jumps in any case.
+            let jump = if matches!(build.get(asked), Op::And(..) | Op::Or(..)) { 0 } else { 2 };
+            first.len() + lengths.iter().sum::<usize>().div_ceil(2) + jump < list.len()
         };
         let case = shorter(build, there).then(|| {
             let sides = sides.map(|outputs| divided(build, there, outputs, depth + 1));
@@ -312,22 +342,6 @@ fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
     }
     let most = asked.into_iter().filter(|(_, times)| *times > 1);
     most.max_by_key(|(value, times)| (*times, Reverse(*value))).map(|(value, _)| value)
-}
-
-/// What is known of other truths where one is true or false.
-pub fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)> {
-    let is = [false, true].map(|truth| build.truth(truth));
-    let mut known = Vec::new();
-    let mut open = vec![(asked, truth)];
-    while let Some((value, truth)) = open.pop() {
-        known.push((value, is[usize::from(truth)]));
-        match (build.get(value), truth) {
-            (Op::And(a, b), true) | (Op::Or(a, b), false) => open.extend([(a, truth), (b, truth)]),
-            (Op::Not(a), truth) => open.push((a, !truth)),
-            _ => {}
-        }
-    }
-    known
 }
 
 #[cfg(test)]

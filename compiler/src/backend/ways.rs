@@ -4,10 +4,11 @@
 //! what becomes of a state, for most often a processor foresees the answer and goes on, while a choice would wait for it. Where a
 //! regime changes there is no line: that is rare. It knows nothing of processors.
 
-use super::regimes::{known, left, needed};
 use super::sides::Sides;
 use crate::ir::build::Build;
+use crate::ir::left::{known, left, needed};
 use crate::ir::{Func, Op, Value, Write};
+use crate::opt::watched::with_fewer;
 use abi::Slot;
 use std::collections::HashSet;
 
@@ -107,7 +108,7 @@ impl Seeker<'_> {
         let list = needed(&self.build, &HashSet::new(), &wanted);
         let Some(question) = self.question(&list, &wanted, held) else {
             self.ends += 1;
-            return (self.ends <= MOST).then(|| self.end(&wanted, held));
+            return (self.ends <= MOST).then(|| self.end(wanted, held));
         };
         let asked = question?;
         let mut side = |truth: bool| {
@@ -125,7 +126,11 @@ impl Seeker<'_> {
     }
 
     /// A line to what is wanted.
-    fn end(&self, wanted: &[Value], held: &[(Slot, u64)]) -> Way {
+    fn end(&mut self, mut wanted: Vec<Value>, held: &[(Slot, u64)]) -> Way {
+        let at = self.slots.len() + 2 * self.rings.len();
+        if let Some(failed) = wanted.get(at) {
+            wanted[at] = with_fewer(&mut self.build, *failed, &wanted[..self.slots.len()]);
+        }
         let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
             Op::Load(from) => from == *slot,
             Op::Real(bits) => held.contains(&(*slot, bits)),
@@ -192,11 +197,12 @@ impl Seeker<'_> {
         waits
     }
 
-    /// Choices of which a side takes long: it is worth a jump.
+    /// Choices of which a side takes long: it is worth a jump. None that only a side of another one needs.
     fn long(&self, list: &[Value], wanted: &[Value]) -> HashSet<Value> {
         let sides = Sides::of(self.build.ops(), list, wanted);
         let is_long = |pair: &[usize; 2]| pair.iter().any(|side| sides.costs[*side] >= LONG);
-        sides.of_choice.iter().filter(|(_, pair)| is_long(pair)).map(|(choice, _)| *choice).collect()
+        let of_all = sides.members[0].iter().filter_map(|value| Some((*value, sides.of_choice.get(value)?)));
+        of_all.filter(|(_, pair)| is_long(pair)).map(|(choice, _)| choice).collect()
     }
 
     /// The comparisons that a truth is put together from, in their order; a none for what is none.

@@ -425,6 +425,20 @@ impl Assembler {
         self.bytes.extend(bytes);
     }
 
+    /// A jump that is taken if a number in the block is not this one, which is no NaN; its target is open. Integers answer that
+    /// sooner than reals, whose comparison may find that there is no order.
+    pub fn unless(&mut self, offset: i32, bits: u64) -> usize {
+        self.plain(&[0x48, 0x8b]); // mov rax, [block + offset]
+        self.operand(0, Place::Memory(Base::Block, offset), None, 1);
+        if f64::from_bits(bits) == 0.0 {
+            self.plain(&[0x48, 0x01, 0xc0]); // add rax, rax: the sign goes
+        } else {
+            self.plain(&[0x48, 0x3b]); // cmp rax, [constant]
+            self.operand(0, Place::Constant(bits), None, 1);
+        }
+        self.jump(&[0x0f, 0x85]) // jne
+    }
+
     /// Where the next instruction begins.
     pub fn here(&self) -> usize {
         self.bytes.len()

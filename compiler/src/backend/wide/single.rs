@@ -130,7 +130,8 @@ impl Writer<'_> {
             Op::Equal(a, b) => (Predicate::Equal, a, b),
             _ => unreachable!("it is a comparison of reals"),
         };
-        let compared = [self.at(a), self.at(b)];
+        let number = self.number_asked(asked);
+        let compared = if number.is_some() { Vec::new() } else { vec![self.at(a), self.at(b)] };
         let order = self.order(&compared, there);
         let mut there = there.to_vec();
         order.iter().for_each(|node| there[node.index()] = true);
@@ -141,8 +142,12 @@ impl Writer<'_> {
         body.write(&|_| Vec::new(), &[]);
         // The side that is jumped to is the one that leaves, if one does.
         let jumps_if = !matches!(sides[0], Way::Leaves) || holds == Predicate::Equal;
-        let jumps = body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]);
+        let jumps = match number {
+            None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
+            Some(_) => Vec::new(),
+        };
         let (held, spilled) = (body.held(), body.spilled());
+        let jumps = number.map_or(jumps, |(slot, bits)| vec![self.code.unless(8 * slot.0 as i32, bits)]);
         if spilled > 0 {
             return None;
         }
@@ -155,6 +160,15 @@ impl Writer<'_> {
         let here = self.code.here();
         jumps.into_iter().for_each(|jump| self.code.lead(jump, here));
         self.way(&sides[other], &there, &held)
+    }
+
+    /// The slot and the bits, if it is asked whether a number of the block is a constant, as of regimes.
+    fn number_asked(&self, asked: Value) -> Option<(Slot, u64)> {
+        let Op::Equal(a, b) = self.func.op(asked) else { return None };
+        [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (self.func.op(load), self.func.op(number)) {
+            (Op::Load(slot), Op::Real(bits)) if !f64::from_bits(bits).is_nan() => Some((slot, bits)),
+            _ => None,
+        })
     }
 
     fn end(
