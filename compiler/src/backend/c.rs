@@ -28,7 +28,9 @@ pub fn source(functions: &[(Function, Func)], description: &Description, params:
         let mut writer = Writer::new(func, &names, &mut helpers, &mut tables);
         bodies += &writer.function(*function);
     }
-    let mut out = heading(description, &names);
+    let step = functions.iter().find(|(function, _)| *function == Function::Step);
+    let timeless = step.is_some_and(|(_, func)| func.stores.iter().all(|(slot, _)| *slot != Slot::TIME));
+    let mut out = heading(description, &names, timeless);
     for helper in &helpers {
         out += &format!("\n{}\n", helper.source());
     }
@@ -82,8 +84,8 @@ fn signature(prefix: &str, function: Function) -> String {
     }
 }
 
-/// What stands before the code: how to use it, and where the numbers lie.
-fn heading(description: &Description, names: &Names) -> String {
+/// What stands before the code: how to use it, and where the numbers lie; of a timeless model no step keeps the time.
+fn heading(description: &Description, names: &Names, timeless: bool) -> String {
     let prefix = &names.prefix;
     let mut out = format!(
         "/* {}\n\n   The numbers of an instance lie in a block of {} doubles, SI units, at the places named below.\n   \
@@ -108,6 +110,7 @@ fn heading(description: &Description, names: &Names) -> String {
     let width = names.slots.iter().map(String::len).max().unwrap_or(0);
     for (at, name) in names.slots.iter().enumerate() {
         let told = match Slot(at as u32) {
+            Slot::TIME if timeless => Some("time, s: for you to keep, no equation reads it".to_string()),
             Slot::TIME => Some("time, s".to_string()),
             Slot::STEP => Some("fixed step, s".into()),
             Slot::COUNT => Some("steps since the start".into()),

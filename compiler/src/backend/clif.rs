@@ -14,6 +14,7 @@
 //! Each operation becomes one instruction or a fixed few. There are no symbols, no traps, and no calls but that of the loop
 //! behind what makes a single iteration.
 
+use super::postpone::postponed;
 use super::regimes::{Apart, Automaton, Case, Then, apart};
 use super::sides::Sides;
 use crate::ir::{Func, Op, Type, Value, Write, sign_of, verify};
@@ -230,6 +231,7 @@ fn once(
     b: &mut FunctionBuilder,
 ) {
     let func = &apart.func;
+    let ordered = |list: &[Value]| postponed(&func.ops, list);
     let before: HashSet<Value> = apart.before.iter().copied().collect();
     let later = || func.ops.iter().enumerate().filter(|(i, _)| !before.contains(&Value(*i as u32))).map(|(_, op)| *op);
     // What is read behind: by operations, or by regimes, in which an output may be what is there already.
@@ -247,7 +249,7 @@ fn once(
     }
     let short = func.ops.len() <= SHORT;
     let mut emitter = Emitter { near, short, ..Emitter::new(func, &facts, block, pool) };
-    emitter.only(&apart.before, &read, b);
+    emitter.only(&ordered(&apart.before), &read, b);
     // What is there by now is stored, so that nothing holds it, unless its slot is still to be read.
     let loads = later().filter_map(|op| if let Op::Load(slot) = op { Some(slot) } else { None });
     let read_later: HashSet<Slot> = loads.chain(apart.automata.iter().map(|automaton| automaton.slot)).collect();
@@ -264,7 +266,7 @@ fn once(
     let of_stage = |stage: Option<&usize>| -> Vec<Value> {
         apart.behind.iter().copied().filter(|value| stages.get(value) == stage).collect()
     };
-    emitter.list(&of_stage(None), b);
+    emitter.list(&ordered(&of_stage(None)), b);
     for (k, automaton) in apart.automata.iter().enumerate() {
         let read = apart.read_behind(k);
         let mut values = read.values;
@@ -274,7 +276,7 @@ fn once(
         values.extend(others.iter().map(|(_, value)| *value).chain(watch.asked().0));
         values.extend(&looked_at);
         emitter.automaton(automaton, &own, &values, b);
-        emitter.list(&of_stage(Some(&k)), b);
+        emitter.list(&ordered(&of_stage(Some(&k))), b);
         let is_there = |value: &Value| stages.get(value).is_none_or(|stage| *stage <= k);
         let (now, later): (Vec<_>, Vec<_>) =
             others.iter().partition(|(slot, value)| is_there(value) && !read.slots.contains(slot));
@@ -668,7 +670,7 @@ impl<'a> Emitter<'a> {
                 Then::Ask(when, _) => read.push(*when),
             }
         });
-        self.only(&case.list, &read, b);
+        self.only(&postponed(&self.func.ops, &case.list), &read, b);
         match &case.then {
             Then::Outputs(outputs) => {
                 let stores = end.stores.iter().map(|(slot, number)| (*slot, outputs[*number]));

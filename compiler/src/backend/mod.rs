@@ -6,6 +6,7 @@ pub mod interp;
 pub mod unsupported;
 mod regimes;
 mod sides;
+mod postpone;
 mod ways;
 mod clif;
 mod repeats;
