@@ -182,7 +182,7 @@ pub struct Delay {
     pub time: Slot,
     /// Least and greatest T in s.
     pub range: (f64, f64),
-    /// Slot of x, in the segment `outputs`.
+    /// Slot of x: its own, or one of the segment `outputs`.
     pub source: Slot,
     /// Slot of the value before, in the segment `memory`.
     pub past: Slot,

@@ -128,6 +128,7 @@ impl crate::program::Program {
     pub fn size_rings(&mut self, step: f64) {
         let mut len = 0;
         let mut layout = self.description.layout.clone();
+        self.start.stores.retain(|(slot, _)| !layout.rings.contains(*slot));
         layout.trial = abi::description::Segment::default();
         let layout = layout.with_rings(0);
         for delay in &mut self.description.delays {
@@ -136,11 +137,11 @@ impl crate::program::Program {
                 len: slots(delay.range.1, step).min(MOST_SAMPLES) as u32,
             };
             len += delay.ring.len;
-            // The value at the start is the first sample.
+            // The value at the start is the first sample, and what was before it.
             let past = self.start.stores.iter().find(|(slot, _)| *slot == delay.past).map(|(_, value)| *value);
-            let first = abi::Slot(delay.ring.start);
-            self.start.stores.retain(|(slot, _)| *slot != first);
-            self.start.stores.push((first, past.expect("the start stores the value before it")));
+            let past = past.expect("the start stores the value before it");
+            let ends = [0, delay.ring.len as usize - 1].map(|k| delay.ring.slot(k));
+            self.start.stores.extend(ends.map(|slot| (slot, past)));
         }
         self.description.layout = Layout::with_rings(layout, len);
     }

@@ -8,7 +8,7 @@ use crate::coupled::{self, Coupling, Shape};
 use crate::derive::{self, Gradient};
 use crate::elimination::Matrix;
 use crate::ir::build::{Build, Env};
-use crate::ir::expr::{Real, Shared, Truth};
+use crate::ir::expr::{Int, Real, Shared, Truth};
 use crate::ir::{Func, Op, Value, Write};
 use crate::math::relaxation;
 use crate::program::Program;
@@ -55,7 +55,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let status = watch(&build, &program.description.guards, &env);
 
     for delay in &program.description.delays {
-        let index = place_in(delay.ring, count);
+        let index = place_in(delay.ring, count).value;
         let mut build = build.borrow_mut();
         let value = build.read(delay.source, &env);
         build.write(Write { base: Slot(delay.ring.start), len: delay.ring.len, index, value });
@@ -89,9 +89,9 @@ pub fn advance(program: &Program, method: Method) -> Func {
 }
 
 /// Where a ring, whose length is a power of two, has the sample of this number: a whole one from 0 up to 2⁵².
-fn place_in(ring: Segment, number: Real) -> Value {
+fn place_in<'a>(ring: Segment, number: Real<'a>) -> Int<'a> {
     // Behind 2⁵² numbers lie 1 apart: the last digits are the number.
-    ((number + 4503599627370496.0).bits() & (i64::from(ring.len) - 1)).value
+    (number + 4503599627370496.0).bits() & (i64::from(ring.len) - 1)
 }
 
 /// Guards that are put together before they meet others, so that many do not wait for each other one by one, and those of
@@ -240,20 +240,18 @@ impl<'a> Model<'a> {
         for delay in &self.program.description.delays {
             let Segment { start, len } = delay.ring;
             assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
-            let sample = |number: Real<'a>| {
-                let index = place_in(delay.ring, number);
-                self.h.same(self.build.borrow_mut().ring(Slot(start), len, index))
-            };
-            // In steps, back from the newest sample.
-            let back = self.load(delay.time) / self.h - c;
-            let ago = back.at_least(0.0);
+            let sample = |index: Int<'a>| self.h.same(self.build.borrow_mut().ring(Slot(start), len, index.value));
+            // In steps; back from the newest sample, and not to before the first.
+            let steps = self.load(delay.time) / self.h;
+            let ago = (steps - c).at_least(0.0).at_most(count);
             let whole = ago.floor();
-            let newer = (count - whole).at_least(0.0);
-            let older = (newer - 1.0).at_least(0.0);
+            let newer = place_in(delay.ring, count - whole);
+            // Of the first sample nothing is before: then its part is 0.
+            let older = (newer - 1) & (i64::from(len) - 1);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
             if let Some(weight) = delay.weight {
-                let part = if c == 0.0 { self.h.constant(0.0) } else { back.below(0.0).choose(-back / c, 0.0) };
+                let part = if c == 0.0 { self.h.constant(0.0) } else { (c - steps).at_least(0.0) / c };
                 env.insert(weight, part.value);
             }
         }

@@ -184,6 +184,20 @@ enum Output {
     Expr(ExprId),
 }
 
+/// Where something to be looked at is found.
+enum Found {
+    /// In the slot of a quantity.
+    Var(VarId),
+    /// In an output slot.
+    Output(usize),
+}
+
+/// Adds an output and returns its number.
+fn added(outputs: &mut Vec<Output>, output: Output) -> usize {
+    outputs.push(output);
+    outputs.len() - 1
+}
+
 impl<'a> Plan<'a> {
     fn new(system: &'a System, types: &'a Types, wanted: &[Wanted], tables: Vec<Lookup>) -> Plan<'a> {
         let independent = independent_params(system);
@@ -205,38 +219,34 @@ impl<'a> Plan<'a> {
         .map(Output::Var)
         .collect();
         // Plain names that have a slot already need no other.
-        let mut shared: HashMap<String, usize> = HashMap::new();
-        let mut observed_at: Vec<Result<VarId, usize>> = Vec::new();
-        for one in wanted {
-            let stored =
-                |id: &VarId| !matches!(system.var(*id).definition, Definition::Value(..)) || independent[id.0 as usize];
-            match system.node(one.expr) {
-                Node::Var(id) if stored(id) => observed_at.push(Ok(*id)),
-                Node::Var(id) => {
-                    let known = outputs.iter().position(|output| matches!(output, Output::Var(other) if other == id));
-                    let at = known.unwrap_or_else(|| {
-                        outputs.push(Output::Var(*id));
-                        outputs.len() - 1
-                    });
-                    observed_at.push(Err(at));
-                }
-                _ => {
-                    let at = *shared.entry(one.text.clone()).or_insert_with(|| {
-                        outputs.push(Output::Expr(one.expr));
-                        outputs.len() - 1
-                    });
-                    observed_at.push(Err(at));
-                }
+        let stored =
+            |id: VarId| !matches!(system.var(id).definition, Definition::Value(..)) || independent[id.0 as usize];
+        let named = |id: VarId, outputs: &mut Vec<Output>| match stored(id) {
+            true => Found::Var(id),
+            false => {
+                let known = outputs.iter().position(|output| matches!(output, Output::Var(other) if *other == id));
+                Found::Output(known.unwrap_or_else(|| added(outputs, Output::Var(id))))
             }
+        };
+        let mut shared: HashMap<String, usize> = HashMap::new();
+        let mut observed_at: Vec<Found> = Vec::new();
+        for one in wanted {
+            observed_at.push(match system.node(one.expr) {
+                Node::Var(id) => named(*id, &mut outputs),
+                _ => {
+                    let at = shared.entry(one.text.clone());
+                    Found::Output(*at.or_insert_with(|| added(&mut outputs, Output::Expr(one.expr))))
+                }
+            });
         }
-        let sources: Vec<usize> = system
-            .delays
-            .iter()
-            .map(|delay| {
-                outputs.push(Output::Expr(delays::of(system, *delay).0));
-                outputs.len() - 1
-            })
-            .collect();
+        let source = |delay: &ExprId| {
+            let (value, _) = delays::of(system, *delay);
+            match system.node(value) {
+                Node::Var(id) => named(*id, &mut outputs),
+                _ => Found::Output(added(&mut outputs, Output::Expr(value))),
+            }
+        };
+        let sources: Vec<Found> = system.delays.iter().map(source).collect();
         let memory = sampled.len() + held.len() + system.blocks.len() + system.crossings.len() + system.events.len();
         let memory = memory + 4 * system.delays.len();
         let n = states.len();
@@ -276,14 +286,21 @@ impl<'a> Plan<'a> {
         let periods = take(system.blocks.len());
         let crossings = take(system.crossings.len());
         let events = take(system.events.len());
-        let delays = system.delays.iter().zip(sources).map(|(delay, source)| {
+        let slot_of = |at: &Found| match at {
+            Found::Output(at) => layout.outputs.slot(*at),
+            Found::Var(id) => match places[id.0 as usize] {
+                Place::Slot(slot) => slot,
+                Place::Computed => unreachable!("it is stored"),
+            },
+        };
+        let delays = system.delays.iter().zip(&sources).map(|(delay, source)| {
             let (_, time) = delays::of(system, *delay);
             let [at, past, weight, slope] = take(4).try_into().expect("four slots");
             Delay {
                 time: at,
                 // Checked before; a text with mistakes is never run.
                 range: delays::range(system, time).unwrap_or((0.0, 0.0)),
-                source: layout.outputs.slot(source),
+                source: slot_of(source),
                 past,
                 weight: (!delays::breaks(system, system.node(*delay))).then_some(weight),
                 slope,
@@ -298,17 +315,7 @@ impl<'a> Plan<'a> {
                 _ => unreachable!("an independent parameter has a value"),
             })
             .collect();
-        let slot_of = |id: VarId| match places[id.0 as usize] {
-            Place::Slot(slot) => slot,
-            Place::Computed => unreachable!("it is stored"),
-        };
-        let observed = observed_at
-            .iter()
-            .map(|at| match at {
-                Ok(id) => slot_of(*id),
-                Err(at) => layout.outputs.slot(*at),
-            })
-            .collect();
+        let observed = observed_at.iter().map(slot_of).collect();
         let mut plan = Plan {
             system,
             types,

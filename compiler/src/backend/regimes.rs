@@ -189,8 +189,10 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
             let members = listed(Place::Within(k));
             let mut outputs: Vec<Value> = needed.into_iter().collect();
             outputs.sort_unstable();
-            let case = |bits: &u64| (*bits, case(&mut build, &mut there, (*load, *bits), &members, &outputs));
             let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
+            let next = func.stores.iter().find(|(stored, _)| *stored == slot).map(|(_, value)| *value);
+            let next = outputs.iter().position(|output| Some(*output) == next);
+            let case = |bits: &u64| (*bits, case(&mut build, &mut there, (*load, *bits), &members, (&outputs, next)));
             let cases = numbers.iter().map(case).collect();
             let general = Case { list: members, then: Then::Outputs(outputs.clone()) };
             Automaton { slot, outputs, cases, general }
@@ -281,26 +283,39 @@ fn watch_behind(func: &Func, watched: Option<Value>, places: &mut [Place]) {
     }
 }
 
-/// What is left of the members where the slot holds this number; `there` is what stands before.
+/// What is left of the members where the slot holds this number; `there` is what stands before. Of the outputs this one, if
+/// any, is what the slot holds next.
 fn case(
     build: &mut Build,
     there: &mut HashSet<Value>,
     (load, bits): (Value, u64),
     members: &[Value],
-    outputs: &[Value],
+    (outputs, next): (&[Value], Option<usize>),
 ) -> Case {
     let held = build.op(Op::Real(bits));
     let outputs = left(build, members, &[(load, held)], outputs);
-    divided(build, there, outputs, 0)
+    divided(build, there, outputs, next.map(|next| (next, held)), 0)
 }
 
-/// What computes the outputs, taken apart by the truth that is asked most often, if that leaves less to do.
-fn divided(build: &mut Build, there: &mut HashSet<Value>, outputs: Vec<Value>, depth: usize) -> Case {
+/// What computes the outputs, taken apart by the truth that is asked most often, if that leaves less to do, and by the one at
+/// which the slot no longer holds what it holds: as a rule it does.
+fn divided(
+    build: &mut Build,
+    there: &mut HashSet<Value>,
+    outputs: Vec<Value>,
+    next: Option<(usize, Value)>,
+    depth: usize,
+) -> Case {
     let list = needed(build, there, &outputs);
-    if depth < DEEPEST
-        && (FEWEST_ASKED..=LONGEST).contains(&list.len())
-        && let Some(asked) = asked_most(build, &list)
-    {
+    if depth == DEEPEST || list.len() > LONGEST {
+        return Case { list, then: Then::Outputs(outputs) };
+    }
+    let often = asked_most(build, &list).filter(|_| list.len() >= FEWEST_ASKED);
+    let turns = next.and_then(|(next, held)| match build.get(outputs[next]) {
+        Op::Select(when, yes, no) if [yes, no].contains(&held) => Some(when),
+        _ => None,
+    });
+    for asked in often.into_iter().chain(turns) {
         let first = needed(build, there, &[asked]);
         let sides = [true, false].map(|truth| {
             let known = known(build, asked, truth);
@@ -313,8 +328,8 @@ fn divided(build: &mut Build, there: &mut HashSet<Value>, outputs: Vec<Value>, d
             let jump = if matches!(build.get(asked), Op::And(..) | Op::Or(..)) { 0 } else { 2 };
             first.len() + lengths.iter().sum::<usize>().div_ceil(2) + jump < list.len()
         };
-        let case = shorter(build, there).then(|| {
-            let sides = sides.map(|outputs| divided(build, there, outputs, depth + 1));
+        let case = (turns == Some(asked) || shorter(build, there)).then(|| {
+            let sides = sides.map(|outputs| divided(build, there, outputs, next, depth + 1));
             Case { list: first.clone(), then: Then::Ask(asked, Box::new(sides)) }
         });
         first.iter().for_each(|value| _ = there.remove(value));
@@ -374,8 +389,15 @@ mod tests {
         let cases: Vec<(f64, Vec<String>)> =
             automaton.cases.iter().map(|(bits, case)| (f64::from_bits(*bits), shown(case))).collect();
         let words = |text: &str| text.split(' ').map(String::from).collect::<Vec<_>>();
-        assert_eq!(cases, [(0.0, words("loa loa loa mul fma les sel")), (1.0, words("loa loa mul"))]);
+        assert_eq!(cases, [(0.0, words("loa loa loa mul fma les")), (1.0, words("loa loa mul"))]);
         assert_eq!(shown(&automaton.general).iter().filter(|op| *op == "sel").count(), 3);
+        // What the slot holds next is asked, not chosen; on either side nothing is left to do.
+        let Then::Ask(_, sides) = &automaton.cases[0].1.then else { panic!("it asks") };
+        let next = sides.each_ref().map(|side| match (&side.list[..], &side.then) {
+            ([], Then::Outputs(outputs)) => outputs.last().map(|output| apart.func.op(*output)),
+            _ => panic!("it ends"),
+        });
+        assert_eq!(next, [1f64, 0.0].map(|number| Some(Op::Real(number.to_bits()))));
     }
 
     /// Slot 4 is a regime; at rest, 0, it asks four times whether a force in slot 5 is above one in slot 6.

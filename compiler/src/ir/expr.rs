@@ -235,9 +235,12 @@ impl<'a> Real<'a> {
     }
 
     /// Itself, but at most the limit; NaN stays NaN.
-    pub fn at_most(self, limit: f64) -> Real<'a> {
-        let limit = self.constant(limit);
-        self.with(|b| b.min(limit.value, self.value))
+    pub fn at_most<T>(self, limit: T) -> Real<'a>
+    where
+        Real<'a>: From<(T, &'a Shared)>,
+    {
+        let limit = self.other(limit);
+        self.with(|b| b.min(limit, self.value))
     }
 
     /// This size, not negative, with the sign of `of`, that of zeros too.
