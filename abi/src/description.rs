@@ -8,11 +8,12 @@ pub struct Slot(pub u32);
 
 impl Slot {
     /// Time `t`, in s. Code of a model in whose equations it stands keeps it; all else is told by
-    /// [`keep_time`](crate::table::keep_time).
+    /// [`keep_clock`](crate::table::keep_clock).
     pub const TIME: Slot = Slot(0);
     /// Fixed step `h`, in s.
     pub const STEP: Slot = Slot(1);
-    /// Number of fixed steps done since the start: a whole number. `t = COUNT · STEP`, never a running sum.
+    /// Number of fixed steps done since the start: a whole number. `t = COUNT · STEP`, never a running sum. Of a single step
+    /// it is told as time is.
     pub const COUNT: Slot = Slot(2);
     /// Number of slots before the first segment.
     pub const FIXED: u32 = 3;
@@ -182,12 +183,15 @@ pub struct Delay {
     pub time: Slot,
     /// Least and greatest T in s.
     pub range: (f64, f64),
+    /// Slot of T in fixed steps, in the segment `memory`, written by `Start` if there is a ring.
+    pub steps: Slot,
     /// Slot of x: its own, or one of the segment `outputs`.
     pub source: Slot,
     /// Slot of the value before, in the segment `memory`.
     pub past: Slot,
-    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. None where
-    /// no step may be longer than the least T: then x at this instant is not needed.
+    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. At the end of
+    /// fixed steps it is always the same, and written by `Start`. None where no step may be longer than the least T: then x at
+    /// this instant is not needed.
     pub weight: Option<Slot>,
     /// Slot of the slope of the value before along time, per s: for ∂f/∂t.
     pub slope: Slot,
@@ -271,12 +275,9 @@ impl Description {
         let delays = self.delays.iter().flat_map(|delay| {
             // An empty ring lies nowhere.
             let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
-            [Some(delay.time), Some(delay.source), Some(delay.past), Some(delay.slope), delay.weight, ring]
+            let each = [delay.time, delay.steps, delay.source, delay.past, delay.slope];
+            each.into_iter().chain(delay.weight).chain(ring)
         });
-        quantities
-            .chain(ticks)
-            .chain(automata)
-            .chain(delays.flatten())
-            .chain(self.guards.iter().map(|guard| guard.slot))
+        quantities.chain(ticks).chain(automata).chain(delays).chain(self.guards.iter().map(|guard| guard.slot))
     }
 }

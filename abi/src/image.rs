@@ -24,7 +24,7 @@ use std::fmt;
 /// The first bytes.
 pub const MAGIC: [u8; 8] = *b"FRICCODE";
 /// Of the format, and of the calls into the code.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 /// The code begins at a multiple of this.
 pub const PAGE: usize = 4096;
 

@@ -1,7 +1,7 @@
 //! A model that runs: its block of numbers and its code, with every access checked.
 
 use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
-use crate::table::{Code, Function, keep_time};
+use crate::table::{Code, Function, keep_clock};
 use std::sync::Arc;
 
 /// One running copy of a compiled model.
@@ -56,11 +56,12 @@ impl Instance {
     }
 
     /// Runs one function up to `n` times; returns the first status that is not 0, at which it stops. Behind fixed steps the
-    /// block tells the time.
+    /// block tells their count and the time.
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
+        let before = self.get(Slot::COUNT);
         let status = self.code.call(function, &mut self.block, &self.description.pool, n);
         if function == Function::Step && n > 0 {
-            keep_time(&mut self.block);
+            keep_clock(&mut self.block, before, n);
         }
         status
     }
@@ -120,9 +121,9 @@ impl Instance {
                 .filter(is_state)
                 .map(|q| &q.path));
         if same_memory {
-            let own: Vec<Slot> =
-                new.ticks.iter().map(|tick| tick.period).chain(new.delays.iter().map(|delay| delay.time)).collect();
-            let own: Vec<(Slot, f64)> = own.into_iter().map(|slot| (slot, self.get(slot))).collect();
+            let periods = new.ticks.iter().map(|tick| tick.period);
+            let delays = new.delays.iter().flat_map(|delay| [delay.time, delay.steps].into_iter().chain(delay.weight));
+            let own: Vec<(Slot, f64)> = periods.chain(delays).map(|slot| (slot, self.get(slot))).collect();
             let memory = &from.block[old.layout.memory.range()];
             self.block[new.layout.memory.range()].copy_from_slice(memory);
             own.into_iter().for_each(|(slot, value)| self.set(slot, value));
@@ -201,12 +202,12 @@ mod tests {
     use crate::description::Layout;
     use crate::table::Interpret;
 
-    /// Counts, and knows no time.
+    /// Counts many steps, one not, and knows no time.
     struct Counts;
 
     impl Interpret for Counts {
         fn call(&self, function: Function, block: &mut [f64], _: &[f64], count: u64) -> u64 {
-            if function == Function::Step {
+            if function == Function::Step && count != 1 {
                 block[Slot::COUNT.index()] += count as f64;
             }
             0
@@ -217,12 +218,13 @@ mod tests {
     }
 
     #[test]
-    fn time_is_told_behind_steps_whose_code_leaves_it() {
+    fn the_clock_is_kept_behind_steps_whose_code_leaves_it() {
         let layout = Layout::new([0; 10]);
         let description = Arc::new(Description { layout, ..Description::default() });
         let mut instance = Instance::new(description, Code::Interpreted(Arc::new(Counts)), &[]);
         instance.start(0.25);
         assert_eq!((instance.advance(3), instance.get(Slot::TIME)), (0, 0.75));
+        assert_eq!((instance.advance(1), instance.get(Slot::COUNT), instance.get(Slot::TIME)), (0, 4.0, 1.0));
         instance.set(Slot::TIME, 9.0);
         instance.call(Function::Outputs);
         instance.advance(0);

@@ -60,10 +60,21 @@ impl Function {
 }
 
 /// Machine code of one function: runs it up to `count` times on the block and stops early at the first non-zero
-/// status, which it returns (0: none). `pool` is the description's pool of constants.
+/// status, which it returns (0: none). `pool` is the description's pool of constants. A call for one fixed step may leave the
+/// count of steps where nothing that it computes hangs on it, and any leaves time where no equation reads it: whoever calls
+/// keeps these, with [`keep_clock`].
 pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
 
-/// Time behind fixed steps, into the block: the count times the step. Their code leaves it where no equation reads it.
+/// The count and time behind a call for `count` fixed steps, at least one, into the block: how many were done, code tells if
+/// it was asked for more than one. `before` is the count before the call.
+pub fn keep_clock(block: &mut [f64], before: f64, count: u64) {
+    if count == 1 {
+        block[Slot::COUNT.index()] = before + 1.0;
+    }
+    keep_time(block);
+}
+
+/// Time behind fixed steps, into the block: the count times the step.
 pub fn keep_time(block: &mut [f64]) {
     block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
 }

@@ -2,9 +2,12 @@
 //!
 //! In: a flat [`System`]. Out: bounds, diagnostics. A T that is never 0 breaks circles: x at this instant is not needed.
 
+use crate::ir::Func;
+use crate::ir::build::Build;
 use crate::system::*;
 use crate::units::{literal, three_digits};
-use abi::description::Layout;
+use abi::Slot;
+use abi::description::{Layout, Segment};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
@@ -128,21 +131,28 @@ impl crate::program::Program {
     pub fn size_rings(&mut self, step: f64) {
         let mut len = 0;
         let mut layout = self.description.layout.clone();
-        self.start.stores.retain(|(slot, _)| !layout.rings.contains(*slot));
-        layout.trial = abi::description::Segment::default();
+        layout.trial = Segment::default();
+        let of_before = layout.rings;
         let layout = layout.with_rings(0);
+        let (mut build, mut stores) = (Build::of(&self.start), self.start.stores.clone());
+        stores.retain(|(slot, _)| !of_before.contains(*slot));
+        let [h, one, zero] = [build.load(Slot::STEP), build.real(1.0), build.real(0.0)];
         for delay in &mut self.description.delays {
-            delay.ring = abi::description::Segment {
-                start: layout.rings.start + len,
-                len: slots(delay.range.1, step).min(MOST_SAMPLES) as u32,
-            };
+            delay.ring =
+                Segment { start: layout.rings.start + len, len: slots(delay.range.1, step).min(MOST_SAMPLES) as u32 };
             len += delay.ring.len;
+            let stored = |slot: Slot| stores.iter().find(|(stored, _)| *stored == slot).map(|(_, value)| *value);
+            let [time, past] = [delay.time, delay.past].map(|slot| stored(slot).expect("the start stores it"));
+            let steps = build.div(time, h);
+            let less = build.sub(one, steps);
+            let weight = build.max(zero, less);
             // The value at the start is the first sample, and what was before it.
-            let past = self.start.stores.iter().find(|(slot, _)| *slot == delay.past).map(|(_, value)| *value);
-            let past = past.expect("the start stores the value before it");
-            let ends = [0, delay.ring.len as usize - 1].map(|k| delay.ring.slot(k));
-            self.start.stores.extend(ends.map(|slot| (slot, past)));
+            let ends = [0, delay.ring.len as usize - 1].map(|k| (delay.ring.slot(k), past));
+            let clock = [(delay.steps, steps)].into_iter().chain(delay.weight.map(|slot| (slot, weight)));
+            stores.retain(|(slot, _)| *slot != delay.steps && Some(*slot) != delay.weight);
+            stores.extend(clock.chain(ends));
         }
+        self.start = Func { ops: build.into_ops(), stores, ..self.start.clone() };
         self.description.layout = Layout::with_rings(layout, len);
     }
 }

@@ -242,7 +242,7 @@ impl<'a> Model<'a> {
             assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
             let sample = |index: Int<'a>| self.h.same(self.build.borrow_mut().ring(Slot(start), len, index.value));
             // In steps; back from the newest sample, and not to before the first.
-            let steps = self.load(delay.time) / self.h;
+            let steps = self.load(delay.steps);
             let ago = (steps - c).at_least(0.0).at_most(count);
             let whole = ago.floor();
             let newer = place_in(delay.ring, count - whole);
@@ -250,7 +250,8 @@ impl<'a> Model<'a> {
             let older = (newer - 1) & (i64::from(len) - 1);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
-            if let Some(weight) = delay.weight {
+            // At the end it is there from the start on.
+            if let Some(weight) = delay.weight.filter(|_| c < 1.0) {
                 let part = if c == 0.0 { self.h.constant(0.0) } else { (c - steps).at_least(0.0) / c };
                 env.insert(weight, part.value);
             }

@@ -248,7 +248,7 @@ impl<'a> Plan<'a> {
         };
         let sources: Vec<Found> = system.delays.iter().map(source).collect();
         let memory = sampled.len() + held.len() + system.blocks.len() + system.crossings.len() + system.events.len();
-        let memory = memory + 4 * system.delays.len();
+        let memory = memory + 5 * system.delays.len();
         let n = states.len();
         let jacobian = if n <= MOST_JACOBIAN { n * n + n } else { 0 };
         let layout = Layout::new(
@@ -295,11 +295,12 @@ impl<'a> Plan<'a> {
         };
         let delays = system.delays.iter().zip(&sources).map(|(delay, source)| {
             let (_, time) = delays::of(system, *delay);
-            let [at, past, weight, slope] = take(4).try_into().expect("four slots");
+            let [at, steps, past, weight, slope] = take(5).try_into().expect("five slots");
             Delay {
                 time: at,
                 // Checked before; a text with mistakes is never run.
                 range: delays::range(system, time).unwrap_or((0.0, 0.0)),
+                steps,
                 source: slot_of(source),
                 past,
                 weight: (!delays::breaks(system, system.node(*delay))).then_some(weight),

@@ -1,11 +1,11 @@
 //! Cases on every back end: each must give the bits of the interpreter.
 
-use crate::case::{Case, Result, all_of};
+use crate::case::{Case, Result};
 use crate::emulator;
-use abi::Description;
 use abi::image::Target;
 use abi::lanes::Batch;
 use abi::table::{Code, Function, Interpret};
+use abi::{Description, Slot};
 use compiler::backend::target::{self, Coder};
 use compiler::backend::wide::{self, Width};
 use compiler::backend::{blob, c, jit};
@@ -116,23 +116,16 @@ fn in_lanes(case: &Case, width: Width) -> Option<Vec<Result>> {
     let alone = case.interpreter();
     let mut batch = Batch::new(lanes);
     let last = batch.width() - 1;
-    let mut out = Vec::new();
-    for run in &case.runs {
-        let mut block = run.start.clone();
-        let mut status = 0;
-        for (function, count) in &run.calls {
-            if function != in_lanes {
-                status = all_of(status, alone.call(*function, &mut block, pool, *count));
-                continue;
-            }
-            (0..=last).for_each(|lane| batch.load(lane, &block));
-            batch.advance(pool, *count);
-            batch.save(last, &mut block);
-            status = all_of(status, batch.status(last));
+    let mut call = |function: Function, block: &mut [f64], count: u64| {
+        if function != *in_lanes {
+            return alone.call(function, block, pool, count);
         }
-        out.push((status, block));
-    }
-    Some(out)
+        (0..=last).for_each(|lane| batch.load(lane, block));
+        batch.advance(pool, count);
+        batch.save(last, block);
+        batch.status(last)
+    };
+    Some(case.runs.iter().map(|run| run.by(&mut call)).collect())
 }
 
 fn image(case: &Case, target: Target) -> Vec<u8> {
@@ -167,22 +160,16 @@ fn compiled_c(cases: &[Case], level: &str) -> Vec<Vec<Result>> {
     // SAFETY: the library runs no code when it is loaded.
     let loaded = unsafe { libloading::Library::new(&library) }.expect("the library loads");
     let results = cases.iter().enumerate().map(|(k, case)| {
-        let one = |run: &crate::case::Run| {
-            let mut block = run.start.clone();
-            let mut status = 0;
-            for (function, count) in &run.calls {
-                let name = format!("case{k}_{}", function.name());
-                // SAFETY: the file just written has a function of this name and type, which stays in the block.
-                let of_call = unsafe {
-                    type Entry = unsafe extern "C" fn(*mut f64, u64) -> u64;
-                    let entry = loaded.get::<Entry>(name.as_bytes()).expect("the function is in the file");
-                    entry(block.as_mut_ptr(), *count)
-                };
-                status = all_of(status, of_call);
+        let call = |function: Function, block: &mut [f64], count: u64| {
+            let name = format!("case{k}_{}", function.name());
+            // SAFETY: the file just written has a function of this name and type, which stays in the block.
+            unsafe {
+                type Entry = unsafe extern "C" fn(*mut f64, u64) -> u64;
+                let entry = loaded.get::<Entry>(name.as_bytes()).expect("the function is in the file");
+                entry(block.as_mut_ptr(), count)
             }
-            (status, block)
         };
-        case.runs.iter().map(one).collect()
+        case.runs.iter().map(|run| run.by(call)).collect()
     });
     let results = results.collect();
     let _ = (fs::remove_file(source), fs::remove_file(library));
@@ -191,6 +178,7 @@ fn compiled_c(cases: &[Case], level: &str) -> Vec<Vec<Result>> {
 
 /// All cases as images for 64-bit Arm, in one run of the emulator.
 fn emulated(cases: &[Case]) -> Vec<Vec<Result>> {
+    assert_eq!((Function::Step as usize, Slot::COUNT.index()), (7, 2), "the numbers in harness.c");
     let mut bytes = Vec::new();
     let number = |bytes: &mut Vec<u8>, n: usize| bytes.extend((n as u64).to_le_bytes());
     number(&mut bytes, cases.len());

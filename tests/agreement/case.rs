@@ -20,8 +20,26 @@ pub struct Run {
     pub calls: Vec<(Function, u64)>,
 }
 
-/// The last status and the block after the calls.
+/// The statuses, put together, and the block after the calls.
 pub type Result = (u64, Vec<f64>);
+
+impl Run {
+    /// What it leads to by these calls. Behind one for a single step the block tells the count, which code may leave to
+    /// whoever calls it.
+    pub fn by(&self, mut call: impl FnMut(Function, &mut [f64], u64) -> u64) -> Result {
+        let mut block = self.start.clone();
+        let mut status = 0;
+        for (function, count) in &self.calls {
+            let before = block[Slot::COUNT.index()];
+            let of_call = call(*function, &mut block, *count);
+            status = all_of(status, of_call);
+            if (*function, *count) == (Function::Step, 1) {
+                block[Slot::COUNT.index()] = before + 1.0;
+            }
+        }
+        (status, block)
+    }
+}
 
 /// A program and its runs.
 pub struct Case {
@@ -52,15 +70,8 @@ impl Case {
     /// What each run leads to.
     pub fn on(&self, code: &Code) -> Vec<Result> {
         let pool = &self.description.pool;
-        let one = |run: &Run| {
-            let mut block = run.start.clone();
-            let mut status = 0;
-            for (function, count) in &run.calls {
-                status = all_of(status, code.call(*function, &mut block, pool, *count));
-            }
-            (status, block)
-        };
-        self.runs.iter().map(one).collect()
+        let call = |function, block: &mut [f64], count| code.call(function, block, pool, count);
+        self.runs.iter().map(|run| run.by(call)).collect()
     }
 
     /// The reference.
@@ -130,7 +141,7 @@ pub fn of_program(name: String, text: &str, program: &Program, method: Method, s
 }
 
 /// A number for the statuses of all calls: those before, and one more.
-pub fn all_of(before: u64, status: u64) -> u64 {
+fn all_of(before: u64, status: u64) -> u64 {
     before.wrapping_mul(31).wrapping_add(status)
 }
 

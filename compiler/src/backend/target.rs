@@ -10,6 +10,7 @@ use super::pieces;
 use super::unsupported::Unsupported;
 use super::wide::{pairs, single};
 use crate::ir::Func;
+use crate::ir::build::prune;
 use abi::image::{Feature, Target};
 use abi::{Layout, Slot};
 use cranelift_codegen::binemit::Reloc;
@@ -150,7 +151,7 @@ impl<'a> Coder<'a> {
     fn single(&self, func: &Func) -> Option<single::Single> {
         let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
         (ours && func.ops.len() <= self.lengths.whole && clif::has_single(func))
-            .then(|| single::single(func).ok())
+            .then(|| single::single(&uncounted(func)).ok())
             .flatten()
     }
 
@@ -167,7 +168,7 @@ impl<'a> Coder<'a> {
             let several = clif::has_single(func);
             if several && !own {
                 context.clear();
-                clif::emit_single(func, &mut context.func, builder, *isa);
+                clif::emit_single(&uncounted(func), &mut context.func, builder, *isa);
                 part(title(ONE), *isa, context)?;
             }
             let several = if several { title("any number of iterations") } else { String::new() };
@@ -188,6 +189,15 @@ impl<'a> Coder<'a> {
         }
         Ok(())
     }
+}
+
+/// The function for a single iteration, which leaves the count to its caller unless something else takes part in it: see
+/// [`abi::table::Entry`].
+fn uncounted(func: &Func) -> Func {
+    let mut uncounted = func.clone();
+    uncounted.stores.retain(|(slot, _)| *slot != Slot::COUNT);
+    let uncounted = prune(&uncounted);
+    if uncounted.loads().contains(&Slot::COUNT) { func.clone() } else { uncounted }
 }
 
 /// A line that says what follows.

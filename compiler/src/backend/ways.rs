@@ -8,7 +8,7 @@ use super::sides::Sides;
 use crate::ir::build::Build;
 use crate::ir::left::{known, left, needed};
 use crate::ir::{Func, Op, Value, Write};
-use crate::opt::watched::with_fewer;
+use crate::opt::watched::{with_fewer, with_less_asked};
 use abi::Slot;
 use std::collections::HashSet;
 
@@ -129,7 +129,8 @@ impl Seeker<'_> {
     fn end(&mut self, mut wanted: Vec<Value>, held: &[(Slot, u64)]) -> Way {
         let at = self.slots.len() + 2 * self.rings.len();
         if let Some(failed) = wanted.get(at) {
-            wanted[at] = with_fewer(&mut self.build, *failed, &wanted[..self.slots.len()]);
+            let fewer = with_fewer(&mut self.build, *failed, &wanted[..self.slots.len()]);
+            wanted[at] = with_less_asked(&mut self.build, fewer);
         }
         let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
             Op::Load(from) => from == *slot,
