@@ -183,8 +183,9 @@ pub struct Delay {
     pub time: Slot,
     /// Least and greatest T in s.
     pub range: (f64, f64),
-    /// Slot of T in fixed steps, in the segment `memory`, written by `Start` if there is a ring.
-    pub steps: Slot,
+    /// Slot of how many fixed steps T lies before the newest sample at the end of a step, no less than 0, in the segment
+    /// `memory`, written by `Start` if there is a ring.
+    pub back: Slot,
     /// Slot of x: its own, or one of the segment `outputs`.
     pub source: Slot,
     /// Slot of the value before, in the segment `memory`.
@@ -275,7 +276,7 @@ impl Description {
         let delays = self.delays.iter().flat_map(|delay| {
             // An empty ring lies nowhere.
             let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
-            let each = [delay.time, delay.steps, delay.source, delay.past, delay.slope];
+            let each = [delay.time, delay.back, delay.source, delay.past, delay.slope];
             each.into_iter().chain(delay.weight).chain(ring)
         });
         quantities.chain(ticks).chain(automata).chain(delays).chain(self.guards.iter().map(|guard| guard.slot))

@@ -317,7 +317,7 @@ encode_structs! {
     Tick { period, due }
     Automaton { path, regimes, slot }
     Segment { start, len }
-    Delay { time, range, steps, source, past, weight, slope, ring }
+    Delay { time, range, back, source, past, weight, slope, ring }
     Guard { path, slot, range, unit }
     Root { text, decides, bends }
 }

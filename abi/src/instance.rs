@@ -122,7 +122,7 @@ impl Instance {
                 .map(|q| &q.path));
         if same_memory {
             let periods = new.ticks.iter().map(|tick| tick.period);
-            let delays = new.delays.iter().flat_map(|delay| [delay.time, delay.steps].into_iter().chain(delay.weight));
+            let delays = new.delays.iter().flat_map(|delay| [delay.time, delay.back].into_iter().chain(delay.weight));
             let own: Vec<(Slot, f64)> = periods.chain(delays).map(|slot| (slot, self.get(slot))).collect();
             let memory = &from.block[old.layout.memory.range()];
             self.block[new.layout.memory.range()].copy_from_slice(memory);

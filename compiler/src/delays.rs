@@ -144,13 +144,12 @@ impl crate::program::Program {
             let stored = |slot: Slot| stores.iter().find(|(stored, _)| *stored == slot).map(|(_, value)| *value);
             let [time, past] = [delay.time, delay.past].map(|slot| stored(slot).expect("the start stores it"));
             let steps = build.div(time, h);
-            let less = build.sub(one, steps);
-            let weight = build.max(zero, less);
+            let [back, weight] = [build.sub(steps, one), build.sub(one, steps)].map(|steps| build.max(zero, steps));
             // The value at the start is the first sample, and what was before it.
             let ends = [0, delay.ring.len as usize - 1].map(|k| (delay.ring.slot(k), past));
-            let clock = [(delay.steps, steps)].into_iter().chain(delay.weight.map(|slot| (slot, weight)));
-            stores.retain(|(slot, _)| *slot != delay.steps && Some(*slot) != delay.weight);
-            stores.extend(clock.chain(ends));
+            let places = [(delay.back, back)].into_iter().chain(delay.weight.map(|slot| (slot, weight)));
+            stores.retain(|(slot, _)| *slot != delay.back && Some(*slot) != delay.weight);
+            stores.extend(places.chain(ends));
         }
         self.start = Func { ops: build.into_ops(), stores, ..self.start.clone() };
         self.description.layout = Layout::with_rings(layout, len);

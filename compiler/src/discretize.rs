@@ -241,20 +241,27 @@ impl<'a> Model<'a> {
             let Segment { start, len } = delay.ring;
             assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
             let sample = |index: Int<'a>| self.h.same(self.build.borrow_mut().ring(Slot(start), len, index.value));
-            // In steps; back from the newest sample, and not to before the first.
-            let steps = self.load(delay.steps);
-            let ago = (steps - c).at_least(0.0).at_most(count);
+            // In steps, back from the newest sample: at the end of the step it is known from the start on.
+            let back = self.load(delay.back);
+            let ago = if c == 1.0 {
+                back
+            } else {
+                let weight = delay.weight.map(|slot| (slot, self.load(slot)));
+                let steps = back + weight.map_or(self.h.constant(1.0), |(_, weight)| 1.0 - weight);
+                if let Some((slot, _)) = weight {
+                    let part = if c == 0.0 { self.h.constant(0.0) } else { (c - steps).at_least(0.0) / c };
+                    env.insert(slot, part.value);
+                }
+                (steps - c).at_least(0.0)
+            };
+            // Not to before the first.
+            let ago = ago.at_most(count);
             let whole = ago.floor();
             let newer = place_in(delay.ring, count - whole);
             // Of the first sample nothing is before: then its part is 0.
             let older = (newer - 1) & (i64::from(len) - 1);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
-            // At the end it is there from the start on.
-            if let Some(weight) = delay.weight.filter(|_| c < 1.0) {
-                let part = if c == 0.0 { self.h.constant(0.0) } else { (c - steps).at_least(0.0) / c };
-                env.insert(weight, part.value);
-            }
         }
     }
 

@@ -295,12 +295,12 @@ impl<'a> Plan<'a> {
         };
         let delays = system.delays.iter().zip(&sources).map(|(delay, source)| {
             let (_, time) = delays::of(system, *delay);
-            let [at, steps, past, weight, slope] = take(5).try_into().expect("five slots");
+            let [at, back, past, weight, slope] = take(5).try_into().expect("five slots");
             Delay {
                 time: at,
                 // Checked before; a text with mistakes is never run.
                 range: delays::range(system, time).unwrap_or((0.0, 0.0)),
-                steps,
+                back,
                 source: slot_of(source),
                 past,
                 weight: (!delays::breaks(system, system.node(*delay))).then_some(weight),
