@@ -267,12 +267,19 @@ fn once(
         apart.behind.iter().copied().filter(|value| stages.get(value) == stage).collect()
     };
     emitter.list(&ordered(&of_stage(None)), b);
+    let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
+    let not_only_watched = func.live_for(stored.iter().copied().chain(written));
     for (k, automaton) in apart.automata.iter().enumerate() {
-        let read = apart.read_behind(k);
+        let read = apart.read_behind(k, |value| not_only_watched[value.index()]);
         let mut values = read.values;
-        // What becomes of its own states each regime stores itself, if they change.
+        // What becomes of its own states each regime stores itself, if they change; what watches reads them from there.
         let (own, others): (Vec<_>, Vec<_>) =
             last.iter().partition(|(slot, value)| automaton.outputs.contains(value) && !read.slots.contains(slot));
+        let places = own.iter().filter(|(_, value)| !values.contains(value)).map(|(slot, value)| (*value, *slot));
+        emitter.stored.extend(places);
+        let watches = apart.behind.iter().filter(|value| !not_only_watched[value.index()]);
+        let watched = watches.flat_map(|value| func.reads(func.op(*value)));
+        values.extend(watched.filter(|value| !emitter.stored.contains_key(value)));
         values.extend(others.iter().map(|(_, value)| *value).chain(watch.asked().0));
         values.extend(&looked_at);
         emitter.automaton(automaton, &own, &values, b);
@@ -487,6 +494,8 @@ pub struct Emitter<'a> {
     pub facts: &'a Facts,
     /// The values that are there, constants apart.
     pub values: Vec<Option<clif::Value>>,
+    /// Values that are read from where they have been stored, each time anew.
+    stored: HashMap<Value, Slot>,
     /// Operands that are another value than their operation says: by operation, and by their number there.
     pub instead: HashMap<(Value, usize), clif::Value>,
     /// Where the block is.
@@ -531,6 +540,7 @@ impl<'a> Emitter<'a> {
             pool,
             ahead: None,
             instant: None,
+            stored: HashMap::new(),
             instead: HashMap::new(),
             near: false,
             short: false,
@@ -583,7 +593,10 @@ impl<'a> Emitter<'a> {
             Op::Real(bits) => b.ins().f64const(f64::from_bits(bits)),
             Op::Int(n) => b.ins().iconst(types::I64, n),
             Op::Bool(truth) => b.ins().iconst(types::I8, i64::from(truth)),
-            _ => self.values[value.index()].expect("operands come first"),
+            _ => self.values[value.index()].unwrap_or_else(|| {
+                let slot = self.stored.get(&value).expect("operands come first");
+                b.ins().load(types::F64, MemFlagsData::trusted(), self.block, offset(slot.0))
+            }),
         }
     }
 
@@ -659,32 +672,41 @@ impl<'a> Emitter<'a> {
 
     /// Writes one case and goes on behind it; nothing of it is there then.
     fn case(&mut self, case: &Case, end: &End, b: &mut FunctionBuilder) {
-        // What is read by the cases within, or behind.
-        let mut read = Vec::new();
-        case.each(&mut |inner| {
-            if !std::ptr::eq(inner, case) {
-                inner.list.iter().for_each(|value| self.func.op(*value).each_operand(|operand| read.push(operand)));
-            }
-            match &inner.then {
-                Then::Outputs(outputs) => read.extend(outputs),
-                Then::Ask(when, _) => read.push(*when),
-            }
-        });
-        self.only(&postponed(&self.func.ops, &case.list), &read, b);
         match &case.then {
             Then::Outputs(outputs) => {
-                let stores = end.stores.iter().map(|(slot, number)| (*slot, outputs[*number]));
                 let is_there = |(slot, value): &(Slot, Value)| match self.func.op(*value) {
                     Op::Load(from) => from == *slot,
                     Op::Real(bits) => end.held == Some((*slot, bits)),
                     _ => false,
                 };
-                self.stores(&stores.filter(|store| !is_there(store)).collect::<Vec<_>>(), b);
-                let read = outputs.iter().zip(&end.outputs).filter(|(_, read)| **read);
-                let read: Vec<BlockArg> = read.map(|(output, _)| BlockArg::Value(self.get(*output, b))).collect();
+                let stores = end.stores.iter().map(|(slot, number)| (*slot, outputs[*number]));
+                let stores: Vec<(Slot, Value)> = stores.filter(|store| !is_there(store)).collect();
+                let read: Vec<Value> =
+                    outputs.iter().zip(&end.outputs).filter(|(_, read)| **read).map(|(output, _)| *output).collect();
+                let wanted: Vec<Value> = stores.iter().map(|(_, value)| *value).chain(read.iter().copied()).collect();
+                let live = self.func.live_for(wanted.iter().copied());
+                let list: Vec<Value> = case.list.iter().copied().filter(|value| live[value.index()]).collect();
+                self.only(&postponed(&self.func.ops, &list), &wanted, b);
+                self.stores(&stores, b);
+                let read: Vec<BlockArg> = read.iter().map(|value| BlockArg::Value(self.get(*value, b))).collect();
                 b.ins().jump(end.behind, &read);
             }
             Then::Ask(when, sides) => {
+                // What is read by the cases within, or behind.
+                let mut read = vec![*when];
+                for side in sides.iter() {
+                    side.each(&mut |inner| {
+                        inner
+                            .list
+                            .iter()
+                            .for_each(|value| self.func.op(*value).each_operand(|operand| read.push(operand)));
+                        match &inner.then {
+                            Then::Outputs(outputs) => read.extend(outputs),
+                            Then::Ask(when, _) => read.push(*when),
+                        }
+                    });
+                }
+                self.only(&postponed(&self.func.ops, &case.list), &read, b);
                 let blocks = [(); 2].map(|()| b.create_block());
                 self.branch(*when, blocks[0], blocks[1], b);
                 for (side, block) in sides.iter().zip(blocks) {

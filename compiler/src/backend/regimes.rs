@@ -38,10 +38,10 @@ impl Apart {
         stages
     }
 
-    /// What is read behind the automaton of this number.
-    pub fn read_behind(&self, number: usize) -> Read {
+    /// What is read behind the automaton of this number: of what depends on several, by these.
+    pub fn read_behind(&self, number: usize, by: impl Fn(Value) -> bool) -> Read {
         let mut read = Read::default();
-        for value in &self.behind {
+        for value in self.behind.iter().filter(|value| by(**value)) {
             read.operation(self.func.op(*value));
         }
         read.values.extend(self.func.writes.iter().flat_map(|write| [write.index, write.value]));
