@@ -418,7 +418,7 @@ fn what_is_made_on_the_way_can_be_read() {
         }
     }
     // A short single step has no frame, and no part of Cranelift's; on 64-bit Arm it has.
-    let law = "model Law {\n  input  v [m/s]\n  param  Fc = 1 N\n  output F [N] = Fc * sign(v)\n}\n";
+    let law = "model Law {\n  input  v [m/s]\n  param  Fc = 1 N\n  output F [N] = Fc * sign(v) + 3 N\n}\n";
     let folder = folder.with("law.fric", law);
     let (asm, _) = folder.check(&["build", "law.fric", "--emit", "asm", "--target", "x86_64"], 0, "");
     let (_, single) = asm.split_once("; one iteration, or go on to more\n").expect("it has one");
@@ -426,7 +426,7 @@ fn what_is_made_on_the_way_can_be_read() {
     let lines: Vec<&str> = single.lines().collect();
     assert_eq!((lines[0], lines[1]), ("  cmp $1, %rdx", "  jne (to any number of iterations)"), "{asm}");
     assert!(lines.len() < 25 && lines.ends_with(&["  xor %eax, %eax", "  ret"]), "{single}");
-    assert!(lines.iter().any(|line| line.contains("(%rip)") && line.ends_with("  ; 1.0")), "{single}");
+    assert!(lines.iter().any(|line| line.contains("(%rip)") && line.ends_with("  ; 3.0")), "{single}");
     let clif = |target| folder.check(&["build", "law.fric", "--emit", "clif", "--target", target], 0, "").0;
     assert!(clif("x86_64").contains("; one iteration is not Cranelift's"));
     assert!(clif("aarch64").contains("; one iteration, or go on to more"));

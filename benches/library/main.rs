@@ -4,7 +4,7 @@
 //! The C (`models.c`, `gcc -O3 -march=native`) gets the same inputs, new ones at every call, and does the same step: by
 //! `expo`, in the form in which one writes it for one model alone. First both go through the same course, whose states
 //! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The bar
-//! is this C as it stands, which neither counts nor watches. Two columns tell what that is worth: the same C with just
+//! is this C as it stands, which does not watch what it does. Two columns tell what that is worth: the same C with just
 //! that, and our step without guards. The last three are of calls whose inputs wait for the outputs of the call
 //! before, as they do where a loop is closed; in all others many calls are under way at once.
 //! A word behind the command takes only models whose names begin with it.
@@ -60,8 +60,8 @@ struct Hand {
     states: *const c_char,
     outputs: *const c_char,
     step: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64),
-    /// The same that also counts and watches. Last its step and its count.
-    checked: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, *mut f64) -> i64,
+    /// The same that also watches.
+    checked: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64) -> i64,
     /// Which states it watches, a bit each.
     watched: u64,
     number_of_outputs: u64,
@@ -252,8 +252,8 @@ fn timed(
     let mut u = vec![0.0; inputs.len()];
     let in_c: Vec<usize> = (0..outputs.len()).collect();
     let in_block: Vec<usize> = outputs.iter().map(|slot| slot.index()).collect();
-    let (mut watched, mut clock) = (x.to_vec(), [h, 0.0]);
-    let (x, watched, clock) = (x.as_mut_ptr(), watched.as_mut_ptr(), clock.as_mut_ptr());
+    let mut watched = x.to_vec();
+    let (x, watched) = (x.as_mut_ptr(), watched.as_mut_ptr());
     let (params, u, out) = (params.as_ptr(), u.as_mut_ptr(), out.as_mut_ptr());
     let of_c = Ports { inputs: u, base: out, outputs: &in_c };
     let ours = ours.map(|(entry, instance)| {
@@ -272,8 +272,8 @@ fn timed(
             step(x, params, u, out, h);
             0
         };
-        // SAFETY: as above, and the clock has its two numbers.
-        let watching = || unsafe { checked(watched, params, u, out, clock) };
+        // SAFETY: as above.
+        let watching = || unsafe { checked(watched, params, u, out, h) };
         times[0].push(round::<false>(rows(), &of_c, plain));
         times[1].push(round::<false>(rows(), &of_c, watching));
         times[4].push(round::<true>(rows(), &of_c, plain));

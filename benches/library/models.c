@@ -929,14 +929,11 @@ static void TwoMass(ARGS) {
     MODEL(Encoder, 0xdu, 2, "x", "count Ts", "y_old @count y v", "y v") \
     MODEL(TwoMass, 0xfu, 1, "F_motor F_load", "m1 m2 k d gap", "x1 v1 x2 v2", "F_shaft")
 
-/* The same step with what ours does at each call besides: it counts, and gives back whether all states and outputs are
- * finite. Of something infinite or NaN the sum is that too, and less itself NaN. `clock`: h, count. */
+/* The same step with what ours does at each call besides: it gives back whether all states and outputs are finite. Of
+ * something infinite or NaN the sum is that too, and less itself NaN. */
 #define CHECKED(name, watched, outputs, ...)                                                                           \
-    __attribute__((flatten)) static int64_t name##_checked(double *restrict x, const double *restrict p,               \
-                                                           const double *restrict u, double *restrict o,               \
-                                                           double *restrict clock) {                                   \
-        double h = clock[0], sum = -0.0;                                                                               \
-        clock[1] += 1;                                                                                                 \
+    __attribute__((flatten)) static int64_t name##_checked(ARGS) {                                                     \
+        double sum = -0.0;                                                                                             \
         name(x, p, u, o, h);                                                                                           \
         _Pragma("GCC unroll 64") for (int k = 0; k < 64; k++) if ((uint64_t)(watched) >> k & 1) sum += x[k];           \
         _Pragma("GCC unroll 64") for (int k = 0; k < (outputs); k++) sum += o[k];                                      \
@@ -947,7 +944,7 @@ MODELS(CHECKED)
 struct model {
     const char *name, *inputs, *params, *states, *outputs;
     void (*step)(ARGS);
-    int64_t (*checked)(double *restrict, const double *restrict, const double *restrict, double *restrict, double *restrict);
+    int64_t (*checked)(ARGS);
     uint64_t watched, number_of_outputs;
 };
 
