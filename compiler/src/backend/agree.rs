@@ -77,8 +77,9 @@ fn a_regime_is_read_before_it_is_set() {
     let set = build.select(less, one, zero);
     build.store(x, next);
     build.store(regime, set);
-    let blocks = [[2.0, 3.0, 0.0], [3.0, 2.0, 0.0], [2.0, 3.0, 1.0], [3.0, 2.0, 1.0]];
-    let blocks = blocks.map(|[v, w, regime]| vec![0.0, 1.0, 0.0, v, w, 5.0, regime]);
+    // −0 is 0, and what is set is not.
+    let regimes = [0.0, -0.0, 1.0].into_iter().flat_map(|regime| [[2.0, 3.0, regime], [3.0, 2.0, regime]]);
+    let blocks: Vec<Vec<f64>> = regimes.map(|[v, w, regime]| vec![0.0, 1.0, 0.0, v, w, 5.0, regime]).collect();
     check(&build.finish(), &layout, &blocks, &[], 1, "a regime that is set");
 }
 

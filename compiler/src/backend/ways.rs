@@ -113,9 +113,12 @@ impl Seeker<'_> {
         let asked = question?;
         let mut side = |truth: bool| {
             let (mut known, mut held) = (known(&mut self.build, asked, truth), held.to_vec());
-            if let Some((load, slot, number)) = self.regime(asked).filter(|_| truth) {
-                let Op::Real(bits) = self.build.get(number) else { unreachable!("it is a number") };
-                known.push((load, number));
+            if let Some((load, slot, bits)) = self.regime(asked).filter(|_| truth) {
+                for value in &list {
+                    if let Some((_, _, other)) = self.regime(*value).filter(|(of, ..)| *of == load) {
+                        known.push((*value, self.build.truth(f64::from_bits(bits) == f64::from_bits(other))));
+                    }
+                }
                 held.push((slot, bits));
             }
             let wanted = left(&mut self.build, &list, &known, &wanted);
@@ -134,7 +137,8 @@ impl Seeker<'_> {
         }
         let is_there = |(slot, value): &(Slot, Value)| match self.build.get(*value) {
             Op::Load(from) => from == *slot,
-            Op::Real(bits) => held.contains(&(*slot, bits)),
+            // What is found to be 0 may be −0.
+            Op::Real(bits) => f64::from_bits(bits) != 0.0 && held.contains(&(*slot, bits)),
             _ => false,
         };
         let stored = self.slots.iter().copied().zip(wanted.iter().copied());
@@ -144,11 +148,11 @@ impl Seeker<'_> {
         Way::Ends { stores: stored.filter(|store| !is_there(store)).collect(), writes, failed: failed.first().copied() }
     }
 
-    /// The load, its slot and the number, if it is asked whether a slot that is stored holds a number.
-    fn regime(&self, asked: Value) -> Option<(Value, Slot, Value)> {
+    /// The load, its slot and the bits of the number, if it is asked whether a slot that is stored holds a number.
+    fn regime(&self, asked: Value) -> Option<(Value, Slot, u64)> {
         let Op::Equal(a, b) = self.build.get(asked) else { return None };
         [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (self.build.get(load), self.build.get(number)) {
-            (Op::Load(slot), Op::Real(_)) if self.slots.contains(&slot) => Some((load, slot, number)),
+            (Op::Load(slot), Op::Real(bits)) if self.slots.contains(&slot) => Some((load, slot, bits)),
             _ => None,
         })
     }
