@@ -135,6 +135,8 @@ enum Place {
     Before,
     Within(usize),
     Behind,
+    /// In each regime that needs it.
+    Each,
     /// It is computed elsewhere, or never.
     Elsewhere,
 }
@@ -168,12 +170,13 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
         let by = places[i];
         func.ops[i].each_operand(|operand| used(operand, by, &mut users));
     }
-    let mut needed: Vec<HashSet<Value>> = vec![HashSet::new(); slots.len()];
+    leave_to_each(func, &mut places);
+    let mut wanted: Vec<HashSet<Value>> = vec![HashSet::new(); slots.len()];
     let mut note = |value: Value, by: Place| {
         if let Place::Within(k) = places[value.index()]
             && by != Place::Within(k)
         {
-            needed[k].insert(value);
+            wanted[k].insert(value);
         }
     };
     func.results().for_each(|value| note(value, Place::Before));
@@ -183,18 +186,18 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
     let listed = |place: Place| -> Vec<Value> { all().filter(|value| places[value.index()] == place).collect() };
     let mut build = Build::of(func);
     let mut there: HashSet<Value> = listed(Place::Before).into_iter().collect();
-    let automata = slots.iter().zip(needed).enumerate().filter(|(_, (_, needed))| !needed.is_empty());
+    let automata = slots.iter().zip(wanted).enumerate().filter(|(_, (_, wanted))| !wanted.is_empty());
     let automata = automata
-        .map(|(k, ((load, numbers), needed))| {
+        .map(|(k, ((load, numbers), wanted))| {
             let members = listed(Place::Within(k));
-            let mut outputs: Vec<Value> = needed.into_iter().collect();
+            let mut outputs: Vec<Value> = wanted.into_iter().collect();
             outputs.sort_unstable();
             let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
             let next = func.stores.iter().find(|(stored, _)| *stored == slot).map(|(_, value)| *value);
             let next = outputs.iter().position(|output| Some(*output) == next);
             let case = |bits: &u64| (*bits, case(&mut build, &mut there, (*load, *bits), &members, (&outputs, next)));
             let cases = numbers.iter().map(case).collect();
-            let general = Case { list: members, then: Then::Outputs(outputs.clone()) };
+            let general = Case { list: needed(&build, &there, &outputs), then: Then::Outputs(outputs.clone()) };
             Automaton { slot, outputs, cases, general }
         })
         .collect();
@@ -252,6 +255,24 @@ fn dependent(func: &Func, late: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<
         *place = Place::Elsewhere;
     }
     of
+}
+
+/// Leaves to each regime what several need and nothing else does, if it is next to nothing: what it reads of the block, a sign.
+fn leave_to_each(func: &Func, places: &mut [Place]) {
+    let mut beyond = vec![false; func.ops.len()];
+    func.results().for_each(|value| beyond[value.index()] = true);
+    for (i, op) in func.ops.iter().enumerate().rev() {
+        let little = match op {
+            Op::Load(slot) => func.stores.iter().all(|(stored, _)| stored != slot),
+            op => matches!(op, Op::Neg(_) | Op::Abs(_)),
+        };
+        if places[i] == Place::Before && !beyond[i] && little {
+            places[i] = Place::Each;
+        }
+        if !matches!(places[i], Place::Within(_) | Place::Each) {
+            op.each_operand(|operand| beyond[operand.index()] = true);
+        }
+    }
 }
 
 /// Puts what only watches, on what is stored anyway, behind all regimes: it is the same in each.
