@@ -10,11 +10,14 @@ mod bench;
 
 mod battery;
 
+mod measured;
+
 mod phenomena;
 
 mod study;
 
 pub mod page;
 
+pub use measured::shown;
 pub use phenomena::Seen;
-pub use study::{Extent, Study, drawn, shown, study};
+pub use study::{Extent, Study, drawn, study};

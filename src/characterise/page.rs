@@ -2,8 +2,9 @@
 //!
 //! In: one [`Study`] or several. Out: a page. Figures are SVG in the page, nothing is fetched, nothing is run.
 
+use super::measured::{Graph, Test, shown};
 use super::phenomena::Seen;
-use super::study::{Graph, Study, Test, figure, shown};
+use super::study::{Study, figure};
 use crate::equations;
 use crate::plot;
 use crate::value::{show, significant};

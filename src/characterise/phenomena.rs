@@ -4,7 +4,7 @@
 //! Nothing here asks what a model says of itself.
 
 use super::battery::Scales;
-use super::study::{Number, Test};
+use super::measured::{Number, Test, plain};
 use super::subject::{External, Subject};
 
 /// A phenomenon and whether the model shows it.
@@ -292,7 +292,7 @@ impl Look<'_> {
             && second > 0.02 * self.scales.f_b
             && second > 1.05 * first
         {
-            let ratio = super::study::plain((100.0 * second / first.max(1e-300)).round() / 100.0);
+            let ratio = plain((100.0 * second / first.max(1e-300)).round() / 100.0);
             return when(
                 true,
                 format!("with the history: the overshoot after a reversal is {ratio} times that from rest"),

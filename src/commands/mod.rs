@@ -17,6 +17,7 @@ mod inspect;
 mod key;
 mod hil;
 mod linearise;
+mod live;
 mod new;
 mod pack;
 mod predict;

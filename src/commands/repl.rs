@@ -1,39 +1,19 @@
 //! `fric`, `fric repl`: a session at the prompt.
 
 use super::End;
+use super::live::{catch_interrupts, forget_interrupt, run_figure, show_run, stop_on_interrupt, tell_fault};
 use crate::args::{Characterise, Repl};
 use crate::compile::Explanation;
 use crate::plot::{self, Axis, Curve, Figure, Panel};
 use crate::repl::{self, COMMANDS, Command, Cut, Editor, Fault, Input, Line, Ran, Session, Value, plain};
 use crate::terminal::{Style, Terminal};
-use crate::{diagram, equations, figure, project, report, results, value};
-use abi::Slot;
+use crate::{diagram, equations, project, report, results};
 use abi::unit::Unit;
-use runtime::engine::{Cause, Continue};
+use runtime::engine::Cause;
 use std::cell::RefCell;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
-use std::sync::atomic::{AtomicBool, Ordering};
-
-/// Set by Ctrl-C, taken back before each line.
-static INTERRUPTED: AtomicBool = AtomicBool::new(false);
-
-/// Whether Ctrl-C was pressed since the line began.
-pub(super) fn interrupted() -> bool {
-    INTERRUPTED.load(Ordering::Relaxed)
-}
-
-/// Lets Ctrl-C stop what runs instead of the process.
-pub(super) fn catch_interrupts() {
-    INTERRUPTED.store(false, Ordering::Relaxed);
-    // Set once for the process; a second call has nothing to add.
-    let _ = ctrlc::set_handler(|| INTERRUPTED.store(true, Ordering::Relaxed));
-}
-
-pub(super) fn watch(_: f64) -> Continue {
-    if interrupted() { Continue::Break(()) } else { Continue::Continue(()) }
-}
 
 pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
     let session = Rc::new(RefCell::new(Session::default()));
@@ -75,7 +55,7 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
                 return End::Failed;
             }
         };
-        INTERRUPTED.store(false, Ordering::Relaxed);
+        forget_interrupt();
         if args.echo && !typed {
             terminal.print(&repl::as_typed(&text));
         }
@@ -100,17 +80,6 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
         if end == End::Failed && !typed && !args.keep_going {
             return end;
         }
-    }
-}
-
-/// Says what is wrong.
-pub(super) fn tell_fault(fault: &Fault, terminal: &Terminal) {
-    match fault {
-        Fault::Found(files, diagnostics) => {
-            terminal.report(&report::full(files, diagnostics, terminal.error_colour()));
-        }
-        Fault::Words(words) => terminal.error(words),
-        Fault::Stopped(failure) => terminal.error(&failure.to_string()),
     }
 }
 
@@ -266,7 +235,7 @@ impl Prompt<'_> {
             },
         };
         let duration = length.map(|length| self.time(length, "run NAME for 20 s")).transpose()?;
-        let ran = self.session.run(name, duration, &watch)?;
+        let ran = self.session.run(name, duration, &stop_on_interrupt)?;
         let held = show_run(&ran, true, self.terminal);
         stopped(&ran)?;
         Ok(if held { Next::Line } else { Next::Missed })
@@ -315,11 +284,11 @@ impl Prompt<'_> {
         let (what, file) = repl::cut_to(rest)?;
         let drawn = match over(what) {
             Some((shows, path, from, to, steady)) => {
-                let cut = self.session.cut(shows, &path, (from, to), steady, &mut watch)?;
+                let cut = self.session.cut(shows, &path, (from, to), steady, &mut stop_on_interrupt)?;
                 cut_figure(&cut, steady)
             }
             None => {
-                let ran = self.session.again(&format!("plot {what}"), false, &watch)?;
+                let ran = self.session.again(&format!("plot {what}"), false, &stop_on_interrupt)?;
                 stopped(&ran)?;
                 run_figure(&ran, true).ok_or("there is nothing to draw")?
             }
@@ -341,7 +310,7 @@ impl Prompt<'_> {
         if rest.is_empty() {
             return Err("expect what? `expect max(x) < 1 mm`".into());
         }
-        let ran = self.session.again(&format!("expect {rest}"), true, &watch)?;
+        let ran = self.session.again(&format!("expect {rest}"), true, &stop_on_interrupt)?;
         stopped(&ran)?;
         let mut held = true;
         for (case, result) in ran.cases.iter().zip(&ran.results) {
@@ -580,61 +549,6 @@ fn stopped(ran: &Ran) -> Result<(), Fault> {
     }
 }
 
-/// Says what a run did, draws its plots, judges its expectations; returns whether they hold.
-pub(super) fn show_run(ran: &Ran, draw: bool, terminal: &mut Terminal) -> bool {
-    if let Some(warnings) = &ran.warnings {
-        tell_fault(warnings, terminal);
-    }
-    let Some(first) = ran.cases.first() else { return true };
-    let outcomes: Vec<_> = ran.results.iter().filter_map(|result| result.as_ref().ok()).collect();
-    let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
-    let cases = if ran.cases.len() > 1 { format!(", {} cases", ran.cases.len()) } else { String::new() };
-    let second = Unit::parse("s").expect("the second is known");
-    terminal.line(&format!(
-        "{}: {}{cases}, {} steps for {}",
-        terminal.styled(Style::Bold, &ran.name),
-        results::solver(&first.experiment.solver),
-        value::count(steps),
-        value::show(first.experiment.duration, &second, 6),
-    ));
-    for note in first.notes.iter().chain(outcomes.iter().flat_map(|outcome| &outcome.notes)) {
-        terminal.line(&format!("  note: {note}"));
-    }
-    if let Some(drawn) = run_figure(ran, false).filter(|_| draw) {
-        terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
-    } else if let ([outcome], true) = (outcomes.as_slice(), draw) {
-        let width = outcome.finals.iter().map(|end| end.path.chars().count()).max().unwrap_or(0);
-        for end in &outcome.finals {
-            let value = Value { si: end.value, unit: end.unit.clone(), boolean: end.boolean };
-            terminal.line(&format!("  {:width$}  {} at the end", end.path, plain(&value)));
-        }
-    }
-    let mut held = true;
-    for (case, result) in ran.cases.iter().zip(&ran.results) {
-        let Ok(outcome) = result else { continue };
-        if !case.label.is_empty() && !outcome.verdicts.is_empty() {
-            terminal.line(&format!("  {}", case.label));
-        }
-        held &= outcome.verdicts.iter().all(|verdict| verdict.holds);
-        let words = results::verdicts(terminal, &outcome.verdicts, "  ");
-        terminal.print(&words);
-    }
-    held
-}
-
-/// The plots of a run in one figure; `last`: only the plot that was added last.
-pub(super) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
-    let first = ran.cases.first()?;
-    let plots = &first.experiment.plots;
-    let plots = if last { &plots[plots.len().saturating_sub(1)..] } else { &plots[..] };
-    if plots.is_empty() {
-        return None;
-    }
-    let cases = figure::recorded(&ran.cases, &ran.results);
-    let subtitle = results::solver(&first.experiment.solver);
-    Some(figure::figure(&ran.name, &subtitle, plots, &cases))
-}
-
 /// A curve over an input or a parameter as a figure: quantities of one unit share axes.
 fn cut_figure(cut: &Cut, steady: bool) -> Figure {
     let (name, unit) = &cut.over;
@@ -658,11 +572,6 @@ fn cut_figure(cut: &Cut, steady: bool) -> Figure {
     let labels: Vec<&str> = cut.series.iter().map(|series| series.label.as_str()).collect();
     let subtitle = if steady { "each point at rest" } else { "states as they are" };
     Figure { title: format!("{} against {name}", labels.join(", ")), subtitle: subtitle.into(), panels }
-}
-
-/// Time of an instance, for those who go on from it.
-pub(super) fn time_of(instance: &abi::Instance) -> f64 {
-    instance.get(Slot::TIME)
 }
 
 #[cfg(test)]

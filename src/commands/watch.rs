@@ -1,8 +1,6 @@
 //! `fric watch`: runs an experiment again whenever its text is saved. States go on by name and unit.
 
-use super::repl::{
-    catch_interrupts, interrupted, run_figure, show_run, tell_fault, time_of, watch as stop_on_interrupt,
-};
+use super::live::{catch_interrupts, interrupted, run_figure, show_run, stop_on_interrupt, tell_fault, time_of};
 use super::{End, has_experiment};
 use crate::args::Watch;
 use crate::plot;

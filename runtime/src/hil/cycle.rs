@@ -9,12 +9,12 @@
 //! lock or write anything but frames; what it leaves behind goes through queues that never wait.
 
 use super::control::{Bounds, Control, Reading, Source, Told};
+use super::counts::Counts;
 use super::trace::{self, Passed, Shape};
-use super::{control, coupling, emergency};
+use super::{control, emergency};
 use crate::can::{Bus, Event, Frame, Received};
 use crate::clock::Clock;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
-use crate::histogram::Histogram;
 use crate::lookahead::Wired;
 use crate::queue::{Receiver, Sender, queue};
 use crate::record::log::{self, Log, Sections};
@@ -106,43 +106,6 @@ pub enum End {
     Refused(String),
     /// By safety or a condition of the rig: why.
     Stopped(Cause, String),
-}
-
-/// What was counted.
-#[derive(Clone, Default)]
-pub struct Counts {
-    /// Cycles in which the model ran.
-    pub cycles: u64,
-    /// Cycles of all kinds.
-    pub all: u64,
-    /// Times a cycle began a period late or more.
-    pub overruns: u64,
-    /// Ticks missed by them.
-    pub missed: u64,
-    /// Readings of drives that a model's cycle had to hold.
-    pub stale: u64,
-    /// Frames lost before they were read.
-    pub lost_frames: u64,
-    /// Frames that a bus did not take.
-    pub refused_frames: u64,
-    /// Error frames, and warnings of buses.
-    pub bus_errors: u64,
-    /// Outputs clamped by range, slew, power.
-    pub clamped: [u64; 3],
-    /// Cycles the log dropped.
-    pub log_dropped: u64,
-    /// Sets of parameters that were refused.
-    pub refused_sets: u64,
-    /// Looking ahead, and energy of the contacts; none: the rig has neither.
-    pub coupling: Option<coupling::Counts>,
-    /// How late cycles began.
-    pub late: Histogram,
-    /// From the begin of a cycle to the last answer read.
-    pub receive: Histogram,
-    /// Model and safety.
-    pub compute: Histogram,
-    /// Commands out.
-    pub send: Histogram,
 }
 
 /// Numbers to look at while the rig is under way: each is written by the cycle and may be read by anybody.

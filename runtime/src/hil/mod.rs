@@ -9,8 +9,9 @@ pub mod control;
 pub mod trace;
 pub mod replay;
 pub mod emergency;
-pub mod cycle;
+pub mod counts;
 pub mod words;
+pub mod cycle;
 pub mod identify;
 pub mod simulated;
 

@@ -1,6 +1,6 @@
 //! What a rig has to say, in words.
 
-use super::cycle::Counts;
+use super::counts::Counts;
 use crate::drive::Step;
 use crate::histogram::Histogram;
 use crate::safety::Cause;
