@@ -6,7 +6,7 @@
 
 use crate::ir::build::Build;
 use crate::ir::left::{known, left, needed};
-use crate::ir::{Func, Op, Type, Value};
+use crate::ir::{Func, Op, Type, Value, number_asked};
 use abi::Slot;
 use std::cmp::Reverse;
 use std::collections::{HashMap, HashSet};
@@ -209,15 +209,7 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
 fn automata(func: &Func) -> Vec<(Value, Vec<u64>)> {
     let mut found: HashMap<Value, Option<Vec<u64>>> = HashMap::new();
     for op in &func.ops {
-        let compared = match *op {
-            Op::Equal(a, b) => match (func.op(a), func.op(b)) {
-                (Op::Load(_), Op::Real(bits)) => Some((a, bits)),
-                (Op::Real(bits), Op::Load(_)) => Some((b, bits)),
-                _ => None,
-            },
-            _ => None,
-        };
-        if let Some((load, bits)) = compared {
+        if let Some((load, _, bits)) = number_asked(*op, |value| func.op(value)) {
             let numbers = found.entry(load).or_insert_with(|| Some(Vec::new()));
             numbers.iter_mut().filter(|numbers| !numbers.contains(&bits)).for_each(|numbers| numbers.push(bits));
         } else if !matches!(op, Op::Select(..)) {

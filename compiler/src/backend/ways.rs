@@ -7,7 +7,7 @@
 use super::sides::Sides;
 use crate::ir::build::Build;
 use crate::ir::left::{known, left, needed};
-use crate::ir::{Func, Op, Value, Write};
+use crate::ir::{Func, Op, Value, Write, number_asked};
 use crate::opt::watched::{with_fewer, with_less_asked};
 use abi::Slot;
 use std::collections::HashSet;
@@ -150,11 +150,8 @@ impl Seeker<'_> {
 
     /// The load, its slot and the bits of the number, if it is asked whether a slot that is stored holds a number.
     fn regime(&self, asked: Value) -> Option<(Value, Slot, u64)> {
-        let Op::Equal(a, b) = self.build.get(asked) else { return None };
-        [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (self.build.get(load), self.build.get(number)) {
-            (Op::Load(slot), Op::Real(bits)) if self.slots.contains(&slot) => Some((load, slot, bits)),
-            _ => None,
-        })
+        let found = number_asked(self.build.get(asked), |value| self.build.get(value));
+        found.filter(|(_, slot, _)| self.slots.contains(slot))
     }
 
     /// What to ask first, regimes before all else; none if there is nothing, and a none within if it is no comparison.

@@ -203,6 +203,16 @@ pub fn sign_of(sign: Op, op: impl Fn(Value) -> Op) -> Option<Value> {
     (alike && is(one, 1.0) && is(minus_one, -1.0)).then_some(x)
 }
 
+/// The load, its slot and the bits of the number, if it is asked whether a slot holds a number written down. `op`: what gives a
+/// value.
+pub fn number_asked(asked: Op, op: impl Fn(Value) -> Op) -> Option<(Value, Slot, u64)> {
+    let Op::Equal(a, b) = asked else { return None };
+    [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (op(load), op(number)) {
+        (Op::Load(slot), Op::Real(bits)) => Some((load, slot, bits)),
+        _ => None,
+    })
+}
+
 /// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Write {

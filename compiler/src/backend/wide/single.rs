@@ -17,7 +17,7 @@ use super::order::order;
 use super::select::{Node, Nodes, Operations, Predicate, What, operations};
 use crate::backend::unsupported::Unsupported;
 use crate::backend::ways::{Way, ways};
-use crate::ir::{Func, Op, Value, Write};
+use crate::ir::{Func, Op, Value, Write, number_asked};
 use abi::Slot;
 use std::collections::{HashMap, HashSet};
 
@@ -164,11 +164,8 @@ impl Writer<'_> {
 
     /// The slot and the bits, if it is asked whether a number of the block is a constant, as of regimes.
     fn number_asked(&self, asked: Value) -> Option<(Slot, u64)> {
-        let Op::Equal(a, b) = self.func.op(asked) else { return None };
-        [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (self.func.op(load), self.func.op(number)) {
-            (Op::Load(slot), Op::Real(bits)) if !f64::from_bits(bits).is_nan() => Some((slot, bits)),
-            _ => None,
-        })
+        let (_, slot, bits) = number_asked(self.func.op(asked), |value| self.func.op(value))?;
+        (!f64::from_bits(bits).is_nan()).then_some((slot, bits))
     }
 
     fn end(
