@@ -1,7 +1,7 @@
 //! A model that runs: its block of numbers and its code, with every access checked.
 
 use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
-use crate::table::{Code, Function, keep_clock};
+use crate::table::{Code, Function, Machine, keep_clock};
 use std::sync::Arc;
 
 /// One running copy of a compiled model.
@@ -9,15 +9,20 @@ use std::sync::Arc;
 pub struct Instance {
     description: Arc<Description>,
     code: Code,
-    block: Vec<f64>,
+    /// Slots, and behind them what the code prepares of parameters.
+    numbers: Vec<f64>,
+    /// Whether that was prepared since a parameter or the length of the step changed.
+    is_prepared: bool,
 }
 
 impl Instance {
     /// A copy whose parameters have their defaults: `params`, SI, as many as the layout has.
     pub fn new(description: Arc<Description>, code: Code, params: &[f64]) -> Instance {
-        let mut block = vec![0.0; description.layout.size()];
-        block[description.layout.params.range()].copy_from_slice(params);
-        Instance { description, code, block }
+        // So that what is in time need not make room.
+        let prepared = code.made(Function::Step).and_then(Machine::prepared).map_or(0, |prepared| prepared.len);
+        let mut numbers = vec![0.0; description.layout.size() + prepared];
+        numbers[description.layout.params.range()].copy_from_slice(params);
+        Instance { description, code, numbers, is_prepared: false }
     }
 
     /// What it is.
@@ -32,22 +37,25 @@ impl Instance {
 
     /// The value in a slot, SI.
     pub fn get(&self, slot: Slot) -> f64 {
-        self.block[slot.index()]
+        self.block()[slot.index()]
     }
 
     /// Writes a slot, SI.
     pub fn set(&mut self, slot: Slot, value: f64) {
-        self.block[slot.index()] = value;
+        self.is_prepared &= slot != Slot::STEP && !self.description.layout.params.contains(slot);
+        let size = self.description.layout.size();
+        self.numbers[..size][slot.index()] = value;
     }
 
     /// All slots.
     pub fn block(&self) -> &[f64] {
-        &self.block
+        &self.numbers[..self.description.layout.size()]
     }
 
     /// All slots, to write.
     pub fn block_mut(&mut self) -> &mut [f64] {
-        &mut self.block
+        self.is_prepared = false;
+        &mut self.numbers[..self.description.layout.size()]
     }
 
     /// Runs one function once; returns its status, 0 for none.
@@ -59,11 +67,26 @@ impl Instance {
     /// block tells their count and the time.
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
         let before = self.get(Slot::COUNT);
-        let status = self.code.call(function, &mut self.block, &self.description.pool, n);
+        let single = if (function, n) == (Function::Step, 1) { self.step_prepared() } else { None };
+        let call = || self.code.call(function, &mut self.numbers, &self.description.pool, n);
+        let status = single.unwrap_or_else(call);
         if function == Function::Step && n > 0 {
-            keep_clock(&mut self.block, before, n);
+            keep_clock(&mut self.numbers, before, n);
         }
         status
+    }
+
+    /// One fixed step, if there is code for which what hangs on parameters is prepared.
+    fn step_prepared(&mut self) -> Option<u64> {
+        let machine = self.code.made(Function::Step)?;
+        let size = self.description.layout.size() + machine.prepared()?.len;
+        if self.numbers.len() < size {
+            // The code was made since.
+            self.numbers.resize(size, 0.0);
+            self.is_prepared = false;
+        }
+        let there = std::mem::replace(&mut self.is_prepared, true);
+        machine.step_prepared(&mut self.numbers, &self.description.pool, there)
     }
 
     /// Puts the model at t = 0 for steps of `h` seconds: initial values and the blocks due at 0, then transitions
@@ -77,9 +100,9 @@ impl Instance {
             let regimes = self.description.layout.regimes.range();
             let most = self.description.automata.iter().map(|automaton| automaton.regimes.len()).max().unwrap_or(0);
             for _ in 0..=most {
-                let before = self.block[regimes.clone()].to_vec();
+                let before = self.numbers[regimes.clone()].to_vec();
                 status = status.max(self.call(Function::Transitions));
-                if self.block[regimes.clone()] == before[..] {
+                if self.numbers[regimes.clone()] == before[..] {
                     break;
                 }
             }
@@ -124,8 +147,8 @@ impl Instance {
             let periods = new.ticks.iter().map(|tick| tick.period);
             let delays = new.delays.iter().flat_map(|delay| [delay.time, delay.back].into_iter().chain(delay.weight));
             let own: Vec<(Slot, f64)> = periods.chain(delays).map(|slot| (slot, self.get(slot))).collect();
-            let memory = &from.block[old.layout.memory.range()];
-            self.block[new.layout.memory.range()].copy_from_slice(memory);
+            let memory = &from.numbers[old.layout.memory.range()];
+            self.numbers[new.layout.memory.range()].copy_from_slice(memory);
             own.into_iter().for_each(|(slot, value)| self.set(slot, value));
         }
         let mut begins = false;
@@ -142,7 +165,7 @@ impl Instance {
             };
             match old.quantities.iter().find(fits) {
                 Some(before) => {
-                    self.block[state.slot.index()] = from.get(before.slot);
+                    self.numbers[state.slot.index()] = from.get(before.slot);
                     carried.kept.push(state.path.clone());
                 }
                 None => carried.fresh.push(state.path.clone()),
@@ -159,7 +182,7 @@ impl Instance {
             });
             match regime {
                 Some(regime) => {
-                    self.block[automaton.slot.index()] = regime as f64;
+                    self.numbers[automaton.slot.index()] = regime as f64;
                     carried.kept.push(named(automaton));
                 }
                 None => carried.fresh.push(named(automaton)),
@@ -200,7 +223,7 @@ impl Instance {
 mod tests {
     use super::*;
     use crate::description::Layout;
-    use crate::table::Interpret;
+    use crate::table::{Interpret, Prepared};
 
     /// Counts many steps, one not, and knows no time.
     struct Counts;
@@ -229,5 +252,49 @@ mod tests {
         instance.call(Function::Outputs);
         instance.advance(0);
         assert_eq!(instance.get(Slot::TIME), 9.0, "what makes no step leaves it");
+    }
+
+    /// Slot 6, behind the block, is twice the parameter in slot 3; slot 5 counts how often it was prepared.
+    unsafe extern "C" fn prepare(block: *mut f64, _: *const f64, _: u64) -> u64 {
+        // SAFETY: the block has six slots and a number behind them.
+        unsafe {
+            *block.add(6) = 2.0 * *block.add(3);
+            *block.add(5) += 1.0;
+        }
+        0
+    }
+
+    /// The state in slot 4 grows by it.
+    unsafe extern "C" fn step(block: *mut f64, _: *const f64, _: u64) -> u64 {
+        // SAFETY: as above.
+        unsafe { *block.add(4) += *block.add(6) };
+        0
+    }
+
+    #[test]
+    fn what_hangs_on_parameters_is_prepared_when_one_changes() {
+        let layout = Layout::new([1, 0, 1, 1, 0, 0, 0, 0, 0, 0]);
+        let (param, state, prepared) = (layout.params.slot(0), layout.states.slot(0), layout.memory.slot(0));
+        let description = Arc::new(Description { layout, ..Description::default() });
+        // SAFETY: they access the block and one number behind it.
+        let machine = unsafe {
+            Machine::new([None; Function::ALL.len()], 6, 0, Arc::new(())).with_prepared(Prepared {
+                prepare: Some(prepare),
+                step,
+                len: 1,
+            })
+        };
+        let mut instance = Instance::new(description, Code::Machine(machine), &[1.0]);
+        let mut after = |change: &dyn Fn(&mut Instance)| {
+            change(&mut instance);
+            instance.advance(1);
+            (instance.get(state), instance.get(prepared), instance.block().len())
+        };
+        assert_eq!(after(&|_| ()), (2.0, 1.0, 6));
+        assert_eq!(after(&|instance| instance.set(state, 10.0)), (12.0, 1.0, 6), "a state prepares nothing");
+        assert_eq!(after(&|instance| instance.set(param, 3.0)), (18.0, 2.0, 6));
+        assert_eq!(after(&|instance| instance.set(Slot::STEP, 0.5)), (24.0, 3.0, 6));
+        assert_eq!(after(&|instance| instance.block_mut()[param.index()] = 4.0), (32.0, 4.0, 6));
+        assert_eq!(after(&|instance| *instance = instance.clone()), (40.0, 4.0, 6), "a copy has it too");
     }
 }

@@ -79,12 +79,28 @@ pub fn keep_time(block: &mut [f64]) {
     block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
 }
 
+/// Machine code of one fixed step of which what hangs on parameters and the length of the step alone is computed beforehand:
+/// so many numbers behind the block.
+#[derive(Clone, Copy)]
+pub struct Prepared {
+    /// Writes these numbers, whatever the count; none if there are none.
+    pub prepare: Option<Entry>,
+    /// One step, on a block whose numbers were written since a parameter or the length of the step changed; the count is 1.
+    pub step: Entry,
+    /// How many they are.
+    pub len: usize,
+}
+
 /// Code that is interpreted, made late, or written by hand in tests.
 pub trait Interpret: Send + Sync {
     /// As [`Entry`], on a block of the description's size.
     fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64;
     /// Whether the function is there.
     fn has(&self, function: Function) -> bool;
+    /// Machine code of the function, if by now there is such.
+    fn made(&self, _: Function) -> Option<&Machine> {
+        None
+    }
 }
 
 /// The code of a model.
@@ -104,6 +120,8 @@ pub struct Machine {
     pool_len: usize,
     /// The step again, in two parts.
     ahead: Option<Arc<Ahead>>,
+    /// The step again, one at a time.
+    prepared: Option<Prepared>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
@@ -119,7 +137,7 @@ impl Machine {
         pool_len: usize,
         memory: Arc<dyn Any + Send + Sync>,
     ) -> Machine {
-        Machine { entries, size, pool_len, ahead: None, _memory: memory }
+        Machine { entries, size, pool_len, ahead: None, prepared: None, _memory: memory }
     }
 
     /// The same, which takes many steps in two parts.
@@ -130,6 +148,15 @@ impl Machine {
         Machine { ahead: Some(Arc::new(ahead)), ..self }
     }
 
+    /// The same, which takes a single step where that is prepared.
+    ///
+    /// # Safety
+    /// It must give the bits of the step that is there, access only the block, so many numbers behind it and the pool,
+    /// be valid as long as the memory of this lives, and not unwind.
+    pub unsafe fn with_prepared(self, prepared: Prepared) -> Machine {
+        Machine { prepared: Some(prepared), ..self }
+    }
+
     /// Whether many steps are taken in two parts.
     pub fn goes_ahead(&self) -> bool {
         self.ahead.is_some()
@@ -137,8 +164,7 @@ impl Machine {
 
     /// As [`Code::call`].
     pub fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
-        assert!(block.len() >= self.size, "block of {} slots, {} needed", block.len(), self.size);
-        assert!(pool.len() >= self.pool_len, "pool of {} numbers, {} needed", pool.len(), self.pool_len);
+        self.check(block, pool, 0);
         let entry =
             self.entries[function as usize].unwrap_or_else(|| panic!("the code has no function `{}`", function.name()));
         let mut left = count;
@@ -156,6 +182,30 @@ impl Machine {
         // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
         unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), left) }
     }
+
+    /// Its single step that is prepared, if it has one.
+    pub fn prepared(&self) -> Option<Prepared> {
+        self.prepared
+    }
+
+    /// One fixed step on a block with the numbers of [`Prepared`] behind it, which are written before unless they are `there`;
+    /// none if the code has no such step.
+    pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], there: bool) -> Option<u64> {
+        let Prepared { prepare, step, len } = self.prepared?;
+        self.check(block, pool, len);
+        if let Some(prepare) = prepare.filter(|_| !there) {
+            // SAFETY: `with_prepared` was promised that it accesses only the lengths just checked.
+            unsafe { prepare(block.as_mut_ptr(), pool.as_ptr(), 1) };
+        }
+        // SAFETY: as above.
+        Some(unsafe { step(block.as_mut_ptr(), pool.as_ptr(), 1) })
+    }
+
+    fn check(&self, block: &[f64], pool: &[f64], more: usize) {
+        let size = self.size + more;
+        assert!(block.len() >= size, "block of {} slots, {size} needed", block.len());
+        assert!(pool.len() >= self.pool_len, "pool of {} numbers, {} needed", pool.len(), self.pool_len);
+    }
 }
 
 impl Code {
@@ -172,6 +222,14 @@ impl Code {
         match self {
             Code::Machine(machine) => machine.entries[function as usize],
             Code::Interpreted(_) => None,
+        }
+    }
+
+    /// Machine code of a function, if by now there is such.
+    pub fn made(&self, function: Function) -> Option<&Machine> {
+        match self {
+            Code::Machine(machine) => Some(machine),
+            Code::Interpreted(code) => code.made(function),
         }
     }
 

@@ -7,6 +7,7 @@ use crate::backend::wide::{self, Width};
 use crate::backend::{interp::Interpreter, jit, target};
 use crate::ir::Func;
 use crate::opt::contract::contract;
+use crate::opt::limited::limited;
 use crate::opt::regroup::regroup;
 use crate::opt::watched::watched;
 use crate::program::Program;
@@ -47,7 +48,7 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 /// # Panics
 /// For the adaptive method, which is no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
-    watched(&contract(&regroup(&discretize::step(program, method))))
+    watched(&limited(&contract(&regroup(&discretize::step(program, method)))))
 }
 
 /// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;
@@ -97,7 +98,7 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     if interpret {
         return (interpreted(), Vec::new());
     }
-    match jit::compile(functions, layout, pool) {
+    match jit::compile_prepared(functions, layout, pool) {
         Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
         Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
     }
@@ -163,7 +164,8 @@ impl Late {
 impl Interpret for Late {
     fn call(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
         let made = &self.made[which as usize];
-        let compiled = || self.make(which, |funcs, layout, pool| jit::compile(funcs, layout, pool).ok().map(|it| it.0));
+        let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
+        let compiled = || self.make(which, make);
         let pays = || made.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > PAYS;
         if (made.machine.get().is_some() || pays())
             && let Some(machine) = made.machine.get_or_init(compiled)
@@ -171,6 +173,10 @@ impl Interpret for Late {
             return machine.call(which, block, pool, count);
         }
         made.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
+    }
+
+    fn made(&self, which: Function) -> Option<&Machine> {
+        self.made[which as usize].machine.get()?.as_ref()
     }
 
     fn has(&self, which: Function) -> bool {
@@ -184,11 +190,12 @@ mod tests {
     use abi::Instance;
 
     const TEXT: &str = "model Contact {
+  param m = 1 kg
   state x [m] = 0
   state v [m/s] = 0
   let F = tanh(v / 1 mm/s) * 1 N
   dx/dt = v
-  dv/dt = (2 N * sin(t / 1 s) - F) / 1 kg
+  dv/dt = (2 N * sin(t / 1 s) - F) / m
   output power [W] = F * v
 }";
 
@@ -206,7 +213,12 @@ mod tests {
         let counts = (0..2 * PAYS).map(|_| 1).chain([PAYS + 1, 3]);
         let bits = |instance: &Instance| instance.block().iter().map(|x| x.to_bits()).collect();
         counts
-            .map(|count| {
+            .enumerate()
+            .map(|(k, count)| {
+                // Now and then a parameter changes, before the code is there and behind.
+                if k % 7 == 3 {
+                    instance.set(program.description.layout.params.slot(0), 1.0 + 0.1 * k as f64);
+                }
                 assert_eq!(instance.advance(count), 0);
                 instance.call(Function::Outputs);
                 bits(&instance)

@@ -53,7 +53,7 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<(Vec<&'sta
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");
     let one = |(case, expected): (&Case, &Vec<Result>)| {
-        let machine = jit::compile(&case.functions, case.layout(), case.description.pool.len());
+        let machine = jit::compile_prepared(&case.functions, case.layout(), case.description.pool.len());
         let code = Code::Machine(machine.unwrap_or_else(|why| panic!("{}: {why}", case.name)).0);
         agree(case, expected, &case.on(&code), "machine code in memory");
         // SAFETY: the compiler has just made it.

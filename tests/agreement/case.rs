@@ -70,8 +70,24 @@ impl Case {
     /// What each run leads to.
     pub fn on(&self, code: &Code) -> Vec<Result> {
         let pool = &self.description.pool;
-        let call = |function, block: &mut [f64], count| code.call(function, block, pool, count);
-        self.runs.iter().map(|run| run.by(call)).collect()
+        let one = |run: &Run| {
+            // Behind the block, from the first single step on.
+            let mut prepared: Option<Vec<f64>> = None;
+            run.by(|function, block, count| {
+                let single = code.made(Function::Step).filter(|_| (function, count) == (Function::Step, 1));
+                let Some((machine, of_step)) = single.and_then(|machine| Some((machine, machine.prepared()?))) else {
+                    return code.call(function, block, pool, count);
+                };
+                let there = prepared.is_some();
+                let behind = prepared.get_or_insert_with(|| vec![f64::NAN; of_step.len]);
+                let mut numbers = [&*block, behind].concat();
+                let status = machine.step_prepared(&mut numbers, pool, there);
+                block.copy_from_slice(&numbers[..block.len()]);
+                behind.copy_from_slice(&numbers[block.len()..]);
+                status.expect("it has such a step")
+            })
+        };
+        self.runs.iter().map(one).collect()
     }
 
     /// The reference.

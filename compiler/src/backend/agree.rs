@@ -3,7 +3,7 @@
 use super::clif::Facts;
 use super::cut::{Lengths, cut};
 use super::interp::Interpreter;
-use super::jit::{compile, cut_at};
+use super::jit::{compile, compile_prepared, cut_at};
 use super::target::{Coder, with};
 use super::wide::{self, Width};
 use crate::ir::build::Build;
@@ -12,6 +12,7 @@ use crate::ir::{Func, Op, Unary, Value};
 use crate::math;
 use abi::image::Target;
 use abi::lanes::Batch;
+use abi::table::Interpret;
 use abi::{Code, Function, Layout, Slot};
 use std::sync::Arc;
 
@@ -38,7 +39,7 @@ fn check_cut(
     what: &str,
 ) {
     let funcs = [(Function::Step, func.clone())];
-    let machine = Code::Machine(cut_at(&funcs, layout, pool.len(), lengths).unwrap().0);
+    let machine = Code::Machine(cut_at(&funcs, layout, pool.len(), lengths, false).unwrap().0);
     let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
     for start in blocks {
         let (mut found, mut expected) = (start.clone(), start.clone());
@@ -126,6 +127,49 @@ fn minimum_and_maximum_agree_at_the_edges() {
     check(&build.finish(), &layout(), &blocks, &[], 1, "extremes");
 }
 
+/// A sign is one instruction where there is AVX-512, of a single step and in lanes; and so is what it does not say of NaN.
+#[test]
+fn signs_agree_at_the_edges() {
+    let layout = Layout::new([0, 0, 1, 0, 0, 3, 0, 0, 0, 0]);
+    let mut build = Build::new("signs");
+    let (x, two) = (build.load(Slot(3)), build.real(2.0));
+    // A state, so that there is a step to make.
+    let next = build.mul(x, two);
+    build.store(Slot(3), next);
+    // Several, so that what they share lies in a register; some of what is read later, the last of what is not.
+    for (slot, of) in [(4, x), (5, next)] {
+        let sign = build.sign(of);
+        build.store(Slot(slot), sign);
+    }
+    let other = build.sub(next, two);
+    let [first, second] = [build.sign(other), build.mul(other, x)];
+    let last = build.fma(first, second, x);
+    build.store(Slot(6), last);
+    let func = build.finish();
+    let below = |x: &f64| [*x, -x, 1.0f64.next_up() * x, f64::from_bits(1) * x];
+    let blocks: Vec<Vec<f64>> = REALS.iter().flat_map(below).map(|x| vec![0.0, 0.0, 0.0, x, 0.0, 0.0, 0.0]).collect();
+    check(&func, &layout, &blocks, &[], 1, "signs");
+    for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
+        let lanes = wide::compile(&func, &layout, 0, width, 1).expect("this processor can");
+        let mut batch = Batch::new(lanes);
+        for starts in blocks.chunks(batch.width()) {
+            starts.iter().enumerate().for_each(|(lane, start)| batch.load(lane, start));
+            batch.advance(&[], 1);
+            for (lane, start) in starts.iter().enumerate() {
+                let (mut expected, mut found) = (start.clone(), start.clone());
+                Interpreter::new(&[(Function::Step, func.clone())], &layout, 0).call(
+                    Function::Step,
+                    &mut expected,
+                    &[],
+                    1,
+                );
+                batch.save(lane, &mut found);
+                assert!(same(&found, &expected), "{width:?}: {found:?} instead of {expected:?}");
+            }
+        }
+    }
+}
+
 /// A function made of chance, a pool and a layout for it, and four blocks to begin with.
 fn of_chance(random: &mut Random) -> (Func, Vec<f64>, Layout, Vec<Vec<f64>>) {
     let len = 20 + random.below(120);
@@ -147,7 +191,7 @@ fn random_programs_agree() {
         check(&func, &layout, &blocks, &pool, count, &format!("seed {seed}, {count} iterations"));
         let code = Interpreter::new(&[(Function::Step, func)], &layout, POOL_LEN);
         for mut block in blocks {
-            stopped += usize::from(abi::table::Interpret::call(&code, Function::Step, &mut block, &pool, count) != 0);
+            stopped += usize::from(code.call(Function::Step, &mut block, &pool, count) != 0);
             nans += block.iter().filter(|x| x.is_nan()).count();
             total += block.len();
         }
@@ -285,6 +329,43 @@ fn iterations_in_one_call_equal_single_calls() {
     }
 }
 
+/// A single step finds behind the block what its parameters lead to, and does what it does without.
+#[test]
+fn what_is_prepared_changes_nothing() {
+    let (mut numbers, mut most) = (0, 0);
+    for seed in 6000..6300 {
+        let mut random = Random(seed);
+        let len = 10 + random.below(100);
+        let func = random::func(&mut random, len);
+        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
+        let layout = random::layout();
+        let funcs = [(Function::Step, func.clone())];
+        let code = compile_prepared(&funcs, &layout, POOL_LEN).unwrap().0;
+        let Some(prepared) = code.prepared() else { continue };
+        numbers += prepared.len;
+        most = most.max(prepared.len);
+        let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL_LEN)));
+        let start: Vec<f64> = (0..layout.size()).map(|_| random.real()).collect();
+        let (mut found, mut expected) = (start.clone(), start.clone());
+        found.resize(start.len() + prepared.len, f64::NAN);
+        // A second step from another state, for which nothing is prepared again.
+        for there in [false, true] {
+            let status = code.step_prepared(&mut found, &pool, there).expect("it has such a step");
+            let of_reference = reference.call(Function::Step, &mut expected, &pool, 1);
+            assert!(
+                status == of_reference && same(&found[..start.len()], &expected),
+                "seed {seed}\n{func}\nfrom {start:?}\nfound {found:?} status {status}\n{expected:?} status {of_reference}"
+            );
+            // What a function of chance does to parameters and counters, no step does.
+            for slot in layout.params.range().chain(0..Slot::FIXED as usize) {
+                (found[slot], expected[slot]) = (start[slot], start[slot]);
+            }
+        }
+    }
+    println!("{numbers} numbers prepared, at most {most} of a step");
+    assert!(numbers > 100);
+}
+
 /// A function that keeps time as a step does: operations on time, parameters and inputs by chance, then others by chance
 /// that take some of these for what they load.
 fn on_time(random: &mut Random) -> Func {
@@ -362,7 +443,7 @@ fn what_goes_ahead_agrees() {
         let code = Interpreter::new(&funcs, &layout, POOL_LEN);
         for mut block in blocks {
             odd += usize::from(block[Slot::COUNT.index()].fract() != 0.0);
-            stopped += usize::from(abi::table::Interpret::call(&code, Function::Step, &mut block, &pool, count) != 0);
+            stopped += usize::from(code.call(Function::Step, &mut block, &pool, count) != 0);
         }
     }
     println!(
@@ -398,7 +479,7 @@ fn lanes_agree_with_instances_alone() {
             assert!(done <= count);
             for (lane, start) in starts.iter().enumerate() {
                 let (mut expected, mut found) = (start.clone(), start.clone());
-                let status = abi::table::Interpret::call(&code, Function::Step, &mut expected, &pool, done);
+                let status = code.call(Function::Step, &mut expected, &pool, done);
                 batch.save(lane, &mut found);
                 assert!(
                     same(&found, &expected) && batch.status(lane) == status,
@@ -467,7 +548,7 @@ fn exponentials_in_lanes_agree_with_instances_alone() {
             assert_eq!(batch.advance(math::pool(), 1), 1);
             for (lane, x) in some.iter().enumerate() {
                 let (mut expected, mut found) = (start(*x), start(*x));
-                abi::table::Interpret::call(&alone, Function::Step, &mut expected, math::pool(), 1);
+                alone.call(Function::Step, &mut expected, math::pool(), 1);
                 batch.save(lane, &mut found);
                 assert!(same(&found, &expected), "{width:?}, x = {x:e}: {found:?} instead of {expected:?}");
             }

@@ -95,33 +95,38 @@ pub fn stays_the_same(func: &Func) -> bool {
     func.writes.is_empty() && func.loads().iter().all(|slot| !stored.contains(slot))
 }
 
-/// Writes a function that makes a single iteration itself and leaves every other count to the function behind it.
+/// Writes a function that makes a single iteration itself and, if it `asks`, leaves every other count to the function behind
+/// it.
 pub fn emit_single(
     func: &Func,
+    asks: bool,
     target: &mut clif::Function,
     context: &mut FunctionBuilderContext,
     isa: &dyn TargetIsa,
 ) {
     target.signature = signature(isa);
     let mut b = FunctionBuilder::new(target, context);
-    let [entry, single, others] = [(); 3].map(|()| b.create_block());
+    let entry = b.create_block();
     b.append_block_params_for_function_params(entry);
     b.switch_to_block(entry);
     let &[block, pool, count] = b.block_params(entry) else { unreachable!("three parameters") };
-    let other = b.ins().icmp_imm_s(IntCC::NotEqual, count, 1);
-    b.ins().brif(other, others, &[], single, &[]);
-    b.switch_to_block(single);
+    if asks {
+        let [single, others] = [(); 2].map(|()| b.create_block());
+        let other = b.ins().icmp_imm_s(IntCC::NotEqual, count, 1);
+        b.ins().brif(other, others, &[], single, &[]);
+        b.set_cold_block(others);
+        b.switch_to_block(others);
+        let name = UserExternalName { namespace: 0, index: 0 };
+        let name = clif::ExternalName::user(b.func.declare_imported_user_function(name));
+        let signature = b.import_signature(signature(isa));
+        let many = b.import_function(ExtFuncData { name, signature, colocated: true, patchable: false });
+        let call = b.ins().call(many, &[block, pool, count]);
+        let status = b.inst_results(call)[0];
+        b.ins().return_(&[status]);
+        b.switch_to_block(single);
+    }
     let (watch, late) = Watch::of(func);
     once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
-    b.set_cold_block(others);
-    b.switch_to_block(others);
-    let name = UserExternalName { namespace: 0, index: 0 };
-    let name = clif::ExternalName::user(b.func.declare_imported_user_function(name));
-    let signature = b.import_signature(signature(isa));
-    let many = b.import_function(ExtFuncData { name, signature, colocated: true, patchable: false });
-    let call = b.ins().call(many, &[block, pool, count]);
-    let status = b.inst_results(call)[0];
-    b.ins().return_(&[status]);
     b.seal_all_blocks();
     b.finalize(isa.frontend_config());
 }
@@ -657,8 +662,9 @@ impl<'a> Emitter<'a> {
         for (bits, case) in &automaton.cases {
             let [this, others] = [(); 2].map(|()| b.create_block());
             let number = b.ins().iconst(types::I64, *bits as i64);
-            let is = b.ins().icmp(IntCC::Equal, held, number);
-            b.ins().brif(is, this, &[], others, &[]);
+            // What is named last follows at once.
+            let is_not = b.ins().icmp(IntCC::NotEqual, held, number);
+            b.ins().brif(is_not, others, &[], this, &[]);
             b.switch_to_block(this);
             self.case(case, &end(Some(*bits)), b);
             b.switch_to_block(others);
@@ -904,6 +910,11 @@ impl<'a> Emitter<'a> {
             Op::Floor(_) => b.ins().floor(x(0)),
             Op::Nearest(_) => b.ins().nearest(x(0)),
             Op::Less(..) => b.ins().fcmp(FloatCC::LessThan, x(0), x(1)),
+            // x − x is +0 or NaN: integers tell which.
+            Op::LessEqual(d, e) if d == e && matches!(self.func.op(d), Op::Sub(x, y) if x == y) => {
+                let bits = b.ins().bitcast(types::I64, MemFlagsData::new(), x(0));
+                b.ins().icmp_imm_s(IntCC::Equal, bits, 0)
+            }
             Op::LessEqual(..) => b.ins().fcmp(FloatCC::LessThanOrEqual, x(0), x(1)),
             Op::Equal(..) => b.ins().fcmp(FloatCC::Equal, x(0), x(1)),
             Op::And(..) | Op::IntAnd(..) => b.ins().band(x(0), x(1)),

@@ -7,10 +7,10 @@ use super::ahead;
 use super::clif::signature;
 use super::cut::Lengths;
 use super::memory::Memory;
-use super::target::{Coder, here};
+use super::target::{Bytes, Coder, here};
 use crate::ir::Func;
 use crate::ir::verify::{Stage, verify};
-use abi::table::{Entry, Machine};
+use abi::table::{Entry, Machine, Prepared};
 use abi::{Function, Layout};
 use cranelift_module::Module;
 use std::sync::Arc;
@@ -29,7 +29,20 @@ pub struct Stats {
 /// # Panics
 /// If a function is not sound or not expanded: a mistake of the passes before.
 pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Result<(Machine, Stats), Unsupported> {
-    cut_at(funcs, layout, pool_len, Lengths::USUAL)
+    cut_at(funcs, layout, pool_len, Lengths::USUAL, false)
+}
+
+/// The same for whoever makes single steps and has room behind the block for what they find
+/// [prepared](abi::table::Prepared): an [`Instance`](abi::Instance).
+///
+/// # Panics
+/// As `compile`.
+pub fn compile_prepared(
+    funcs: &[(Function, Func)],
+    layout: &Layout,
+    pool_len: usize,
+) -> Result<(Machine, Stats), Unsupported> {
+    cut_at(funcs, layout, pool_len, Lengths::USUAL, true)
 }
 
 /// The same, with functions cut into pieces of these lengths.
@@ -38,11 +51,17 @@ pub(super) fn cut_at(
     layout: &Layout,
     pool_len: usize,
     lengths: Lengths,
+    prepares: bool,
 ) -> Result<(Machine, Stats), Unsupported> {
-    let (entries, memory, stats) = generate(funcs, layout, pool_len, lengths)?;
+    let (entries, prepared, memory, stats) = generate(funcs, layout, pool_len, lengths, prepares)?;
     // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and
     // every table in the pool, the index of a table is held inside it, and code without calls does not unwind.
     let machine = unsafe { Machine::new(entries, layout.size(), pool_len, Arc::new(memory)) };
+    let machine = match prepared {
+        // SAFETY: it is the step again, from the same memory; what it accesses behind the block is counted.
+        Some(prepared) => unsafe { machine.with_prepared(prepared) },
+        None => machine,
+    };
     // A step in pieces goes ahead no faster: its instants would be one long line again.
     let step = funcs.iter().find(|(function, func)| *function == Function::Step && func.ops.len() <= lengths.whole);
     let machine = match step.and_then(|(_, step)| ahead::compile(step, layout, pool_len)) {
@@ -60,7 +79,8 @@ fn generate(
     layout: &Layout,
     pool_len: usize,
     lengths: Lengths,
-) -> Result<(Entries, Memory, Stats), Unsupported> {
+    prepares: bool,
+) -> Result<(Entries, Option<Prepared>, Memory, Stats), Unsupported> {
     let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
@@ -68,24 +88,46 @@ fn generate(
     coder.cut_at(lengths);
     let mut stats = Stats::default();
     let mut ids = Vec::new();
+    let mut single = None;
     for (function, func) in funcs {
         verify(func, layout, pool_len, Stage::Expanded).unwrap_or_else(|fault| panic!("{fault}"));
-        let bytes = coder.function(func)?;
         let failed = |error| Unsupported(format!("no memory for the code of `{}`: {error}", func.name));
-        let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
-        module.define_function_bytes(id, bytes.alignment as u64, &bytes.code, &[]).map_err(failed)?;
-        stats.functions.push((*function, func.ops.len(), bytes.code.len()));
-        ids.push((*function, id));
+        let mut define = |bytes: &Bytes| {
+            let id = module.declare_anonymous_function(&signature(&**isa)).map_err(failed)?;
+            module.define_function_bytes(id, bytes.alignment as u64, &bytes.code, &[]).map_err(failed)?;
+            Ok(id)
+        };
+        let prepared = if prepares && *function == Function::Step { coder.prepared(func, layout)? } else { None };
+        let (id, at, len) = match prepared {
+            Some(prepared) => {
+                let id = define(&prepared.bytes)?;
+                let prepare = prepared.prepare.as_ref().map(&mut define).transpose()?;
+                single = Some((id, prepare, prepared.len));
+                (id, prepared.many, prepared.bytes.code.len())
+            }
+            None => {
+                let bytes = coder.function(func)?;
+                (define(&bytes)?, 0, bytes.code.len())
+            }
+        };
+        stats.functions.push((*function, func.ops.len(), len));
+        ids.push((*function, id, at));
     }
     let failed = |error| Unsupported(format!("the code cannot be made executable: {error}"));
     module.finalize_definitions().map_err(failed)?;
-    let mut entries = [None; Function::ALL.len()];
-    for (function, id) in ids {
-        let address = module.get_finalized_function(id);
+    let entry = |id, at: usize| {
+        let address = module.get_finalized_function(id).wrapping_add(at);
         // SAFETY: `address` is the beginning of code that was compiled with the signature of `Entry`.
-        entries[function as usize] = Some(unsafe { std::mem::transmute::<*const u8, Entry>(address) });
-    }
-    Ok((entries, memory, stats))
+        unsafe { std::mem::transmute::<*const u8, Entry>(address) }
+    };
+    let mut entries = [None; Function::ALL.len()];
+    ids.into_iter().for_each(|(function, id, at)| entries[function as usize] = Some(entry(id, at)));
+    let prepared = single.map(|(step, prepare, len)| Prepared {
+        prepare: prepare.map(|id| entry(id, 0)),
+        step: entry(step, 0),
+        len,
+    });
+    Ok((entries, prepared, memory, stats))
 }
 
 #[cfg(all(test, target_os = "linux"))]
@@ -113,8 +155,8 @@ mod tests {
         let x = build.load(Slot(3));
         let next = build.add(x, x);
         build.store(Slot(3), next);
-        let (entries, memory, stats) =
-            generate(&[(Function::Step, build.finish())], &layout, 0, Lengths::USUAL).unwrap();
+        let (entries, _, memory, stats) =
+            generate(&[(Function::Step, build.finish())], &layout, 0, Lengths::USUAL, false).unwrap();
         assert_eq!(stats.functions.len(), 1);
         let address = entries[Function::Step as usize].unwrap() as usize;
         let executable = || mapped("r-xp").iter().any(|range| range.contains(&address));

@@ -12,6 +12,7 @@ mod clif;
 mod repeats;
 mod cut;
 mod pieces;
+mod prepared;
 mod listing;
 pub mod target;
 mod memory;

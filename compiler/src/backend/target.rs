@@ -7,6 +7,7 @@ use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
 use super::listing::listing;
 use super::pieces;
+use super::prepared::Halves;
 use super::unsupported::Unsupported;
 use super::wide::{pairs, single};
 use crate::ir::Func;
@@ -27,6 +28,8 @@ pub struct Coder<'a> {
     context: Context,
     builder: FunctionBuilderContext,
     lengths: Lengths,
+    /// Whether the processor has AVX-512 F.
+    by_kind: bool,
 }
 
 /// Code of a function, and the power of two at a multiple of which it must begin.
@@ -37,10 +40,35 @@ pub struct Bytes {
     pub alignment: usize,
 }
 
+/// Code of a function that begins with what makes one iteration, where what can be is [prepared](Coder::prepared).
+pub struct PreparedBytes {
+    /// Of the whole.
+    pub bytes: Bytes,
+    /// At which byte what makes any number of iterations begins, which needs nothing prepared.
+    pub many: usize,
+    /// What prepares, if there is anything to.
+    pub prepare: Option<Bytes>,
+    /// How many numbers lie behind the block.
+    pub len: usize,
+}
+
+/// What makes one iteration.
+struct Single {
+    func: Func,
+    /// Whether it asks how many are wanted and leaves all counts but one to others.
+    asks: bool,
+}
+
 impl<'a> Coder<'a> {
     /// For this processor or target.
     pub fn new(isa: &'a OwnedTargetIsa) -> Coder<'a> {
-        Coder { isa: &**isa, context: Context::new(), builder: FunctionBuilderContext::new(), lengths: Lengths::USUAL }
+        Coder {
+            isa: &**isa,
+            context: Context::new(),
+            builder: FunctionBuilderContext::new(),
+            lengths: Lengths::USUAL,
+            by_kind: isa.isa_flags().iter().any(|flag| flag.name == "has_avx512f" && flag.as_bool() == Some(true)),
+        }
     }
 
     /// Other lengths of functions and pieces than the usual.
@@ -53,18 +81,48 @@ impl<'a> Coder<'a> {
     /// # Panics
     /// If the code calls anything but its own pieces: a mistake of `clif`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
+        let single = self.single(func).map(|func| Single { func, asks: true });
+        Ok(self.parts(func, single)?.0)
+    }
+
+    /// The code of a function on blocks of this layout whose single iterations find prepared what hangs on parameters and
+    /// the length of the step alone; none where single iterations have no code of their own.
+    pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
+        let Some(single) = self.single(func) else { return Ok(None) };
+        let Halves { prepare, step } = Halves::of(&single, layout);
+        let len = prepare.stores.len();
+        let (bytes, many) = self.parts(func, Some(Single { func: step, asks: false }))?;
+        let prepare = if len > 0 { Some(self.once(&prepare)?) } else { None };
+        Ok(Some(PreparedBytes { bytes, many, prepare, len }))
+    }
+
+    /// The code of a function that is called for one iteration only.
+    fn once(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
+        match self.own(&Single { func: func.clone(), asks: false }) {
+            Some(own) => Ok(Bytes { code: own.code, alignment: 64 }),
+            None => {
+                self.context.clear();
+                clif::emit(func, None, &mut self.context.func, &mut self.builder, self.isa);
+                self.bytes(func)
+            }
+        }
+    }
+
+    /// All parts of the code of a function, and at which byte what makes any number of iterations begins.
+    fn parts(&mut self, func: &Func, single: Option<Single>) -> Result<(Bytes, usize), Unsupported> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        let single = self.single(func);
-        let own = single.is_some();
-        if let Some(single) = single {
+        let own = single.as_ref().and_then(|single| self.own(single));
+        let several = single.is_some();
+        let single = if own.is_some() { None } else { single };
+        if let Some(own) = own {
             begins.push(0);
-            let to_others = single.to_others.into_iter();
+            let to_others = own.to_others.into_iter();
             calls.extend(to_others.map(|at| (at, Call { kind: Reloc::X86CallPCRel4, piece: 0, addend: -4 })));
-            all = Bytes { code: single.code, alignment: 64 };
+            all = Bytes { code: own.code, alignment: 64 };
         }
-        self.each_part(func, own, |_, isa, context| {
+        self.each_part(func, single.as_ref(), several, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -85,7 +143,7 @@ impl<'a> Coder<'a> {
             // What calls lies first.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
-        Ok(all)
+        Ok((all, if several { begins[1] } else { 0 }))
     }
 
     /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are
@@ -114,9 +172,11 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let own = self.has_own_single(func);
-        let mut text = if own { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
-        self.each_part(func, own, |what, _, context| {
+        let (own, single) = self.own_or_not(func);
+        let mut text =
+            if own.is_some() { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
+        let several = own.is_some() || single.is_some();
+        self.each_part(func, single.as_ref(), several, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
             Ok(())
@@ -127,12 +187,13 @@ impl<'a> Coder<'a> {
     /// The function as assembly; what Cranelift makes as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
-        let single = self.single(func);
-        if let Some(single) = &single {
+        let (own, single) = self.own_or_not(func);
+        let several = own.is_some() || single.is_some();
+        if let Some(own) = &own {
             text += &title(ONE);
-            text += &listing(&single.code, single.len, &single.to_others);
+            text += &listing(&own.code, own.len, &own.to_others);
         }
-        self.each_part(func, single.is_some(), |what, isa, context| {
+        self.each_part(func, single.as_ref(), several, |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
             text += &what;
@@ -144,31 +205,43 @@ impl<'a> Coder<'a> {
 
     /// Whether a single iteration of a function is in our own instructions.
     pub fn has_own_single(&self, func: &Func) -> bool {
-        self.single(func).is_some()
+        self.own_or_not(func).0.is_some()
     }
 
-    /// A single iteration of a short function in our own instructions, where there are such.
-    fn single(&self, func: &Func) -> Option<single::Single> {
+    /// A single iteration in our own instructions, or what is left to Cranelift.
+    fn own_or_not(&self, func: &Func) -> (Option<single::Single>, Option<Single>) {
+        let single = self.single(func).map(|func| Single { func, asks: true });
+        match single.as_ref().and_then(|single| self.own(single)) {
+            Some(own) => (Some(own), None),
+            None => (None, single),
+        }
+    }
+
+    /// What makes a single iteration of a function, if that has code of its own.
+    fn single(&self, func: &Func) -> Option<Func> {
+        (func.ops.len() <= self.lengths.whole && clif::has_single(func)).then(|| uncounted(func))
+    }
+
+    /// A single iteration in our own instructions, where there are such.
+    fn own(&self, single: &Single) -> Option<single::Single> {
         let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
-        (ours && func.ops.len() <= self.lengths.whole && clif::has_single(func))
-            .then(|| single::single(&uncounted(func)).ok())
-            .flatten()
+        if ours { single::single(&single.func, single.asks, self.by_kind).ok() } else { None }
     }
 
-    /// Gives the function as Cranelift's own: whole, behind what makes a single iteration unless that is our `own`, or cut:
-    /// then the loop first and the pieces in their order. Of several parts each has a line that says what it is.
+    /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop
+    /// first and the pieces in their order. Of `several` parts each has a line that says what it is.
     fn each_part(
         &mut self,
         func: &Func,
-        own: bool,
+        single: Option<&Single>,
+        several: bool,
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
-        let Coder { isa, context, builder, lengths } = self;
+        let Coder { isa, context, builder, lengths, .. } = self;
         if func.ops.len() <= lengths.whole {
-            let several = clif::has_single(func);
-            if several && !own {
+            if let Some(single) = single {
                 context.clear();
-                clif::emit_single(&uncounted(func), &mut context.func, builder, *isa);
+                clif::emit_single(&single.func, single.asks, &mut context.func, builder, *isa);
                 part(title(ONE), *isa, context)?;
             }
             let several = if several { title("any number of iterations") } else { String::new() };

@@ -2,7 +2,7 @@
 //!
 //! In: a sound, expanded function. Out: [`Ways`]: a tree of questions with a line at each end. What is asked is what chooses
 //! what becomes of a state, for most often a processor foresees the answer and goes on, while a choice would wait for it. Where a
-//! regime changes there is no line: that is rare. It knows nothing of processors.
+//! regime changes is set apart: that is rare. It knows nothing of processors.
 
 use super::sides::Sides;
 use crate::ir::build::Build;
@@ -33,7 +33,9 @@ pub enum Way {
     },
     /// By a comparison of reals: where it holds, and where it does not.
     Asks(Value, Box<[Way; 2]>),
-    /// A regime changes: this is left to others.
+    /// A regime changes, which is rare.
+    Changes(Box<Way>),
+    /// The same, and another one besides, or on too many ways: this is left to others.
     Leaves,
 }
 
@@ -41,9 +43,16 @@ impl Way {
     /// The way and all that it goes on to.
     pub fn each(&self, each: &mut impl FnMut(&Way)) {
         each(self);
-        if let Way::Asks(_, sides) = self {
-            sides.iter().for_each(|side| side.each(each));
+        match self {
+            Way::Asks(_, sides) => sides.iter().for_each(|side| side.each(each)),
+            Way::Changes(rest) => rest.each(each),
+            Way::Ends { .. } | Way::Leaves => {}
         }
+    }
+
+    /// Whether it is seldom gone.
+    pub fn is_rare(&self) -> bool {
+        matches!(self, Way::Changes(_) | Way::Leaves)
     }
 
     /// What it asks, or what it ends with.
@@ -51,7 +60,7 @@ impl Way {
         let (asked, stores, writes, failed) = match self {
             Way::Ends { stores, writes, failed } => (None, &stores[..], &writes[..], *failed),
             Way::Asks(asked, _) => (Some(*asked), &[][..], &[][..], None),
-            Way::Leaves => (None, &[][..], &[][..], None),
+            Way::Changes(_) | Way::Leaves => (None, &[][..], &[][..], None),
         };
         let written = writes.iter().flat_map(|write| [write.index, write.value]);
         asked.into_iter().chain(stores.iter().map(|(_, value)| *value)).chain(written).chain(failed)
@@ -62,6 +71,9 @@ impl Way {
 const LONG: u32 = 12;
 /// Most ends: behind a question, what is the same on both sides stands twice.
 const MOST: usize = 12;
+/// Most ends where a regime has changed, and of these most from where it does.
+const MOST_CHANGED: usize = 16;
+const MOST_FROM_CHANGE: usize = 3;
 
 /// All ways; none if they are too many, or if something is asked that is no comparison.
 pub fn ways(func: &Func) -> Option<Ways> {
@@ -77,7 +89,7 @@ pub fn ways(func: &Func) -> Option<Ways> {
     let stored = func.stores.iter().map(|(_, value)| *value);
     let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
     let wanted: Vec<Value> = stored.chain(written).chain(failed).collect();
-    let mut seeker = Seeker { build, slots, rings: &func.writes, read, ends: 0 };
+    let mut seeker = Seeker { build, slots, rings: &func.writes, read, ends: 0, changed: 0, has_changed: false };
     let begin = seeker.way(wanted, &[])?;
     Some(Ways { func: Func { ops: seeker.build.into_ops(), ..func.clone() }, begin })
 }
@@ -90,8 +102,11 @@ struct Seeker<'a> {
     rings: &'a [Write],
     /// Slots that are read.
     read: HashSet<Slot>,
-    /// Ends so far.
+    /// Ends so far, and those where a regime has changed.
     ends: usize,
+    changed: usize,
+    /// Whether one has on the way that is looked for.
+    has_changed: bool,
 }
 
 impl Seeker<'_> {
@@ -103,8 +118,32 @@ impl Seeker<'_> {
             _ => false,
         };
         if self.slots.iter().zip(&wanted).any(changes) {
-            return Some(Way::Leaves);
+            return Some(self.changed(wanted));
         }
+        self.on(wanted, held)
+    }
+
+    /// The same from where a regime changes. What regimes were counts no more: all that they become is stored.
+    fn changed(&mut self, wanted: Vec<Value>) -> Way {
+        if self.has_changed || self.changed == MOST_CHANGED {
+            return Way::Leaves;
+        }
+        self.has_changed = true;
+        let ends = std::mem::take(&mut self.ends);
+        let rest = self.on(wanted, &[]);
+        let own = std::mem::replace(&mut self.ends, ends);
+        self.has_changed = false;
+        match rest {
+            Some(rest) if own <= MOST_FROM_CHANGE && self.changed + own <= MOST_CHANGED => {
+                self.changed += own;
+                Way::Changes(Box::new(rest))
+            }
+            _ => Way::Leaves,
+        }
+    }
+
+    /// How it goes on while no regime is seen to change.
+    fn on(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
         let list = needed(&self.build, &HashSet::new(), &wanted);
         let Some(question) = self.question(&list, &wanted, held) else {
             self.ends += 1;
@@ -224,7 +263,7 @@ mod tests {
 
     /// A spring in slot 3 that moves with slot 5 while slot 4, its regime, is 0, up to 1, where it is held from then on.
     #[test]
-    fn a_regime_that_stays_is_a_line_and_one_that_changes_is_left() {
+    fn a_regime_that_stays_is_a_line_and_one_that_changes_another() {
         let mut build = Build::new("step");
         let [x, regime, v] = [3, 4, 5].map(|slot| build.load(Slot(slot)));
         let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
@@ -244,7 +283,12 @@ mod tests {
         };
         assert_eq!(stores[..], []);
         assert!(matches!(ways.func.op(*far), Op::Less(..)));
-        let [Way::Leaves, Way::Ends { stores, failed: None, .. }] = &**of_moving else { panic!("it leaves or stays") };
+        let [Way::Changes(changed), Way::Ends { stores, failed: None, .. }] = &**of_moving else {
+            panic!("it changes or stays")
+        };
+        let Way::Ends { stores: of_changed, .. } = &**changed else { panic!("it is one line") };
+        let [(Slot(3), moved), (Slot(4), Value(_))] = of_changed[..] else { panic!("spring and regime are stored") };
+        assert!(matches!(ways.func.op(moved), Op::Add(..)));
         let [(Slot(3), next)] = stores[..] else { panic!("the spring moves") };
         assert!(matches!(ways.func.op(next), Op::Add(..)));
     }

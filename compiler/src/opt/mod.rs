@@ -2,4 +2,5 @@
 
 pub mod regroup;
 pub mod contract;
+pub mod limited;
 pub mod watched;

@@ -218,6 +218,29 @@ impl<'a> Body<'a> {
         opcodes.iter().map(|opcode| self.code.jump(&[0x0f, *opcode])).collect()
     }
 
+    /// A jump that is taken if a number that is kept, +0 or NaN, is NaN; its target is open. Where it is not, rax is 0.
+    pub fn unless_zero(&mut self, number: Node) -> usize {
+        self.bits(number);
+        self.code.plain(&[0x48, 0x85, 0xc0]); // test rax, rax
+        self.code.jump(&[0x0f, 0x85]) // jne
+    }
+
+    /// A jump that is taken if a number that is kept, not below 0 or NaN, is not at most one of these bits; its target is open.
+    pub fn unless_at_most(&mut self, number: Node, bits: u64) -> usize {
+        self.bits(number);
+        self.code.compare_bits(bits);
+        self.code.jump(&[0x0f, 0x87]) // ja
+    }
+
+    /// The bits of a number that is kept, in rax.
+    fn bits(&mut self, number: Node) {
+        self.now = (self.order.len(), 0);
+        let register = self.in_register(number);
+        let high = (!register >> 3 & 1) << 7;
+        self.code.plain(&[0xc4, 0x61 | high, 0xf9, 0x7e, 0xc0 | (register & 7) << 3]); // vmovq rax, register
+        self.locked.clear();
+    }
+
     /// Stores what is kept, some of it into rings, of which the first slot and the index are given; it ends the line.
     pub fn store_kept(&mut self, stores: &[(Node, Home)], writes: &[(Slot, Node, Node)]) {
         self.now = (self.order.len(), 0);
@@ -634,6 +657,13 @@ impl<'a> Body<'a> {
             (_, last) => (self.in_register(a), last),
         };
         let to = self.result(node);
+        if instruction == i::BY_KIND {
+            // It waits for what the result's register held: that is to be what it needs anyway.
+            if to != first && last != Place::Register(to) {
+                self.code.vector(i::LOAD, to, 0, Place::Register(first), None);
+            }
+            return self.code.vector(instruction, to, first, last, Some(0));
+        }
         self.code.vector(instruction, to, first, last, None);
     }
 

@@ -1,4 +1,5 @@
-//! Vector instructions of x86-64 as bytes: VEX with one number, 128 and 256 bits, EVEX with 512 bits.
+//! Vector instructions of x86-64 as bytes: VEX with one number, 128 and 256 bits, EVEX with 512 bits and, of one
+//! instruction, with one number.
 //!
 //! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
 //! is reached relative to the instruction. Knows nothing of programs.
@@ -89,6 +90,7 @@ impl Instruction {
                 Some(Instruction(3, map, w, opcode))
             }
             i::ROUND => Some(Instruction(1, map, w, 0x0b)),
+            i::BY_KIND => Some(Instruction(1, map, w, 0x55)),
             i::LOAD => Some(i::LOAD_FIRST),
             i::STORE => Some(i::STORE_FIRST),
             _ if fused => Some(Instruction(1, map, w, opcode | 1)),
@@ -147,6 +149,8 @@ pub mod instructions {
     pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
     /// EVEX only.
     pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
+    /// By what kind of number v is, as the bits of rm say for each kind. The immediate is 0: no exceptions.
+    pub const BY_KIND: Instruction = Instruction(1, 3, [1, 0], 0x54);
     /// v · 2^⌊rm⌋
     pub const SCALE: Instruction = Instruction(1, 2, [1, 0], 0x2c);
     /// From the two vectors d and rm, d first, by the low bits of v.
@@ -213,6 +217,10 @@ impl Assembler {
             Vectors::Avx512 => {
                 self.evex(what, reg, second, last, mask);
                 self.operand(reg, last, immediate, self.width.bytes());
+            }
+            Vectors::One if what == instructions::BY_KIND => {
+                self.evex(what.of_one().expect("there is one of it"), reg, second, last, mask);
+                self.operand(reg, last, immediate, 8);
             }
             // From one register to another it moves all.
             Vectors::One => {
@@ -328,7 +336,10 @@ impl Assembler {
         let (x, b, broadcast) = match last {
             Place::Register(register) => (bit(register, 4), bit(register, 3), 0),
             Place::Memory(base, _) => (1, bit(base as u8, 3), 0),
-            Place::Constant(_) => (1, 1, u8::from(opcode != instructions::BROADCAST.3)),
+            // Of one number there is nothing to be broadcast.
+            Place::Constant(_) => {
+                (1, 1, u8::from(self.width == Vectors::Avx512 && opcode != instructions::BROADCAST.3))
+            }
             Place::Row(_) => (1, 1, 0),
         };
         let p0 = bit(reg, 3) << 7 | x << 6 | b << 5 | bit(reg, 4) << 4 | map;
@@ -433,10 +444,15 @@ impl Assembler {
         if f64::from_bits(bits) == 0.0 {
             self.plain(&[0x48, 0x01, 0xc0]); // add rax, rax: the sign goes
         } else {
-            self.plain(&[0x48, 0x3b]); // cmp rax, [constant]
-            self.operand(0, Place::Constant(bits), None, 1);
+            self.compare_bits(bits);
         }
         self.jump(&[0x0f, 0x85]) // jne
+    }
+
+    /// Compares rax with these bits.
+    pub fn compare_bits(&mut self, bits: u64) {
+        self.plain(&[0x48, 0x3b]); // cmp rax, [constant]
+        self.operand(0, Place::Constant(bits), None, 1);
     }
 
     /// Where the next instruction begins.

@@ -263,7 +263,7 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
-    let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
+    let mut selection = Selection::new(width, width == Vectors::Avx512);
     let of = selection.operations(func, &func.live())?;
     let at = |value: Value| of[value.index()];
     let failed = func.status.map(|status| match func.failure() {
@@ -293,12 +293,13 @@ pub struct Operations {
     pub indices: Vec<Node>,
 }
 
-/// The wanted operations of a function and what writes to rings need, whose operands are wanted.
+/// The wanted operations of a function and what writes to rings need, whose operands are wanted, in one lane. `by_kind`:
+/// whether there is the instruction of this name, of AVX-512 F.
 ///
 /// # Errors
 /// As [`select`].
-pub fn operations(func: &Func, width: Vectors, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
-    let mut selection = Selection { width, nodes: Vec::new(), known: HashMap::new() };
+pub fn operations(func: &Func, by_kind: bool, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
+    let mut selection = Selection::new(Vectors::One, by_kind);
     let of = selection.operations(func, wanted)?;
     let indices = writes.iter().map(|write| selection.inside(func, write.index, write.len, &of)).collect();
     let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes: selection.nodes, pooled: false };
@@ -307,11 +308,21 @@ pub fn operations(func: &Func, width: Vectors, wanted: &[bool], writes: &[Write]
 
 struct Selection {
     width: Vectors,
+    /// Whether an instruction goes by the kind of a number.
+    by_kind: bool,
     nodes: Vec<What>,
     known: HashMap<What, Node>,
 }
 
+/// For each kind of number, of quiet NaN first, what becomes of it: a quiet NaN (2), itself (1), −1 (9) or 1 (10). The kinds are
+/// quiet and signalling NaN, ±0, 1, −∞, ∞, below 0, above 0.
+const SIGN_BY_KIND: u64 = 0xa9a9_a122;
+
 impl Selection {
+    fn new(width: Vectors, by_kind: bool) -> Selection {
+        Selection { width, by_kind, nodes: Vec::new(), known: HashMap::new() }
+    }
+
     fn operations(&mut self, func: &Func, wanted: &[bool]) -> Result<Vec<Node>, Unsupported> {
         let types = verify::types(func).expect("the function is sound");
         let mut of: Vec<Node> = Vec::with_capacity(func.ops.len());
@@ -471,6 +482,10 @@ impl Selection {
 
     /// ±1 with the sign of x, unless x is neither above nor below 0.
     fn sign(&mut self, x: Node) -> Node {
+        if self.by_kind {
+            let kinds = self.constant(SIGN_BY_KIND);
+            return self.add(What::Two(i::BY_KIND, false, x, kinds));
+        }
         let [sign, one, zero] = [SIGN, 1f64.to_bits(), 0].map(|bits| self.constant(bits));
         let negative = self.add(What::Two(i::AND, true, x, sign));
         let unit = self.add(What::Two(i::OR, true, negative, one));

@@ -3,8 +3,8 @@
 //! In: an expanded step. Out: [`Single`], for steps of which each way through is short.
 //!
 //! ```text
-//! if the count is not 1: go on to the others
-//! questions, each as soon as what it compares is there; where a regime changes: go on to the others
+//! if the count is not 1 and that is asked: go on to the others
+//! questions, each as soon as what it compares is there; where a regime changes: go on behind all else
 //! then, for each end of its own: everything; what the step does not read is stored as soon as it is there
 //! if something fails: go on to the others
 //! what it reads is stored; return 0
@@ -38,15 +38,18 @@ const LONGEST: usize = 100;
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
+/// If it `asks`, it leaves every count but 1 to the others; else it is called for one step only. `by_kind`: whether the
+/// processor has the instruction of this name, of AVX-512 F.
+///
 /// # Errors
 /// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
-pub fn single(func: &Func) -> Result<Single, Unsupported> {
+pub fn single(func: &Func, asks: bool, by_kind: bool) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
     if func.ops.len() > LARGEST {
         return Err(unsuitable("is too long"));
     }
     // Whether there are instructions is known before the ways.
-    operations(func, Vectors::One, &func.live(), &func.writes)?;
+    operations(func, by_kind, &func.live(), &func.writes)?;
     let ways = ways(func).ok_or_else(|| unsuitable("has too many ways"))?;
     let mut written = Vec::new();
     ways.begin.each(&mut |way| {
@@ -55,7 +58,7 @@ pub fn single(func: &Func) -> Result<Single, Unsupported> {
         }
     });
     let Operations { nodes, of, indices } =
-        operations(&ways.func, Vectors::One, &wanted(&ways.func, &ways.begin), &written)?;
+        operations(&ways.func, by_kind, &wanted(&ways.func, &ways.begin), &written)?;
     let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
     let place = |(number, node): (u32, &What)| match node {
@@ -65,12 +68,19 @@ pub fn single(func: &Func) -> Result<Single, Unsupported> {
     };
     let homes = (0..).zip(&nodes.nodes).filter_map(place).collect();
     let mut code = Assembler::new(Vectors::One);
-    code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
-    let to_others = vec![code.jump(&[0x0f, 0x85])]; // jne
-    let mut writer = Writer { code, func: &ways.func, nodes: &nodes, of, indices, homes, read, to_others };
+    let mut to_others = Vec::new();
+    if asks {
+        code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
+        to_others.push(code.jump(&[0x0f, 0x85])); // jne
+    }
+    let mut writer =
+        Writer { code, func: &ways.func, nodes: &nodes, of, indices, homes, read, to_others, aside: Vec::new() };
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
+    while let Some(Aside { jumps, way, there, held }) = writer.aside.pop() {
+        writer.arrive(jumps, way, &there, &held).ok_or_else(|| unsuitable("is too long"))?;
+    }
     let len = writer.code.here();
     Ok(Single { code: writer.code.finish(), len, to_others: writer.to_others })
 }
@@ -99,9 +109,19 @@ struct Writer<'a> {
     /// What the step reads.
     read: HashSet<Slot>,
     to_others: Vec<usize>,
+    /// What is rare and comes behind all else.
+    aside: Vec<Aside<'a>>,
 }
 
-impl Writer<'_> {
+/// A way that is still to be written, and what it finds.
+struct Aside<'a> {
+    jumps: Vec<usize>,
+    way: &'a Way,
+    there: Vec<bool>,
+    held: Held,
+}
+
+impl<'a> Writer<'a> {
     fn at(&self, value: Value) -> Node {
         self.of[value.index()]
     }
@@ -111,10 +131,11 @@ impl Writer<'_> {
     }
 
     /// Writes one way from where some nodes are there; none if it is too long.
-    fn way(&mut self, way: &Way, there: &[bool], held: &Held) -> Option<()> {
+    fn way(&mut self, way: &'a Way, there: &[bool], held: &Held) -> Option<()> {
         match way {
             Way::Ends { stores, writes, failed } => self.end(stores, writes, *failed, there, held),
             Way::Asks(asked, sides) => self.question(*asked, sides, there, held),
+            Way::Changes(rest) => self.way(rest, there, held),
             Way::Leaves => {
                 let jump = self.code.jump(&[0xe9]);
                 self.to_others.push(jump);
@@ -123,7 +144,7 @@ impl Writer<'_> {
         }
     }
 
-    fn question(&mut self, asked: Value, sides: &[Way; 2], there: &[bool], held: &Held) -> Option<()> {
+    fn question(&mut self, asked: Value, sides: &'a [Way; 2], there: &[bool], held: &Held) -> Option<()> {
         let (holds, a, b) = match self.func.op(asked) {
             Op::Less(a, b) => (Predicate::Less, a, b),
             Op::LessEqual(a, b) => (Predicate::LessEqual, a, b),
@@ -140,8 +161,8 @@ impl Writer<'_> {
         compared.iter().chain(&later).for_each(|node| body.keep(*node));
         body.resume(held);
         body.write(&|_| Vec::new(), &[]);
-        // The side that is jumped to is the one that leaves, if one does.
-        let jumps_if = !matches!(sides[0], Way::Leaves) || holds == Predicate::Equal;
+        // The side that is jumped to is the one that is rare, if one is.
+        let jumps_if = !sides[0].is_rare() || holds == Predicate::Equal;
         let jumps = match number {
             None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
             Some(_) => Vec::new(),
@@ -153,13 +174,24 @@ impl Writer<'_> {
         }
         let [next, other] = if jumps_if { [0, 1] } else { [1, 0] };
         self.way(&sides[next], &there, &held)?;
-        if matches!(sides[other], Way::Leaves) {
-            self.to_others.extend(jumps);
-            return Some(());
+        match &sides[other] {
+            Way::Leaves => {
+                self.to_others.extend(jumps);
+                Some(())
+            }
+            Way::Changes(rest) => {
+                self.aside.push(Aside { jumps, way: rest, there, held });
+                Some(())
+            }
+            other => self.arrive(jumps, other, &there, &held),
         }
+    }
+
+    /// Writes one way that some jumps lead to.
+    fn arrive(&mut self, jumps: Vec<usize>, way: &'a Way, there: &[bool], held: &Held) -> Option<()> {
         let here = self.code.here();
         jumps.into_iter().for_each(|jump| self.code.lead(jump, here));
-        self.way(&sides[other], &there, &held)
+        self.way(way, there, held)
     }
 
     /// The slot and the bits, if it is asked whether a number of the block is a constant, as of regimes.
@@ -201,15 +233,22 @@ impl Writer<'_> {
         let to_block =
             |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
         body.write(&to_block, &early_nodes);
+        // The last of them leaves behind what is returned.
+        let returns = writes.is_empty() && matches!(questions.last(), Some(Question::Nothing(_)));
         for question in questions {
             match question {
                 Question::Compare(predicate, a, b) => self.to_others.extend(body.ask(predicate, a, b)),
+                Question::Beyond(number, bits) => self.to_others.push(body.unless_at_most(number, bits)),
+                Question::Nothing(number) => self.to_others.push(body.unless_zero(number)),
                 Question::Mask(mask) => self.to_others.push(body.test(mask)),
             }
         }
         body.store_kept(&late, &writes);
         let fits = body.spilled() == 0;
-        self.code.plain(&[0x31, 0xc0, 0xc3]); // xor eax, eax; ret
+        if !returns {
+            self.code.plain(&[0x31, 0xc0]); // xor eax, eax
+        }
+        self.code.plain(&[0xc3]); // ret
         fits.then_some(())
     }
 
@@ -249,6 +288,10 @@ impl Writer<'_> {
 enum Question {
     /// Whether numbers are in an order.
     Compare(Predicate, Node, Node),
+    /// Whether a number less itself is not 0: then it is NaN. Integers answer that, and the answer is the status too.
+    Nothing(Node),
+    /// Whether a number that is not below 0, or NaN, is not at most one of these bits: integers answer that, too.
+    Beyond(Node, u64),
     /// Whether a mask is set.
     Mask(Node),
 }
@@ -257,23 +300,49 @@ impl Question {
     fn operands(&self) -> Vec<Node> {
         match self {
             Question::Compare(_, a, b) => vec![*a, *b],
-            Question::Mask(mask) => vec![*mask],
+            Question::Nothing(node) | Question::Beyond(node, _) | Question::Mask(node) => vec![*node],
         }
     }
 }
 
-/// One of them suffices.
+/// One of them suffices. What is asked of integers comes last.
 fn questions(nodes: &Nodes, failed: Node) -> Vec<Question> {
     let mut open = vec![failed];
     let mut questions = Vec::new();
     while let Some(node) = open.pop() {
         match nodes.nodes[node.index()] {
             What::Two(instructions::OR, _, a, b) => open.extend([a, b]),
+            What::Compare(Predicate::NotLessEqual, a, b) if a == b && is_nothing(nodes, a) => {
+                questions.push(Question::Nothing(a))
+            }
+            What::Compare(Predicate::NotLessEqual, a, b)
+                if let (true, What::Constant(bits)) = (is_size(nodes, a), nodes.nodes[b.index()])
+                    && bits <= f64::INFINITY.to_bits() =>
+            {
+                questions.push(Question::Beyond(a, bits));
+            }
             What::Compare(predicate, a, b) if predicate.is_of_order() => {
                 questions.push(Question::Compare(predicate, a, b));
             }
             _ => questions.push(Question::Mask(node)),
         }
     }
+    questions.sort_by_key(|question| matches!(question, Question::Nothing(_)));
     questions
+}
+
+/// Whether a node is a number less itself: +0 or NaN.
+fn is_nothing(nodes: &Nodes, node: Node) -> bool {
+    matches!(nodes.nodes[node.index()], What::Two(instructions::SUB, _, a, b) if a == b)
+}
+
+/// Whether a node is +0, above it or NaN.
+fn is_size(nodes: &Nodes, node: Node) -> bool {
+    match nodes.nodes[node.index()] {
+        What::Two(instructions::AND, _, a, b) => {
+            [a, b].iter().any(|part| nodes.nodes[part.index()] == What::Constant(!(1 << 63)))
+        }
+        What::Two(instructions::ADD | instructions::MAX, _, a, b) => is_size(nodes, a) && is_size(nodes, b),
+        _ => is_nothing(nodes, node),
+    }
 }

@@ -1,0 +1,89 @@
+//! Takes out of a step what hangs on parameters and the length of the step alone.
+//!
+//! In: a sound, expanded function. Out: [`Halves`]: the rest of it, which finds these numbers behind the block, and a
+//! function that puts them there. A loop computes them once, before its first iteration; who makes one step at a time
+//! computes them when a parameter changes. They are the same operations either way: the same bits.
+
+use crate::ir::build::prune;
+use crate::ir::verify::types;
+use crate::ir::{Func, Op, Type, Value};
+use abi::{Layout, Slot};
+
+/// A function in two parts.
+pub struct Halves {
+    /// Writes the numbers, each to a slot behind the block.
+    pub prepare: Func,
+    /// All else.
+    pub step: Func,
+}
+
+impl Halves {
+    /// Takes a function on blocks of this layout apart.
+    pub fn of(func: &Func, layout: &Layout) -> Halves {
+        let types = types(func).expect("the function is sound");
+        let mut fixed: Vec<bool> = Vec::with_capacity(func.ops.len());
+        for op in &func.ops {
+            fixed.push(match op {
+                Op::Load(slot) => layout.params.contains(*slot) || *slot == Slot::STEP,
+                Op::Ring { .. } => false,
+                op => {
+                    let mut all = true;
+                    op.each_operand(|operand| all &= fixed[operand.index()]);
+                    all
+                }
+            });
+        }
+        // A sign costs less than to read another number.
+        let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_));
+        let is_prepared = |at: usize| fixed[at] && types[at] == Type::Real && !is_free(&func.ops[at]);
+        let mut needed = vec![false; func.ops.len()];
+        let results = func.stores.iter().map(|(_, value)| *value).chain(func.status);
+        results.chain(func.writes.iter().flat_map(|write| [write.index, write.value])).for_each(|value| {
+            needed[value.index()] = true;
+        });
+        for at in (0..func.ops.len()).rev().filter(|at| !is_prepared(*at)) {
+            if needed[at] {
+                func.ops[at].each_operand(|operand| needed[operand.index()] = true);
+            }
+        }
+        let (mut step, mut stores) = (func.clone(), Vec::new());
+        for at in (0..func.ops.len()).filter(|at| needed[*at] && is_prepared(*at)) {
+            let slot = Slot((layout.size() + stores.len()) as u32);
+            stores.push((slot, Value(at as u32)));
+            step.ops[at] = Op::Load(slot);
+        }
+        let name = format!("{}, prepared", func.name);
+        let prepare = Func { name, ops: func.ops.clone(), stores, writes: Vec::new(), status: None };
+        Halves { prepare: prune(&prepare), step: prune(&step) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::build::Build;
+
+    #[test]
+    fn what_hangs_on_parameters_alone_is_prepared_and_nothing_else() {
+        // A parameter and an input, a state; at 3, 4 and 5.
+        let layout = Layout::new([1, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
+        let mut build = Build::new("step");
+        let [p, u, x] = [3, 4, 5].map(|slot| build.load(Slot(slot)));
+        let h = build.load(Slot::STEP);
+        let rate = build.div(h, p);
+        let gain = build.sqrt(rate);
+        let limit = build.less(p, gain);
+        let plain = build.mul(p, u);
+        let moved = build.fma(gain, u, x);
+        let next = build.select(limit, moved, plain);
+        build.store(Slot(5), next);
+        let func = build.finish();
+
+        let Halves { prepare, step } = Halves::of(&func, &layout);
+        assert_eq!(prepare.stores.iter().map(|(slot, _)| slot.0).collect::<Vec<_>>(), [6], "{prepare}");
+        assert_eq!(prepare.loads(), [Slot::STEP, Slot(3)], "{prepare}");
+        // The truth that hangs on it is no number: it is found out in the step, from what is prepared.
+        assert_eq!(step.loads(), [3, 4, 5, 6].map(Slot), "{step}");
+        assert!(!step.ops.iter().any(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))), "{step}");
+    }
+}
