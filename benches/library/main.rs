@@ -164,6 +164,7 @@ struct Times {
     ours_in_turn: f64,
 }
 
+/// Holds a model's step against its C over the same course, then times both.
 fn compare(name: &str, loaded: &mut compiler::Loaded, hands: [&Hand; PLACES]) -> Times {
     let hand = hands[0];
     // A sampled model is called at its own pace.
@@ -366,6 +367,7 @@ fn timed(
     // States, parameters, inputs and outputs, as one declares them; one more of the C that watches.
     let all: Vec<f64> = [x, params, &vec![0.0; inputs.len() + outputs.len()]].concat();
     let mut of_c = [Moving::new(&all), Moving::new(&all)];
+    // In turn: C one call behind the other, C that watches, C; ours one call behind the other, ours, unguarded, unprepared.
     let mut times = [const { [const { Vec::new() }; PLACES] }; 7];
     for number in 0..ROUNDS {
         let rows = number * (WARM + CALLS) % COURSE * inputs.len();
