@@ -9,8 +9,9 @@ use std::sync::Arc;
 pub struct Instance {
     description: Arc<Description>,
     code: Code,
-    /// Slots, and behind them what the code prepares of parameters.
+    /// So many slots, and behind them what the code prepares of parameters.
     numbers: Vec<f64>,
+    size: usize,
     /// Whether that was prepared since a parameter or the length of the step changed.
     is_prepared: bool,
 }
@@ -20,9 +21,10 @@ impl Instance {
     pub fn new(description: Arc<Description>, code: Code, params: &[f64]) -> Instance {
         // So that what is in time need not make room.
         let prepared = code.made(Function::Step).and_then(Machine::prepared).map_or(0, |prepared| prepared.len);
-        let mut numbers = vec![0.0; description.layout.size() + prepared];
+        let size = description.layout.size();
+        let mut numbers = vec![0.0; size + prepared];
         numbers[description.layout.params.range()].copy_from_slice(params);
-        Instance { description, code, numbers, is_prepared: false }
+        Instance { description, code, numbers, size, is_prepared: false }
     }
 
     /// What it is.
@@ -43,19 +45,18 @@ impl Instance {
     /// Writes a slot, SI.
     pub fn set(&mut self, slot: Slot, value: f64) {
         self.is_prepared &= slot != Slot::STEP && !self.description.layout.params.contains(slot);
-        let size = self.description.layout.size();
-        self.numbers[..size][slot.index()] = value;
+        self.numbers[..self.size][slot.index()] = value;
     }
 
     /// All slots.
     pub fn block(&self) -> &[f64] {
-        &self.numbers[..self.description.layout.size()]
+        &self.numbers[..self.size]
     }
 
     /// All slots, to write.
     pub fn block_mut(&mut self) -> &mut [f64] {
         self.is_prepared = false;
-        &mut self.numbers[..self.description.layout.size()]
+        &mut self.numbers[..self.size]
     }
 
     /// Runs one function once; returns its status, 0 for none.
@@ -79,7 +80,7 @@ impl Instance {
     /// One fixed step, if there is code for which what hangs on parameters is prepared.
     fn step_prepared(&mut self) -> Option<u64> {
         let machine = self.code.made(Function::Step)?;
-        let size = self.description.layout.size() + machine.prepared()?.len;
+        let size = self.size + machine.prepared()?.len;
         if self.numbers.len() < size {
             // The code was made since.
             self.numbers.resize(size, 0.0);
@@ -100,9 +101,9 @@ impl Instance {
             let regimes = self.description.layout.regimes.range();
             let most = self.description.automata.iter().map(|automaton| automaton.regimes.len()).max().unwrap_or(0);
             for _ in 0..=most {
-                let before = self.numbers[regimes.clone()].to_vec();
+                let before = self.block()[regimes.clone()].to_vec();
                 status = status.max(self.call(Function::Transitions));
-                if self.numbers[regimes.clone()] == before[..] {
+                if self.block()[regimes.clone()] == before[..] {
                     break;
                 }
             }
@@ -147,7 +148,7 @@ impl Instance {
             let periods = new.ticks.iter().map(|tick| tick.period);
             let delays = new.delays.iter().flat_map(|delay| [delay.time, delay.back].into_iter().chain(delay.weight));
             let own: Vec<(Slot, f64)> = periods.chain(delays).map(|slot| (slot, self.get(slot))).collect();
-            let memory = &from.numbers[old.layout.memory.range()];
+            let memory = &from.block()[old.layout.memory.range()];
             self.numbers[new.layout.memory.range()].copy_from_slice(memory);
             own.into_iter().for_each(|(slot, value)| self.set(slot, value));
         }
@@ -165,7 +166,7 @@ impl Instance {
             };
             match old.quantities.iter().find(fits) {
                 Some(before) => {
-                    self.numbers[state.slot.index()] = from.get(before.slot);
+                    self.set(state.slot, from.get(before.slot));
                     carried.kept.push(state.path.clone());
                 }
                 None => carried.fresh.push(state.path.clone()),
@@ -182,7 +183,7 @@ impl Instance {
             });
             match regime {
                 Some(regime) => {
-                    self.numbers[automaton.slot.index()] = regime as f64;
+                    self.set(automaton.slot, regime as f64);
                     carried.kept.push(named(automaton));
                 }
                 None => carried.fresh.push(named(automaton)),

@@ -175,13 +175,10 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hands: [&Hand; PLACES]) ->
     let built = compiler::build(loaded, &NoSources, name, &Changes::default(), &mut Vec::new());
     let mut program = built.unwrap_or_else(|found| panic!("{name}: {found:?}")).program;
     program.size_rings(h);
-    let contained = codes(
-        || functions(&program),
-        |functions| {
-            let made = jit::compile(functions, &program.description.layout, program.description.pool.len());
-            Code::Machine(made.unwrap_or_else(|why| panic!("{name}: {why}")).0)
-        },
-    );
+    let contained = codes(&program, |functions| {
+        let made = jit::compile(functions, &program.description.layout, program.description.pool.len());
+        Code::Machine(made.unwrap_or_else(|why| panic!("{name}: {why}")).0)
+    });
     let mut ours = Running::new(&program);
     program.description.guards.clear();
     let mut bare = Running::new(&program);
@@ -257,17 +254,13 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hands: [&Hand; PLACES]) ->
     timed(hands, ways, &x, &params, (&course, &inputs, &outputs), h)
 }
 
-/// What the step needs.
-fn functions(program: &Program) -> Vec<(Function, Func)> {
-    compiler::functions(program, Method::Expo)
-}
-
 /// The code in each of its places: those of the other functions before it, or some of them, or none.
-fn codes(functions: impl Fn() -> Vec<(Function, Func)>, make: impl Fn(&[(Function, Func)]) -> Code) -> [Code; PLACES] {
+fn codes(program: &Program, make: impl Fn(&[(Function, Func)]) -> Code) -> [Code; PLACES] {
+    let functions = compiler::functions(program, Method::Expo);
+    let step = functions.iter().position(|(function, _)| *function == Function::Step).expect("there is a step");
     std::array::from_fn(|place| {
         let before = [usize::MAX, 0, 1, 2][place];
-        let mut functions = functions();
-        let step = functions.iter().position(|(function, _)| *function == Function::Step).expect("there is a step");
+        let mut functions = functions.clone();
         functions.drain(before.min(step)..step);
         make(&functions)
     })
@@ -281,14 +274,11 @@ struct Running {
 
 impl Running {
     fn new(program: &Program) -> Running {
-        let codes = codes(
-            || functions(program),
-            |functions| {
-                let (code, notes) = compiler::code(functions, &program.description, false);
-                assert!(notes.is_empty(), "{notes:?}");
-                code
-            },
-        );
+        let codes = codes(program, |functions| {
+            let (code, notes) = compiler::code(functions, &program.description, false);
+            assert!(notes.is_empty(), "{notes:?}");
+            code
+        });
         let instance = Instance::new(Arc::new(program.description.clone()), codes[0].clone(), &program.params);
         Running { instance, codes }
     }

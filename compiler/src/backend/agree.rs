@@ -149,6 +149,7 @@ fn signs_agree_at_the_edges() {
     let below = |x: &f64| [*x, -x, 1.0f64.next_up() * x, f64::from_bits(1) * x];
     let blocks: Vec<Vec<f64>> = REALS.iter().flat_map(below).map(|x| vec![0.0, 0.0, 0.0, x, 0.0, 0.0, 0.0]).collect();
     check(&func, &layout, &blocks, &[], 1, "signs");
+    let alone = Interpreter::new(&[(Function::Step, func.clone())], &layout, 0);
     for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
         let lanes = wide::compile(&func, &layout, 0, width, 1).expect("this processor can");
         let mut batch = Batch::new(lanes);
@@ -157,12 +158,7 @@ fn signs_agree_at_the_edges() {
             batch.advance(&[], 1);
             for (lane, start) in starts.iter().enumerate() {
                 let (mut expected, mut found) = (start.clone(), start.clone());
-                Interpreter::new(&[(Function::Step, func.clone())], &layout, 0).call(
-                    Function::Step,
-                    &mut expected,
-                    &[],
-                    1,
-                );
+                alone.call(Function::Step, &mut expected, &[], 1);
                 batch.save(lane, &mut found);
                 assert!(same(&found, &expected), "{width:?}: {found:?} instead of {expected:?}");
             }
@@ -334,18 +330,14 @@ fn iterations_in_one_call_equal_single_calls() {
 fn what_is_prepared_changes_nothing() {
     let (mut numbers, mut most) = (0, 0);
     for seed in 6000..6300 {
-        let mut random = Random(seed);
-        let len = 10 + random.below(100);
-        let func = random::func(&mut random, len);
-        let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
-        let layout = random::layout();
+        let (func, pool, layout, blocks) = of_chance(&mut Random(seed));
+        let start = &blocks[0];
         let funcs = [(Function::Step, func.clone())];
         let code = compile_prepared(&funcs, &layout, POOL_LEN).unwrap().0;
         let Some(prepared) = code.prepared() else { continue };
         numbers += prepared.len;
         most = most.max(prepared.len);
         let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL_LEN)));
-        let start: Vec<f64> = (0..layout.size()).map(|_| random.real()).collect();
         let (mut found, mut expected) = (start.clone(), start.clone());
         found.resize(start.len() + prepared.len, f64::NAN);
         // A second step from another state, for which nothing is prepared again.

@@ -36,19 +36,14 @@ impl Halves {
         // A sign costs less than to read another number.
         let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_));
         let is_prepared = |at: usize| fixed[at] && types[at] == Type::Real && !is_free(&func.ops[at]);
-        let mut needed = vec![false; func.ops.len()];
-        let results = func.stores.iter().map(|(_, value)| *value).chain(func.status);
-        results.chain(func.writes.iter().flat_map(|write| [write.index, write.value])).for_each(|value| {
-            needed[value.index()] = true;
-        });
-        for at in (0..func.ops.len()).rev().filter(|at| !is_prepared(*at)) {
-            if needed[at] {
-                func.ops[at].each_operand(|operand| needed[operand.index()] = true);
-            }
-        }
         let (mut step, mut stores) = (func.clone(), Vec::new());
-        for at in (0..func.ops.len()).filter(|at| needed[*at] && is_prepared(*at)) {
-            let slot = Slot((layout.size() + stores.len()) as u32);
+        let all: Vec<usize> = (0..func.ops.len()).filter(|at| is_prepared(*at)).collect();
+        let first = Slot(layout.size() as u32);
+        all.iter().for_each(|at| step.ops[*at] = Op::Load(first));
+        // What only other prepared numbers need is not kept.
+        let live = step.live();
+        for at in all.into_iter().filter(|at| live[*at]) {
+            let slot = Slot(first.0 + stores.len() as u32);
             stores.push((slot, Value(at as u32)));
             step.ops[at] = Op::Load(slot);
         }

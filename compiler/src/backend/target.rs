@@ -81,8 +81,7 @@ impl<'a> Coder<'a> {
     /// # Panics
     /// If the code calls anything but its own pieces: a mistake of `clif`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        let single = self.single(func).map(|func| Single { func, asks: true });
-        Ok(self.parts(func, single)?.0)
+        Ok(self.parts(func, self.asking(func))?.0)
     }
 
     /// The code of a function on blocks of this layout whose single iterations find prepared what hangs on parameters and
@@ -92,20 +91,19 @@ impl<'a> Coder<'a> {
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
         let (bytes, many) = self.parts(func, Some(Single { func: step, asks: false }))?;
-        let prepare = if len > 0 { Some(self.once(&prepare)?) } else { None };
+        let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
         Ok(Some(PreparedBytes { bytes, many, prepare, len }))
     }
 
     /// The code of a function that is called for one iteration only.
-    fn once(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        match self.own(&Single { func: func.clone(), asks: false }) {
-            Some(own) => Ok(Bytes { code: own.code, alignment: 64 }),
-            None => {
-                self.context.clear();
-                clif::emit(func, None, &mut self.context.func, &mut self.builder, self.isa);
-                self.bytes(func)
-            }
+    fn once(&mut self, func: Func) -> Result<Bytes, Unsupported> {
+        let single = Single { func, asks: false };
+        if let Some(own) = self.own(&single) {
+            return Ok(Bytes { code: own.code, alignment: 64 });
         }
+        self.context.clear();
+        clif::emit(&single.func, None, &mut self.context.func, &mut self.builder, self.isa);
+        self.bytes(&single.func)
     }
 
     /// All parts of the code of a function, and at which byte what makes any number of iterations begins.
@@ -113,9 +111,8 @@ impl<'a> Coder<'a> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        let own = single.as_ref().and_then(|single| self.own(single));
         let several = single.is_some();
-        let single = if own.is_some() { None } else { single };
+        let (own, single) = self.own_or_not(single);
         if let Some(own) = own {
             begins.push(0);
             let to_others = own.to_others.into_iter();
@@ -172,10 +169,11 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let (own, single) = self.own_or_not(func);
+        let single = self.asking(func);
+        let several = single.is_some();
+        let (own, single) = self.own_or_not(single);
         let mut text =
             if own.is_some() { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
-        let several = own.is_some() || single.is_some();
         self.each_part(func, single.as_ref(), several, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
@@ -187,8 +185,9 @@ impl<'a> Coder<'a> {
     /// The function as assembly; what Cranelift makes as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let mut text = String::new();
-        let (own, single) = self.own_or_not(func);
-        let several = own.is_some() || single.is_some();
+        let single = self.asking(func);
+        let several = single.is_some();
+        let (own, single) = self.own_or_not(single);
         if let Some(own) = &own {
             text += &title(ONE);
             text += &listing(&own.code, own.len, &own.to_others);
@@ -205,12 +204,16 @@ impl<'a> Coder<'a> {
 
     /// Whether a single iteration of a function is in our own instructions.
     pub fn has_own_single(&self, func: &Func) -> bool {
-        self.own_or_not(func).0.is_some()
+        self.own_or_not(self.asking(func)).0.is_some()
+    }
+
+    /// What makes a single iteration of a function and leaves all other counts to others, if that has code of its own.
+    fn asking(&self, func: &Func) -> Option<Single> {
+        self.single(func).map(|func| Single { func, asks: true })
     }
 
     /// A single iteration in our own instructions, or what is left to Cranelift.
-    fn own_or_not(&self, func: &Func) -> (Option<single::Single>, Option<Single>) {
-        let single = self.single(func).map(|func| Single { func, asks: true });
+    fn own_or_not(&self, single: Option<Single>) -> (Option<single::Single>, Option<Single>) {
         match single.as_ref().and_then(|single| self.own(single)) {
             Some(own) => (Some(own), None),
             None => (None, single),

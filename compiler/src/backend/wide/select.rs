@@ -253,7 +253,8 @@ pub struct Nodes {
     pub pooled: bool,
 }
 
-const SIGN: u64 = 1 << 63;
+/// The bit of a real's sign.
+pub const SIGN: u64 = 1 << 63;
 
 /// `pooled`: the pool begins with the tables of the elementary functions.
 ///

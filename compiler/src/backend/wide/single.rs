@@ -14,7 +14,7 @@
 use super::body::{Body, Held, Home};
 use super::encode::{Assembler, Base, Vectors, instructions};
 use super::order::order;
-use super::select::{Node, Nodes, Operations, Predicate, What, operations};
+use super::select::{Node, Nodes, Operations, Predicate, SIGN, What, operations};
 use crate::backend::unsupported::Unsupported;
 use crate::backend::ways::{Way, ways};
 use crate::ir::{Func, Op, Value, Write, number_asked};
@@ -305,7 +305,7 @@ impl Question {
     }
 }
 
-/// One of them suffices. What is asked of integers comes last.
+/// One of them suffices. Whether all is finite comes last, since what answers that is the status.
 fn questions(nodes: &Nodes, failed: Node) -> Vec<Question> {
     let mut open = vec![failed];
     let mut questions = Vec::new();
@@ -340,7 +340,7 @@ fn is_nothing(nodes: &Nodes, node: Node) -> bool {
 fn is_size(nodes: &Nodes, node: Node) -> bool {
     match nodes.nodes[node.index()] {
         What::Two(instructions::AND, _, a, b) => {
-            [a, b].iter().any(|part| nodes.nodes[part.index()] == What::Constant(!(1 << 63)))
+            [a, b].iter().any(|part| nodes.nodes[part.index()] == What::Constant(!SIGN))
         }
         What::Two(instructions::ADD | instructions::MAX, _, a, b) => is_size(nodes, a) && is_size(nodes, b),
         _ => is_nothing(nodes, node),
