@@ -93,7 +93,9 @@ enum State {
 }
 
 fn main() {
-    let libraries: [_; PLACES] = std::array::from_fn(|place| gcc::built("library/models.c", 16 + 1040 * place));
+    let built = |source: &str| -> [_; PLACES] { std::array::from_fn(|place| gcc::built(source, 16 + 1040 * place)) };
+    let (libraries, calls) = (built("library/models.c"), built("library/calls.c"));
+    let around = calls.each_ref().map(Around::of);
     let hands = libraries.each_ref().map(|library| {
         // SAFETY: the table is in the source.
         unsafe { library.get::<*const Hand>(b"models") }.expect("the source has a table")
@@ -124,7 +126,7 @@ fn main() {
             continue;
         }
         let hands = hands.each_ref().map(|hands| hand(hands, name));
-        let Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } = compare(name, &mut loaded, hands);
+        let Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } = compare(name, &mut loaded, (hands, &around));
         let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn];
         let [ratio, to_checked, unguarded, unprepared, in_turn] = of_model;
         println!(
@@ -165,7 +167,7 @@ struct Times {
 }
 
 /// Holds a model's step against its C over the same course, then times both.
-fn compare(name: &str, loaded: &mut compiler::Loaded, hands: [&Hand; PLACES]) -> Times {
+fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; PLACES], &[Around; PLACES])) -> Times {
     let hand = hands[0];
     // A sampled model is called at its own pace.
     let h = match name {
@@ -251,7 +253,7 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, hands: [&Hand; PLACES]) ->
         }
     }
     let ways = [Way::of(&made, ours), Way::of(&bare.codes, &bare.instance), Way::of(&contained, ours)];
-    timed(hands, ways, &x, &params, (&course, &inputs, &outputs), h)
+    timed((hands, around), ways, &x, &params, (&course, &inputs, &outputs), h)
 }
 
 /// The code in each of its places: those of the other functions before it, or some of them, or none.
@@ -344,7 +346,7 @@ impl Moving {
 
 /// Medians of interleaved rounds, and of these the means over the places.
 fn timed(
-    hands: [&Hand; PLACES],
+    (hands, around): ([&Hand; PLACES], &[Around; PLACES]),
     mut ways: [Way; 3],
     x: &[f64],
     params: &[f64],
@@ -363,41 +365,58 @@ fn timed(
         let rows = number * (WARM + CALLS) % COURSE * inputs.len();
         let rows = &course[rows..][..(WARM + CALLS) * inputs.len()];
         let place = number / (ROUNDS / PLACES);
-        let (step, checked) = (black_box(hands[place].step), black_box(hands[place].checked));
+        let around = &around[place];
         // Nobody is always the first, or behind the same.
         for kind in (0..7).map(|k| (k + number) % 7) {
-            let time = if kind < 3 {
+            let calls = if kind < 3 {
                 let numbers = of_c[kind % 2].next();
                 // SAFETY: so many numbers there are.
                 let (params, u) = unsafe { (numbers.add(x.len()), numbers.add(x.len() + params.len())) };
                 // SAFETY: as above.
                 let out = unsafe { u.add(inputs.len()) };
-                let ports = Ports { inputs: u, base: out, outputs: &in_c };
-                // SAFETY: the arrays are as long as the names that the source gives.
-                let plain = move || unsafe {
-                    step(numbers, params, u, out, h);
-                    0
-                };
-                // SAFETY: as above.
-                let watching = move || unsafe { checked(numbers, params, u, out, h) };
-                match kind {
-                    0 => at_place::<true>(place, rows, ports, plain),
-                    1 => at_place::<false>(place, rows, ports, watching),
-                    _ => at_place::<false>(place, rows, ports, plain),
+                let Hand { step, checked, .. } = hands[place];
+                Calls {
+                    step: if kind == 1 { *checked as *const () } else { *step as *const () },
+                    first: numbers,
+                    second: params,
+                    third: u.cast(),
+                    fourth: out,
+                    h,
+                    mask: if kind == 1 { -1 } else { 0 },
+                    inputs: u,
+                    width: inputs.len(),
+                    base: out,
+                    outputs: in_c.as_ptr(),
+                    number_of_outputs: in_c.len(),
                 }
             } else {
                 let Way { entries, pool, numbers } = &mut ways[(kind - 3).saturating_sub(1)];
-                let (entry, pool, block) = (entries[place], pool.as_ptr(), numbers.next());
-                // SAFETY: block and pool are those of the model; the inputs lie in the block.
-                let own = move || unsafe { entry(block, pool, 1) as i64 };
-                // SAFETY: as above.
-                let ports = Ports { inputs: unsafe { block.add(first) }, base: block, outputs: &in_block };
-                match kind {
-                    3 => at_place::<true>(place, rows, ports, own),
-                    _ => at_place::<false>(place, rows, ports, own),
+                let block = numbers.next();
+                Calls {
+                    step: entries[place] as *const (),
+                    first: block,
+                    second: pool.as_ptr(),
+                    third: std::ptr::without_provenance(1),
+                    fourth: block,
+                    h,
+                    mask: -1,
+                    // SAFETY: the inputs lie in the block.
+                    inputs: unsafe { block.add(first) },
+                    width: inputs.len(),
+                    base: block,
+                    outputs: in_block.as_ptr(),
+                    number_of_outputs: in_block.len(),
                 }
             };
-            times[kind][place].push(time);
+            let calls_of = if matches!(kind, 0 | 3) { around.in_turn } else { around.many };
+            let (warm, timed) = rows.split_at(WARM * inputs.len());
+            // SAFETY: the step takes what is given to it, and there is a row for each call.
+            let all = |rows: &[f64], number| unsafe { calls_of(&calls, rows.as_ptr(), number) };
+            assert_eq!(all(warm, WARM), 1, "no guard fires");
+            let begun = Instant::now();
+            let fine = all(timed, CALLS);
+            times[kind][place].push(begun.elapsed().as_secs_f64() / CALLS as f64 * 1e9);
+            assert_eq!(fine, 1, "no guard fires");
         }
     }
     let of_place = |mut times: Vec<f64>| {
@@ -409,61 +428,40 @@ fn timed(
     Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn }
 }
 
-/// Where a step reads its inputs, one behind the other, and leaves its outputs.
-#[derive(Clone, Copy)]
-struct Ports<'a> {
+/// What stands around each call, `calls.c`: the same for each kind of step.
+#[repr(C)]
+struct Calls {
+    step: *const (),
+    first: *mut f64,
+    second: *const f64,
+    third: *const (),
+    fourth: *mut f64,
+    h: f64,
+    /// Of the status, what is asked.
+    mask: i64,
+    /// Where a step reads its inputs, one behind the other.
     inputs: *mut f64,
+    width: usize,
+    /// Where it leaves its outputs, in numbers behind the base.
     base: *const f64,
-    /// Numbers behind the base.
-    outputs: &'a [usize],
+    outputs: *const usize,
+    number_of_outputs: usize,
 }
 
-/// Nanoseconds a call over rows of inputs, some of them before the clock runs: all that stands around the call is the same
-/// for each kind of step. If it `WAITS`, nothing of a call can begin that needs an input before the call before has left its
-/// outputs.
-fn at_place<const WAITS: bool>(place: usize, rows: &[f64], ports: Ports, call: impl Fn() -> i64) -> f64 {
-    match place {
-        0 => round::<WAITS, 0>(rows, ports, call),
-        1 => round::<WAITS, 1>(rows, ports, call),
-        2 => round::<WAITS, 2>(rows, ports, call),
-        _ => round::<WAITS, 3>(rows, ports, call),
-    }
+type Made = unsafe extern "C" fn(&Calls, *const f64, usize) -> i32;
+
+/// The same in one of its places.
+struct Around {
+    many: Made,
+    in_turn: Made,
 }
 
-/// The same, in this place.
-#[inline(never)]
-fn round<const WAITS: bool, const PLACE: usize>(rows: &[f64], ports: Ports, call: impl Fn() -> i64) -> f64 {
-    // Else they might become one.
-    black_box(PLACE);
-    let Ports { inputs, base, outputs } = ports;
-    let width = rows.len() / (WARM + CALLS);
-    let (mut sum, mut nanoseconds) = (0.0, 0.0);
-    let mut row = rows.as_ptr();
-    for calls in [WARM, CALLS] {
-        let begun = Instant::now();
-        for _ in 0..calls {
-            for k in 0..width {
-                // SAFETY: the rows are as long as the model has inputs, and as many as there are calls.
-                let from = unsafe { *row.add(k) };
-                let input = if WAITS { from + 0.0 * sum } else { from };
-                // SAFETY: as above.
-                unsafe { inputs.add(k).write_volatile(input) };
-            }
-            // SAFETY: as above.
-            row = unsafe { row.add(width) };
-            assert_eq!(call(), 0, "no guard fires");
-            if WAITS {
-                sum = 0.0;
-            }
-            for from in outputs {
-                // SAFETY: these are the model's outputs.
-                sum += unsafe { base.add(*from).read_volatile() };
-            }
-        }
-        nanoseconds = begun.elapsed().as_secs_f64() / calls as f64 * 1e9;
+impl Around {
+    fn of(library: &libloading::Library) -> Around {
+        // SAFETY: the source has them.
+        let made = |name: &[u8]| *unsafe { library.get::<Made>(name) }.expect("the source has it");
+        Around { many: made(b"many"), in_turn: made(b"in_turn") }
     }
-    black_box(sum);
-    nanoseconds
 }
 
 fn slot(description: &Description, name: &str, path: &str) -> Slot {

@@ -55,6 +55,19 @@ impl Way {
         matches!(self, Way::Changes(_) | Way::Leaves)
     }
 
+    /// Whether it has more usual ends than another that is not rare.
+    pub fn asks_more_than(&self, other: &Way) -> bool {
+        !other.is_rare() && self.usual_ends() > other.usual_ends()
+    }
+
+    fn usual_ends(&self) -> usize {
+        match self {
+            Way::Asks(_, sides) => sides.iter().map(Way::usual_ends).sum(),
+            Way::Ends { .. } => 1,
+            Way::Changes(_) | Way::Leaves => 0,
+        }
+    }
+
     /// What it asks, or what it ends with.
     pub fn reads(&self) -> impl Iterator<Item = Value> {
         let (asked, stores, writes, failed) = match self {

@@ -7,11 +7,12 @@
 //! - a product that something else uses too: it would be computed twice, and what is compared with it would differ from
 //!   what it enters;
 //! - a sum or difference of two products: forces k·a and −k·a cancel, and fused they would leave what k·a was rounded by.
+//!   Squares never do.
 //!
 //! Both rules look at one sum alone, so mirror images of a contact are fused alike.
 
 use crate::ir::build::Build;
-use crate::ir::{Func, Op, Value};
+use crate::ir::{Func, Op, Value, is_not_negative};
 
 /// Fuses what may be.
 pub fn contract(func: &Func) -> Func {
@@ -30,10 +31,11 @@ pub fn contract(func: &Func) -> Func {
             Op::Neg(plain) => matches!(func.op(plain), Op::Mul(..)),
             op => matches!(op, Op::Mul(..)),
         };
+        let grows = |x: Value, y: Value| [x, y].iter().all(|part| is_not_negative(*part, |value| func.op(value)));
         let fused = match *op {
             Op::Add(x, y) => match (product(x), product(y)) {
-                (Some((a, b)), _) if !cancels(y) => Some(build.fma(a, b, at(y))),
-                (_, Some((a, b))) if !cancels(x) => Some(build.fma(a, b, at(x))),
+                (Some((a, b)), _) if !cancels(y) || grows(x, y) => Some(build.fma(a, b, at(y))),
+                (_, Some((a, b))) if !cancels(x) || grows(x, y) => Some(build.fma(a, b, at(x))),
                 _ => None,
             },
             Op::Sub(x, y) => match (product(x), product(y)) {

@@ -115,6 +115,11 @@ impl<'a> Body<'a> {
         }
     }
 
+    /// Keeps a node for the question at the end, which reads it; before those that are kept to the end.
+    pub fn keep_asked(&mut self, node: Node) {
+        self.uses.entry(node).or_default().push(self.order.len());
+    }
+
     /// Keeps a node to the end.
     pub fn keep(&mut self, node: Node) {
         self.uses.entry(node).or_default().push(self.order.len() + 1);
@@ -654,6 +659,10 @@ impl<'a> Body<'a> {
         let (first, last) = match (self.place_for(instruction, a), self.place_for(instruction, b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
+            _ if a == b => {
+                let both = self.in_register(a);
+                (both, Place::Register(both))
+            }
             (_, last) => (self.in_register(a), last),
         };
         let to = self.result(node);

@@ -158,11 +158,13 @@ impl<'a> Writer<'a> {
         order.iter().for_each(|node| there[node.index()] = true);
         let later = self.later(sides, &there);
         let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
-        compared.iter().chain(&later).for_each(|node| body.keep(*node));
+        compared.iter().for_each(|node| body.keep_asked(*node));
+        later.iter().for_each(|node| body.keep(*node));
         body.resume(held);
         body.write(&|_| Vec::new(), &[]);
-        // The side that is jumped to is the one that is rare, if one is.
-        let jumps_if = !sides[0].is_rare() || holds == Predicate::Equal;
+        // The side that is jumped to is the one that is rare, if one is, or the one that asks more: of several questions
+        // that must all hold, each leads to the same side if it does not.
+        let jumps_if = holds == Predicate::Equal || !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]);
         let jumps = match number {
             None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
             Some(_) => Vec::new(),
