@@ -1,21 +1,42 @@
 //! C written by hand, as a library: what generated code is measured against.
 
-use std::path::Path;
+use libloading::Library;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// `benches/SOURCE` by gcc -O3 -march=native, loaded; the source may want to know how many bytes to put before its code.
-pub fn built(source: &str, lead: usize) -> libloading::Library {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(source);
-    let name = source.with_extension(format!("{lead}.so"));
-    let library = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name.file_name().expect("a source has a name"));
-    let built = Command::new("gcc")
-        .args(["-O3", "-march=native", "-shared", "-fPIC", "-Wall", "-Wextra", "-pedantic", "-o"])
-        .arg(&library)
-        .arg(format!("-DLEAD={lead}"))
-        .arg(&source)
-        .arg("-lm")
-        .status();
-    assert!(built.expect("gcc runs").success(), "{} builds", source.display());
-    // SAFETY: the library runs no code when it is loaded.
-    unsafe { libloading::Library::new(&library) }.expect("the library loads")
+/// `benches/SOURCE` by gcc -O3 -march=native, loaded.
+#[allow(dead_code, reason = "not every bench has one place only")]
+pub fn built(source: &str) -> Library {
+    let [library] = built_at(source, [0]);
+    library
+}
+
+/// The same in several places: behind so many bytes.
+pub fn built_at<const N: usize>(source: &str, leads: [usize; N]) -> [Library; N] {
+    let object = room(source, "o");
+    gcc("-c", &object, &["-O3", "-march=native", "-fPIC", "-Wall", "-Wextra", "-pedantic"], &[&in_benches(source)]);
+    leads.map(|lead| {
+        let before = room(source, &format!("{lead}.s"));
+        let text = format!(".text\n.skip {lead}\n.section .note.GNU-stack\n");
+        std::fs::write(&before, text).expect("there is room for it");
+        let library = room(source, &format!("{lead}.so"));
+        gcc("-shared", &library, &[], &[&before, &object]);
+        // SAFETY: the library runs no code when it is loaded.
+        unsafe { Library::new(&library) }.expect("the library loads")
+    })
+}
+
+fn in_benches(source: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(source)
+}
+
+/// What becomes of a source, by its ending.
+fn room(source: &str, ending: &str) -> PathBuf {
+    let name = in_benches(source).with_extension(ending);
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join(name.file_name().expect("a source has a name"))
+}
+
+fn gcc(what: &str, out: &Path, how: &[&str], of: &[&Path]) {
+    let status = Command::new("gcc").arg(what).args(how).arg("-o").arg(out).args(of).arg("-lm").status();
+    assert!(status.expect("gcc runs").success(), "{} is built", out.display());
 }

@@ -68,7 +68,7 @@ fn servo(watched: bool) -> Program {
 type Hand = unsafe extern "C" fn(state: *mut f64, params: *const f64, h: f64, count: u64);
 
 fn main() {
-    let library = gcc::built("servo.c", 0);
+    let library = gcc::built("servo.c");
     println!("PID servo with LuGre, {} µs, one instance; below 1 is faster than gcc -O3 -march=native", H * 1e6);
     for (method, name) in [(Method::Euler, "euler"), (Method::Rk4, "rk4")] {
         // SAFETY: the library was just built from a source with functions of this name and type.

@@ -4,11 +4,6 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* So many bytes before all code: where it lies matters. */
-#define TEXT_OF(number) #number
-#define SKIP(number) __asm__(".text\n.skip " TEXT_OF(number))
-SKIP(LEAD);
-
 typedef int64_t step(double *, const double *, const void *, double *, double);
 
 struct calls {

@@ -44,9 +44,9 @@ const COURSE: usize = 4096;
 const COMPARED: usize = 20_000;
 /// Largest difference of a quantity, as a share of the largest value that it has had.
 const TOLERANCE: f64 = 1e-9;
-const ROUNDS: usize = PLACES * 41;
+const ROUNDS: usize = PLACES * 29;
 /// Places where the code lies in turn.
-const PLACES: usize = 4;
+const PLACES: usize = 12;
 /// Calls of a round, and those before the clock runs.
 const CALLS: usize = 1000;
 const WARM: usize = 200;
@@ -93,8 +93,8 @@ enum State {
 }
 
 fn main() {
-    let built = |source: &str| -> [_; PLACES] { std::array::from_fn(|place| gcc::built(source, 16 + 1040 * place)) };
-    let (libraries, calls) = (built("library/models.c"), built("library/calls.c"));
+    let leads: [usize; PLACES] = std::array::from_fn(|place| 16 + 1040 * place);
+    let [libraries, calls] = ["library/models.c", "library/calls.c"].map(|source| gcc::built_at(source, leads));
     let around = calls.each_ref().map(Around::of);
     let hands = libraries.each_ref().map(|library| {
         // SAFETY: the table is in the source.
@@ -126,7 +126,8 @@ fn main() {
             continue;
         }
         let hands = hands.each_ref().map(|hands| hand(hands, name));
-        let Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } = compare(name, &mut loaded, (hands, &around));
+        let Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } =
+            compare(name, &mut loaded, (hands, &around));
         let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn];
         let [ratio, to_checked, unguarded, unprepared, in_turn] = of_model;
         println!(
@@ -256,16 +257,11 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; 
     timed((hands, around), ways, &x, &params, (&course, &inputs, &outputs), h)
 }
 
-/// The code in each of its places: those of the other functions before it, or some of them, or none.
+/// The code in each of its places: behind so many more functions.
 fn codes(program: &Program, make: impl Fn(&[(Function, Func)]) -> Code) -> [Code; PLACES] {
     let functions = compiler::functions(program, Method::Expo);
-    let step = functions.iter().position(|(function, _)| *function == Function::Step).expect("there is a step");
-    std::array::from_fn(|place| {
-        let before = [usize::MAX, 0, 1, 2][place];
-        let mut functions = functions.clone();
-        functions.drain(before.min(step)..step);
-        make(&functions)
-    })
+    let start = functions.iter().find(|(function, _)| *function == Function::Start).expect("there is a start");
+    std::array::from_fn(|place| make(&[&vec![start.clone(); place], &functions[..]].concat()))
 }
 
 /// A model and its code.
@@ -320,7 +316,8 @@ struct Moving {
     /// Where pages begin, and where in one they lie.
     page: usize,
     at: usize,
-    len: usize,
+    /// What they begin with.
+    first: Vec<f64>,
 }
 
 impl Moving {
@@ -328,18 +325,23 @@ impl Moving {
     const LINE: usize = 64 / size_of::<f64>();
 
     fn new(numbers: &[f64]) -> Moving {
-        let len = numbers.len();
-        let mut room = vec![0.0; 2 * Moving::PAGE + len];
+        let room = vec![0.0; 2 * Moving::PAGE + numbers.len()];
         let page = room.as_ptr().align_offset(4096);
-        room[page..page + len].copy_from_slice(numbers);
-        Moving { room, page, at: 0, len }
+        let mut moving = Moving { room, page, at: 0, first: numbers.to_vec() };
+        moving.again();
+        moving
+    }
+
+    /// They are what they were at first.
+    fn again(&mut self) {
+        self.room[self.page + self.at..][..self.first.len()].copy_from_slice(&self.first);
     }
 
     /// Where they lie for one more round.
     fn next(&mut self) -> *mut f64 {
         let begin = self.page + self.at;
         self.at = (self.at + Moving::LINE) % Moving::PAGE;
-        self.room.copy_within(begin..begin + self.len, self.page + self.at);
+        self.room.copy_within(begin..begin + self.first.len(), self.page + self.at);
         self.room[self.page + self.at..].as_mut_ptr()
     }
 }
@@ -366,6 +368,9 @@ fn timed(
         let rows = &course[rows..][..(WARM + CALLS) * inputs.len()];
         let place = number / (ROUNDS / PLACES);
         let around = &around[place];
+        if number % (ROUNDS / PLACES) == 0 {
+            of_c.iter_mut().chain(ways.iter_mut().map(|way| &mut way.numbers)).for_each(Moving::again);
+        }
         // Nobody is always the first, or behind the same.
         for kind in (0..7).map(|k| (k + number) % 7) {
             let calls = if kind < 3 {

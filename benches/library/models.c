@@ -6,11 +6,6 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* So many bytes before all code: where it lies matters. */
-#define TEXT_OF(number) #number
-#define SKIP(number) __asm__(".text\n.skip " TEXT_OF(number))
-SKIP(LEAD);
-
 #define ARGS double *restrict x, const double *restrict p, const double *restrict u, double *restrict o, double h
 #define STATELESS (void)x, (void)h
 #define UNUSED(what) (void)(what)

@@ -6,11 +6,11 @@
 
 use super::sides::Sides;
 use crate::ir::build::Build;
-use crate::ir::left::{known, left, needed};
+use crate::ir::left::{known as truths, left, needed};
 use crate::ir::{Func, Op, Value, Write, number_asked};
 use crate::opt::watched::{with_fewer, with_less_asked};
 use abi::Slot;
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 
 /// The ways through a function.
 pub struct Ways {
@@ -35,7 +35,7 @@ pub enum Way {
     Asks(Value, Box<[Way; 2]>),
     /// A regime changes, which is rare.
     Changes(Box<Way>),
-    /// The same, and another one besides, or on too many ways: this is left to others.
+    /// The same, and another one besides, or on too many ways; or one is none of its own: this is left to others.
     Leaves,
 }
 
@@ -80,7 +80,7 @@ impl Way {
     }
 }
 
-/// Operations, by their cost, from which on a side of a choice is long.
+/// Operations, by their cost, from which on the sides of a choice are long.
 const LONG: u32 = 12;
 /// Most ends: behind a question, what is the same on both sides stands twice.
 const MOST: usize = 12;
@@ -102,15 +102,46 @@ pub fn ways(func: &Func) -> Option<Ways> {
     let stored = func.stores.iter().map(|(_, value)| *value);
     let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
     let wanted: Vec<Value> = stored.chain(written).chain(failed).collect();
-    let mut seeker = Seeker { build, slots, rings: &func.writes, read, ends: 0, changed: 0, has_changed: false };
-    let begin = seeker.way(wanted, &[])?;
+    let numbers = slots.iter().map(|slot| (*slot, numbers(func, *slot))).collect();
+    let rings = &func.writes;
+    let mut seeker = Seeker { build, slots, numbers, rings, read, ends: 0, changed: 0, has_changed: false };
+    let begin = seeker.way(wanted, &Known::default())?;
     Some(Ways { func: Func { ops: seeker.build.into_ops(), ..func.clone() }, begin })
+}
+
+/// The numbers that a slot is asked for, and those that it becomes: bits of all, if any.
+fn numbers(func: &Func, slot: Slot) -> HashSet<u64> {
+    let asked = func.ops.iter().filter_map(|op| number_asked(*op, |value| func.op(value)));
+    let mut numbers: HashSet<u64> = asked.filter(|(_, of, _)| *of == slot).map(|(.., bits)| bits).collect();
+    if !numbers.is_empty() {
+        let stored = func.stores.iter().filter(|(stored, _)| *stored == slot);
+        let mut open: Vec<Value> = stored.map(|(_, value)| *value).collect();
+        while let Some(value) = open.pop() {
+            match func.op(value) {
+                Op::Select(_, yes, no) => open.extend([yes, no]),
+                Op::Real(bits) => _ = numbers.insert(bits),
+                _ => {}
+            }
+        }
+    }
+    numbers
+}
+
+/// What is known of regimes on a way: slots, and bits of numbers.
+#[derive(Clone, Default)]
+struct Known {
+    /// What they are.
+    held: Vec<(Slot, u64)>,
+    /// What they are not.
+    excluded: Vec<(Slot, u64)>,
 }
 
 struct Seeker<'a> {
     build: Build,
     /// Slots that are stored.
     slots: Vec<Slot>,
+    /// The numbers of each that is a regime.
+    numbers: HashMap<Slot, HashSet<u64>>,
     /// What is written to rings, without a way.
     rings: &'a [Write],
     /// Slots that are read.
@@ -123,17 +154,16 @@ struct Seeker<'a> {
 }
 
 impl Seeker<'_> {
-    /// To what is stored, what is written to rings, index and value, and what then fails; `held` are the regimes that are
-    /// known by now, with the bits of their numbers.
-    fn way(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
+    /// To what is stored, what is written to rings, index and value, and what then fails.
+    fn way(&mut self, wanted: Vec<Value>, known: &Known) -> Option<Way> {
         let changes = |(slot, value): (&Slot, &Value)| match self.build.get(*value) {
-            Op::Real(bits) => held.iter().any(|(held, before)| held == slot && *before != bits),
+            Op::Real(bits) => known.held.iter().any(|(held, before)| held == slot && *before != bits),
             _ => false,
         };
         if self.slots.iter().zip(&wanted).any(changes) {
             return Some(self.changed(wanted));
         }
-        self.on(wanted, held)
+        self.on(wanted, known)
     }
 
     /// The same from where a regime changes. What regimes were counts no more: all that they become is stored.
@@ -143,7 +173,7 @@ impl Seeker<'_> {
         }
         self.has_changed = true;
         let ends = std::mem::take(&mut self.ends);
-        let rest = self.on(wanted, &[]);
+        let rest = self.on(wanted, &Known::default());
         let own = std::mem::replace(&mut self.ends, ends);
         self.has_changed = false;
         match rest {
@@ -156,25 +186,34 @@ impl Seeker<'_> {
     }
 
     /// How it goes on while no regime is seen to change.
-    fn on(&mut self, wanted: Vec<Value>, held: &[(Slot, u64)]) -> Option<Way> {
+    fn on(&mut self, wanted: Vec<Value>, known: &Known) -> Option<Way> {
         let list = needed(&self.build, &HashSet::new(), &wanted);
-        let Some(question) = self.question(&list, &wanted, held) else {
+        let Some(question) = self.question(&list, &wanted, &known.held) else {
             self.ends += 1;
-            return (self.ends <= MOST).then(|| self.end(wanted, held));
+            return (self.ends <= MOST).then(|| self.end(wanted, &known.held));
         };
         let asked = question?;
         let mut side = |truth: bool| {
-            let (mut known, mut held) = (known(&mut self.build, asked, truth), held.to_vec());
-            if let Some((load, slot, bits)) = self.regime(asked).filter(|_| truth) {
-                for value in &list {
-                    if let Some((_, _, other)) = self.regime(*value).filter(|(of, ..)| *of == load) {
-                        known.push((*value, self.build.truth(f64::from_bits(bits) == f64::from_bits(other))));
+            let (mut truths, mut known) = (truths(&mut self.build, asked, truth), known.clone());
+            if let Some((load, slot, bits)) = self.regime(asked) {
+                if truth {
+                    for value in &list {
+                        if let Some((_, _, other)) = self.regime(*value).filter(|(of, ..)| *of == load) {
+                            let is_other = f64::from_bits(bits) == f64::from_bits(other);
+                            truths.push((*value, self.build.truth(is_other)));
+                        }
+                    }
+                    known.held.push((slot, bits));
+                } else {
+                    known.excluded.push((slot, bits));
+                    // It is none of its numbers: nobody but who looks for mistakes puts another one there.
+                    if self.numbers[&slot].iter().all(|bits| known.excluded.contains(&(slot, *bits))) {
+                        return Some(Way::Leaves);
                     }
                 }
-                held.push((slot, bits));
             }
-            let wanted = left(&mut self.build, &list, &known, &wanted);
-            self.way(wanted, &held)
+            let wanted = left(&mut self.build, &list, &truths, &wanted);
+            self.way(wanted, &known)
         };
         let sides = [side(true)?, side(false)?];
         Some(if matches!(sides, [Way::Leaves, Way::Leaves]) { Way::Leaves } else { Way::Asks(asked, Box::new(sides)) })
@@ -251,19 +290,30 @@ impl Seeker<'_> {
         waits
     }
 
-    /// Choices of which a side takes long: it is worth a jump. None that only a side of another one needs.
+    /// Choices whose sides take long: it is worth a jump. None that only a side of another one needs.
     fn long(&self, list: &[Value], wanted: &[Value]) -> HashSet<Value> {
         let sides = Sides::of(self.build.ops(), list, wanted);
-        let is_long = |pair: &[usize; 2]| pair.iter().any(|side| sides.costs[*side] >= LONG);
+        let is_long = |pair: &[usize; 2]| pair.iter().map(|side| sides.costs[*side]).sum::<u32>() >= LONG;
         let of_all = sides.members[0].iter().filter_map(|value| Some((*value, sides.of_choice.get(value)?)));
         of_all.filter(|(_, pair)| is_long(pair)).map(|(choice, _)| choice).collect()
     }
 
-    /// The comparisons that a truth is put together from, in their order; a none for what is none.
+    /// The comparisons that a truth is put together from, in their order; a none for what is none. Those with 0 come last: a
+    /// bound is seldom reached, and then from one side, while what has a direction has either.
     fn parts(&self, truth: Value) -> Vec<Option<Value>> {
+        let mut parts = self.comparisons(truth);
+        let is_zero = |value: Value| matches!(self.build.get(value), Op::Real(bits) if f64::from_bits(bits) == 0.0);
+        parts.sort_by_key(|part| match part.map(|part| self.build.get(part)) {
+            Some(Op::Less(a, b) | Op::LessEqual(a, b)) => is_zero(a) || is_zero(b),
+            _ => false,
+        });
+        parts
+    }
+
+    fn comparisons(&self, truth: Value) -> Vec<Option<Value>> {
         match self.build.get(truth) {
-            Op::And(a, b) | Op::Or(a, b) => [self.parts(a), self.parts(b)].concat(),
-            Op::Not(a) => self.parts(a),
+            Op::And(a, b) | Op::Or(a, b) => [self.comparisons(a), self.comparisons(b)].concat(),
+            Op::Not(a) => self.comparisons(a),
             Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) => vec![Some(truth)],
             _ => vec![None],
         }

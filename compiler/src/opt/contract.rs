@@ -7,12 +7,12 @@
 //! - a product that something else uses too: it would be computed twice, and what is compared with it would differ from
 //!   what it enters;
 //! - a sum or difference of two products: forces k·a and −k·a cancel, and fused they would leave what k·a was rounded by.
-//!   Squares never do.
+//!   Squares never do; and a product with a sign is not rounded, so that the same comes out.
 //!
 //! Both rules look at one sum alone, so mirror images of a contact are fused alike.
 
 use crate::ir::build::Build;
-use crate::ir::{Func, Op, Value, is_not_negative};
+use crate::ir::{Func, Op, Value, is_not_negative, sign_of};
 
 /// Fuses what may be.
 pub fn contract(func: &Func) -> Func {
@@ -32,23 +32,24 @@ pub fn contract(func: &Func) -> Func {
             op => matches!(op, Op::Mul(..)),
         };
         let grows = |x: Value, y: Value| [x, y].iter().all(|part| is_not_negative(*part, |value| func.op(value)));
+        let is_sign = |value: Value| sign_of(func.op(value), |value| func.op(value)).is_some();
+        let is_exact = |value: Value| matches!(func.op(value), Op::Mul(a, b) if is_sign(a) || is_sign(b));
         let fused = match *op {
-            Op::Add(x, y) => match (product(x), product(y)) {
-                (Some((a, b)), _) if !cancels(y) || grows(x, y) => Some(build.fma(a, b, at(y))),
-                (_, Some((a, b))) if !cancels(x) || grows(x, y) => Some(build.fma(a, b, at(x))),
-                _ => None,
-            },
-            Op::Sub(x, y) => match (product(x), product(y)) {
-                (Some((a, b)), _) if !cancels(y) => {
-                    let less = build.neg(at(y));
-                    Some(build.fma(a, b, less))
+            Op::Add(x, y) | Op::Sub(x, y) => {
+                let adds = matches!(op, Op::Add(..));
+                let fits = |x: Value, y: Value| is_exact(x) || !cancels(y) || adds && grows(x, y);
+                match (product(x).filter(|_| fits(x, y)), product(y).filter(|_| fits(y, x))) {
+                    (Some((a, b)), other) if is_exact(x) || other.is_none() || !is_exact(y) => {
+                        let rest = if adds { at(y) } else { build.neg(at(y)) };
+                        Some(build.fma(a, b, rest))
+                    }
+                    (_, Some((a, b))) => {
+                        let a = if adds { a } else { build.neg(a) };
+                        Some(build.fma(a, b, at(x)))
+                    }
+                    _ => None,
                 }
-                (_, Some((a, b))) if !cancels(x) => {
-                    let less = build.neg(a);
-                    Some(build.fma(less, b, at(x)))
-                }
-                _ => None,
-            },
+            }
             _ => None,
         };
         let op = op.map(at);
@@ -114,6 +115,30 @@ mod tests {
                 b.div(ratio, minus)
             });
             assert_eq!(count(&listing, "fma"), 0, "{listing}");
+        }
+    }
+
+    #[test]
+    fn squares_and_signs_never_cancel() {
+        let norm = contracted(|b, [x, y, ..]| {
+            let squares = [b.mul(x, x), b.mul(y, y)];
+            b.add(squares[0], squares[1])
+        });
+        assert_eq!((count(&norm, "fma"), count(&norm, "mul")), (1, 1), "{norm}");
+        // The product with a sign is the one that is fused, wherever it stands.
+        for turned in [false, true] {
+            for of_two in [Build::add, Build::sub] {
+                let force = contracted(|b, [v, y, z, _]| {
+                    let [zero, one, minus_one] = [0.0, 1.0, -1.0].map(|number| b.real(number));
+                    let (above, below) = (b.less(zero, v), b.less(v, zero));
+                    let rest = b.mul(zero, v);
+                    let other = b.select(below, minus_one, rest);
+                    let sign = b.select(above, one, other);
+                    let (dry, viscous) = (b.mul(y, sign), b.mul(z, v));
+                    if turned { of_two(b, viscous, dry) } else { of_two(b, dry, viscous) }
+                });
+                assert_eq!((count(&force, "fma"), count(&force, "mul")), (1, 2), "{force}");
+            }
         }
     }
 

@@ -376,6 +376,9 @@ impl<'a> Body<'a> {
     fn load(&mut self, node: Node, register: u8, place: Place) {
         match place {
             _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
+            Place::Constant(0) if self.width == Vectors::One => {
+                self.code.vector(i::XOR, register, register, Place::Register(register), None);
+            }
             Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::BROADCAST, register, 0, place, None);
             }

@@ -436,11 +436,21 @@ impl Assembler {
         self.bytes.extend(bytes);
     }
 
-    /// A jump that is taken if a number in the block is not this one, which is no NaN; its target is open. Integers answer that
-    /// sooner than reals, whose comparison may find that there is no order.
-    pub fn unless(&mut self, offset: i32, bits: u64) -> usize {
+    /// A number of the block, to rax.
+    pub fn bring_number(&mut self, offset: i32) {
         self.plain(&[0x48, 0x8b]); // mov rax, [block + offset]
         self.operand(0, Place::Memory(Base::Block, offset), None, 1);
+    }
+
+    /// A jump that is taken if a number of the block is not +0; its target is open.
+    pub fn unless_clear(&mut self, offset: i32) -> usize {
+        self.plain(&[0x48, 0x83]); // cmp qword [block + offset], 0
+        self.operand(7, Place::Memory(Base::Block, offset), Some(0), 1);
+        self.jump(&[0x0f, 0x85]) // jne
+    }
+
+    /// A jump that is taken if rax is not this number, which is no NaN; its target is open. Of 0 rax does not keep the sign.
+    pub fn unless_number(&mut self, bits: u64) -> usize {
         if f64::from_bits(bits) == 0.0 {
             self.plain(&[0x48, 0x01, 0xc0]); // add rax, rax: the sign goes
         } else {

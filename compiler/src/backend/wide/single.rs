@@ -5,9 +5,9 @@
 //! ```text
 //! if the count is not 1 and that is asked: go on to the others
 //! questions, each as soon as what it compares is there; where a regime changes: go on behind all else
-//! then, for each end of its own: everything; what the step does not read is stored as soon as it is there
+//! then, for each end of its own: everything; what registers have no room for and the step does not read is stored
 //! if something fails: go on to the others
-//! what it reads is stored; return 0
+//! what it reads is stored, then the rest; return 0
 //! ```
 //! The others are code for any count. They do the step again, in full and with its status: what it reads is as it was.
 
@@ -73,12 +73,14 @@ pub fn single(func: &Func, asks: bool, by_kind: bool) -> Result<Single, Unsuppor
         code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
         to_others.push(code.jump(&[0x0f, 0x85])); // jne
     }
-    let mut writer =
-        Writer { code, func: &ways.func, nodes: &nodes, of, indices, homes, read, to_others, aside: Vec::new() };
+    let (func, nodes) = (&ways.func, &nodes);
+    let (in_rax, is_within, aside) = (None, false, Vec::new());
+    let mut writer = Writer { code, func, nodes, of, indices, homes, read, to_others, in_rax, is_within, aside };
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
     while let Some(Aside { jumps, way, there, held }) = writer.aside.pop() {
+        (writer.in_rax, writer.is_within) = (None, false);
         writer.arrive(jumps, way, &there, &held).ok_or_else(|| unsuitable("is too long"))?;
     }
     let len = writer.code.here();
@@ -109,6 +111,10 @@ struct Writer<'a> {
     /// What the step reads.
     read: HashSet<Slot>,
     to_others: Vec<usize>,
+    /// The number of the block that rax holds.
+    in_rax: Option<Slot>,
+    /// Whether a question has been answered with yes to which no was usual, too.
+    is_within: bool,
     /// What is rare and comes behind all else.
     aside: Vec<Aside<'a>>,
 }
@@ -163,19 +169,26 @@ impl<'a> Writer<'a> {
         body.resume(held);
         body.write(&|_| Vec::new(), &[]);
         // The side that is jumped to is the one that is rare, if one is, or the one that asks more: of several questions
-        // that must all hold, each leads to the same side if it does not.
-        let jumps_if = holds == Predicate::Equal || !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]);
+        // that must all hold, each leads to the same side if it does not. Where all but the last do, it does as a rule.
+        let changes = self.is_within && matches!(sides[0], Way::Changes(_));
+        let usual = !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]);
+        let jumps_if = holds == Predicate::Equal || changes || usual;
         let jumps = match number {
             None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
             Some(_) => Vec::new(),
         };
         let (held, spilled) = (body.held(), body.spilled());
-        let jumps = number.map_or(jumps, |(slot, bits)| vec![self.code.unless(8 * slot.0 as i32, bits)]);
+        let jumps = number.map_or(jumps, |(slot, bits)| vec![self.unless(slot, bits, &sides[1])]);
         if spilled > 0 {
             return None;
         }
         let [next, other] = if jumps_if { [0, 1] } else { [1, 0] };
+        let is_within = number.is_none() && !sides[1].is_rare();
+        let in_rax = self.in_rax;
+        self.is_within = is_within && next == 0;
         self.way(&sides[next], &there, &held)?;
+        self.in_rax = in_rax;
+        self.is_within = is_within && other == 0;
         match &sides[other] {
             Way::Leaves => {
                 self.to_others.extend(jumps);
@@ -186,6 +199,31 @@ impl<'a> Writer<'a> {
                 Some(())
             }
             other => self.arrive(jumps, other, &there, &held),
+        }
+    }
+
+    /// A jump that is taken, to a way, if a number of the block is not this one, which is no NaN. Integers answer that sooner than
+    /// reals, whose comparison may find that there is no order.
+    fn unless(&mut self, slot: Slot, bits: u64, to: &Way) -> usize {
+        let offset = 8 * slot.0 as i32;
+        // Where nothing but its other numbers is asked next, a −0 is left to others in the end.
+        if bits == 0 && self.only_asks(to, slot) {
+            return self.code.unless_clear(offset);
+        }
+        if self.in_rax != Some(slot) {
+            self.code.bring_number(offset);
+        }
+        self.in_rax = (f64::from_bits(bits) != 0.0).then_some(slot);
+        self.code.unless_number(bits)
+    }
+
+    /// Whether a way asks for other numbers of a slot of the block until it leaves.
+    fn only_asks(&self, way: &Way, slot: Slot) -> bool {
+        match way {
+            Way::Asks(asked, sides) => {
+                self.number_asked(*asked).is_some_and(|(of, _)| of == slot) && self.only_asks(&sides[1], slot)
+            }
+            way => matches!(way, Way::Leaves),
         }
     }
 
@@ -211,17 +249,22 @@ impl<'a> Writer<'a> {
         held: &Held,
     ) -> Option<()> {
         let stores = stores.iter().map(|(slot, value)| (*slot, self.at(*value)));
-        let (late, early): (Vec<_>, Vec<_>) = stores.partition(|(slot, _)| self.read.contains(slot));
-        let late: Vec<(Node, Home)> = late.into_iter().map(|(slot, node)| (node, home(slot))).collect();
+        let (mut late, mut early): (Vec<_>, Vec<_>) = stores.partition(|(slot, _)| self.read.contains(slot));
         let writes: Vec<(Slot, Node, Node)> =
             writes.iter().map(|write| (write.base, self.index(write), self.at(write.value))).collect();
         let questions = failed.map_or_else(Vec::new, |failed| questions(self.nodes, self.at(failed)));
         let asked = questions.iter().flat_map(Question::operands);
         let written = writes.iter().flat_map(|(_, index, value)| [*index, *value]);
-        let kept: Vec<Node> = asked.chain(written).chain(late.iter().map(|(node, _)| *node)).collect();
+        let mut kept: Vec<Node> = asked.chain(written).chain(late.iter().map(|(_, node)| *node)).collect();
         if kept.len() > MOST_KEPT {
             return None;
         }
+        // The next step waits for what it reads: that is stored before all else, if there is room for the rest until then.
+        if !late.is_empty() && kept.len() + early.len() <= MOST_KEPT {
+            kept.extend(early.iter().map(|(_, node)| *node));
+            late.append(&mut early);
+        }
+        let late: Vec<(Node, Home)> = late.into_iter().map(|(slot, node)| (node, home(slot))).collect();
         let early_nodes: Vec<Node> = early.iter().map(|(_, node)| *node).collect();
         let roots: Vec<Node> = kept.iter().chain(&early_nodes).copied().collect();
         let order = self.order(&roots, there);
@@ -230,7 +273,8 @@ impl<'a> Writer<'a> {
         }
         let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
         kept.iter().for_each(|node| body.keep(*node));
-        early_nodes.iter().filter(|node| there[node.index()]).for_each(|node| body.keep(*node));
+        let lies = |node: &&Node| there[node.index()] || self.nodes.nodes[node.index()].is_leaf();
+        early_nodes.iter().filter(lies).for_each(|node| body.keep(*node));
         body.resume(held);
         let to_block =
             |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
