@@ -28,8 +28,8 @@ pub struct Coder<'a> {
     context: Context,
     builder: FunctionBuilderContext,
     lengths: Lengths,
-    /// Whether the processor has AVX-512 F.
-    by_kind: bool,
+    /// Whether the processor has AVX-512 F and DQ.
+    avx512: bool,
 }
 
 /// Code of a function, and the power of two at a multiple of which it must begin.
@@ -67,7 +67,9 @@ impl<'a> Coder<'a> {
             context: Context::new(),
             builder: FunctionBuilderContext::new(),
             lengths: Lengths::USUAL,
-            by_kind: isa.isa_flags().iter().any(|flag| flag.name == "has_avx512f" && flag.as_bool() == Some(true)),
+            avx512: ["has_avx512f", "has_avx512dq"]
+                .iter()
+                .all(|name| isa.isa_flags().iter().any(|flag| flag.name == *name && flag.as_bool() == Some(true))),
         }
     }
 
@@ -228,7 +230,7 @@ impl<'a> Coder<'a> {
     /// A single iteration in our own instructions, where there are such.
     fn own(&self, single: &Single) -> Option<single::Single> {
         let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
-        if ours { single::single(&single.func, single.asks, self.by_kind).ok() } else { None }
+        if ours { single::single(&single.func, single.asks, self.avx512).ok() } else { None }
     }
 
     /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop

@@ -5,7 +5,7 @@
 //! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
 //! registers are free.
 
-use super::encode::{Assembler, Base, Instruction, Place, Vectors, instructions as i};
+use super::encode::{Assembler, Base, Instruction, OF_SIZE, Place, Vectors, instructions as i};
 use super::select::{Direction, Node, Nodes, Predicate, Signs, What};
 use crate::math;
 use abi::Slot;
@@ -313,13 +313,24 @@ impl<'a> Body<'a> {
             return Place::Register(register);
         }
         let place = self.memory(node);
+        // Of single numbers 0 is not read but made.
+        if place == Place::Constant(0) && self.width == Vectors::One {
+            return Place::Register(self.loaded(node, place));
+        }
         if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
             return place;
         }
+        Place::Register(self.loaded(node, place))
+    }
+
+    /// A register for a node that lies somewhere else.
+    fn loaded(&mut self, node: Node, place: Place) -> u8 {
+        let mask = self.is_mask(node);
         let register = self.take(mask);
         self.load(node, register, place);
+        let copy = self.copy(node);
         self.own(copy, mask, register);
-        Place::Register(register)
+        register
     }
 
     /// The same for an instruction: one of whole vectors does not read a single number from memory.
@@ -363,13 +374,7 @@ impl<'a> Body<'a> {
     fn in_register(&mut self, node: Node) -> u8 {
         match self.place(node) {
             Place::Register(register) => register,
-            place => {
-                let register = self.take(self.is_mask(node));
-                self.load(node, register, place);
-                let copy = self.copy(node);
-                self.own(copy, self.is_mask(node), register);
-                register
-            }
+            place => self.loaded(node, place),
         }
     }
 
@@ -676,7 +681,7 @@ impl<'a> Body<'a> {
             }
             return self.code.vector(instruction, to, first, last, Some(0));
         }
-        self.code.vector(instruction, to, first, last, None);
+        self.code.vector(instruction, to, first, last, (instruction == i::SIZE).then_some(OF_SIZE));
     }
 
     /// One of three operands is overwritten, one may lie in memory.

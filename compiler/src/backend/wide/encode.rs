@@ -91,6 +91,7 @@ impl Instruction {
             }
             i::ROUND => Some(Instruction(1, map, w, 0x0b)),
             i::BY_KIND => Some(Instruction(1, map, w, 0x55)),
+            i::SIZE => Some(Instruction(1, map, w, 0x51)),
             i::LOAD => Some(i::LOAD_FIRST),
             i::STORE => Some(i::STORE_FIRST),
             _ if fused => Some(Instruction(1, map, w, opcode | 1)),
@@ -98,6 +99,9 @@ impl Instruction {
         }
     }
 }
+
+/// The less of two numbers, without its sign.
+pub const OF_SIZE: u8 = 8;
 
 #[rustfmt::skip]
 #[allow(missing_docs)]
@@ -151,6 +155,8 @@ pub mod instructions {
     pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
     /// By what kind of number v is, as the bits of rm say for each kind. The immediate is 0: no exceptions.
     pub const BY_KIND: Instruction = Instruction(1, 3, [1, 0], 0x54);
+    /// Of v and rm, which are the same, less the sign: the immediate is [`OF_SIZE`](super::OF_SIZE).
+    pub const SIZE: Instruction = Instruction(1, 3, [1, 0], 0x50);
     /// v · 2^⌊rm⌋
     pub const SCALE: Instruction = Instruction(1, 2, [1, 0], 0x2c);
     /// From the two vectors d and rm, d first, by the low bits of v.
@@ -218,7 +224,7 @@ impl Assembler {
                 self.evex(what, reg, second, last, mask);
                 self.operand(reg, last, immediate, self.width.bytes());
             }
-            Vectors::One if what == instructions::BY_KIND => {
+            Vectors::One if matches!(what, instructions::BY_KIND | instructions::SIZE) => {
                 self.evex(what.of_one().expect("there is one of it"), reg, second, last, mask);
                 self.operand(reg, last, immediate, 8);
             }

@@ -294,13 +294,13 @@ pub struct Operations {
     pub indices: Vec<Node>,
 }
 
-/// The wanted operations of a function and what writes to rings need, whose operands are wanted, in one lane. `by_kind`:
-/// whether there is the instruction of this name, of AVX-512 F.
+/// The wanted operations of a function and what writes to rings need, whose operands are wanted, in one lane. `avx512`:
+/// whether there are the instructions of AVX-512 F and DQ.
 ///
 /// # Errors
 /// As [`select`].
-pub fn operations(func: &Func, by_kind: bool, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
-    let mut selection = Selection::new(Vectors::One, by_kind);
+pub fn operations(func: &Func, avx512: bool, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
+    let mut selection = Selection::new(Vectors::One, avx512);
     let of = selection.operations(func, wanted)?;
     let indices = writes.iter().map(|write| selection.inside(func, write.index, write.len, &of)).collect();
     let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes: selection.nodes, pooled: false };
@@ -309,8 +309,8 @@ pub fn operations(func: &Func, by_kind: bool, wanted: &[bool], writes: &[Write])
 
 struct Selection {
     width: Vectors,
-    /// Whether an instruction goes by the kind of a number.
-    by_kind: bool,
+    /// Whether there are the instructions of AVX-512 F and DQ.
+    avx512: bool,
     nodes: Vec<What>,
     known: HashMap<What, Node>,
 }
@@ -320,8 +320,8 @@ struct Selection {
 const SIGN_BY_KIND: u64 = 0xa9a9_a122;
 
 impl Selection {
-    fn new(width: Vectors, by_kind: bool) -> Selection {
-        Selection { width, by_kind, nodes: Vec::new(), known: HashMap::new() }
+    fn new(width: Vectors, avx512: bool) -> Selection {
+        Selection { width, avx512, nodes: Vec::new(), known: HashMap::new() }
     }
 
     fn operations(&mut self, func: &Func, wanted: &[bool]) -> Result<Vec<Node>, Unsupported> {
@@ -404,6 +404,8 @@ impl Selection {
             Op::Mul(a, b) => What::Two(i::MUL, true, at(a), at(b)),
             Op::Div(a, b) => What::Two(i::DIV, false, at(a), at(b)),
             Op::Neg(a) => What::Two(i::XOR, true, at(a), self.constant(SIGN)),
+            // Single numbers wait for what they read, as a constant is, sooner than for what is done to them.
+            Op::Abs(a) if !wide && self.avx512 => What::Two(i::SIZE, true, at(a), at(a)),
             Op::Abs(a) => What::Two(i::AND, true, at(a), self.constant(!SIGN)),
             Op::Sqrt(a) => What::One(i::SQRT, None, at(a)),
             Op::Fma(a, b, c) => {
@@ -483,7 +485,7 @@ impl Selection {
 
     /// ±1 with the sign of x, unless x is neither above nor below 0.
     fn sign(&mut self, x: Node) -> Node {
-        if self.by_kind {
+        if self.avx512 {
             let kinds = self.constant(SIGN_BY_KIND);
             return self.add(What::Two(i::BY_KIND, false, x, kinds));
         }

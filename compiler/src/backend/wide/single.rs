@@ -38,18 +38,18 @@ const LONGEST: usize = 100;
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
-/// If it `asks`, it leaves every count but 1 to the others; else it is called for one step only. `by_kind`: whether the
-/// processor has the instruction of this name, of AVX-512 F.
+/// If it `asks`, it leaves every count but 1 to the others; else it is called for one step only. `avx512`: whether the
+/// processor has AVX-512 F and DQ.
 ///
 /// # Errors
 /// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
-pub fn single(func: &Func, asks: bool, by_kind: bool) -> Result<Single, Unsupported> {
+pub fn single(func: &Func, asks: bool, avx512: bool) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
     if func.ops.len() > LARGEST {
         return Err(unsuitable("is too long"));
     }
     // Whether there are instructions is known before the ways.
-    operations(func, by_kind, &func.live(), &func.writes)?;
+    operations(func, avx512, &func.live(), &func.writes)?;
     let ways = ways(func).ok_or_else(|| unsuitable("has too many ways"))?;
     let mut written = Vec::new();
     ways.begin.each(&mut |way| {
@@ -57,8 +57,7 @@ pub fn single(func: &Func, asks: bool, by_kind: bool) -> Result<Single, Unsuppor
             written.extend(writes);
         }
     });
-    let Operations { nodes, of, indices } =
-        operations(&ways.func, by_kind, &wanted(&ways.func, &ways.begin), &written)?;
+    let Operations { nodes, of, indices } = operations(&ways.func, avx512, &wanted(&ways.func, &ways.begin), &written)?;
     let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
     let place = |(number, node): (u32, &What)| match node {
@@ -385,6 +384,7 @@ fn is_nothing(nodes: &Nodes, node: Node) -> bool {
 /// Whether a node is +0, above it or NaN.
 fn is_size(nodes: &Nodes, node: Node) -> bool {
     match nodes.nodes[node.index()] {
+        What::Two(instructions::SIZE, ..) => true,
         What::Two(instructions::AND, _, a, b) => {
             [a, b].iter().any(|part| nodes.nodes[part.index()] == What::Constant(!SIGN))
         }
