@@ -14,8 +14,9 @@
 //! Each operation becomes one instruction or a fixed few. There are no symbols, no traps, and no calls but that of the loop
 //! behind what makes a single iteration.
 
+use super::copies::{asked_by_many, given};
 use super::postpone::postponed;
-use super::regimes::{Apart, Automaton, Case, Then, apart};
+use super::regimes::{Apart, Automaton, Case, Numbers, Then, apart, numbers};
 use super::sides::Sides;
 use crate::ir::{Func, Op, Type, Value, Write, sign_of, verify};
 use abi::Slot;
@@ -71,7 +72,7 @@ pub fn emit(
     b.switch_to_block(prepare);
     let same = ahead.is_none() && stays_the_same(func);
     if same && func.ops.len() <= STRAIGHT {
-        once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
+        once(&apart(func, &Numbers::new(), &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
     } else {
         let count = if same { b.ins().iconst(types::I64, 1) } else { count };
         let emitter = Emitter { ahead, near: near(isa), ..Emitter::new(func, &facts, block, pool) };
@@ -125,10 +126,38 @@ pub fn emit_single(
         b.ins().return_(&[status]);
         b.switch_to_block(single);
     }
-    let (watch, late) = Watch::of(func);
-    once(&apart(func, &late, watch.asked().0), watch, &late, (block, pool), near(isa), &mut b);
+    in_copies(func, &numbers(func), (block, pool), (near(isa), 0), &mut b);
     b.seal_all_blocks();
     b.finalize(isa.frontend_config());
+}
+
+/// Most questions behind each other, for each answer to which there is a copy.
+const COPIED: usize = 2;
+
+/// Writes one iteration without a loop, from where `b` stands to its returns: a copy for each answer to what several automata
+/// ask alike.
+fn in_copies(
+    func: &Func,
+    numbers: &Numbers,
+    ports: (clif::Value, clif::Value),
+    (near, asked): (bool, usize),
+    b: &mut FunctionBuilder,
+) {
+    let Some(question) = asked_by_many(func).filter(|_| asked < COPIED) else {
+        let (watch, late) = Watch::of(func);
+        return once(&apart(func, numbers, &late, watch.asked().0), watch, &late, ports, near, b);
+    };
+    let facts = Facts::of(func);
+    let mut emitter = Emitter { near, ..Emitter::new(func, &facts, ports.0, ports.1) };
+    let live = func.live_for([question].into_iter());
+    let list = (0..func.ops.len()).filter(|i| live[*i]).map(|i| Value(i as u32));
+    emitter.list(&list.collect::<Vec<_>>(), b);
+    let sides = [true, false].map(|truth| (b.create_block(), given(func, question, truth)));
+    emitter.ask(question, sides[0].0, sides[1].0, b);
+    for (side, func) in sides {
+        b.switch_to_block(side);
+        in_copies(&func, numbers, ports, (near, asked + 1), b);
+    }
 }
 
 /// Whether constants are best read from behind the code: x86-64 would make each in a general register first.
@@ -659,21 +688,39 @@ impl<'a> Emitter<'a> {
             held: held.map(|bits| (automaton.slot, bits)),
         };
         let held = b.ins().load(types::I64, MemFlagsData::trusted(), self.block, offset(automaton.slot.0));
-        for (bits, case) in &automaton.cases {
+        // Regimes that are left at once are seldom held.
+        let mut cases: Vec<(u64, &Case)> = automaton.cases.iter().map(|(bits, case)| (*bits, case)).collect();
+        cases.sort_by_key(|(bits, case)| self.changes(case, &end(Some(*bits))));
+        let mut general = None;
+        for (bits, case) in cases {
             let [this, others] = [(); 2].map(|()| b.create_block());
-            let number = b.ins().iconst(types::I64, *bits as i64);
+            if self.changes(case, &end(Some(bits))) {
+                b.set_cold_block(this);
+            }
+            let number = b.ins().iconst(types::I64, bits as i64);
             // What is named last follows at once.
             let is_not = b.ins().icmp(IntCC::NotEqual, held, number);
             b.ins().brif(is_not, others, &[], this, &[]);
             b.switch_to_block(this);
-            self.case(case, &end(Some(*bits)), b);
+            self.case(case, &end(Some(bits)), b);
             b.switch_to_block(others);
+            general = Some(others);
         }
+        general.into_iter().for_each(|block| b.set_cold_block(block));
         self.case(&automaton.general, &end(None), b);
         b.switch_to_block(behind);
         for output in automaton.outputs.iter().filter(|output| read.contains(output)) {
             self.values[output.index()] = Some(b.append_block_param(behind, self.facts.type_of(*output)));
         }
+    }
+
+    /// Whether a case, without a question, ends with another number in the slot than it held.
+    fn changes(&self, case: &Case, end: &End) -> bool {
+        let Then::Outputs(outputs) = &case.then else { return false };
+        end.stores.iter().any(|(slot, number)| {
+            let held = end.held.filter(|(held, _)| held == slot);
+            matches!((held, self.func.op(outputs[*number])), (Some((_, bits)), Op::Real(next)) if next != bits)
+        })
     }
 
     /// Writes one case and goes on behind it; nothing of it is there then.
@@ -714,6 +761,11 @@ impl<'a> Emitter<'a> {
                 }
                 self.only(&postponed(&self.func.ops, &case.list), &read, b);
                 let blocks = [(); 2].map(|()| b.create_block());
+                for (block, side) in blocks.iter().zip(sides.iter()) {
+                    if self.changes(side, end) {
+                        b.set_cold_block(*block);
+                    }
+                }
                 self.branch(*when, blocks[0], blocks[1], b);
                 for (side, block) in sides.iter().zip(blocks) {
                     b.switch_to_block(block);

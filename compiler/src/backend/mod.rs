@@ -5,6 +5,7 @@
 pub mod interp;
 pub mod unsupported;
 mod regimes;
+mod copies;
 mod sides;
 mod postpone;
 mod ways;

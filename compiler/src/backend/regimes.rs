@@ -9,7 +9,7 @@ use crate::ir::left::{known, left, needed};
 use crate::ir::{Func, Op, Type, Value, number_asked};
 use abi::Slot;
 use std::cmp::Reverse;
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 /// A function whose operations are taken apart.
 pub struct Apart {
@@ -141,10 +141,23 @@ enum Place {
     Elsewhere,
 }
 
-/// Takes a function apart; `late` are operations that are not wanted, `watched` is the truth that ends the step.
-pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
+/// Numbers that slots are asked for, and that are known to be those of regimes: their bits.
+pub type Numbers = HashMap<Slot, Vec<u64>>;
+
+/// Those of a function.
+pub fn numbers(func: &Func) -> Numbers {
+    let of_load = |(load, numbers)| match func.op(load) {
+        Op::Load(slot) => (slot, numbers),
+        _ => unreachable!("it is a load"),
+    };
+    automata(func, &Numbers::new()).into_iter().map(of_load).collect()
+}
+
+/// Takes a function apart, which may be a copy in which not all `numbers` are asked for; `late` are operations that are not
+/// wanted, `watched` is the truth that ends the step.
+pub fn apart(func: &Func, numbers: &Numbers, late: &[bool], watched: Option<Value>) -> Apart {
     let all = || (0..func.ops.len()).map(|i| Value(i as u32));
-    let slots = automata(func);
+    let slots = automata(func, numbers);
     let mut places = dependent(func, late, &slots);
     watch_behind(func, watched, &mut places);
     for k in 0..slots.len() {
@@ -205,8 +218,24 @@ pub fn apart(func: &Func, late: &[bool], watched: Option<Value>) -> Apart {
     Apart { func: Func { ops, ..func.clone() }, before: listed(Place::Before), automata, behind: listed(Place::Behind) }
 }
 
-/// Loads that are only compared with constants and chosen, and these constants, by their bits.
-fn automata(func: &Func) -> Vec<(Value, Vec<u64>)> {
+/// Operations that automata read, and how many do, of those that are `wanted`.
+pub fn automata_that_ask(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, usize)> {
+    let places = dependent(func, &vec![false; func.ops.len()], &automata(func, &Numbers::new()));
+    let mut readers: BTreeMap<Value, HashSet<usize>> = BTreeMap::new();
+    for (op, place) in func.ops.iter().zip(places) {
+        let Place::Within(k) = place else { continue };
+        op.each_operand(|operand| {
+            if wanted(func.op(operand)) {
+                readers.entry(operand).or_default().insert(k);
+            }
+        });
+    }
+    readers.into_iter().map(|(value, readers)| (value, readers.len())).collect()
+}
+
+/// Loads that are only compared with constants and chosen, and these constants, by their bits, with those that are known
+/// besides.
+fn automata(func: &Func, known: &Numbers) -> Vec<(Value, Vec<u64>)> {
     let mut found: HashMap<Value, Option<Vec<u64>>> = HashMap::new();
     for op in &func.ops {
         if let Some((load, _, bits)) = number_asked(*op, |value| func.op(value)) {
@@ -218,6 +247,12 @@ fn automata(func: &Func) -> Vec<(Value, Vec<u64>)> {
                     found.insert(operand, None);
                 }
             });
+        }
+    }
+    for (load, numbers) in &mut found {
+        let (Some(numbers), Op::Load(slot)) = (numbers, func.op(*load)) else { continue };
+        for bits in known.get(&slot).into_iter().flatten().filter(|bits| !numbers.contains(bits)).collect::<Vec<_>>() {
+            numbers.push(*bits);
         }
     }
     let told = |(load, numbers): (Value, Option<Vec<u64>>)| Some((load, numbers.filter(|it| it.len() <= MOST)?));
@@ -393,7 +428,7 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let apart = apart(&func, &vec![false; func.ops.len()], None);
+        let apart = apart(&func, &Numbers::new(), &vec![false; func.ops.len()], None);
         let [automaton] = &apart.automata[..] else { panic!("one automaton") };
         assert_eq!((automaton.slot, &apart.behind[..]), (Slot(4), &[][..]));
         let shown = |case: &Case| -> Vec<String> {
@@ -431,7 +466,7 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let apart = apart(&func, &vec![false; func.ops.len()], None);
+        let apart = apart(&func, &Numbers::new(), &vec![false; func.ops.len()], None);
         let Then::Ask(asked, sides) = &apart.automata[0].cases[0].1.then else { panic!("it asks") };
         assert!(matches!(apart.func.op(*asked), Op::Less(..)));
         for side in sides.iter() {
