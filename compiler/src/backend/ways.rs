@@ -60,6 +60,11 @@ impl Way {
         !other.is_rare() && self.usual_ends() > other.usual_ends()
     }
 
+    /// Whether it asks next for what changes a regime.
+    pub fn may_change(&self) -> bool {
+        matches!(self, Way::Asks(_, sides) if matches!(sides[0], Way::Changes(_)))
+    }
+
     fn usual_ends(&self) -> usize {
         match self {
             Way::Asks(_, sides) => sides.iter().map(Way::usual_ends).sum(),

@@ -170,7 +170,7 @@ impl<'a> Writer<'a> {
         // The side that is jumped to is the one that is rare, if one is, or the one that asks more: of several questions
         // that must all hold, each leads to the same side if it does not. Where all but the last do, it does as a rule.
         let changes = self.is_within && matches!(sides[0], Way::Changes(_));
-        let usual = !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]);
+        let usual = !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]) && !sides[0].may_change();
         let jumps_if = holds == Predicate::Equal || changes || usual;
         let jumps = match number {
             None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
