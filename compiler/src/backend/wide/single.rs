@@ -35,6 +35,8 @@ pub struct Single {
 const LARGEST: usize = 250;
 /// Most instructions of a way, both sides of each choice counted: of longer ones a jump over a side is worth more.
 const LONGEST: usize = 100;
+/// Most ways from where a regime changes that stand among the others.
+const MOST_AMONG: usize = 8;
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
@@ -73,8 +75,11 @@ pub fn single(func: &Func, asks: bool, avx512: bool) -> Result<Single, Unsupport
         to_others.push(code.jump(&[0x0f, 0x85])); // jne
     }
     let (func, nodes) = (&ways.func, &nodes);
-    let (in_rax, is_within, aside) = (None, false, Vec::new());
-    let mut writer = Writer { code, func, nodes, of, indices, homes, read, to_others, in_rax, is_within, aside };
+    let mut changes = 0;
+    ways.begin.each(&mut |way| changes += usize::from(matches!(way, Way::Changes(_))));
+    let (in_rax, is_crowded, is_within, aside) = (None, changes > MOST_AMONG, false, Vec::new());
+    let mut writer =
+        Writer { code, func, nodes, of, indices, homes, read, to_others, in_rax, is_crowded, is_within, aside };
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
@@ -112,9 +117,11 @@ struct Writer<'a> {
     to_others: Vec<usize>,
     /// The number of the block that rax holds.
     in_rax: Option<Slot>,
+    /// Whether what is rare is so much that it comes behind all else.
+    is_crowded: bool,
     /// Whether a question has been answered with yes to which no was usual, too.
     is_within: bool,
-    /// What is rare and comes behind all else.
+    /// What comes behind all else.
     aside: Vec<Aside<'a>>,
 }
 
@@ -193,7 +200,7 @@ impl<'a> Writer<'a> {
                 self.to_others.extend(jumps);
                 Some(())
             }
-            Way::Changes(rest) => {
+            Way::Changes(rest) if self.is_crowded => {
                 self.aside.push(Aside { jumps, way: rest, there, held });
                 Some(())
             }
