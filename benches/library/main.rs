@@ -8,6 +8,7 @@
 //! parameters alone is prepared when one changes. Three columns tell what that is worth: the same C when it watches too, our
 //! step without guards, and our step that prepares nothing, as images have it. The last three are of calls whose inputs wait
 //! for the outputs of the call before, as they do where a loop is closed; in all others many calls are under way at once.
+//! `C to C`, one half of its rounds against the other, says what this can tell apart.
 //! A word behind the command takes only models whose names begin with it.
 //!
 //! Where numbers lie may cost a step more than all else: a load waits for a store with the same last twelve digits of
@@ -47,6 +48,8 @@ const TOLERANCE: f64 = 1e-9;
 const ROUNDS: usize = PLACES * 29;
 /// Places where the code lies in turn.
 const PLACES: usize = 12;
+/// Kinds of calls.
+const KINDS: usize = 7;
 /// Calls of a round, and those before the clock runs.
 const CALLS: usize = 1000;
 const WARM: usize = 200;
@@ -116,8 +119,19 @@ fn main() {
     let names: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
     println!("one step a call by `expo`, new inputs at each; below 1 is faster than C through a pointer");
     println!(
-        "{:<22} {:>8} {:>8} {:>8} {:>7} {:>10} {:>10} {:>10} {:>9} {:>8} {:>7}",
-        "", "C", "checked", "ours", "ratio", "to checked", "unguarded", "unprepared", "C in turn", "ours", "in turn"
+        "{:<22} {:>8} {:>8} {:>8} {:>7} {:>10} {:>10} {:>10} {:>9} {:>8} {:>7} {:>7}",
+        "",
+        "C",
+        "checked",
+        "ours",
+        "ratio",
+        "to checked",
+        "unguarded",
+        "unprepared",
+        "C in turn",
+        "ours",
+        "in turn",
+        "C to C"
     );
     let (mut ratios, mut left_out) = ([const { Vec::new() }; WHAT.len()], Vec::new());
     for name in names.iter().filter(|name| name.starts_with(&chosen)) {
@@ -126,13 +140,13 @@ fn main() {
             continue;
         }
         let hands = hands.each_ref().map(|hands| hand(hands, name));
-        let Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } =
+        let Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn } =
             compare(name, &mut loaded, (hands, &around));
-        let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn];
-        let [ratio, to_checked, unguarded, unprepared, in_turn] = of_model;
+        let of_model = [ours / c, ours / checked, bare / c, unprepared / c, ours_in_turn / c_in_turn, c_to_c];
+        let [ratio, to_checked, unguarded, unprepared, in_turn, _] = of_model;
         println!(
             "{name:<22} {c:5.1} ns {checked:5.1} ns {ours:5.1} ns {ratio:7.3} {to_checked:10.3} {unguarded:10.3} \
-             {unprepared:10.3} {c_in_turn:6.1} ns {ours_in_turn:5.1} ns {in_turn:7.3}"
+             {unprepared:10.3} {c_in_turn:6.1} ns {ours_in_turn:5.1} ns {in_turn:7.3} {c_to_c:7.3}"
         );
         ratios.iter_mut().zip(of_model).for_each(|(ratios, ratio)| ratios.push((ratio, name)));
     }
@@ -150,11 +164,13 @@ fn main() {
 }
 
 /// The ratios, in the order of the columns.
-const WHAT: [&str; 5] = ["ratio", "to checked", "unguarded", "unprepared", "in turn"];
+const WHAT: [&str; 6] = ["ratio", "to checked", "unguarded", "unprepared", "in turn", "C to C"];
 
 /// Nanoseconds a call, medians.
 struct Times {
     c: f64,
+    /// The larger of two halves of its rounds by the smaller.
+    c_to_c: f64,
     /// C that watches too.
     checked: f64,
     ours: f64,
@@ -362,7 +378,9 @@ fn timed(
     let all: Vec<f64> = [x, params, &vec![0.0; inputs.len() + outputs.len()]].concat();
     let mut of_c = [Moving::new(&all), Moving::new(&all)];
     // In turn: C one call behind the other, C that watches, C; ours one call behind the other, ours, unguarded, unprepared.
-    let mut times = [const { [const { Vec::new() }; PLACES] }; 7];
+    let mut times = [const { [const { Vec::new() }; PLACES] }; KINDS];
+    let mut order: [usize; KINDS] = std::array::from_fn(|kind| kind);
+    let mut drawn = 1;
     for number in 0..ROUNDS {
         let rows = number * (WARM + CALLS) % COURSE * inputs.len();
         let rows = &course[rows..][..(WARM + CALLS) * inputs.len()];
@@ -372,7 +390,10 @@ fn timed(
             of_c.iter_mut().chain(ways.iter_mut().map(|way| &mut way.numbers)).for_each(Moving::again);
         }
         // Nobody is always the first, or behind the same: what a step finds foreseen is what ran before it has left.
-        for kind in (0..7).map(|k| (k * (1 + number % 6) + number) % 7) {
+        for kind in 0..KINDS {
+            order.swap(kind, draw(&mut drawn) % (kind + 1));
+        }
+        for kind in order {
             let calls = if kind < 3 {
                 let numbers = of_c[kind % 2].next();
                 // SAFETY: so many numbers there are.
@@ -424,13 +445,24 @@ fn timed(
             assert_eq!(fine, 1, "no guard fires");
         }
     }
-    let of_place = |mut times: Vec<f64>| {
+    let median = |mut times: Vec<f64>| {
         times.sort_by(f64::total_cmp);
-        times[times.len() / 2] / PLACES as f64
+        times[times.len() / 2]
     };
-    let times = times.map(|places| places.into_iter().map(of_place).sum::<f64>());
-    let [c_in_turn, checked, c, ours_in_turn, ours, bare, unprepared] = times;
-    Times { c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn }
+    let mean = |places: &[Vec<f64>; PLACES], every: usize, from: usize| {
+        let of_place = |times: &Vec<f64>| median(times.iter().skip(from).step_by(every).copied().collect());
+        places.iter().map(of_place).sum::<f64>() / PLACES as f64
+    };
+    let halves = [0, 1].map(|half| mean(&times[2], 2, half));
+    let c_to_c = halves[0].max(halves[1]) / halves[0].min(halves[1]);
+    let [c_in_turn, checked, c, ours_in_turn, ours, bare, unprepared] = times.map(|places| mean(&places, 1, 0));
+    Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn }
+}
+
+/// A number drawn by a linear congruence: the same in every run.
+fn draw(last: &mut u64) -> usize {
+    *last = last.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+    (*last >> 33) as usize
 }
 
 /// What stands around each call, `calls.c`: the same for each kind of step.
