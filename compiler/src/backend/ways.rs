@@ -55,14 +55,15 @@ impl Way {
         matches!(self, Way::Changes(_) | Way::Leaves)
     }
 
-    /// Whether it has more usual ends than another that is not rare.
-    pub fn asks_more_than(&self, other: &Way) -> bool {
-        !other.is_rare() && self.usual_ends() > other.usual_ends()
-    }
-
-    /// Whether it asks next for what changes a regime.
-    pub fn may_change(&self) -> bool {
-        matches!(self, Way::Asks(_, sides) if matches!(sides[0], Way::Changes(_)))
+    /// Which of the sides of a question is the usual one: not one that is rare, nor one that asks next for what changes a regime,
+    /// or asks more: of several questions that must all hold, each leads to the same side if it does not.
+    pub fn usual([yes, no]: &[Way; 2]) -> usize {
+        let may_change = matches!(yes, Way::Asks(_, sides) if matches!(sides[0], Way::Changes(_)));
+        match (yes.is_rare(), no.is_rare()) {
+            (true, _) => 1,
+            (false, true) => 0,
+            (false, false) => usize::from(may_change || yes.usual_ends() > no.usual_ends()),
+        }
     }
 
     fn usual_ends(&self) -> usize {

@@ -174,13 +174,12 @@ impl<'a> Writer<'a> {
         later.iter().for_each(|node| body.keep(*node));
         body.resume(held);
         body.write(&|_| Vec::new(), &[]);
-        // The side that is jumped to is the one that is rare, if one is, or the one that asks more: of several questions
-        // that must all hold, each leads to the same side if it does not. Where all but the last do, it does as a rule.
+        // The usual side follows. Where all but the last of several questions that must hold do, the last does as a rule.
         let changes = self.is_within && matches!(sides[0], Way::Changes(_));
-        let usual = !sides[0].is_rare() && !sides[0].asks_more_than(&sides[1]) && !sides[0].may_change();
-        let jumps_if = holds == Predicate::Equal || changes || usual;
+        let next = if holds == Predicate::Equal || changes { 0 } else { Way::usual(sides) };
+        let other = 1 - next;
         let jumps = match number {
-            None => body.ask(if jumps_if { holds.not() } else { holds }, compared[0], compared[1]),
+            None => body.ask(if next == 0 { holds.not() } else { holds }, compared[0], compared[1]),
             Some(_) => Vec::new(),
         };
         let (held, spilled) = (body.held(), body.spilled());
@@ -188,7 +187,6 @@ impl<'a> Writer<'a> {
         if spilled > 0 {
             return None;
         }
-        let [next, other] = if jumps_if { [0, 1] } else { [1, 0] };
         let is_within = number.is_none() && !sides[1].is_rare();
         let in_rax = self.in_rax;
         self.is_within = is_within && next == 0;
