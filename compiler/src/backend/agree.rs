@@ -1,10 +1,11 @@
 //! Every back end gives the bits of the interpreter; machine code is never writable and is given back.
 
 use super::clif::Facts;
+use super::copies::asked_by_many;
 use super::cut::{Lengths, cut};
 use super::interp::Interpreter;
 use super::jit::{compile, compile_prepared, cut_at};
-use super::target::{Coder, with};
+use super::target::{self, Coder, with};
 use super::wide::{self, Width};
 use crate::ir::build::Build;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
@@ -590,6 +591,79 @@ fn what_a_regime_leaves_may_be_there_already() {
         .collect();
     for count in [1, 3] {
         check(&build.clone().finish(), &layout, &blocks, &[1.0, 2.0, 3.0, 4.0], count, "regimes");
+    }
+}
+
+/// Springs that slide at ±1, by three regimes each, at a speed in slot 3: their states come first, then their regimes, then the
+/// sum of their forces, which is watched.
+fn springs(number: u32) -> (Func, Layout) {
+    let layout = Layout::new([0, 1, number, 0, number, 1, 0, 0, 0, 0]);
+    let mut build = Build::new("springs");
+    let v = build.load(layout.inputs.slot(0));
+    let [zero, one, two, minus_one] = [0.0, 1.0, 2.0, -1.0].map(|number| build.real(number));
+    let [forth, back] = [build.less(zero, v), build.less(v, zero)];
+    let mut sum = None;
+    for k in 0..number as usize {
+        let [state, slot] = [layout.states.slot(k), layout.regimes.slot(k)];
+        let [f, regime] = [state, slot].map(|slot| build.load(slot));
+        let [sticks, slides, slides_back] = [zero, one, two].map(|number| build.equal(regime, number));
+        let moved = build.add(f, v);
+        let moved = build.select(sticks, moved, f);
+        let [above, below] = [build.less(one, moved), build.less(moved, minus_one)];
+        let yields = |build: &mut Build, beyond, direction| {
+            let both = build.and(beyond, direction);
+            build.and(sticks, both)
+        };
+        let [up, down] = [yields(&mut build, above, forth), yields(&mut build, below, back)];
+        let [turns, turns_back] = [build.and(slides, back), build.and(slides_back, forth)];
+        let mut next = regime;
+        for (when, number) in [(turns, zero), (turns_back, zero), (down, two), (up, one)] {
+            next = build.select(when, number, next);
+        }
+        let held = build.select(down, minus_one, moved);
+        let f = build.select(up, one, held);
+        build.store(state, f);
+        build.store(slot, next);
+        sum = Some(sum.map_or(f, |sum| build.add(sum, f)));
+    }
+    let sum = sum.unwrap();
+    build.store(layout.outputs.slot(0), sum);
+    let rest = build.sub(sum, sum);
+    let fine = build.less_equal(rest, rest);
+    let [none, failed] = [0, 1].map(|number| build.int(number));
+    let status = build.select(fine, none, failed);
+    build.status(status);
+    (build.finish(), layout)
+}
+
+/// Whatever number stands where a regime does, −0 and none of its own too: with one automaton in our own instructions, with
+/// four in copies for the direction.
+#[test]
+fn any_number_of_a_regime_agrees() {
+    let numbers = [0.0, -0.0, 1.0, 2.0, 7.0, f64::NAN];
+    for count in [1, 4] {
+        let (func, layout) = springs(count);
+        let here = target::here().expect("there is machine code");
+        assert_eq!(Coder::new(here).has_own_single(&func), count == 1 && cfg!(all(target_arch = "x86_64", unix)));
+        assert_eq!(asked_by_many(&func).is_some(), count > 1);
+        let mut blocks = Vec::new();
+        for v in [-0.7, -0.0, 0.0, 0.7, f64::NAN, f64::INFINITY] {
+            for f in [-1.5, -0.5, 0.0, 0.5, 1.5, f64::NAN] {
+                for (k, number) in numbers.into_iter().enumerate() {
+                    let count = count as usize;
+                    let mut block = vec![0.0, 1e-3, 0.0, v];
+                    block.extend(std::iter::repeat_n(f, count));
+                    // Behind the first any of the others.
+                    block
+                        .extend((0..count).map(|later| if later == 0 { number } else { numbers[(k + 2 * later) % 4] }));
+                    block.push(0.0);
+                    blocks.push(block);
+                }
+            }
+        }
+        for steps in [1, 3] {
+            check(&func, &layout, &blocks, &[], steps, &format!("{count} springs, {steps} steps"));
+        }
     }
 }
 

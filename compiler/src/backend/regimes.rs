@@ -251,9 +251,9 @@ fn automata(func: &Func, known: &Numbers) -> Vec<(Value, Vec<u64>)> {
     }
     for (load, numbers) in &mut found {
         let (Some(numbers), Op::Load(slot)) = (numbers, func.op(*load)) else { continue };
-        for bits in known.get(&slot).into_iter().flatten().filter(|bits| !numbers.contains(bits)).collect::<Vec<_>>() {
-            numbers.push(*bits);
-        }
+        let more = known.get(&slot).into_iter().flatten().filter(|bits| !numbers.contains(bits));
+        let more: Vec<u64> = more.copied().collect();
+        numbers.extend(more);
     }
     let told = |(load, numbers): (Value, Option<Vec<u64>>)| Some((load, numbers.filter(|it| it.len() <= MOST)?));
     let mut found: Vec<(Value, Vec<u64>)> = found.into_iter().filter_map(told).collect();

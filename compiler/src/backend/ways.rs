@@ -361,4 +361,34 @@ mod tests {
         let [(Slot(3), next)] = stores[..] else { panic!("the spring moves") };
         assert!(matches!(ways.func.op(next), Op::Add(..)));
     }
+
+    /// A spring in slot 3 that yields where it is beyond 1 and slot 5 is above 0, and then is in regime 1 for good.
+    #[test]
+    fn a_bound_is_asked_before_a_direction_and_other_numbers_leave() {
+        let mut build = Build::new("step");
+        let [x, regime, v] = [3, 4, 5].map(|slot| build.load(Slot(slot)));
+        let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
+        let (holds, yields) = (build.equal(regime, zero), build.equal(regime, one));
+        let moved = build.add(x, v);
+        let moved = build.select(holds, moved, x);
+        let next = build.select(yields, one, moved);
+        let (forth, far) = (build.less(zero, v), build.less(one, moved));
+        let both = build.and(forth, far);
+        let leaves = build.and(holds, both);
+        let changed = build.select(leaves, one, regime);
+        build.store(Slot(3), next);
+        build.store(Slot(4), changed);
+        let ways = ways(&build.finish()).expect("there are few");
+        let Way::Asks(_, of_regime) = &ways.begin else { panic!("it asks for the regime") };
+        let Way::Asks(bound, of_bound) = &of_regime[0] else { panic!("it asks for the bound") };
+        let Op::Less(limit, _) = ways.func.op(*bound) else { panic!("it is a comparison") };
+        assert_eq!(ways.func.op(limit), Op::Real(1f64.to_bits()));
+        let Way::Asks(direction, of_direction) = &of_bound[0] else { panic!("it asks for the direction") };
+        let Op::Less(rest, _) = ways.func.op(*direction) else { panic!("it is a comparison") };
+        assert_eq!(ways.func.op(rest), Op::Real(0));
+        assert!(matches!(of_direction[..], [Way::Changes(_), Way::Ends { .. }]));
+        assert_eq!([Way::usual(of_bound), Way::usual(of_direction)], [1, 1]);
+        let Way::Asks(_, of_other) = &of_regime[1] else { panic!("it asks for the other regime") };
+        assert!(matches!(of_other[..], [Way::Ends { .. }, Way::Leaves]));
+    }
 }
