@@ -216,6 +216,7 @@ impl<'a> Body<'a> {
             Predicate::NotEqual => &[0x85, 0x8a],  // jne, jp
             _ => unreachable!("it is no such question"),
         };
+        self.lock([first, last].into_iter());
         let first = self.in_register(first);
         let last = self.place(last);
         self.code.vector(i::COMPARE_FIRST, first, 0, last, None);
@@ -483,6 +484,15 @@ impl<'a> Body<'a> {
         register
     }
 
+    /// What an instruction reads does not give way to what it loads.
+    fn lock(&mut self, operands: impl Iterator<Item = Node>) {
+        for operand in operands {
+            if let Some(register) = self.register.get(&self.copy(operand)) {
+                self.locked.push((self.is_mask(operand), *register));
+            }
+        }
+    }
+
     fn node(&mut self, node: Node) {
         let what = self.what(node);
         let copy = self.copy(node);
@@ -490,12 +500,7 @@ impl<'a> Body<'a> {
             // It came with another.
             return what.operands().for_each(|operand| self.release(operand));
         }
-        // What this instruction reads does not give way to what it loads.
-        for operand in what.operands() {
-            if let Some(register) = self.register.get(&self.copy(operand)) {
-                self.locked.push((self.is_mask(operand), *register));
-            }
-        }
+        self.lock(what.operands());
         match what {
             What::Load(_) | What::Number(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
