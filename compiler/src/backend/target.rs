@@ -55,6 +55,8 @@ pub struct PreparedBytes {
 /// What makes one iteration.
 struct Single {
     func: Func,
+    /// How blocks are laid out, where parameters and what is behind a block are written seldom.
+    layout: Option<Layout>,
     /// Whether it asks how many are wanted and leaves all counts but one to others.
     asks: bool,
 }
@@ -92,14 +94,14 @@ impl<'a> Coder<'a> {
         let Some(single) = self.single(func) else { return Ok(None) };
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
-        let (bytes, many) = self.parts(func, Some(Single { func: step, asks: false }))?;
+        let (bytes, many) = self.parts(func, Some(Single { func: step, layout: Some(layout.clone()), asks: false }))?;
         let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
         Ok(Some(PreparedBytes { bytes, many, prepare, len }))
     }
 
     /// The code of a function that is called for one iteration only.
     fn once(&mut self, func: Func) -> Result<Bytes, Unsupported> {
-        let single = Single { func, asks: false };
+        let single = Single { func, layout: None, asks: false };
         if let Some(own) = self.own(&single) {
             return Ok(Bytes { code: own.code, alignment: 64 });
         }
@@ -211,7 +213,7 @@ impl<'a> Coder<'a> {
 
     /// What makes a single iteration of a function and leaves all other counts to others, if that has code of its own.
     fn asking(&self, func: &Func) -> Option<Single> {
-        self.single(func).map(|func| Single { func, asks: true })
+        self.single(func).map(|func| Single { func, layout: None, asks: true })
     }
 
     /// A single iteration in our own instructions, or what is left to Cranelift.
@@ -230,7 +232,10 @@ impl<'a> Coder<'a> {
     /// A single iteration in our own instructions, where there are such.
     fn own(&self, single: &Single) -> Option<single::Single> {
         let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
-        if ours { single::single(&single.func, single.asks, self.avx512).ok() } else { None }
+        let rests = |slot: Slot| {
+            single.layout.as_ref().is_some_and(|layout| layout.params.contains(slot) || slot.index() >= layout.size())
+        };
+        if ours { single::single(&single.func, single.asks, self.avx512, rests).ok() } else { None }
     }
 
     /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop

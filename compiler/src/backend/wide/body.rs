@@ -388,6 +388,7 @@ impl<'a> Body<'a> {
             Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::BROADCAST, register, 0, place, None);
             }
+            place if self.nodes.of_two.contains(&node) => self.code.vector(i::LOAD_TWO, register, 0, place, None),
             place => self.code.vector(i::LOAD, register, 0, place, None),
         }
     }

@@ -143,6 +143,8 @@ pub mod instructions {
     pub const FIRST_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x14);
     pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
     /// Of one number, from memory.
+    /// The same as [`LOAD`], of a single number the next one too.
+    pub const LOAD_TWO: Instruction = Instruction(1, 1, [1, 1], 0x10);
     pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
     pub const STORE_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x11);
     /// Sets the flags as of integers without a sign; of NaN as of less and equal.

@@ -7,12 +7,13 @@ use super::select::{Node, Nodes};
 pub fn order(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
     let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
     // Registers that a node takes while it is computed, if nothing is shared.
-    let mut need: Vec<usize> = Vec::with_capacity(nodes.nodes.len());
+    let mut need = vec![0; nodes.nodes.len()];
     for (index, node) in nodes.nodes.iter().enumerate() {
+        // What stands behind it is a leaf.
         let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
         of.sort_unstable_by(|a, b| b.cmp(a));
         let most = of.iter().enumerate().map(|(before, need)| need + before).max();
-        need.push(if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) });
+        need[index] = if is_read(Node(index as u32)) { 0 } else { most.unwrap_or(0).max(1) };
     }
     let operands = |node: Node| {
         let mut operands: Vec<Node> = nodes.nodes[node.index()].operands().collect();

@@ -9,7 +9,7 @@ use crate::backend::unsupported::Unsupported;
 use crate::ir::{Func, Op, Type, Unary, Value, Write, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// The node of this number.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -251,6 +251,26 @@ pub struct Nodes {
     pub failed: Option<Node>,
     /// Whether the pool begins with the tables of the elementary functions.
     pub pooled: bool,
+    /// Loads that bring the number of the next slot along, for who takes it from there.
+    pub of_two: HashSet<Node>,
+}
+
+impl Nodes {
+    /// Reads slots side by side two at a time, of those for which this pays.
+    pub fn load_pairs(&mut self, pays: impl Fn(Slot) -> bool) {
+        let slot =
+            |what: &What| if let What::Load(slot) = what { Some(*slot).filter(|slot| pays(*slot)) } else { None };
+        let loads = (0..).zip(&self.nodes).filter_map(|(number, what)| Some((slot(what)?, Node(number))));
+        let mut loads: Vec<(Slot, Node)> = loads.collect();
+        loads.sort_unstable();
+        let mut loads = loads.into_iter().peekable();
+        while let Some((slot, first)) = loads.next() {
+            if let Some((_, second)) = loads.next_if(|(next, _)| next.0 == slot.0 + 1) {
+                self.nodes[second.index()] = What::Two(i::SECOND_OF_TWO, true, first, first);
+                self.of_two.insert(first);
+            }
+        }
+    }
 }
 
 /// The bit of a real's sign.
@@ -281,7 +301,8 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
         }
     });
     let stores = func.stores.iter().map(|(slot, value)| (*slot, at(*value))).collect();
-    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
+    let of_two = HashSet::new();
+    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled, of_two })
 }
 
 /// Operations as nodes, with nothing stored.
@@ -303,7 +324,8 @@ pub fn operations(func: &Func, avx512: bool, wanted: &[bool], writes: &[Write]) 
     let mut selection = Selection::new(Vectors::One, avx512);
     let of = selection.operations(func, wanted)?;
     let indices = writes.iter().map(|write| selection.inside(func, write.index, write.len, &of)).collect();
-    let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes: selection.nodes, pooled: false };
+    let (nodes, of_two) = (selection.nodes, HashSet::new());
+    let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes, pooled: false, of_two };
     Ok(Operations { nodes, of, indices })
 }
 

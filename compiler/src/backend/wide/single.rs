@@ -41,11 +41,11 @@ const MOST_AMONG: usize = 8;
 const MOST_KEPT: usize = 12;
 
 /// If it `asks`, it leaves every count but 1 to the others; else it is called for one step only. `avx512`: whether the
-/// processor has AVX-512 F and DQ.
+/// processor has AVX-512 F and DQ. `rests`: whether a slot was written long before, so that it is read together with the next.
 ///
 /// # Errors
 /// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
-pub fn single(func: &Func, asks: bool, avx512: bool) -> Result<Single, Unsupported> {
+pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> bool) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
     if func.ops.len() > LARGEST {
         return Err(unsuitable("is too long"));
@@ -59,7 +59,8 @@ pub fn single(func: &Func, asks: bool, avx512: bool) -> Result<Single, Unsupport
             written.extend(writes);
         }
     });
-    let Operations { nodes, of, indices } = operations(&ways.func, avx512, &wanted(&ways.func, &ways.begin), &written)?;
+    let Operations { mut nodes, of, indices } =
+        operations(&ways.func, avx512, &wanted(&ways.func, &ways.begin), &written)?;
     let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
     let read: HashSet<Slot> = func.loads().into_iter().collect();
     let place = |(number, node): (u32, &What)| match node {
@@ -68,6 +69,7 @@ pub fn single(func: &Func, asks: bool, avx512: bool) -> Result<Single, Unsupport
         _ => None,
     };
     let homes = (0..).zip(&nodes.nodes).filter_map(place).collect();
+    nodes.load_pairs(rests);
     let mut code = Assembler::new(Vectors::One);
     let mut to_others = Vec::new();
     if asks {
