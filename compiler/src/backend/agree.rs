@@ -359,6 +359,46 @@ fn what_is_prepared_changes_nothing() {
     assert!(numbers > 100);
 }
 
+/// Parameters that lie side by side are read two at a time, where the first of them is asked for alone too.
+#[test]
+fn parameters_read_in_pairs_agree() {
+    let layout = Layout::new([5, 1, 1, 0, 0, 2, 0, 0, 0, 0]);
+    let mut build = Build::new("pairs");
+    let p: [Value; 5] = std::array::from_fn(|k| build.load(layout.params.slot(k)));
+    let [u, x] = [layout.inputs.slot(0), layout.states.slot(0)].map(|slot| build.load(slot));
+    let ratio = build.div(p[4], p[3]);
+    let moved = build.fma(p[1], u, x);
+    let held = build.min(p[2], moved);
+    let beyond = build.less(p[0], held);
+    let next = build.select(beyond, p[0], held);
+    build.store(layout.states.slot(0), next);
+    for (slot, with) in [(0, p[1]), (1, ratio)] {
+        let output = build.mul(next, with);
+        build.store(layout.outputs.slot(slot), output);
+    }
+    let funcs = [(Function::Step, build.finish())];
+    let here = target::here().expect("there is machine code");
+    let own = Coder::new(here).has_own_single(&funcs[0].1);
+    assert_eq!(own, cfg!(all(target_arch = "x86_64", unix)));
+    let code = compile_prepared(&funcs, &layout, 0).unwrap().0;
+    let len = code.prepared().expect("a single step has code of its own").len;
+    assert_eq!(len, 1, "a ratio of parameters");
+    let reference = Interpreter::new(&funcs, &layout, 0);
+    for (k, number) in REALS.iter().enumerate() {
+        for other in REALS {
+            let mut block = vec![0.0; layout.size()];
+            block[layout.params.range()].copy_from_slice(&[*number, *other, 2.0, REALS[(k + 5) % REALS.len()], 3.0]);
+            block[layout.inputs.slot(0).index()] = *other;
+            block[layout.states.slot(0).index()] = *number;
+            let (mut found, mut expected) = (block.clone(), block);
+            found.resize(expected.len() + len, f64::NAN);
+            let status = code.step_prepared(&mut found, &[], false).expect("it has such a step");
+            assert_eq!(status, reference.call(Function::Step, &mut expected, &[], 1));
+            assert!(same(&found[..expected.len()], &expected), "{found:?} instead of {expected:?}");
+        }
+    }
+}
+
 /// A function that keeps time as a step does: operations on time, parameters and inputs by chance, then others by chance
 /// that take some of these for what they load.
 fn on_time(random: &mut Random) -> Func {
