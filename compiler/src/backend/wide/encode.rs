@@ -142,9 +142,9 @@ pub mod instructions {
     /// Of each two lanes the first, or the second: v's, then rm's.
     pub const FIRST_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x14);
     pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
-    /// Of one number, from memory.
     /// The same as [`LOAD`], of a single number the next one too.
     pub const LOAD_TWO: Instruction = Instruction(1, 1, [1, 1], 0x10);
+    /// Of one number, from memory.
     pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
     pub const STORE_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x11);
     /// Sets the flags as of integers without a sign; of NaN as of less and equal.
@@ -450,10 +450,9 @@ impl Assembler {
         self.operand(0, Place::Memory(Base::Block, offset), None, 1);
     }
 
-    /// A jump that is taken if a number of the block is not +0; its target is open.
-    pub fn unless_clear(&mut self, offset: i32) -> usize {
-        self.plain(&[0x48, 0x83]); // cmp qword [block + offset], 0
-        self.operand(7, Place::Memory(Base::Block, offset), Some(0), 1);
+    /// A jump that is taken if rax is not +0; its target is open.
+    pub fn unless_clear(&mut self) -> usize {
+        self.plain(&[0x48, 0x85, 0xc0]); // test rax, rax
         self.jump(&[0x0f, 0x85]) // jne
     }
 

@@ -256,16 +256,27 @@ pub struct Nodes {
 }
 
 impl Nodes {
-    /// Reads slots side by side two at a time, of those for which this pays.
-    pub fn load_pairs(&mut self, pays: impl Fn(Slot) -> bool) {
-        let slot =
-            |what: &What| if let What::Load(slot) = what { Some(*slot).filter(|slot| pays(*slot)) } else { None };
+    /// These and all that they need.
+    pub fn needed(&self, roots: impl Iterator<Item = Node>) -> HashSet<Node> {
+        let (mut open, mut needed): (Vec<Node>, _) = (roots.collect(), HashSet::new());
+        while let Some(node) = open.pop() {
+            if needed.insert(node) {
+                open.extend(self.nodes[node.index()].operands());
+            }
+        }
+        needed
+    }
+
+    /// Reads slots side by side two at a time, of those that may be and that are read on the same `ways`: the nodes of each.
+    pub fn load_pairs(&mut self, may: impl Fn(Slot) -> bool, ways: &[HashSet<Node>]) {
+        let slot = |what: &What| if let What::Load(slot) = what { Some(*slot).filter(|slot| may(*slot)) } else { None };
         let loads = (0..).zip(&self.nodes).filter_map(|(number, what)| Some((slot(what)?, Node(number))));
         let mut loads: Vec<(Slot, Node)> = loads.collect();
         loads.sort_unstable();
         let mut loads = loads.into_iter().peekable();
         while let Some((slot, first)) = loads.next() {
-            if let Some((_, second)) = loads.next_if(|(next, _)| next.0 == slot.0 + 1) {
+            let together = |second| ways.iter().all(|way| way.contains(&first) == way.contains(&second));
+            if let Some((_, second)) = loads.next_if(|(next, second)| next.0 == slot.0 + 1 && together(*second)) {
                 self.nodes[second.index()] = What::Two(i::SECOND_OF_TWO, true, first, first);
                 self.of_two.insert(first);
             }

@@ -69,7 +69,11 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
         _ => None,
     };
     let homes = (0..).zip(&nodes.nodes).filter_map(place).collect();
-    nodes.load_pairs(rests);
+    let mut to_ends = Vec::new();
+    each_to_end(&ways.begin, &mut Vec::new(), &mut |reads| {
+        to_ends.push(nodes.needed(reads.iter().map(|value| of[value.index()])));
+    });
+    nodes.load_pairs(rests, &to_ends);
     let mut code = Assembler::new(Vectors::One);
     let mut to_others = Vec::new();
     if asks {
@@ -103,6 +107,18 @@ fn wanted(func: &Func, begin: &Way) -> Vec<bool> {
     let mut reads = Vec::new();
     begin.each(&mut |way| reads.extend(way.reads()));
     func.live_for(reads.into_iter())
+}
+
+/// What is read on each usual way from the beginning to an end, behind what was `read` before.
+fn each_to_end(way: &Way, read: &mut Vec<Value>, each: &mut impl FnMut(&[Value])) {
+    let before = read.len();
+    read.extend(way.reads());
+    match way {
+        Way::Ends { .. } => each(read),
+        Way::Asks(_, sides) => sides.iter().for_each(|side| each_to_end(side, read, each)),
+        Way::Changes(_) | Way::Leaves => {}
+    }
+    read.truncate(before);
 }
 
 struct Writer<'a> {
@@ -212,12 +228,13 @@ impl<'a> Writer<'a> {
     /// reals, whose comparison may find that there is no order.
     fn unless(&mut self, slot: Slot, bits: u64, to: &Way) -> usize {
         let offset = 8 * slot.0 as i32;
-        // Where nothing but its other numbers is asked next, a −0 is left to others in the end.
-        if bits == 0 && self.only_asks(to, slot) {
-            return self.code.unless_clear(offset);
-        }
         if self.in_rax != Some(slot) {
             self.code.bring_number(offset);
+        }
+        // Where nothing but its other numbers is asked next, a −0 is left to others in the end.
+        if bits == 0 && self.only_asks(to, slot) {
+            self.in_rax = Some(slot);
+            return self.code.unless_clear();
         }
         self.in_rax = (f64::from_bits(bits) != 0.0).then_some(slot);
         self.code.unless_number(bits)
