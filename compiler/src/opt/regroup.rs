@@ -33,7 +33,7 @@ pub fn regroup(func: &Func) -> Func {
 }
 
 /// Slots that an iteration takes over from the one before, time and the count of steps apart: no state holds them back.
-fn carried(func: &Func) -> HashSet<Slot> {
+pub(super) fn carried(func: &Func) -> HashSet<Slot> {
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
     let waits = |slot: &Slot| stored.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
     func.loads().into_iter().filter(waits).collect()
@@ -358,7 +358,7 @@ mod tests {
         let next = (z + h * (v - p * v.abs() / g * z)).value;
         let mut build = build.into_inner();
         build.store(layout.states.slot(0), next);
-        let func = crate::opt::contract::contract(&regroup(&build.finish()));
+        let func = crate::opt::contract::contract(&regroup(&build.finish()), &layout);
         assert!(critical_path(&func) <= 11, "{func}");
     }
 
