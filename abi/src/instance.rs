@@ -224,7 +224,7 @@ impl Instance {
 mod tests {
     use super::*;
     use crate::description::Layout;
-    use crate::table::{Interpret, Prepared};
+    use crate::table::{Entry, Interpret, Prepared};
 
     /// Counts many steps, one not, and knows no time.
     struct Counts;
@@ -297,5 +297,33 @@ mod tests {
         assert_eq!(after(&|instance| instance.set(Slot::STEP, 0.5)), (24.0, 3.0, 6));
         assert_eq!(after(&|instance| instance.block_mut()[param.index()] = 4.0), (32.0, 4.0, 6));
         assert_eq!(after(&|instance| *instance = instance.clone()), (40.0, 4.0, 6), "a copy has it too");
+    }
+
+    unsafe extern "C" fn refused(block: *mut f64, _: *const f64, _: u64) -> u64 {
+        // SAFETY: as above.
+        unsafe { *block.add(5) = 1.0 };
+        (-f64::NAN).to_bits()
+    }
+
+    unsafe extern "C" fn failed(block: *mut f64, _: *const f64, count: u64) -> u64 {
+        // SAFETY: as above.
+        unsafe { *block.add(4) += 2.0 };
+        count + 2
+    }
+
+    #[test]
+    fn a_prepared_step_that_gives_back_nan_is_made_by_the_other() {
+        let layout = Layout::new([1, 0, 1, 1, 0, 0, 0, 0, 0, 0]);
+        let state = layout.states.slot(0);
+        let description = Arc::new(Description { layout, ..Description::default() });
+        let mut entries = [None; Function::ALL.len()];
+        entries[Function::Step as usize] = Some(failed as Entry);
+        // SAFETY: they access the block.
+        let machine = unsafe {
+            let prepared = Prepared { prepare: None, step: refused, len: 0 };
+            Machine::new(entries, 6, 0, Arc::new(())).with_prepared(prepared)
+        };
+        let mut instance = Instance::new(description, Code::Machine(machine), &[1.0]);
+        assert_eq!((instance.advance(1), instance.get(state)), (3, 2.0));
     }
 }

@@ -85,7 +85,9 @@ pub fn keep_time(block: &mut [f64]) {
 pub struct Prepared {
     /// Writes these numbers, whatever the count; none if there are none.
     pub prepare: Option<Entry>,
-    /// One step, on a block whose numbers were written since a parameter or the length of the step changed; the count is 1.
+    /// One step, on a block whose numbers were written since a parameter or the length of the step changed; the count is 1. It
+    /// gives back the status, or the bits of a NaN, which are no status, if the [`Entry`] for any number of steps is to make it
+    /// and tell: what that reads is as it was.
     pub step: Entry,
     /// How many they are.
     pub len: usize,
@@ -198,7 +200,8 @@ impl Machine {
             unsafe { prepare(block.as_mut_ptr(), pool.as_ptr(), 1) };
         }
         // SAFETY: as above.
-        Some(unsafe { step(block.as_mut_ptr(), pool.as_ptr(), 1) })
+        let status = unsafe { step(block.as_mut_ptr(), pool.as_ptr(), 1) };
+        Some(if f64::from_bits(status).is_nan() { self.call(Function::Step, block, pool, 1) } else { status })
     }
 
     fn check(&self, block: &[f64], pool: &[f64], more: usize) {

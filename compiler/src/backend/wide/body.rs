@@ -60,6 +60,8 @@ pub struct Body<'a> {
     now: (usize, usize),
     /// What r10 holds, of single numbers.
     index: Option<Node>,
+    /// Whether constants of single numbers are made, not read; 0 always is.
+    makes: bool,
 }
 
 impl<'a> Body<'a> {
@@ -98,6 +100,7 @@ impl<'a> Body<'a> {
             locked: Vec::new(),
             now: (0, 0),
             index: None,
+            makes: false,
         }
     }
 
@@ -113,6 +116,11 @@ impl<'a> Body<'a> {
                 self.own(copy, false, register);
             }
         }
+    }
+
+    /// Makes constants of single numbers instead of reading them.
+    pub fn make_constants(&mut self) {
+        self.makes = true;
     }
 
     /// Keeps a node for the question at the end, which reads it; before those that are kept to the end.
@@ -238,8 +246,8 @@ impl<'a> Body<'a> {
         self.code.jump(&[0x0f, 0x87]) // ja
     }
 
-    /// The bits of a number that is kept, in rax.
-    fn bits(&mut self, number: Node) {
+    /// Brings the bits of a number that is kept to rax.
+    pub fn bits(&mut self, number: Node) {
         self.now = (self.order.len(), 0);
         let register = self.in_register(number);
         let high = (!register >> 3 & 1) << 7;
@@ -314,8 +322,10 @@ impl<'a> Body<'a> {
             return Place::Register(register);
         }
         let place = self.memory(node);
-        // Of single numbers 0 is not read but made.
-        if place == Place::Constant(0) && self.width == Vectors::One {
+        if let (Place::Constant(bits), Vectors::One) = (place, self.width)
+            && self.is_made(bits)
+            && (bits == 0 || self.is_free())
+        {
             return Place::Register(self.loaded(node, place));
         }
         if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
@@ -352,6 +362,17 @@ impl<'a> Body<'a> {
         })
     }
 
+    /// Whether some vector register holds nothing.
+    fn is_free(&self) -> bool {
+        let free = |(register, copy): (u8, &Option<Copy>)| copy.is_none() && !self.locked.contains(&(false, register));
+        (0..).zip(&self.vector_of).any(free)
+    }
+
+    /// Whether a constant of single numbers is made, not read.
+    fn is_made(&self, bits: u64) -> bool {
+        bits == 0 || self.makes
+    }
+
     /// Whether a copy can be read from memory.
     fn is_in_memory(&self, copy: Copy) -> bool {
         let node = Node((copy / self.vectors) as u32);
@@ -382,9 +403,7 @@ impl<'a> Body<'a> {
     fn load(&mut self, node: Node, register: u8, place: Place) {
         match place {
             _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
-            Place::Constant(0) if self.width == Vectors::One => {
-                self.code.vector(i::XOR, register, register, Place::Register(register), None);
-            }
+            Place::Constant(bits) if self.width == Vectors::One && self.is_made(bits) => self.code.make(register, bits),
             Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::BROADCAST, register, 0, place, None);
             }

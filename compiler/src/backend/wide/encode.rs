@@ -150,6 +150,8 @@ pub mod instructions {
     /// Sets the flags as of integers without a sign; of NaN as of less and equal.
     pub const COMPARE_FIRST: Instruction = Instruction(1, 1, [0, 0], 0x2e);
     pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
+    /// Of numbers of 32 bits.
+    pub const INT_EQUAL_HALVES: Instruction = Instruction(1, 1, [0, 0], 0x76);
     pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
     pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
@@ -444,6 +446,28 @@ impl Assembler {
         self.bytes.extend(bytes);
     }
 
+    /// Makes a constant of single numbers without reading it: from ones, or by way of r11.
+    pub fn make(&mut self, register: u8, bits: u64) {
+        let own = Place::Register(register);
+        if bits == 0 {
+            return self.vector(instructions::XOR, register, register, own, None);
+        }
+        let (left, right) = (bits.trailing_zeros(), bits.leading_zeros());
+        if left + bits.count_ones() + right == 64 {
+            self.vector(instructions::INT_EQUAL_HALVES, register, register, own, None);
+            // /6: left, /2: right.
+            for (digit, by) in [(6, if left > 0 { left + right } else { 0 }), (2, right)] {
+                if by > 0 {
+                    self.vector(instructions::SHIFT, digit, register, own, Some(by as u8));
+                }
+            }
+            return;
+        }
+        self.plain(&[0x49, 0xbb]); // mov r11, bits
+        self.plain(&bits.to_le_bytes());
+        self.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 7, 0xf9, 0x6e, 0xc3 | (register & 7) << 3]); // vmovq register, r11
+    }
+
     /// A number of the block, to rax.
     pub fn bring_number(&mut self, offset: i32) {
         self.plain(&[0x48, 0x8b]); // mov rax, [block + offset]
@@ -613,6 +637,19 @@ mod tests {
             c.at_index(STORE_FIRST, 1, Base::Block, 0x140);
         };
         check(Vectors::One, by_index, &index.concat());
+        // vpcmpeqd xmm9, xmm9, xmm9; vpsllq xmm9, xmm9, 54; vpsrlq xmm9, xmm9, 2
+        let one = [
+            [0xc4, 0x41, 0x31, 0x76, 0xc9].as_slice(),
+            &[0xc4, 0xc1, 0x31, 0x73, 0xf1, 0x36],
+            &[0xc4, 0xc1, 0x31, 0x73, 0xd1, 0x02],
+        ];
+        check(Vectors::One, |c| c.make(9, 1f64.to_bits()), &one.concat());
+        // vpcmpeqd xmm3, xmm3, xmm3; vpsllq xmm3, xmm3, 63 and vpsrlq xmm3, xmm3, 1
+        check(Vectors::One, |c| c.make(3, 1 << 63), &[0xc5, 0xe1, 0x76, 0xdb, 0xc5, 0xe1, 0x73, 0xf3, 0x3f]);
+        check(Vectors::One, |c| c.make(3, !(1 << 63)), &[0xc5, 0xe1, 0x76, 0xdb, 0xc5, 0xe1, 0x73, 0xd3, 0x01]);
+        // mov r11, 0x3ff8000000000001; vmovq xmm12, r11
+        let other = [0x49, 0xbb, 1, 0, 0, 0, 0, 0, 0xf8, 0x3f, 0xc4, 0x41, 0xf9, 0x6e, 0xe3];
+        check(Vectors::One, |c| c.make(12, 0x3ff8_0000_0000_0001), &other);
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
         check(Vectors::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9

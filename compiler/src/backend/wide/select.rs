@@ -204,6 +204,11 @@ impl What {
         all.into_iter().flatten()
     }
 
+    /// Whether it occupies the one part of a processor that divides.
+    pub fn divides(self) -> bool {
+        matches!(self, What::Two(i::DIV, ..) | What::One(i::SQRT, ..))
+    }
+
     /// Whether it lies in memory from the beginning.
     pub fn is_leaf(self) -> bool {
         matches!(self, What::Load(_) | What::Number(_)) || self.is_shared()

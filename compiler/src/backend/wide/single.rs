@@ -40,7 +40,7 @@ const MOST_AMONG: usize = 8;
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
-/// If it `asks`, it leaves every count but 1 to the others; else it is called for one step only. `avx512`: whether the
+/// If it `asks`, it leaves every count but 1 to the others; else it is called as [`abi::table::Prepared`] says. `avx512`: whether the
 /// processor has AVX-512 F and DQ. `rests`: whether a slot was written long before, so that it is read together with the next.
 ///
 /// # Errors
@@ -84,8 +84,25 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
     let mut changes = 0;
     ways.begin.each(&mut |way| changes += usize::from(matches!(way, Way::Changes(_))));
     let (in_rax, is_crowded, is_within, aside) = (None, changes > MOST_AMONG, false, Vec::new());
-    let mut writer =
-        Writer { code, func, nodes, of, indices, homes, read, to_others, in_rax, is_crowded, is_within, aside };
+    // While it divides, the processor goes ahead as far as it can keep track of what it reads. With AVX-512 it keeps track of more.
+    let makes = !avx512 && matches!(ways.begin, Way::Ends { .. });
+    let is_asked = !asks;
+    let mut writer = Writer {
+        code,
+        func,
+        nodes,
+        of,
+        indices,
+        homes,
+        read,
+        to_others,
+        in_rax,
+        is_crowded,
+        is_asked,
+        makes,
+        is_within,
+        aside,
+    };
     writer
         .way(&ways.begin, &vec![false; nodes.nodes.len()], &Held::default())
         .ok_or_else(|| unsuitable("is too long"))?;
@@ -137,6 +154,10 @@ struct Writer<'a> {
     in_rax: Option<Slot>,
     /// Whether what is rare is so much that it comes behind all else.
     is_crowded: bool,
+    /// Whether who calls makes the step again if what it gives back is NaN.
+    is_asked: bool,
+    /// Whether constants are made where the processor divides meanwhile.
+    makes: bool,
     /// Whether a question has been answered with yes to which no was usual, too.
     is_within: bool,
     /// What comes behind all else.
@@ -295,6 +316,9 @@ impl<'a> Writer<'a> {
             return None;
         }
         let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
+        if self.makes && order.iter().any(|node| self.nodes.nodes[node.index()].divides()) {
+            body.make_constants();
+        }
         kept.iter().for_each(|node| body.keep(*node));
         let lies = |node: &&Node| there[node.index()] || self.nodes.nodes[node.index()].is_leaf();
         early_nodes.iter().filter(lies).for_each(|node| body.keep(*node));
@@ -302,12 +326,14 @@ impl<'a> Writer<'a> {
         let to_block =
             |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
         body.write(&to_block, &early_nodes);
-        // The last of them leaves behind what is returned.
+        // The last of them leaves behind what is returned, and that is all if the step can be made again now.
         let returns = writes.is_empty() && matches!(questions.last(), Some(Question::Nothing(_)));
+        let tells = returns && self.is_asked && late.is_empty();
         for question in questions {
             match question {
                 Question::Compare(predicate, a, b) => self.to_others.extend(body.ask(predicate, a, b)),
                 Question::Beyond(number, bits) => self.to_others.push(body.unless_at_most(number, bits)),
+                Question::Nothing(number) if tells => body.bits(number),
                 Question::Nothing(number) => self.to_others.push(body.unless_zero(number)),
                 Question::Mask(mask) => self.to_others.push(body.test(mask)),
             }
