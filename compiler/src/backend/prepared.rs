@@ -9,6 +9,17 @@ use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
 
+/// For how many iterations code of one is called.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Called {
+    /// Any number: all counts but one it leaves to others.
+    Any,
+    /// One.
+    One,
+    /// One, which is made again where NaN is given back: see [`Prepared`](abi::table::Prepared).
+    OneOrAgain,
+}
+
 /// A function in two parts.
 pub struct Halves {
     /// Writes the numbers, each to a slot behind the block.

@@ -7,7 +7,7 @@ use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
 use super::listing::listing;
 use super::pieces;
-use super::prepared::Halves;
+use super::prepared::{Called, Halves};
 use super::unsupported::Unsupported;
 use super::wide::{pairs, single};
 use crate::ir::Func;
@@ -20,6 +20,7 @@ use cranelift_codegen::isa::{self, CallConv, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
 use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
+use std::collections::HashSet;
 use std::sync::OnceLock;
 
 /// Makes code, function by function; what it needs on the way is kept for the next.
@@ -57,8 +58,13 @@ struct Single {
     func: Func,
     /// How blocks are laid out, where parameters and what is behind a block are written seldom.
     layout: Option<Layout>,
-    /// Whether it asks how many are wanted and leaves all counts but one to others.
-    asks: bool,
+    /// What an iteration reads of which nothing is prepared.
+    read: HashSet<Slot>,
+    called: Called,
+}
+
+fn read(func: &Func) -> HashSet<Slot> {
+    func.loads().into_iter().collect()
 }
 
 impl<'a> Coder<'a> {
@@ -94,14 +100,16 @@ impl<'a> Coder<'a> {
         let Some(single) = self.single(func) else { return Ok(None) };
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
-        let (bytes, many) = self.parts(func, Some(Single { func: step, layout: Some(layout.clone()), asks: false }))?;
+        let layout = Some(layout.clone());
+        let of_one = Single { func: step, layout, read: read(&single), called: Called::OneOrAgain };
+        let (bytes, many) = self.parts(func, Some(of_one))?;
         let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
         Ok(Some(PreparedBytes { bytes, many, prepare, len }))
     }
 
     /// The code of a function that is called for one iteration only.
     fn once(&mut self, func: Func) -> Result<Bytes, Unsupported> {
-        let single = Single { func, layout: None, asks: false };
+        let single = Single { read: read(&func), func, layout: None, called: Called::One };
         if let Some(own) = self.own(&single) {
             return Ok(Bytes { code: own.code, alignment: 64 });
         }
@@ -213,7 +221,7 @@ impl<'a> Coder<'a> {
 
     /// What makes a single iteration of a function and leaves all other counts to others, if that has code of its own.
     fn asking(&self, func: &Func) -> Option<Single> {
-        self.single(func).map(|func| Single { func, layout: None, asks: true })
+        self.single(func).map(|func| Single { read: read(&func), func, layout: None, called: Called::Any })
     }
 
     /// A single iteration in our own instructions, or what is left to Cranelift.
@@ -235,7 +243,8 @@ impl<'a> Coder<'a> {
         let rests = |slot: Slot| {
             single.layout.as_ref().is_some_and(|layout| layout.params.contains(slot) || slot.index() >= layout.size())
         };
-        if ours { single::single(&single.func, single.asks, self.avx512, rests).ok() } else { None }
+        let make = || single::single(&single.func, single.called, &single.read, self.avx512, rests).ok();
+        if ours { make() } else { None }
     }
 
     /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop
@@ -251,7 +260,7 @@ impl<'a> Coder<'a> {
         if func.ops.len() <= lengths.whole {
             if let Some(single) = single {
                 context.clear();
-                clif::emit_single(&single.func, single.asks, &mut context.func, builder, *isa);
+                clif::emit_single(&single.func, single.called == Called::Any, &mut context.func, builder, *isa);
                 part(title(ONE), *isa, context)?;
             }
             let several = if several { title("any number of iterations") } else { String::new() };

@@ -9,12 +9,14 @@
 //! if something fails: go on to the others
 //! what it reads is stored, then the rest; return 0
 //! ```
-//! The others are code for any count. They do the step again, in full and with its status: what it reads is as it was.
+//! The others are code for any count. They do the step again, in full and with its status: what it reads is as it was. Where who
+//! calls sees to that and nothing of it is stored, what the last question asks for is returned.
 
 use super::body::{Body, Held, Home};
 use super::encode::{Assembler, Base, Vectors, instructions};
 use super::order::order;
 use super::select::{Node, Nodes, Operations, Predicate, SIGN, What, operations};
+use crate::backend::prepared::Called;
 use crate::backend::unsupported::Unsupported;
 use crate::backend::ways::{Way, ways};
 use crate::ir::{Func, Op, Value, Write, number_asked};
@@ -40,12 +42,18 @@ const MOST_AMONG: usize = 8;
 /// Most numbers that lie in registers to the end, so that others have room.
 const MOST_KEPT: usize = 12;
 
-/// If it `asks`, it leaves every count but 1 to the others; else it is called as [`abi::table::Prepared`] says. `avx512`: whether the
-/// processor has AVX-512 F and DQ. `rests`: whether a slot was written long before, so that it is read together with the next.
+/// `called`: for how many steps. `read`: what the others read. `avx512`: whether the processor has AVX-512 F and DQ. `rests`:
+/// whether a slot was written long before, so that it is read together with the next.
 ///
 /// # Errors
 /// If a step is too long, or needs what there are no instructions for: another way is better, or the only one.
-pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> bool) -> Result<Single, Unsupported> {
+pub fn single(
+    func: &Func,
+    called: Called,
+    read: &HashSet<Slot>,
+    avx512: bool,
+    rests: impl Fn(Slot) -> bool,
+) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
     if func.ops.len() > LARGEST {
         return Err(unsuitable("is too long"));
@@ -62,7 +70,6 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
     let Operations { mut nodes, of, indices } =
         operations(&ways.func, avx512, &wanted(&ways.func, &ways.begin), &written)?;
     let indices = written.iter().map(|write| (write.index, write.len)).zip(indices).collect();
-    let read: HashSet<Slot> = func.loads().into_iter().collect();
     let place = |(number, node): (u32, &What)| match node {
         What::Load(slot) => Some((Node(number), home(*slot))),
         What::Number(entry) => Some((Node(number), Home { base: Base::Pool, begin: 0, index: *entry as usize })),
@@ -76,7 +83,7 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
     nodes.load_pairs(rests, &to_ends);
     let mut code = Assembler::new(Vectors::One);
     let mut to_others = Vec::new();
-    if asks {
+    if called == Called::Any {
         code.plain(&[0x48, 0x83, 0xfa, 1]); // cmp rdx, 1
         to_others.push(code.jump(&[0x0f, 0x85])); // jne
     }
@@ -86,7 +93,6 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
     let (in_rax, is_crowded, is_within, aside) = (None, changes > MOST_AMONG, false, Vec::new());
     // While it divides, the processor goes ahead as far as it can keep track of what it reads. With AVX-512 it keeps track of more.
     let makes = !avx512 && matches!(ways.begin, Way::Ends { .. });
-    let is_asked = !asks;
     let mut writer = Writer {
         code,
         func,
@@ -98,7 +104,7 @@ pub fn single(func: &Func, asks: bool, avx512: bool, rests: impl Fn(Slot) -> boo
         to_others,
         in_rax,
         is_crowded,
-        is_asked,
+        called,
         makes,
         is_within,
         aside,
@@ -147,15 +153,14 @@ struct Writer<'a> {
     /// Of each index of a ring of so many slots, held inside.
     indices: HashMap<(Value, u32), Node>,
     homes: HashMap<Node, Home>,
-    /// What the step reads.
-    read: HashSet<Slot>,
+    /// What the others read.
+    read: &'a HashSet<Slot>,
     to_others: Vec<usize>,
     /// The number of the block that rax holds.
     in_rax: Option<Slot>,
     /// Whether what is rare is so much that it comes behind all else.
     is_crowded: bool,
-    /// Whether who calls makes the step again if what it gives back is NaN.
-    is_asked: bool,
+    called: Called,
     /// Whether constants are made where the processor divides meanwhile.
     makes: bool,
     /// Whether a question has been answered with yes to which no was usual, too.
@@ -328,7 +333,7 @@ impl<'a> Writer<'a> {
         body.write(&to_block, &early_nodes);
         // The last of them leaves behind what is returned, and that is all if the step can be made again now.
         let returns = writes.is_empty() && matches!(questions.last(), Some(Question::Nothing(_)));
-        let tells = returns && self.is_asked && late.is_empty();
+        let tells = returns && self.called == Called::OneOrAgain && late.is_empty();
         for question in questions {
             match question {
                 Question::Compare(predicate, a, b) => self.to_others.extend(body.ask(predicate, a, b)),
