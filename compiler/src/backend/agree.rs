@@ -359,6 +359,15 @@ fn what_is_prepared_changes_nothing() {
     assert!(numbers > 100);
 }
 
+/// The status is 1 where a number is not finite.
+fn fails_unless_finite(build: &mut Build, number: Value) {
+    let rest = build.sub(number, number);
+    let fine = build.less_equal(rest, rest);
+    let [none, failed] = [0, 1].map(|number| build.int(number));
+    let status = build.select(fine, none, failed);
+    build.status(status);
+}
+
 /// Beside a division a single step makes its constants: runs of ones anywhere, the least and the largest, and others.
 #[test]
 fn constants_beside_a_division_agree() {
@@ -374,11 +383,7 @@ fn constants_beside_a_division_agree() {
         let product = build.mul(quotient, constant);
         let sum = build.add(product, a);
         build.store(layout.outputs.slot(0), sum);
-        let rest = build.sub(sum, sum);
-        let fine = build.less_equal(rest, rest);
-        let [none, failed] = [0, 1].map(|number| build.int(number));
-        let status = build.select(fine, none, failed);
-        build.status(status);
+        fails_unless_finite(&mut build, sum);
         let block = |k: usize| {
             let mut block = vec![0.0; layout.size()];
             block[layout.params.range()].copy_from_slice(&[REALS[k % REALS.len()], REALS[(k + 3) % REALS.len()]]);
@@ -701,11 +706,7 @@ fn springs(number: u32) -> (Func, Layout) {
     }
     let sum = sum.unwrap();
     build.store(layout.outputs.slot(0), sum);
-    let rest = build.sub(sum, sum);
-    let fine = build.less_equal(rest, rest);
-    let [none, failed] = [0, 1].map(|number| build.int(number));
-    let status = build.select(fine, none, failed);
-    build.status(status);
+    fails_unless_finite(&mut build, sum);
     (build.finish(), layout)
 }
 
