@@ -20,7 +20,6 @@ use cranelift_codegen::isa::{self, CallConv, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
 use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
-use std::collections::HashSet;
 use std::sync::OnceLock;
 
 /// Makes code, function by function; what it needs on the way is kept for the next.
@@ -59,12 +58,8 @@ struct Single {
     /// How blocks are laid out, where parameters and what is behind a block are written seldom.
     layout: Option<Layout>,
     /// What an iteration reads of which nothing is prepared.
-    read: HashSet<Slot>,
+    read: Vec<Slot>,
     called: Called,
-}
-
-fn read(func: &Func) -> HashSet<Slot> {
-    func.loads().into_iter().collect()
 }
 
 impl<'a> Coder<'a> {
@@ -101,7 +96,7 @@ impl<'a> Coder<'a> {
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
         let layout = Some(layout.clone());
-        let of_one = Single { func: step, layout, read: read(&single), called: Called::OneOrAgain };
+        let of_one = Single { func: step, layout, read: single.loads(), called: Called::OneOrAgain };
         let (bytes, many) = self.parts(func, Some(of_one))?;
         let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
         Ok(Some(PreparedBytes { bytes, many, prepare, len }))
@@ -109,7 +104,7 @@ impl<'a> Coder<'a> {
 
     /// The code of a function that is called for one iteration only.
     fn once(&mut self, func: Func) -> Result<Bytes, Unsupported> {
-        let single = Single { read: read(&func), func, layout: None, called: Called::One };
+        let single = Single { read: func.loads(), func, layout: None, called: Called::One };
         if let Some(own) = self.own(&single) {
             return Ok(Bytes { code: own.code, alignment: 64 });
         }
@@ -221,7 +216,7 @@ impl<'a> Coder<'a> {
 
     /// What makes a single iteration of a function and leaves all other counts to others, if that has code of its own.
     fn asking(&self, func: &Func) -> Option<Single> {
-        self.single(func).map(|func| Single { read: read(&func), func, layout: None, called: Called::Any })
+        self.single(func).map(|func| Single { read: func.loads(), func, layout: None, called: Called::Any })
     }
 
     /// A single iteration in our own instructions, or what is left to Cranelift.
@@ -243,8 +238,10 @@ impl<'a> Coder<'a> {
         let rests = |slot: Slot| {
             single.layout.as_ref().is_some_and(|layout| layout.params.contains(slot) || slot.index() >= layout.size())
         };
-        let make = || single::single(&single.func, single.called, &single.read, self.avx512, rests).ok();
-        if ours { make() } else { None }
+        if !ours {
+            return None;
+        }
+        single::single(&single.func, single.called, &single.read, self.avx512, rests).ok()
     }
 
     /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop

@@ -324,7 +324,7 @@ impl<'a> Body<'a> {
         let place = self.memory(node);
         if let (Place::Constant(bits), Vectors::One) = (place, self.width)
             && self.is_made(bits)
-            && (bits == 0 || self.is_free())
+            && (bits == 0 || self.is_room_until(usize::MAX))
         {
             return Place::Register(self.loaded(node, place));
         }
@@ -360,12 +360,6 @@ impl<'a> Body<'a> {
             let later = |copy: Copy| self.is_in_memory(copy) && self.next_use(copy).is_none_or(|other| other > next);
             !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
         })
-    }
-
-    /// Whether some vector register holds nothing.
-    fn is_free(&self) -> bool {
-        let free = |(register, copy): (u8, &Option<Copy>)| copy.is_none() && !self.locked.contains(&(false, register));
-        (0..).zip(&self.vector_of).any(free)
     }
 
     /// Whether a constant of single numbers is made, not read.

@@ -50,7 +50,7 @@ const MOST_KEPT: usize = 12;
 pub fn single(
     func: &Func,
     called: Called,
-    read: &HashSet<Slot>,
+    read: &[Slot],
     avx512: bool,
     rests: impl Fn(Slot) -> bool,
 ) -> Result<Single, Unsupported> {
@@ -154,7 +154,7 @@ struct Writer<'a> {
     indices: HashMap<(Value, u32), Node>,
     homes: HashMap<Node, Home>,
     /// What the others read.
-    read: &'a HashSet<Slot>,
+    read: &'a [Slot],
     to_others: Vec<usize>,
     /// The number of the block that rax holds.
     in_rax: Option<Slot>,
