@@ -4,10 +4,11 @@
 //! function that puts them there. A loop computes them once, before its first iteration; who makes one step at a time
 //! computes them when a parameter changes. They are the same operations either way: the same bits.
 
-use crate::ir::build::prune;
+use crate::ir::build::{Build, prune};
 use crate::ir::verify::types;
 use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
+use std::collections::HashMap;
 
 /// For how many iterations code of one is called.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -44,30 +45,43 @@ impl Halves {
                 }
             });
         }
-        // A sign costs less than to read another number.
-        let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_));
-        let is_prepared = |at: usize| fixed[at] && types[at] == Type::Real && !is_free(&func.ops[at]);
-        let (mut step, mut stores) = (func.clone(), Vec::new());
+        // A sign costs less than to read another number, and bits cost what reading those would.
+        let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_) | Op::ToBits(_));
+        let is_prepared = |at: usize| fixed[at] && types[at] != Type::Bool && !is_free(&func.ops[at]);
         let all: Vec<usize> = (0..func.ops.len()).filter(|at| is_prepared(*at)).collect();
         let first = Slot(layout.size() as u32);
-        all.iter().for_each(|at| step.ops[*at] = Op::Load(first));
+        let mut rest = func.clone();
+        all.iter().for_each(|at| rest.ops[*at] = Op::Load(first));
         // What only other prepared numbers need is not kept.
-        let live = step.live();
-        for at in all.into_iter().filter(|at| live[*at]) {
-            let slot = Slot(first.0 + stores.len() as u32);
-            stores.push((slot, Value(at as u32)));
-            step.ops[at] = Op::Load(slot);
+        let live = rest.live();
+        let kept: Vec<usize> = all.into_iter().filter(|at| live[*at]).collect();
+        let slots: HashMap<usize, Slot> =
+            kept.iter().enumerate().map(|(k, at)| (*at, Slot(first.0 + k as u32))).collect();
+        let (mut prepare, mut stores, mut step) = (Build::of(func), Vec::new(), Build::new(&func.name));
+        for at in kept {
+            let value = Value(at as u32);
+            // An integer lies there as the real of the same bits.
+            let number = if types[at] == Type::Int { prepare.from_bits(value) } else { value };
+            stores.push((slots[&at], number));
+        }
+        let mut moved: Vec<Value> = Vec::with_capacity(func.ops.len());
+        for (at, op) in func.ops.iter().enumerate() {
+            let found = slots.get(&at).map(|slot| step.load(*slot));
+            moved.push(match found {
+                Some(number) if types[at] == Type::Int => step.to_bits(number),
+                Some(number) => number,
+                None => step.op(op.map(|operand| moved[operand.index()])),
+            });
         }
         let name = format!("{}, prepared", func.name);
-        let prepare = Func { name, ops: func.ops.clone(), stores, writes: Vec::new(), status: None };
-        Halves { prepare: prune(&prepare), step: prune(&step) }
+        let prepare = Func { name, ops: prepare.into_ops(), stores, writes: Vec::new(), status: None };
+        Halves { prepare: prune(&prepare), step: step.finish_as(func, &moved) }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ir::build::Build;
 
     #[test]
     fn what_hangs_on_parameters_alone_is_prepared_and_nothing_else() {

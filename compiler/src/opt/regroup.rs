@@ -23,6 +23,9 @@ type Ready = Option<i32>;
 /// When time is ready: long before, for no state holds it back. What depends on time alone stays below 0, and keeps its order.
 const EARLY: i32 = i32::MIN / 2;
 
+/// Cycles, of two sums, from which on it is worth to split a sum on the way to what is affine throughout.
+const WORTH: i32 = 6;
+
 /// Regroups a function that is iterated.
 pub fn regroup(func: &Func) -> Func {
     let carried = carried(func);
@@ -242,9 +245,25 @@ impl<'a> Pass<'a> {
                 return sum;
             }
         }
+        let whole = self.split_at(sum, &links);
+        if self.at(whole) < self.at(sum) {
+            return whole;
+        }
+        // Where all is affine, what is on the way down is as late as the last. Some operations stand twice then, for what is
+        // split there is read elsewhere, too: it is to be worth them.
+        let parts: Vec<Value> = (1..links.len()).map(|length| self.split_at(sum, &links[..length])).collect();
+        let soonest = parts.into_iter().min_by_key(|part| self.at(*part)).unwrap_or(sum);
+        let spared = self.at(sum).zip(self.at(soonest)).map_or(0, |(sum, soonest)| sum - soonest);
+        if spared >= WORTH { soonest } else { sum }
+    }
+
+    /// A sum split at the last of these links, each an operation that is affine in its operand.
+    fn split_at(&mut self, sum: Value, links: &[(Op, Value)]) -> Value {
+        let Some((_, late)) = links.last() else { return sum };
         let (mut rest, mut factor, mut negative): (Option<Value>, Option<Value>, bool) = (None, None, false);
-        for (op, operand) in links.into_iter().rev() {
-            match op {
+        for (op, operand) in links.iter().rev() {
+            let operand = *operand;
+            match *op {
                 Op::Neg(_) => {
                     rest = rest.map(|rest| self.op(Op::Neg(rest)));
                     negative = !negative;
@@ -272,7 +291,7 @@ impl<'a> Pass<'a> {
             }
         }
         let Some(rest) = rest else { return sum };
-        let product = factor.map_or(late, |factor| self.op(Op::Mul(factor, late)));
+        let product = factor.map_or(*late, |factor| self.op(Op::Mul(factor, *late)));
         self.op(if negative { Op::Sub(rest, product) } else { Op::Add(rest, product) })
     }
 }

@@ -34,6 +34,11 @@ pub struct Held {
     vector_of: Vec<Option<Copy>>,
 }
 
+/// By so many operations what is loaded into a register of its own comes before what reads it, where it is told so.
+const AHEAD: usize = 4;
+/// Registers that must be free for that, one of them for what is loaded.
+const FREE: usize = 4;
+
 /// A straight line being written.
 pub struct Body<'a> {
     code: &'a mut Assembler,
@@ -62,6 +67,10 @@ pub struct Body<'a> {
     index: Option<Node>,
     /// Whether constants of single numbers are made, not read; 0 always is.
     makes: bool,
+    /// What has been loaded into a register of its own, and for which place in the order.
+    loads: Vec<(usize, Node)>,
+    /// The same of another writing of the line, to be loaded sooner.
+    sooner: Vec<(usize, Node)>,
 }
 
 impl<'a> Body<'a> {
@@ -101,6 +110,8 @@ impl<'a> Body<'a> {
             now: (0, 0),
             index: None,
             makes: false,
+            loads: Vec::new(),
+            sooner: Vec::new(),
         }
     }
 
@@ -144,6 +155,7 @@ impl<'a> Body<'a> {
         let order = self.order;
         for (at, node) in order.iter().enumerate() {
             let homes = stores(*node);
+            self.load_ahead(at);
             for k in 0..self.vectors {
                 self.now = (at, k);
                 self.node(*node);
@@ -167,6 +179,31 @@ impl<'a> Body<'a> {
                     self.store(*node, register, self.at_home(home, k));
                 }
                 self.done(*node);
+            }
+        }
+    }
+
+    /// What was loaded into registers of its own while the line was written, and for which place in the order.
+    pub fn loads(self) -> Vec<(usize, Node)> {
+        self.loads
+    }
+
+    /// Loads some of what the line reads sooner: what another writing of it has loaded.
+    pub fn load_sooner(&mut self, loads: Vec<(usize, Node)>) {
+        self.sooner = loads;
+    }
+
+    /// Before a place in the order: what is to be loaded sooner than it is read.
+    fn load_ahead(&mut self, at: usize) {
+        self.now = (at, 0);
+        let soon = self.sooner.iter().filter(|(place, _)| (at + 1..=at + AHEAD).contains(place));
+        for node in soon.map(|(_, node)| *node).collect::<Vec<Node>>() {
+            let copy = self.copy(node);
+            let free = self.vector_of.iter().filter(|owner| owner.is_none()).count();
+            if free >= FREE && !self.register.contains_key(&copy) {
+                let place = self.memory(node);
+                self.loaded(node, place);
+                self.locked.clear();
             }
         }
     }
@@ -339,6 +376,7 @@ impl<'a> Body<'a> {
         let mask = self.is_mask(node);
         let register = self.take(mask);
         self.load(node, register, place);
+        self.loads.push((self.now.0, node));
         let copy = self.copy(node);
         self.own(copy, mask, register);
         register
@@ -730,7 +768,10 @@ impl<'a> Body<'a> {
                 let to = self.take(false);
                 match place {
                     Place::Register(_) => self.code.vector(i::LOAD, to, 0, place, None),
-                    place => self.load(all[over], to, place),
+                    place => {
+                        self.loads.push((self.now.0, all[over]));
+                        self.load(all[over], to, place)
+                    }
                 }
                 (to, false)
             }

@@ -213,11 +213,12 @@ impl<'a> Writer<'a> {
         let mut there = there.to_vec();
         order.iter().for_each(|node| there[node.index()] = true);
         let later = self.later(sides, &there);
-        let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
-        compared.iter().for_each(|node| body.keep_asked(*node));
-        later.iter().for_each(|node| body.keep(*node));
-        body.resume(held);
-        body.write(&|_| Vec::new(), &[]);
+        let begin = |body: &mut Body| {
+            compared.iter().for_each(|node| body.keep_asked(*node));
+            later.iter().for_each(|node| body.keep(*node));
+            body.resume(held);
+        };
+        let mut body = line(&mut self.code, self.nodes, &order, &self.homes, &begin, (&|_| Vec::new(), &[]));
         // The usual side follows. Where all but the last of several questions that must hold do, the last does as a rule.
         let changes = self.is_within && matches!(sides[0], Way::Changes(_));
         let next = if holds == Predicate::Equal || changes { 0 } else { Way::usual(sides) };
@@ -320,17 +321,20 @@ impl<'a> Writer<'a> {
         if order.len() > LONGEST {
             return None;
         }
-        let mut body = Body::new(&mut self.code, self.nodes, &order, &self.homes, Vectors::One, 1, 0);
-        if self.makes && order.iter().any(|node| self.nodes.nodes[node.index()].divides()) {
-            body.make_constants();
-        }
-        kept.iter().for_each(|node| body.keep(*node));
+        let makes = self.makes && order.iter().any(|node| self.nodes.nodes[node.index()].divides());
         let lies = |node: &&Node| there[node.index()] || self.nodes.nodes[node.index()].is_leaf();
-        early_nodes.iter().filter(lies).for_each(|node| body.keep(*node));
-        body.resume(held);
+        let begin = |body: &mut Body| {
+            if makes {
+                body.make_constants();
+            }
+            kept.iter().for_each(|node| body.keep(*node));
+            early_nodes.iter().filter(lies).for_each(|node| body.keep(*node));
+            body.resume(held);
+        };
         let to_block =
             |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
-        body.write(&to_block, &early_nodes);
+        let stores = (&to_block as &dyn Fn(Node) -> Vec<Home>, &early_nodes[..]);
+        let mut body = line(&mut self.code, self.nodes, &order, &self.homes, &begin, stores);
         // The last of them leaves behind what is returned, and that is all if the step can be made again now.
         let returns = writes.is_empty() && matches!(questions.last(), Some(Question::Nothing(_)));
         let tells = returns && self.called == Called::OneOrAgain && late.is_empty();
@@ -382,6 +386,29 @@ impl<'a> Writer<'a> {
         }
         later
     }
+}
+
+/// Writes a line of single numbers; `begin` tells what is kept and held, `stores` and `rest` are those of [`Body::write`]. It is
+/// written twice, the first time to see what it loads: an operation that waits for its own load waits longer than one whose
+/// load stands some operations before.
+fn line<'a>(
+    code: &'a mut Assembler,
+    nodes: &'a Nodes,
+    order: &'a [Node],
+    homes: &'a HashMap<Node, Home>,
+    begin: &dyn Fn(&mut Body),
+    (stores, rest): (&dyn Fn(Node) -> Vec<Home>, &[Node]),
+) -> Body<'a> {
+    let mut scratch = Assembler::new(Vectors::One);
+    let mut trial = Body::new(&mut scratch, nodes, order, homes, Vectors::One, 1, 0);
+    begin(&mut trial);
+    trial.write(stores, rest);
+    let loads = trial.loads();
+    let mut body = Body::new(code, nodes, order, homes, Vectors::One, 1, 0);
+    begin(&mut body);
+    body.load_sooner(loads);
+    body.write(stores, rest);
+    body
 }
 
 /// What ends a step with a status.
