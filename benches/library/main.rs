@@ -8,7 +8,7 @@
 //! parameters alone is prepared when one changes. Three columns tell what that is worth: the same C when it watches too, our
 //! step without guards, and our step that prepares nothing, as images have it. The last three are of calls whose inputs wait
 //! for the outputs of the call before, as they do where a loop is closed; in all others many calls are under way at once.
-//! `C to C`, one half of its rounds against the other, says what this can tell apart.
+//! `C to C`, the same C twice and in each round in two places, says what this can tell apart.
 //! A word behind the command takes only models whose names begin with it.
 //!
 //! Where numbers lie may cost a step more than all else: a load waits for a store with the same last twelve digits of
@@ -49,7 +49,7 @@ const ROUNDS: usize = PLACES * 29;
 /// Places where the code lies in turn.
 const PLACES: usize = 12;
 /// Kinds of calls.
-const KINDS: usize = 7;
+const KINDS: usize = 8;
 /// Calls of a round, and those before the clock runs.
 const CALLS: usize = 1000;
 const WARM: usize = 200;
@@ -169,7 +169,7 @@ const WHAT: [&str; 6] = ["ratio", "to checked", "unguarded", "unprepared", "in t
 /// Nanoseconds a call, medians.
 struct Times {
     c: f64,
-    /// The larger of two halves of its rounds by the smaller.
+    /// The larger by the smaller of two measurements of it, whose rounds find it in other places.
     c_to_c: f64,
     /// C that watches too.
     checked: f64,
@@ -377,7 +377,8 @@ fn timed(
     // States, parameters, inputs and outputs, as one declares them; one more of the C that watches.
     let all: Vec<f64> = [x, params, &vec![0.0; inputs.len() + outputs.len()]].concat();
     let mut of_c = [Moving::new(&all), Moving::new(&all)];
-    // In turn: C one call behind the other, C that watches, C; ours one call behind the other, ours, unguarded, unprepared.
+    // In turn: C one call behind the other, C that watches, C, C elsewhere; ours one call behind the other, ours, unguarded,
+    // unprepared.
     let mut times = [const { [const { Vec::new() }; PLACES] }; KINDS];
     let mut order: [usize; KINDS] = std::array::from_fn(|kind| kind);
     let mut drawn = 1;
@@ -385,7 +386,8 @@ fn timed(
         let rows = number * (WARM + CALLS) % COURSE * inputs.len();
         let rows = &course[rows..][..(WARM + CALLS) * inputs.len()];
         let place = number / (ROUNDS / PLACES);
-        let around = &around[place];
+        // What calls lies elsewhere in each round: how it meets what is called is a matter of luck, too.
+        let around = &around[number % PLACES];
         if number % (ROUNDS / PLACES) == 0 {
             of_c.iter_mut().chain(ways.iter_mut().map(|way| &mut way.numbers)).for_each(Moving::again);
         }
@@ -394,13 +396,14 @@ fn timed(
             order.swap(kind, draw(&mut drawn) % (kind + 1));
         }
         for kind in order {
-            let calls = if kind < 3 {
+            let calls = if kind < 4 {
                 let numbers = of_c[kind % 2].next();
                 // SAFETY: so many numbers there are.
                 let (params, u) = unsafe { (numbers.add(x.len()), numbers.add(x.len() + params.len())) };
                 // SAFETY: as above.
                 let out = unsafe { u.add(inputs.len()) };
-                let Hand { step, checked, .. } = hands[place];
+                let elsewhere = if kind == 3 { PLACES / 2 } else { 0 };
+                let Hand { step, checked, .. } = hands[(place + elsewhere) % PLACES];
                 Calls {
                     step: if kind == 1 { *checked as *const () } else { *step as *const () },
                     first: numbers,
@@ -416,7 +419,7 @@ fn timed(
                     number_of_outputs: in_c.len(),
                 }
             } else {
-                let Way { entries, pool, numbers } = &mut ways[(kind - 3).saturating_sub(1)];
+                let Way { entries, pool, numbers } = &mut ways[(kind - 4).saturating_sub(1)];
                 let block = numbers.next();
                 Calls {
                     step: entries[place] as *const (),
@@ -434,7 +437,7 @@ fn timed(
                     number_of_outputs: in_block.len(),
                 }
             };
-            let calls_of = if matches!(kind, 0 | 3) { around.in_turn } else { around.many };
+            let calls_of = if matches!(kind, 0 | 4) { around.in_turn } else { around.many };
             let (warm, timed) = rows.split_at(WARM * inputs.len());
             // SAFETY: the step takes what is given to it, and there is a row for each call.
             let all = |rows: &[f64], number| unsafe { calls_of(&calls, rows.as_ptr(), number) };
@@ -449,13 +452,9 @@ fn timed(
         times.sort_by(f64::total_cmp);
         times[times.len() / 2]
     };
-    let mean = |places: &[Vec<f64>; PLACES], every: usize, from: usize| {
-        let of_place = |times: &Vec<f64>| median(times.iter().skip(from).step_by(every).copied().collect());
-        places.iter().map(of_place).sum::<f64>() / PLACES as f64
-    };
-    let halves = [0, 1].map(|half| mean(&times[2], 2, half));
-    let c_to_c = halves[0].max(halves[1]) / halves[0].min(halves[1]);
-    let [c_in_turn, checked, c, ours_in_turn, ours, bare, unprepared] = times.map(|places| mean(&places, 1, 0));
+    let mean = |places: [Vec<f64>; PLACES]| places.map(median).iter().sum::<f64>() / PLACES as f64;
+    let [c_in_turn, checked, c, again, ours_in_turn, ours, bare, unprepared] = times.map(mean);
+    let c_to_c = again.max(c) / again.min(c);
     Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn }
 }
 
