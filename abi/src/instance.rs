@@ -282,6 +282,7 @@ mod tests {
             Machine::new([None; Function::ALL.len()], 6, 0, Arc::new(())).with_prepared(Prepared {
                 prepare: Some(prepare),
                 step,
+                told: None,
                 len: 1,
             })
         };
@@ -311,19 +312,27 @@ mod tests {
         count + 2
     }
 
+    unsafe extern "C" fn told(block: *mut f64, _: *const f64, _: u64) -> u64 {
+        // SAFETY: as above.
+        unsafe { *block.add(5) as u64 + 6 }
+    }
+
     #[test]
-    fn a_prepared_step_that_gives_back_nan_is_made_by_the_other() {
+    fn of_a_prepared_step_that_gives_back_nan_what_it_left_tells_or_the_other_makes_it_again() {
         let layout = Layout::new([1, 0, 1, 1, 0, 0, 0, 0, 0, 0]);
         let state = layout.states.slot(0);
         let description = Arc::new(Description { layout, ..Description::default() });
         let mut entries = [None; Function::ALL.len()];
         entries[Function::Step as usize] = Some(failed as Entry);
         // SAFETY: they access the block.
-        let machine = unsafe {
-            let prepared = Prepared { prepare: None, step: refused, len: 0 };
-            Machine::new(entries, 6, 0, Arc::new(())).with_prepared(prepared)
+        let instance = |told| unsafe {
+            let prepared = Prepared { prepare: None, step: refused, told, len: 0 };
+            let machine = Machine::new(entries, 6, 0, Arc::new(())).with_prepared(prepared);
+            Instance::new(description.clone(), Code::Machine(machine), &[1.0])
         };
-        let mut instance = Instance::new(description, Code::Machine(machine), &[1.0]);
-        assert_eq!((instance.advance(1), instance.get(state)), (3, 2.0));
+        let mut made_again = instance(None);
+        assert_eq!((made_again.advance(1), made_again.get(state)), (3, 2.0));
+        let mut asked = instance(Some(told as Entry));
+        assert_eq!((asked.advance(1), asked.get(state)), (7, 0.0));
     }
 }

@@ -642,8 +642,9 @@ impl<'a> Model<'a> {
 mod tests {
     use super::*;
     use crate::backend::interp::Interpreter;
-    use crate::backend::jit::compile;
+    use crate::backend::jit::{compile, compile_prepared};
     use crate::ir::Unary;
+    use crate::ir::random::REALS;
     use crate::math::{POOL, expand};
     use abi::description::{Automaton, Tick};
     use abi::unit::Unit;
@@ -980,6 +981,44 @@ mod tests {
                 assert_eq!(status(x), 1, "{x} in {range:?}");
             }
         }
+    }
+
+    /// A single step that has stored all leaves it to that to tell its status: of any ranges of a state and an output.
+    #[test]
+    fn what_a_step_has_left_tells_its_status() {
+        const ALL: f64 = f64::INFINITY;
+        let mut program = program(1, |_, x| (vec![0.5 * x[0] * x[0]], 0.75 - x[0]));
+        let layout = program.description.layout.clone();
+        let [x, y] = [layout.states.slot(0), layout.outputs.slot(0)];
+        let guard = |slot, range| Guard { path: String::new(), slot, range, unit: Unit::none() };
+        let ranges = [(-ALL, ALL), (-2.0, 2.0), (-1.0, 2.0), (0.0, ALL), (-ALL, 1.0)];
+        let (mut failed, mut fine) = (0, 0);
+        for (of_state, of_output) in ranges.iter().flat_map(|a| ranges.map(|b| (*a, b))) {
+            program.description.guards = vec![guard(x, of_state), guard(y, of_output)];
+            let funcs = [(Function::Step, expand(&step(&program, Method::Euler)))];
+            let code = compile_prepared(&funcs, &layout, POOL.len()).unwrap().0;
+            let prepared = code.prepared().expect("a single step has code of its own");
+            assert_eq!(prepared.told.is_some(), cfg!(all(target_arch = "x86_64", unix)));
+            let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL.len())));
+            for number in REALS.iter().copied().chain([0.7, -0.7, 1.7, -1.7, 1e200]) {
+                let mut block = vec![0.0; layout.size()];
+                (block[Slot::STEP.index()], block[x.index()]) = (1.0, number);
+                let (mut found, mut expected) = (block.clone(), block);
+                found.resize(expected.len() + prepared.len, f64::NAN);
+                let status = code.step_prepared(&mut found, &POOL, false).expect("it has such a step");
+                let of_reference = reference.call(Function::Step, &mut expected, &POOL, 1);
+                // Who calls keeps the count.
+                found[Slot::COUNT.index()] = expected[Slot::COUNT.index()];
+                let same =
+                    found.iter().zip(&expected).all(|(a, b)| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan());
+                assert!(
+                    status == of_reference && same,
+                    "{of_state:?} {of_output:?} from {number}: {status} and not {of_reference}, {found:?}, {expected:?}"
+                );
+                *(if status == 0 { &mut fine } else { &mut failed }) += 1;
+            }
+        }
+        assert!(failed > 100 && fine > 100, "{failed} have failed, {fine} not");
     }
 
     #[test]

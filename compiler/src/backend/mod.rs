@@ -14,6 +14,7 @@ mod repeats;
 mod cut;
 mod pieces;
 mod prepared;
+mod told;
 mod listing;
 pub mod target;
 mod memory;

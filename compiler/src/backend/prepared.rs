@@ -19,6 +19,8 @@ pub enum Called {
     One,
     /// One, which is made again where NaN is given back: see [`Prepared`](abi::table::Prepared).
     OneOrAgain,
+    /// One, of which what it has left tells the status where NaN is given back.
+    OneOrTold,
 }
 
 /// A function in two parts.
@@ -82,6 +84,7 @@ impl Halves {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::backend::interp::run_once;
 
     #[test]
     fn what_hangs_on_parameters_alone_is_prepared_and_nothing_else() {
@@ -105,5 +108,28 @@ mod tests {
         // The truth that hangs on it is no number: it is found out in the step, from what is prepared.
         assert_eq!(step.loads(), [3, 4, 5, 6].map(Slot), "{step}");
         assert!(!step.ops.iter().any(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))), "{step}");
+    }
+
+    #[test]
+    fn an_integer_is_prepared_as_the_real_of_its_bits() {
+        // A parameter and an input, at 3 and 4; a state.
+        let layout = Layout::new([1, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
+        let mut build = Build::new("step");
+        let [p, u] = [3, 4].map(|slot| build.load(Slot(slot)));
+        let [seed, drawn] = [p, u].map(|number| build.op(Op::ToInt(number)));
+        let odd = build.int(0x9E37_79B9);
+        let mixed = build.op(Op::IntMul(seed, odd));
+        let both = build.op(Op::IntXor(mixed, drawn));
+        let next = build.op(Op::ToReal(both));
+        build.store(Slot(5), next);
+
+        let Halves { prepare, step } = Halves::of(&build.finish(), &layout);
+        assert_eq!(prepare.stores.iter().map(|(slot, _)| slot.0).collect::<Vec<_>>(), [6], "{prepare}");
+        assert_eq!(step.loads(), [4, 6].map(Slot), "{step}");
+        assert!(!step.ops.iter().any(|op| matches!(op, Op::IntMul(..))), "{step}");
+        let mut block = [0.0, 0.0, 0.0, 5.0, 3.0, 0.0, f64::NAN];
+        run_once(&prepare, &mut block, &[]);
+        run_once(&step, &mut block, &[]);
+        assert_eq!(block[5], (5 * 0x9E37_79B9_i64 ^ 3) as f64);
     }
 }

@@ -8,6 +8,7 @@ use super::cut::{Lengths, cut};
 use super::listing::listing;
 use super::pieces;
 use super::prepared::{Called, Halves};
+use super::told::told;
 use super::unsupported::Unsupported;
 use super::wide::{pairs, single};
 use crate::ir::Func;
@@ -48,8 +49,19 @@ pub struct PreparedBytes {
     pub many: usize,
     /// What prepares, if there is anything to.
     pub prepare: Option<Bytes>,
+    /// What tells the status of an iteration that has given back NaN, if it is not to be made again.
+    pub told: Option<Bytes>,
     /// How many numbers lie behind the block.
     pub len: usize,
+}
+
+/// The code of a function, of one or several parts.
+struct Parts {
+    all: Bytes,
+    /// At which byte what makes any number of iterations begins.
+    many: usize,
+    /// Whether what makes one is in our own instructions.
+    is_own: bool,
 }
 
 /// What makes one iteration.
@@ -86,7 +98,7 @@ impl<'a> Coder<'a> {
     /// # Panics
     /// If the code calls anything but its own pieces: a mistake of `clif`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        Ok(self.parts(func, self.asking(func))?.0)
+        Ok(self.parts(func, self.asking(func))?.all)
     }
 
     /// The code of a function on blocks of this layout whose single iterations find prepared what hangs on parameters and
@@ -96,10 +108,21 @@ impl<'a> Coder<'a> {
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
         let layout = Some(layout.clone());
-        let of_one = Single { func: step, layout, read: single.loads(), called: Called::OneOrAgain };
-        let (bytes, many) = self.parts(func, Some(of_one))?;
+        let told = told(&single);
+        let called = if told.is_some() { Called::OneOrTold } else { Called::OneOrAgain };
+        let of_one = Single { func: step, layout, read: single.loads(), called };
+        let Parts { all: bytes, many, is_own } = self.parts(func, Some(of_one))?;
         let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
-        Ok(Some(PreparedBytes { bytes, many, prepare, len }))
+        // What is not in our own instructions always gives the status.
+        let told = told.filter(|_| is_own).map(|told| self.plain(&told)).transpose()?;
+        Ok(Some(PreparedBytes { bytes, many, prepare, told, len }))
+    }
+
+    /// The code of a function as Cranelift makes it.
+    fn plain(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
+        self.context.clear();
+        clif::emit_single(func, false, &mut self.context.func, &mut self.builder, self.isa);
+        self.bytes(func)
     }
 
     /// The code of a function that is called for one iteration only.
@@ -113,13 +136,14 @@ impl<'a> Coder<'a> {
         self.bytes(&single.func)
     }
 
-    /// All parts of the code of a function, and at which byte what makes any number of iterations begins.
-    fn parts(&mut self, func: &Func, single: Option<Single>) -> Result<(Bytes, usize), Unsupported> {
+    /// All parts of the code of a function.
+    fn parts(&mut self, func: &Func, single: Option<Single>) -> Result<Parts, Unsupported> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
         let several = single.is_some();
         let (own, single) = self.own_or_not(single);
+        let is_own = own.is_some();
         if let Some(own) = own {
             begins.push(0);
             let to_others = own.to_others.into_iter();
@@ -147,7 +171,7 @@ impl<'a> Coder<'a> {
             // What calls lies first.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
-        Ok((all, if several { begins[1] } else { 0 }))
+        Ok(Parts { all, many: if several { begins[1] } else { 0 }, is_own })
     }
 
     /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are

@@ -381,6 +381,21 @@ mod tests {
         assert!(critical_path(&func) <= 11, "{func}");
     }
 
+    #[test]
+    fn where_all_is_affine_a_sum_is_split_on_the_way_down() {
+        // An observer of place and speed, both iterated: r = v + 2 p (q − X) + m (x − X), X' = x + h r, V' = v + h (q − X).
+        let func = built(|[p, q, m], [x, v]| {
+            let (mut place, mut speed) = (x, v);
+            for _ in 0..3 {
+                let rate = speed + 2.0 * p * (q - place) + m * (x - place);
+                (place, speed) = (x + 1e-3 * rate, v + 1e-3 * (p * p * (q - place)));
+            }
+            [place, speed]
+        });
+        let [plain, regrouped] = [func.clone(), regroup(&func)].map(|func| critical_path(&func));
+        assert!(regrouped + 9 <= plain, "{plain} cycles, {regrouped} regrouped");
+    }
+
     /// The same algebra: values agree up to rounding.
     #[test]
     fn values_stay_the_same_up_to_rounding() {

@@ -283,13 +283,39 @@ impl<'a> Body<'a> {
         self.code.jump(&[0x0f, 0x87]) // ja
     }
 
-    /// Brings the bits of a number that is kept to rax.
+    /// Brings the bits of a number or mask that is kept to rax.
     pub fn bits(&mut self, number: Node) {
         self.now = (self.order.len(), 0);
         let register = self.in_register(number);
+        self.bits_of(register);
+    }
+
+    fn bits_of(&mut self, register: u8) {
         let high = (!register >> 3 & 1) << 7;
         self.code.plain(&[0xc4, 0x61 | high, 0xf9, 0x7e, 0xc0 | (register & 7) << 3]); // vmovq rax, register
         self.locked.clear();
+    }
+
+    /// Brings 0 to rax, or all ones, which are a NaN, if a comparison of two numbers that are kept holds.
+    pub fn answer(&mut self, predicate: Predicate, a: Node, b: Node) {
+        self.now = (self.order.len(), 0);
+        self.lock([a, b].into_iter());
+        let first = self.in_register(a);
+        let last = self.place(b);
+        self.answered(predicate, first, last);
+    }
+
+    /// The same if a number that is kept, not below 0 or NaN, is not at most one of these bits.
+    pub fn answer_at_most(&mut self, number: Node, bits: u64) {
+        self.now = (self.order.len(), 0);
+        let first = self.in_register(number);
+        self.answered(Predicate::NotLessEqual, first, Place::Constant(bits));
+    }
+
+    fn answered(&mut self, predicate: Predicate, first: u8, last: Place) {
+        let to = self.take(false);
+        self.code.vector(i::COMPARE, to, first, last, Some(predicate as u8));
+        self.bits_of(to);
     }
 
     /// Stores what is kept, some of it into rings, of which the first slot and the index are given; it ends the line.

@@ -302,7 +302,17 @@ impl<'a> Writer<'a> {
         let (mut late, mut early): (Vec<_>, Vec<_>) = stores.partition(|(slot, _)| self.read.contains(slot));
         let writes: Vec<(Slot, Node, Node)> =
             writes.iter().map(|write| (write.base, self.index(write), self.at(write.value))).collect();
-        let questions = failed.map_or_else(Vec::new, |failed| questions(self.nodes, self.at(failed)));
+        let mut questions = failed.map_or_else(Vec::new, |failed| questions(self.nodes, self.at(failed)));
+        // What the last of them leaves behind is returned. That is all if the step can be told or made again then, and if there is
+        // one only, its answer is.
+        let of_number = matches!(questions.last(), Some(Question::Nothing(_)));
+        let tells = writes.is_empty()
+            && match self.called {
+                Called::OneOrTold => of_number || questions.len() == 1,
+                Called::OneOrAgain => of_number && late.is_empty(),
+                Called::Any | Called::One => false,
+            };
+        let returns = tells || writes.is_empty() && of_number;
         let asked = questions.iter().flat_map(Question::operands);
         let written = writes.iter().flat_map(|(_, index, value)| [*index, *value]);
         let mut kept: Vec<Node> = asked.chain(written).chain(late.iter().map(|(_, node)| *node)).collect();
@@ -335,19 +345,22 @@ impl<'a> Writer<'a> {
             |node: Node| early.iter().filter(|(_, value)| *value == node).map(|(slot, _)| home(*slot)).collect();
         let stores = (&to_block as &dyn Fn(Node) -> Vec<Home>, &early_nodes[..]);
         let mut body = line(&mut self.code, self.nodes, &order, &self.homes, &begin, stores);
-        // The last of them leaves behind what is returned, and that is all if the step can be made again now.
-        let returns = writes.is_empty() && matches!(questions.last(), Some(Question::Nothing(_)));
-        let tells = returns && self.called == Called::OneOrAgain && late.is_empty();
+        let told = if tells { questions.pop() } else { None };
         for question in questions {
             match question {
                 Question::Compare(predicate, a, b) => self.to_others.extend(body.ask(predicate, a, b)),
                 Question::Beyond(number, bits) => self.to_others.push(body.unless_at_most(number, bits)),
-                Question::Nothing(number) if tells => body.bits(number),
                 Question::Nothing(number) => self.to_others.push(body.unless_zero(number)),
                 Question::Mask(mask) => self.to_others.push(body.test(mask)),
             }
         }
         body.store_kept(&late, &writes);
+        match told {
+            Some(Question::Compare(predicate, a, b)) => body.answer(predicate, a, b),
+            Some(Question::Beyond(number, bits)) => body.answer_at_most(number, bits),
+            Some(Question::Nothing(number) | Question::Mask(number)) => body.bits(number),
+            None => {}
+        }
         let fits = body.spilled() == 0;
         if !returns {
             self.code.plain(&[0x31, 0xc0]); // xor eax, eax
