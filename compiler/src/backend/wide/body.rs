@@ -5,7 +5,7 @@
 //! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
 //! registers are free.
 
-use super::encode::{Assembler, Base, Instruction, OF_SIZE, Place, Vectors, instructions as i};
+use super::encode::{Assembler, Base, Instruction, OF_SIZE, Place, Vectors, ZEROING, instructions as i};
 use super::select::{Direction, Node, Nodes, Predicate, Signs, What};
 use crate::math;
 use abi::Slot;
@@ -651,6 +651,13 @@ impl<'a> Body<'a> {
                 self.code.mask(i::MASK_AND, to, when, Place::Register(a));
                 self.code.mask(i::MASK_OR, to, to, Place::Register(other));
                 what.operands().for_each(|operand| self.release(operand));
+            }
+            What::Scale(when, a, b) => {
+                let mask = self.in_register(when);
+                let first = self.in_register(a);
+                let last = self.place(b);
+                let to = self.result(node);
+                self.code.masked(i::SCALE, to, first, last, None, mask | ZEROING);
             }
             What::Select(when, a, b) => {
                 let mask = self.in_register(when);

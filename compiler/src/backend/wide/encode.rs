@@ -201,6 +201,9 @@ pub struct Assembler {
     wanted_tables: Option<usize>,
 }
 
+/// Beside the number of a mask register: where that does not hold, the result is 0, and not what it was.
+pub const ZEROING: u8 = 1 << 7;
+
 impl Assembler {
     pub fn new(width: Vectors) -> Assembler {
         Assembler {
@@ -221,7 +224,7 @@ impl Assembler {
         self.masked(what, reg, second, last, immediate, 0);
     }
 
-    /// An instruction with a mask register; 0: none. VEX has no masks.
+    /// An instruction with a mask register, perhaps with [`ZEROING`]; 0: none. VEX has no masks.
     pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
         match self.width {
             Vectors::Avx512 => {

@@ -130,6 +130,8 @@ pub enum What {
     Select(Node, Node, Node),
     /// The same of masks.
     MaskSelect(Node, Node, Node),
+    /// Where the first, a mask, holds: the second times 2 to the power of the third, down to a whole number; else 0. AVX-512 only.
+    Scale(Node, Node, Node),
     /// Entries of the table at `base`, at indices that lie inside.
     Gather {
         base: u32,
@@ -197,9 +199,11 @@ impl What {
             | What::TestBits(a, b)
             | What::MaskAnd(a, b)
             | What::MaskOr(a, b) => [Some(a), Some(b), None],
-            What::Fma { a, b, c, .. } | What::Select(a, b, c) | What::MaskSelect(a, b, c) | What::Permute(a, b, c) => {
-                [Some(a), Some(b), Some(c)]
-            }
+            What::Fma { a, b, c, .. }
+            | What::Select(a, b, c)
+            | What::MaskSelect(a, b, c)
+            | What::Scale(a, b, c)
+            | What::Permute(a, b, c) => [Some(a), Some(b), Some(c)],
         };
         all.into_iter().flatten()
     }
@@ -236,6 +240,7 @@ impl What {
             | What::Fma { .. }
             | What::Shift(..)
             | What::Select(..)
+            | What::Scale(..)
             | What::Gather { .. }
             | What::Ring { .. }
             | What::Number(_)
@@ -540,9 +545,12 @@ impl Selection {
     /// `falls`: x is not above 0. AVX-512 only.
     fn exp(&mut self, x: Node, falls: bool) -> Node {
         let number = |own: &mut Self, x: f64| own.constant(x.to_bits());
-        // Beyond these the result is 0 or infinite, and nothing on the way may be. Of NaN the second is taken.
+        // Below this the result is 0, and whatever is on the way is not looked at: to find out that a result is too small for any digit
+        // may take a processor two hundred cycles. NaN is not below.
         let least = number(self, -746.0);
-        let mut x = self.add(What::Two(i::MAX, false, least, x));
+        let counts = self.add(What::Compare(Predicate::NotLess, x, least));
+        // Beyond this it is infinite, and nothing on the way may be. Of NaN the second is taken.
+        let mut x = x;
         if !falls {
             let most = number(self, 746.0);
             x = self.add(What::Two(i::MIN, false, most, x));
@@ -565,7 +573,7 @@ impl Selection {
         let mantissa = fused(self, Signs::Plain, scale, p, scale);
         let part = number(self, 1.0 / f64::from(tables::EXP_LEN));
         let exponent = self.add(What::Two(i::MUL, true, k, part));
-        self.add(What::Two(i::SCALE, false, mantissa, exponent))
+        self.add(What::Scale(counts, mantissa, exponent))
     }
 
     /// Entries of a table of 64 by the low six bits of an integer.
