@@ -200,7 +200,7 @@ impl<'a> Body<'a> {
         for node in soon.map(|(_, node)| *node).collect::<Vec<Node>>() {
             let copy = self.copy(node);
             let free = self.vector_of.iter().filter(|owner| owner.is_none()).count();
-            if free >= FREE && !self.register.contains_key(&copy) {
+            if free >= FREE && self.is_in_memory(copy) && !self.register.contains_key(&copy) {
                 let place = self.memory(node);
                 self.loaded(node, place);
                 self.locked.clear();

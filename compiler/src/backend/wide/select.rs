@@ -556,10 +556,12 @@ impl Selection {
             x = self.add(What::Two(i::MIN, false, most, x));
         }
         let fused = |own: &mut Self, signs: Signs, a: Node, b: Node, c: Node| own.add(What::Fma { signs, a, b, c });
-        let (steps, round) = (number(self, exponential::STEPS), number(self, exponential::ROUND));
+        // Of ln 2, not of its 64th parts: k is the exponent at once. Its last digits, which tell the part, are the same.
+        let parts = f64::from(tables::EXP_LEN);
+        let [steps, round] = [exponential::STEPS, exponential::ROUND].map(|x| number(self, x / parts));
         let rounded = fused(self, Signs::Plain, x, steps, round);
         let k = self.add(What::Two(i::SUB, false, rounded, round));
-        let [first, rest] = [exponential::STEP.0, exponential::STEP.1].map(|part| number(self, part));
+        let [first, rest] = [exponential::STEP.0, exponential::STEP.1].map(|part| number(self, parts * part));
         let high = fused(self, Signs::Negated, k, first, x);
         let r = fused(self, Signs::Negated, k, rest, high);
         let scale = self.sixty_four(Sixteen::Power, rounded);
@@ -571,9 +573,7 @@ impl Selection {
         let sum = self.add(What::Two(i::ADD, true, r, tail));
         let p = fused(self, Signs::Plain, square, q, sum);
         let mantissa = fused(self, Signs::Plain, scale, p, scale);
-        let part = number(self, 1.0 / f64::from(tables::EXP_LEN));
-        let exponent = self.add(What::Two(i::MUL, true, k, part));
-        self.add(What::Scale(counts, mantissa, exponent))
+        self.add(What::Scale(counts, mantissa, k))
     }
 
     /// Entries of a table of 64 by the low six bits of an integer.
