@@ -130,6 +130,6 @@ mod tests {
         let mut block = [0.0, 0.0, 0.0, 5.0, 3.0, 0.0, f64::NAN];
         run_once(&prepare, &mut block, &[]);
         run_once(&step, &mut block, &[]);
-        assert_eq!(block[5], (5 * 0x9E37_79B9_i64 ^ 3) as f64);
+        assert_eq!(block[5], ((5 * 0x9E37_79B9_i64) ^ 3) as f64);
     }
 }
