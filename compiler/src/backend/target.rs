@@ -108,20 +108,20 @@ impl<'a> Coder<'a> {
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
         let layout = Some(layout.clone());
-        let told = told(&single);
+        let told = if single::may_be(&step) { told(&single) } else { None };
         let called = if told.is_some() { Called::OneOrTold } else { Called::OneOrAgain };
         let of_one = Single { func: step, layout, read: single.loads(), called };
         let Parts { all: bytes, many, is_own } = self.parts(func, Some(of_one))?;
         let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
         // What is not in our own instructions always gives the status.
-        let told = told.filter(|_| is_own).map(|told| self.plain(&told)).transpose()?;
+        let told = told.filter(|_| is_own).map(|told| self.plain(&told, None)).transpose()?;
         Ok(Some(PreparedBytes { bytes, many, prepare, told, len }))
     }
 
-    /// The code of a function as Cranelift makes it.
-    fn plain(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
+    /// The code of a function for any number of iterations, in one piece, as Cranelift makes it.
+    fn plain(&mut self, func: &Func, ahead: Option<clif::GoneAhead>) -> Result<Bytes, Unsupported> {
         self.context.clear();
-        clif::emit_single(func, false, &mut self.context.func, &mut self.builder, self.isa);
+        clif::emit(func, ahead, &mut self.context.func, &mut self.builder, self.isa);
         self.bytes(func)
     }
 
@@ -131,9 +131,7 @@ impl<'a> Coder<'a> {
         if let Some(own) = self.own(&single) {
             return Ok(Bytes { code: own.code, alignment: 64 });
         }
-        self.context.clear();
-        clif::emit(&single.func, None, &mut self.context.func, &mut self.builder, self.isa);
-        self.bytes(&single.func)
+        self.plain(&single.func, None)
     }
 
     /// All parts of the code of a function.
@@ -177,10 +175,7 @@ impl<'a> Coder<'a> {
     /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are
     /// numbers that `lanes` steps have each its own of.
     pub fn rest(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
-        self.context.clear();
-        let ahead = Some(clif::GoneAhead { first: Slot(size as u32), lanes });
-        clif::emit(func, ahead, &mut self.context.func, &mut self.builder, self.isa);
-        self.bytes(func)
+        self.plain(func, Some(clif::GoneAhead { first: Slot(size as u32), lanes }))
     }
 
     /// The code of a function for lanes, and the numbers it needs behind the blocks.

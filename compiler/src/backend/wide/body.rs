@@ -402,7 +402,6 @@ impl<'a> Body<'a> {
         let mask = self.is_mask(node);
         let register = self.take(mask);
         self.load(node, register, place);
-        self.loads.push((self.now.0, node));
         let copy = self.copy(node);
         self.own(copy, mask, register);
         register
@@ -459,6 +458,7 @@ impl<'a> Body<'a> {
     }
 
     fn load(&mut self, node: Node, register: u8, place: Place) {
+        self.loads.push((self.now.0, node));
         match place {
             _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
             Place::Constant(bits) if self.width == Vectors::One && self.is_made(bits) => self.code.make(register, bits),
@@ -801,10 +801,7 @@ impl<'a> Body<'a> {
                 let to = self.take(false);
                 match place {
                     Place::Register(_) => self.code.vector(i::LOAD, to, 0, place, None),
-                    place => {
-                        self.loads.push((self.now.0, all[over]));
-                        self.load(all[over], to, place)
-                    }
+                    place => self.load(all[over], to, place),
                 }
                 (to, false)
             }

@@ -55,7 +55,7 @@ pub fn single(
     rests: impl Fn(Slot) -> bool,
 ) -> Result<Single, Unsupported> {
     let unsuitable = |what: &str| Unsupported(format!("`{}` {what}", func.name));
-    if func.ops.len() > LARGEST {
+    if !may_be(func) {
         return Err(unsuitable("is too long"));
     }
     // Whether there are instructions is known before the ways.
@@ -118,6 +118,11 @@ pub fn single(
     }
     let len = writer.code.here();
     Ok(Single { code: writer.code.finish(), len, to_others: writer.to_others })
+}
+
+/// Whether a step is short enough for this to be tried.
+pub fn may_be(func: &Func) -> bool {
+    func.ops.len() <= LARGEST
 }
 
 /// Where a slot lies.
