@@ -15,6 +15,7 @@ use crate::drive::hooks::{self, Effect, Hook, Start};
 use crate::drive::sign::SignTest;
 use crate::drive::{self, Step};
 use crate::record::log::{Sections, Settings, Sink};
+use crate::record::parts::Limits;
 use crate::safety::{Cause, Order};
 use abi::rig::{Cia402, Kind, Overrun, Rig};
 use abi::{Instance, Slot};
@@ -549,7 +550,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
     // A reader that never reads: the first write beyond the pipe's room waits for ever.
     let mut options = std::fs::OpenOptions::new();
     let reader = options.read(true).custom_flags(libc::O_NONBLOCK).open(&path).unwrap();
-    let log = Settings { sink: Sink::File(path), cycles_per_block: 100, patient: false };
+    let log = Settings { sink: Sink::File(path, Limits::default()), cycles_per_block: 100, patient: false };
     let mut stand = Stand::of(bench::pair(), quick(), 1, Some(log));
     stand.reach(Step::Armed);
     while stand.hil.counts().log_dropped == 0 {

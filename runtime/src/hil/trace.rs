@@ -9,9 +9,7 @@ use crate::safety::{Cause, Clamps, Order};
 use abi::Slot;
 use abi::rig::Rig;
 
-pub use crate::record::log::CYCLE;
-/// Kind of message: all that the next cycle depends on.
-pub const STATE: u32 = 2;
+pub use crate::record::log::{CYCLE, STATE};
 /// Kind of message: frames of a cycle.
 pub const FRAMES: u32 = 3;
 

@@ -15,7 +15,15 @@ use std::io::{self, Read, Write};
 /// What such a file begins with.
 pub const MAGIC: &[u8] = b"fric log 1\n";
 /// A longer block is not one that was written here.
-const LONGEST: u32 = 1 << 28;
+pub const LONGEST: u32 = 1 << 28;
+
+/// Bytes of a block in the file besides its own.
+pub const OVERHEAD: u64 = 12;
+
+/// What tells two heads apart: CRC-32.
+pub fn mark(bytes: &[u8]) -> u32 {
+    crc32fast::hash(bytes)
+}
 
 /// One block.
 #[derive(Clone, PartialEq, Eq, Debug)]

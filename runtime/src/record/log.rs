@@ -5,8 +5,13 @@
 //!
 //! A block is closed after a fixed number of messages of kind [`CYCLE`], not after a time: so two equal runs leave equal
 //! files. A full queue drops the message and counts it, and the next one that fits says how many are missing.
+//!
+//! The thread packs each block (see [`packed`](super::packed)) and begins a new file where the last one has become long
+//! enough (see [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
 
-use super::blocks::{Block, BlockReader, BlockWriter, End};
+use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK_LONGEST};
+use super::packed;
+use super::parts::{self, Limits};
 use crate::queue::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::fs::File;
@@ -21,9 +26,14 @@ use std::time::Duration;
 const HEAD: u32 = 1;
 const MESSAGES: u32 = 2;
 const TAIL: u32 = 3;
+const PACKED: u32 = 4;
+/// Name of the section that a file after the first has in its head: number of the part, hash of the first head.
+const PART: &str = "part";
 
 /// Kind of message: one cycle.
 pub const CYCLE: u32 = 1;
+/// Kind of message: all that the next cycle depends on. A new file begins with one.
+pub const STATE: u32 = 2;
 /// Kind of message: so many messages were dropped here.
 pub const LOST: u32 = 0;
 
@@ -83,8 +93,8 @@ impl Sections {
 
 /// Where a log goes.
 pub enum Sink {
-    /// Into this file, whole.
-    File(PathBuf),
+    /// Into this file, and those that follow it.
+    File(PathBuf, Limits),
     /// So many blocks are kept, and written to this file only if the run ends with a stop: a black box.
     BlackBox(PathBuf, usize),
 }
@@ -119,6 +129,12 @@ struct Shared {
     broken: AtomicBool,
     /// Bytes written.
     written: AtomicU64,
+    /// Bytes that were free on the disk when it was last looked at.
+    free: AtomicU64,
+    /// Files begun.
+    parts: AtomicU64,
+    /// Old logs removed to make room.
+    removed: AtomicU64,
 }
 
 /// What is left to say at the end.
@@ -126,8 +142,12 @@ struct Shared {
 pub struct Summary {
     /// Messages that were dropped because the queue was full.
     pub dropped: u64,
-    /// Bytes of the file.
+    /// Bytes of all files.
     pub bytes: u64,
+    /// Files.
+    pub parts: u64,
+    /// Old logs that were removed, to stay within [`Limits::keep`].
+    pub removed: u64,
 }
 
 impl Log {
@@ -168,6 +188,11 @@ impl Log {
         put(words);
     }
 
+    /// Bytes that were free on the disk of the log when it was last looked at.
+    pub fn free(&self) -> u64 {
+        self.shared.free.load(Ordering::Relaxed)
+    }
+
     /// Messages dropped until now.
     pub fn dropped(&self) -> u64 {
         self.dropped
@@ -188,7 +213,9 @@ impl Log {
         self.shared.over.store(true, Ordering::Release);
         let thread = self.thread.take().expect("a log ends once");
         thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
-        Ok(Summary { dropped, bytes: self.shared.written.load(Ordering::Relaxed) })
+        let [bytes, parts, removed] =
+            [&self.shared.written, &self.shared.parts, &self.shared.removed].map(|count| count.load(Ordering::Relaxed));
+        Ok(Summary { dropped, bytes, parts, removed })
     }
 }
 
@@ -232,18 +259,94 @@ struct Carrier {
 }
 
 enum Out {
-    File(BlockWriter<File>),
+    File(Parts),
     Ring { path: PathBuf, head: Vec<u8>, blocks: VecDeque<Vec<u8>>, most: usize },
+}
+
+/// The files of a log.
+struct Parts {
+    first: PathBuf,
+    limits: Limits,
+    writer: BlockWriter<File>,
+    /// Number of the file being written, from 1.
+    number: u32,
+    /// Bytes in it.
+    bytes: u64,
+    head: Vec<u8>,
+}
+
+impl Parts {
+    fn begin(first: PathBuf, mut limits: Limits) -> io::Result<Parts> {
+        if let Some(keep) = limits.keep {
+            limits.part = limits.part.min(keep / 4);
+        }
+        let writer = BlockWriter::new(parts::create(&first, 1)?)?;
+        Ok(Parts { first, limits, writer, number: 1, bytes: 0, head: Vec::new() })
+    }
+
+    /// Begins the next file, with the head and the number of the part.
+    fn next(&mut self) -> io::Result<()> {
+        self.number += 1;
+        self.bytes = 0;
+        self.writer = BlockWriter::new(parts::create(&self.first, self.number)?)?;
+        let part = format!("{} {:08x}", self.number, blocks::mark(&self.head));
+        let head = Sections::read(&self.head).unwrap_or_default().with(PART, part);
+        self.write(HEAD, &head.bytes())?;
+        Ok(())
+    }
+
+    /// Appends a block; returns its bytes in the file.
+    fn write(&mut self, kind: u32, bytes: &[u8]) -> io::Result<u64> {
+        if kind == HEAD && self.number == 1 {
+            self.head = bytes.to_vec();
+        }
+        self.writer.write(kind, bytes)?;
+        let added = bytes.len() as u64 + blocks::OVERHEAD;
+        self.bytes += added;
+        Ok(added)
+    }
+
+    /// Makes room where all logs together may have so many bytes; looks at the disk. Returns the bytes that are free and how
+    /// many old logs were removed.
+    fn make_room(&self) -> io::Result<(u64, u64)> {
+        let path = parts::path(&self.first, self.number);
+        // While this file grows to its full length, all together stay within `keep`.
+        let removed = match self.limits.keep {
+            Some(keep) if self.bytes < self.limits.part / 2 => {
+                parts::remove_oldest(&path, keep.saturating_sub(self.limits.part).max(self.bytes))?
+            }
+            _ => 0,
+        };
+        let free = parts::free(&path)?;
+        if free < self.limits.reserve {
+            let (free, reserve) = (free >> 20, self.limits.reserve >> 20);
+            let why = format!("the disk has {free} MB free, and the last {reserve} MB are left to others");
+            return Err(io::Error::new(io::ErrorKind::StorageFull, why));
+        }
+        Ok((free, removed))
+    }
 }
 
 impl Carrier {
     fn new(sink: Sink, cycles_per_block: u32, queue: Receiver<u64>, shared: Arc<Shared>) -> io::Result<Carrier> {
         let out = match sink {
-            Sink::File(path) => Out::File(BlockWriter::new(File::create(path)?)?),
+            Sink::File(path, limits) => Out::File(Parts::begin(path, limits)?),
             Sink::BlackBox(path, most) => Out::Ring { path, head: Vec::new(), blocks: VecDeque::new(), most },
         };
+        shared.parts.store(1, Ordering::Relaxed);
         let (block, tail) = (Vec::new(), Vec::new());
-        Ok(Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, tail })
+        let mut carrier = Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, tail };
+        carrier.make_room()?;
+        Ok(carrier)
+    }
+
+    fn make_room(&mut self) -> io::Result<()> {
+        if let Out::File(parts) = &self.out {
+            let (free, removed) = parts.make_room()?;
+            self.shared.free.store(free, Ordering::Relaxed);
+            self.shared.removed.fetch_add(removed, Ordering::Relaxed);
+        }
+        Ok(())
     }
 
     /// Carries until all is over.
@@ -282,6 +385,11 @@ impl Carrier {
                 }
             }
             _ => {
+                if let (STATE, Out::File(parts)) = (kind, &self.out)
+                    && parts.bytes >= parts.limits.part
+                {
+                    self.next_part()?;
+                }
                 self.block.extend(words.iter().flat_map(|word| word.to_le_bytes()));
                 self.cycles += u32::from(kind == CYCLE);
                 if self.cycles >= self.cycles_per_block {
@@ -299,15 +407,29 @@ impl Carrier {
         if block.is_empty() { Ok(()) } else { self.keep(MESSAGES, block) }
     }
 
+    /// Ends this file and begins the next one.
+    fn next_part(&mut self) -> io::Result<()> {
+        self.close()?;
+        let Out::File(parts) = &mut self.out else { return Ok(()) };
+        parts.next()?;
+        self.shared.written.fetch_add(parts.bytes, Ordering::Relaxed);
+        self.shared.parts.fetch_add(1, Ordering::Relaxed);
+        Ok(())
+    }
+
     fn keep(&mut self, kind: u32, bytes: Vec<u8>) -> io::Result<()> {
+        let (kind, bytes) = if kind == MESSAGES { (PACKED, packed::pack(&bytes)) } else { (kind, bytes) };
         match &mut self.out {
-            Out::File(writer) => {
-                writer.write(kind, &bytes)?;
-                self.shared.written.fetch_add(bytes.len() as u64 + 12, Ordering::Relaxed);
+            Out::File(parts) => {
+                let added = parts.write(kind, &bytes)?;
+                self.shared.written.fetch_add(added, Ordering::Relaxed);
+                if kind == PACKED {
+                    self.make_room()?;
+                }
             }
             Out::Ring { head, blocks, most, .. } => match kind {
                 HEAD => *head = bytes,
-                MESSAGES => {
+                PACKED => {
                     blocks.push_back(bytes);
                     if blocks.len() > *most {
                         blocks.pop_front();
@@ -325,7 +447,7 @@ impl Carrier {
         let mut writer = BlockWriter::new(File::create(path)?)?;
         writer.write(HEAD, head)?;
         for block in blocks {
-            writer.write(MESSAGES, block)?;
+            writer.write(PACKED, block)?;
         }
         writer.write(TAIL, &self.tail)
     }
@@ -340,7 +462,7 @@ pub struct Message {
     pub words: Vec<u64>,
 }
 
-/// Reads a log from its beginning.
+/// Reads a log from the beginning of a file on, and through the files that follow it.
 pub struct Reader {
     blocks: BlockReader<BufReader<File>>,
     /// What stands at its beginning.
@@ -348,14 +470,26 @@ pub struct Reader {
     tail: Option<Sections>,
     bytes: Vec<u8>,
     at: usize,
+    /// The file being read, the number of its part, and what all parts of the log have in common.
+    path: PathBuf,
+    number: u32,
+    mark: u32,
 }
 
 impl Reader {
-    /// Opens a log.
+    /// Opens a log, or a later part of one.
     ///
     /// # Errors
     /// Why not, in words.
     pub fn open(path: &Path) -> Result<Reader, String> {
+        let (blocks, head) = Reader::begin(path)?;
+        let bytes = head.bytes();
+        let (number, mark) = part_of(&head).unwrap_or((1, blocks::mark(&bytes)));
+        let path = path.to_path_buf();
+        Ok(Reader { blocks, head, tail: None, bytes: Vec::new(), at: 0, path, number, mark })
+    }
+
+    fn begin(path: &Path) -> Result<(BlockReader<BufReader<File>>, Sections), String> {
         let file = File::open(path).map_err(|error| match error.kind() {
             io::ErrorKind::NotFound => "there is no such file".to_string(),
             _ => error.to_string(),
@@ -365,7 +499,18 @@ impl Reader {
         let first = blocks.block().map_err(|error| error.to_string())?;
         let head = first.filter(|block| block.kind == HEAD).and_then(|block| Sections::read(&block.bytes));
         let Some(head) = head else { return Err("its head is cut off or damaged".into()) };
-        Ok(Reader { blocks, head, tail: None, bytes: Vec::new(), at: 0 })
+        Ok((blocks, head))
+    }
+
+    /// Goes on with the next file of the log; false if there is none.
+    fn follow(&mut self) -> bool {
+        let path = parts::following(&self.path, self.number);
+        let Ok((blocks, head)) = Reader::begin(&path) else { return false };
+        if part_of(&head) != Some((self.number + 1, self.mark)) {
+            return false;
+        }
+        (self.blocks, self.path, self.number) = (blocks, path, self.number + 1);
+        true
     }
 
     /// The next message; none at the end of what can be read.
@@ -375,8 +520,18 @@ impl Reader {
     pub fn message(&mut self) -> io::Result<Option<Message>> {
         while self.at == self.bytes.len() {
             match self.blocks.block()? {
-                None => return Ok(None),
+                None => {
+                    let goes_on = self.tail.is_none() && self.blocks.end() == Some(End::Whole) && self.follow();
+                    if !goes_on {
+                        return Ok(None);
+                    }
+                }
                 Some(Block { kind: MESSAGES, bytes }) => (self.bytes, self.at) = (bytes, 0),
+                Some(Block { kind: PACKED, bytes }) => {
+                    let unpacked = packed::unpack(&bytes, BLOCK_LONGEST as usize);
+                    let odd = || io::Error::other("a block of the log cannot be unpacked");
+                    (self.bytes, self.at) = (unpacked.ok_or_else(odd)?, 0);
+                }
                 Some(Block { kind: TAIL, bytes }) => self.tail = Sections::read(&bytes),
                 Some(_) => {}
             }
@@ -396,6 +551,11 @@ impl Reader {
         Ok(Some(message))
     }
 
+    /// The file being read.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// What stands at its end; none if it has not been reached or was never written.
     pub fn tail(&self) -> Option<&Sections> {
         self.tail.as_ref()
@@ -407,9 +567,16 @@ impl Reader {
     }
 }
 
+/// Number and mark in the head of a file after the first.
+fn part_of(head: &Sections) -> Option<(u32, u32)> {
+    let (number, mark) = head.text(PART)?.split_once(' ')?;
+    Some((number.parse().ok().filter(|number| *number > 1)?, u32::from_str_radix(mark, 16).ok()?))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::chance::Chance;
 
     fn head() -> Sections {
         Sections::default().with("rig", "r").with("empty", "").with("bytes", [0, 255, 3])
@@ -438,7 +605,7 @@ mod tests {
     fn messages_reach_the_file_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
-        let mut log = Log::begin(settings(Sink::File(path.clone())), &head()).unwrap();
+        let mut log = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
         for k in 0..1000u64 {
             log.push(CYCLE, &[k, !k]);
             if k % 100 == 0 {
@@ -463,7 +630,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = |name: &str, pause: bool| {
             let path = folder.path().join(name);
-            let mut log = Log::begin(settings(Sink::File(path.clone())), &head()).unwrap();
+            let mut log = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
             for k in 0..200u64 {
                 log.push(CYCLE, &[k]);
                 if pause && k % 37 == 0 {
@@ -516,7 +683,7 @@ mod tests {
     fn a_log_that_was_not_ended_is_read_as_far_as_it_goes() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
-        let mut log = Log::begin(settings(Sink::File(path.clone())), &head()).unwrap();
+        let mut log = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
         (0..25).for_each(|k| log.push(CYCLE, &[k]));
         drop(log);
         let mut reader = Reader::open(&path).unwrap();
@@ -527,6 +694,95 @@ mod tests {
         let mut reader = Reader::open(&path).unwrap();
         assert_eq!(messages(&mut reader).len(), 20);
         assert!(matches!(reader.end(), Some(End::Cut { .. })));
+    }
+
+    /// Writes messages at random, with a state now and then, into parts of `limits`; returns the first file and what was written.
+    fn in_parts(folder: &Path, seed: u64, limits: Limits) -> (PathBuf, Vec<Message>) {
+        let (mut chance, path) = (Chance(seed), folder.join(format!("{seed}.friclog")));
+        let mut log = Log::begin(settings(Sink::File(path.clone(), limits)), &head()).unwrap();
+        let mut written = Vec::new();
+        for k in 0..200 + chance.below(400) {
+            let kind = if chance.below(17) == 0 { STATE } else { CYCLE };
+            let words: Vec<u64> = [k].into_iter().chain((0..chance.below(20)).map(|_| chance.number())).collect();
+            log.push(kind, &words);
+            written.push(Message { kind, words });
+        }
+        if chance.below(4) > 0 {
+            log.end(&Sections::default().with("end", "as asked"), false).unwrap();
+        }
+        (path, written)
+    }
+
+    #[test]
+    fn parts_are_read_as_one_log_and_each_from_its_own_beginning() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut most = 0;
+        for seed in 0..40 {
+            let limits = Limits { part: 2000 + 500 * (seed % 9), ..Limits::default() };
+            let (path, written) = in_parts(folder.path(), seed, limits);
+            assert_eq!(messages(&mut Reader::open(&path).unwrap()), written, "seed {seed}");
+            let mut at = 0;
+            for number in (2..).take_while(|number| parts::path(&path, *number).exists()) {
+                let found = messages(&mut Reader::open(&parts::path(&path, number)).unwrap());
+                assert_eq!(found, written[written.len() - found.len()..], "seed {seed}, part {number}");
+                assert_eq!(found[0].kind, STATE, "seed {seed}, part {number}");
+                assert!(written.len() - found.len() > at, "seed {seed}: a part without a message");
+                (at, most) = (written.len() - found.len(), most.max(number));
+            }
+        }
+        assert!(most > 5, "{most} parts at most");
+    }
+
+    #[test]
+    fn a_part_that_is_cut_ends_the_log_there_and_a_part_of_another_log_is_not_taken() {
+        let folder = tempfile::tempdir().unwrap();
+        let limits = Limits { part: 3000, ..Limits::default() };
+        let (path, written) = in_parts(folder.path(), 1, limits);
+        let second = parts::path(&path, 2);
+        let bytes = std::fs::read(&second).unwrap();
+        std::fs::write(&second, &bytes[..bytes.len() - 1]).unwrap();
+        let mut reader = Reader::open(&path).unwrap();
+        let found = messages(&mut reader);
+        assert!(!found.is_empty() && found == written[..found.len()]);
+        assert!(matches!(reader.end(), Some(End::Cut { .. })));
+        assert_eq!(reader.path(), second);
+        std::fs::write(&second, bytes).unwrap();
+        // The same parts after another head.
+        let other = folder.path().join("other.friclog");
+        let mut log = Log::begin(settings(Sink::File(other.clone(), limits)), &Sections::default().with("a", "b")).unwrap();
+        log.push(CYCLE, &[1]);
+        drop(log);
+        std::fs::copy(&second, parts::path(&other, 2)).unwrap();
+        assert_eq!(messages(&mut Reader::open(&other).unwrap()).len(), 1);
+    }
+
+    #[test]
+    fn all_parts_together_stay_within_what_may_be_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let keep = 40_000;
+        let path = folder.path().join("a.friclog");
+        let limits = Limits { keep: Some(keep), ..Limits::default() };
+        let mut log = Log::begin(settings(Sink::File(path.clone(), limits)), &head()).unwrap();
+        let mut chance = Chance(7);
+        for k in 0..3000 {
+            log.push(if k % 20 == 0 { STATE } else { CYCLE }, &std::array::from_fn::<u64, 8, _>(|_| chance.number()));
+            if k % 100 == 0 {
+                let sizes = std::fs::read_dir(folder.path()).unwrap().flatten().filter_map(|file| file.metadata().ok());
+                assert!(sizes.map(|file| file.len()).sum::<u64>() <= keep);
+            }
+        }
+        let summary = log.end(&Sections::default().with("end", "x"), false).unwrap();
+        assert!(summary.parts > 10 && summary.removed > 10 && !path.exists(), "{summary:?}");
+        let last = parts::path(&path, summary.parts as u32);
+        assert!(Reader::open(&last).is_ok());
+    }
+
+    #[test]
+    fn a_disk_that_is_nearly_full_gets_no_log() {
+        let folder = tempfile::tempdir().unwrap();
+        let limits = Limits { reserve: u64::MAX, ..Limits::default() };
+        let begun = Log::begin(settings(Sink::File(folder.path().join("a.friclog"), limits)), &head());
+        assert_eq!(begun.err().unwrap().kind(), io::ErrorKind::StorageFull);
     }
 
     #[test]

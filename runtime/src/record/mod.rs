@@ -5,6 +5,8 @@
 
 pub mod blocks;
 pub mod csv;
+mod packed;
+pub mod parts;
 pub mod log;
 
 use abi::Slot;

@@ -1,0 +1,166 @@
+//! A log in several files: their names, how many of them are kept, and the space that is free for them.
+//!
+//! In: the path of a log and how large it may become. Out: files, opened one after the other. Knows nothing of what is
+//! in them.
+//!
+//! The first part bears the name that was asked for, `rtfs.friclog`; those that follow have their number before the
+//! ending, `rtfs.2.friclog`, `rtfs.3.friclog`, …
+
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+/// The ending of logs.
+pub const ENDING: &str = "friclog";
+
+/// How large a log may become.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Limits {
+    /// Bytes after which a part is followed by the next one.
+    pub part: u64,
+    /// Bytes that all logs in the folder may have together: the oldest files are removed. None: all are kept.
+    pub keep: Option<u64>,
+    /// Bytes of the disk that a log leaves free; it stops growing there.
+    pub reserve: u64,
+}
+
+impl Default for Limits {
+    /// Parts of 256 MB, all of them kept, 64 MB left free.
+    fn default() -> Limits {
+        Limits { part: 256 << 20, keep: None, reserve: 64 << 20 }
+    }
+}
+
+/// The path of part `number` (from 1) of the log whose first part is `first`.
+pub fn path(first: &Path, number: u32) -> PathBuf {
+    match (number, first.extension()) {
+        (0 | 1, _) => first.to_path_buf(),
+        (_, Some(ending)) => first.with_extension(format!("{number}.{}", ending.to_string_lossy())),
+        (_, None) => first.with_extension(number.to_string()),
+    }
+}
+
+/// The path of the part that follows this one of number `number`.
+pub fn following(this: &Path, number: u32) -> PathBuf {
+    let name = this.file_name().unwrap_or_default().to_string_lossy();
+    let (stem, ending) = name.rsplit_once('.').map_or((&*name, None), |(stem, ending)| (stem, Some(ending)));
+    let first = match (stem.strip_suffix(&format!(".{number}")), ending) {
+        _ if number <= 1 => name.to_string(),
+        (Some(stem), Some(ending)) => format!("{stem}.{ending}"),
+        (None, Some(ending)) if ending == number.to_string() => stem.to_string(),
+        _ => name.to_string(),
+    };
+    path(&this.with_file_name(first), number + 1)
+}
+
+/// Opens part `number`. The first part removes the parts of an earlier log of its name, so that no reader takes them for
+/// its own.
+///
+/// # Errors
+/// Those of the files.
+pub fn create(first: &Path, number: u32) -> io::Result<File> {
+    let file = File::create(path(first, number))?;
+    if number == 1 {
+        for old in (2..).map(|number| path(first, number)).take_while(|old| old.is_file()) {
+            fs::remove_file(old)?;
+        }
+    }
+    Ok(file)
+}
+
+/// Removes the oldest logs in the folder of `current` until all together have `keep` bytes at most. The current part
+/// stays. Returns how many files were removed.
+///
+/// # Errors
+/// Those of the files.
+pub fn remove_oldest(current: &Path, keep: u64) -> io::Result<u64> {
+    let folder = match current.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    let mut logs: Vec<(SystemTime, PathBuf, u64)> = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let (path, metadata) = (entry.path(), entry.metadata()?);
+        if metadata.is_file() && path.extension().is_some_and(|ending| ending == ENDING) {
+            logs.push((metadata.modified()?, path, metadata.len()));
+        }
+    }
+    logs.sort();
+    let mut total: u64 = logs.iter().map(|(_, _, bytes)| bytes).sum();
+    let mut removed = 0;
+    for (_, path, bytes) in logs {
+        if total <= keep {
+            break;
+        }
+        if path.file_name() != current.file_name() {
+            fs::remove_file(&path)?;
+            (total, removed) = (total - bytes, removed + 1);
+        }
+    }
+    Ok(removed)
+}
+
+/// Bytes that are free on the disk of this file or folder.
+///
+/// # Errors
+/// Those of the system.
+pub fn free(path: &Path) -> io::Result<u64> {
+    let disk = rustix::fs::statvfs(path)?;
+    Ok(disk.f_bavail * disk.f_frsize)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    #[test]
+    fn each_part_names_the_next() {
+        for first in ["out/rtfs.friclog", "a.2.friclog", "log", "x.y.friclog"].map(Path::new) {
+            let mut this = path(first, 1);
+            assert_eq!(this, first);
+            for number in 1..12 {
+                this = following(&this, number);
+                assert_eq!(this, path(first, number + 1));
+            }
+        }
+        assert_eq!(path(Path::new("out/rtfs.friclog"), 3), Path::new("out/rtfs.3.friclog"));
+    }
+
+    #[test]
+    fn a_new_log_takes_the_parts_of_an_old_one_away() {
+        let folder = tempfile::tempdir().unwrap();
+        let first = folder.path().join("a.friclog");
+        (1..=3).for_each(|number| drop(create(&first, number).unwrap()));
+        fs::write(folder.path().join("b.2.friclog"), "").unwrap();
+        create(&first, 1).unwrap();
+        let mut names: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        names.sort();
+        assert_eq!(names, ["a.friclog", "b.2.friclog"]);
+    }
+
+    #[test]
+    fn the_oldest_logs_go_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let named = |name: &str| folder.path().join(name);
+        let now = SystemTime::now();
+        for (age, name) in (0..).zip(["now.friclog", "c.friclog", "b.friclog", "a.friclog", "notes.txt"]) {
+            fs::write(named(name), [0; 100]).unwrap();
+            let file = File::options().write(true).open(named(name)).unwrap();
+            file.set_modified(now - Duration::from_secs(100 * age)).unwrap();
+        }
+        assert_eq!(remove_oldest(&named("now.friclog"), 400).unwrap(), 0);
+        assert_eq!(remove_oldest(&named("now.friclog"), 299).unwrap(), 2);
+        assert!(!named("a.friclog").exists() && !named("b.friclog").exists() && named("c.friclog").exists());
+        assert_eq!(remove_oldest(&named("now.friclog"), 0).unwrap(), 1);
+        assert!(named("now.friclog").exists() && named("notes.txt").exists());
+    }
+
+    #[test]
+    fn a_disk_has_room() {
+        assert!(free(tempfile::tempdir().unwrap().path()).unwrap() > 0);
+        assert!(free(Path::new("nowhere/at/all")).is_err());
+    }
+}
