@@ -396,6 +396,12 @@ pub struct Hil {
     /// The log [default: out/RIG.friclog]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub log: Option<PathBuf>,
+    /// Go on in a further file, RIG.2.friclog, after so many bytes of log
+    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, default_value = "256MB")]
+    pub roll: u64,
+    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
+    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, conflicts_with = "no_log")]
+    pub keep: Option<u64>,
     /// Keep only the last ten seconds, written if the rig is stopped by safety
     #[arg(long, conflicts_with = "log")]
     pub no_log: bool,

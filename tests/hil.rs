@@ -446,7 +446,7 @@ fn wrong_usage_is_told() {
 /// A run at the pace of the wall that counts what this machine misses, once its log is there.
 fn under_way(folder: &Path, log: &str) -> std::process::Child {
     let example = example();
-    let mut command = fric(folder, &["hil", "--sim", "--count-overruns", "--log", log, &example]);
+    let mut command = fric(folder, &["hil", "--sim", "--count-overruns", "--roll", "40kB", "--log", log, &example]);
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     while !folder.join(log).exists() {
         std::thread::sleep(Duration::from_millis(20));
@@ -497,6 +497,74 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     assert!(said.contains("agree to the bit"), "{said}");
 }
 
+/// Files of a log, the first one first.
+fn parts_of(first: &Path) -> Vec<PathBuf> {
+    (1..).map(|number| runtime::record::parts::path(first, number)).take_while(|path| path.exists()).collect()
+}
+
+/// The words of a message take 8 bytes each, and one more word: what a log held before it was packed.
+#[test]
+fn a_log_takes_a_quarter_of_its_words_goes_on_in_further_files_and_replays_through_them() {
+    let folder = folder("hil-roll");
+    let hil = ["hil", "--sim", "--fast", "--for", "12s", "--roll", "150kB", "--log"];
+    for log in ["a.friclog", "b.friclog"] {
+        run(&folder, &[&hil[..], &[log, &example()]].concat(), 0);
+    }
+    let [a, b] = ["a.friclog", "b.friclog"].map(|log| parts_of(&folder.join(log)));
+    assert!(a.len() > 3 && a.len() == b.len(), "{} files", a.len());
+    for (a, b) in a.iter().zip(&b) {
+        assert!(fs::read(a).unwrap() == fs::read(b).unwrap(), "{} and {} differ", a.display(), b.display());
+    }
+    let mut reader = runtime::record::log::Reader::open(&a[0]).unwrap();
+    let mut words = 0;
+    while let Some(message) = reader.message().unwrap() {
+        words += message.words.len() + 1;
+    }
+    let packed: u64 = a.iter().map(|path| fs::metadata(path).unwrap().len()).sum();
+    // Heads, with the texts of rig and library in each file, are among them.
+    assert!(packed * 4 <= 8 * words as u64, "{packed} of {} bytes", 8 * words);
+    let cycles = |log: &Path| -> u64 {
+        let said = run(&folder, &["replay", log.to_str().unwrap()], 0);
+        assert!(said.contains("agree to the bit; "), "{said}");
+        assert!(!said.contains("could not be computed"), "{said}");
+        said.split(": ").nth(1).unwrap().split(' ').next().unwrap().replace(',', "").parse().unwrap()
+    };
+    let all = cycles(&a[0]);
+    assert!(all > 12_000);
+    let alone: Vec<u64> = a.iter().map(|path| cycles(path)).collect();
+    assert!(alone.is_sorted_by(|one, next| one > next), "{alone:?}");
+    run(
+        &folder,
+        &[
+            "hil",
+            "--sim",
+            "--fast",
+            "--for",
+            "12s",
+            "--roll",
+            "1MB",
+            "--keep",
+            "400kB",
+            "--log",
+            "c.friclog",
+            &example(),
+        ],
+        0,
+    );
+    let size = |path: PathBuf| fs::metadata(path).unwrap().len();
+    let left = fs::read_dir(&folder).unwrap().flatten().map(|entry| entry.path());
+    let left: u64 = left.filter(|path| path.extension().is_some_and(|ending| ending == "friclog")).map(size).sum();
+    assert!(left <= 400_000, "{left} bytes");
+}
+
+#[test]
+fn simulated_time_without_an_end_is_wrong_usage() {
+    let folder = folder("hil-endless");
+    assert!(run(&folder, &["hil", "--sim", "--fast", &example()], 2).contains("--fast needs --for"));
+    assert!(run(&folder, &["hil", "--sim", "--fast", "--for", "1s", "--roll", "12", &example()], 2).contains("256MB"));
+    assert!(!folder.join("out").exists(), "nothing was begun");
+}
+
 /// `FRIC_KILLS` says how often; 200 is the full measure.
 #[test]
 fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
@@ -520,7 +588,7 @@ fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
         let due: f64 = csv.lines().last().unwrap().split(',').nth(1).unwrap().parse().unwrap();
         let lost = killed - (started + due);
         assert!(due > 0.5 && lost < 1.0, "kill {kill}: {lost} s lost of {} s", killed - started);
-        fs::remove_file(path).unwrap();
+        parts_of(&path).iter().for_each(|path| fs::remove_file(path).unwrap());
     }
 }
 

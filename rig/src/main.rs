@@ -96,6 +96,12 @@ struct Run {
     /// The log [default: DIR/log/RIG-TIME.friclog]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     log: Option<PathBuf>,
+    /// Go on in a further file, RIG-TIME.2.friclog, after so many bytes of log
+    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, default_value = "256MB")]
+    roll: u64,
+    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
+    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
+    keep: Option<u64>,
     #[command(flatten)]
     store: Store,
     #[command(flatten)]
@@ -220,6 +226,7 @@ fn ran(args: &Run) -> Result<u8, String> {
         duration: args.duration,
         buses: &args.bus,
         log: args.log.as_deref(),
+        limits: runtime::record::parts::Limits { part: args.roll, keep: args.keep, ..Default::default() },
     };
     run::run(&wanted)
 }

@@ -18,6 +18,7 @@ use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, words as told};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
+use runtime::record::parts::{self, Limits};
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -54,6 +55,8 @@ pub struct Wanted<'a> {
     pub buses: &'a [(String, String)],
     /// The recording.
     pub log: Option<&'a Path>,
+    /// How large it may become.
+    pub limits: Limits,
 }
 
 /// How it ended.
@@ -112,6 +115,9 @@ pub fn run(wanted: &Wanted) -> Result<u8, String> {
 }
 
 fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<Ended, String> {
+    if wanted.fast && wanted.duration.is_none() && !wanted.check {
+        return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
+    }
     let mut rig = open.rig()?;
     for (bus, address) in wanted.buses {
         let Some(known) = rig.buses.iter_mut().find(|known| known.name == *bus) else {
@@ -123,7 +129,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     let control = open.program("control")?;
     let log = log(wanted, open, &rig)?;
     let path = match &log.0.sink {
-        Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
+        Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     };
     let simulated = wanted.sim || rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
     let mut options = Options { arms_itself: simulated, checks_only: wanted.check, ..Options::default() };
@@ -179,8 +185,8 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     let written = hil.finish();
     words::print(&counts.lines().map(|line| format!("  {line}\n")).collect::<String>());
     match written {
-        Ok(Some(_)) if path.exists() => words::print(&format!("  wrote {}\n", path.display())),
-        Ok(_) => {}
+        Ok(Some(summary)) => words::print(&format!("  wrote {}\n", summary.words(&path))),
+        Ok(None) => {}
         Err(error) => return Err(format!("the log {} is not whole: {error}", path.display())),
     }
     // Whoever stops a rig for which another package waits wants that one next, unless the process itself is to end.
@@ -224,7 +230,7 @@ fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), 
         fs::create_dir_all(folder).map_err(|error| format!("cannot write {}: {error}", folder.display()))?;
     }
     let cycles_per_block = u32::try_from((BLOCK_NS / rig.period_ns).max(1)).unwrap_or(u32::MAX);
-    let settings = Settings { sink: Sink::File(path), cycles_per_block, patient: repeatable };
+    let settings = Settings { sink: Sink::File(path, wanted.limits), cycles_per_block, patient: repeatable };
     Ok((settings, head))
 }
 
@@ -303,12 +309,13 @@ fn socket(dir: &Path) -> PathBuf {
 fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
     let text = format!(
-        "{}: {}, {} cycles, late {} us at most, {} missed\n",
+        "{}: {}, {} cycles, late {} us at most, {} missed{}\n",
         target.display(),
         told::stage(number(&gauges.stage)),
         number(&gauges.cycles),
         number(&gauges.late_ns_max) / 1000,
         number(&gauges.missed),
+        parts::warning(number(&gauges.log_free)).map_or(String::new(), |warning| format!("; {warning}")),
     );
     let fresh = dir.join(".state");
     // A disk that is full is no reason to disturb the cycle.

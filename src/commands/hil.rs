@@ -22,8 +22,9 @@ use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
+use runtime::record::parts::{self, Limits};
 use std::io::{BufRead, IsTerminal};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -126,6 +127,9 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
 
 /// What cannot be asked for together.
 fn usage(args: &Args, ready: &Ready, simulated: bool) -> Result<(), String> {
+    if simulated && args.fast && args.duration.is_none() && !args.check && !args.identify {
+        return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
+    }
     if simulated {
         return Ok(());
     }
@@ -165,9 +169,9 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
         let path = PathBuf::from("out").join(format!("{name}.blackbox.friclog"));
         Sink::BlackBox(path, (BLACK_BOX_NS / BLOCK_NS) as usize)
     } else {
-        Sink::File(path)
+        Sink::File(path, Limits { part: args.roll, keep: args.keep, ..Limits::default() })
     };
-    let (Sink::File(path) | Sink::BlackBox(path, _)) = &sink;
+    let (Sink::File(path, _) | Sink::BlackBox(path, _)) = &sink;
     project::make_folder_of(path).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
     let cycles_per_block = cycles(BLOCK_NS);
     // Where time stands meanwhile, the log may take its time.
@@ -303,7 +307,7 @@ fn run(
     let Ready { rig, control, plant, notes, .. } = ready;
     let description = control.description().clone();
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
-        Sink::File(path) | Sink::BlackBox(path, _) => path.clone(),
+        Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
     let fast = simulated && args.fast;
     let mut options = hil_options(args, &rig, simulated);
@@ -349,6 +353,7 @@ fn run(
     }
     if !args.quiet {
         begin(&rig, simulated, fast, &refusals, &notes, terminal);
+        log_path.iter().filter(|_| !args.no_log).for_each(|path| terminal.line(&room(path)));
     }
     let over = Arc::new(AtomicBool::new(false));
     let view = (!args.quiet && !fast && std::io::stdout().is_terminal()).then(|| {
@@ -419,6 +424,13 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
     }
 }
 
+/// Where the log goes, and the space that is free there.
+fn room(log: &Path) -> String {
+    let folder = log.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let free = parts::free(folder).map_or(String::new(), |free| format!(", {} free on its disk", parts::size(free)));
+    format!("  log {}{free}", log.display())
+}
+
 /// Tells how it ended, after the log was closed.
 fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
     let counts = words::counts(hil.counts());
@@ -448,8 +460,8 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
         }
     };
     match (written, log) {
-        (Ok(Some(summary)), Some(path)) if path.exists() && !args.quiet => {
-            terminal.line(&format!("  wrote {} ({:.1} MB)", path.display(), summary.bytes as f64 * 1e-6));
+        (Ok(Some(summary)), Some(path)) if summary.bytes > 0 && !args.quiet => {
+            terminal.line(&format!("  wrote {}", summary.words(&path)));
         }
         (Err(error), path) => {
             let path = path.map_or(String::new(), |path| path.display().to_string());
@@ -477,12 +489,13 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
         let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
         let micro = |ns: u64| value::significant(ns as f64 * 1e-3, 3);
         let mut text = format!(
-            "\x1b[2K  {:<32} {:>9.3} s   late {} µs, at most {} µs   {} missed\n",
+            "\x1b[2K  {:<32} {:>9.3} s   late {} µs, at most {} µs   {} missed{}\n",
             words::stage(number(&gauges.stage)),
             number(&gauges.cycles) as f64 * rig.period_ns as f64 * 1e-9,
             micro(number(&gauges.late_ns)),
             micro(number(&gauges.late_ns_max)),
             number(&gauges.missed),
+            parts::warning(number(&gauges.log_free)).map_or(String::new(), |warning| format!("   {warning}")),
         );
         for (i, (name, gauge)) in names.iter().zip(&gauges.values).enumerate() {
             let si = f64::from_bits(number(gauge));

@@ -71,9 +71,11 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     if let Err(why) = exports.write(args, terminal) {
         return fail(terminal, &why);
     }
+    // A log goes on in further files; the last one that was read is the one of whose end there is something to say.
+    let last = if reader.path() == args.log { "it".into() } else { reader.path().display().to_string() };
     let ends = match reader.end() {
-        Some(LogEnd::Cut { at }) => format!("it is cut off at byte {at}: the writer was killed"),
-        Some(LogEnd::Damaged { at }) => return fail(terminal, &format!("it is damaged at byte {at}")),
+        Some(LogEnd::Cut { at }) => format!("{last} is cut off at byte {at}: the writer was killed"),
+        Some(LogEnd::Damaged { at }) => return fail(terminal, &format!("{last} is damaged at byte {at}")),
         Some(LogEnd::Whole) | None => match reader.tail().and_then(|tail| tail.text("end")) {
             Some(end) => format!("it ended {end}"),
             None => "it was not ended: the writer was killed".into(),

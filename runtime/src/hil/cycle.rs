@@ -123,6 +123,8 @@ pub struct Gauges {
     pub late_ns_max: AtomicU64,
     /// Ticks missed.
     pub missed: AtomicU64,
+    /// Bytes that are free on the disk of the log; 0 without a log.
+    pub log_free: AtomicU64,
     /// Permitted outputs, then recorded quantities: SI, as bits.
     pub values: Vec<AtomicU64>,
 }
@@ -701,6 +703,7 @@ impl Hil {
         gauges.late_ns.store(self.cycle.late_ns.into(), Ordering::Relaxed);
         gauges.late_ns_max.fetch_max(if runs { self.cycle.late_ns.into() } else { 0 }, Ordering::Relaxed);
         gauges.missed.store(counts.missed, Ordering::Relaxed);
+        gauges.log_free.store(self.log.as_ref().map_or(0, Log::free), Ordering::Relaxed);
         let stage = match self.order {
             Order::Wait | Order::Follow => self.fieldbus.step() as u64,
             order => 100 + trace::order_number(order),

@@ -36,7 +36,8 @@ fn run_of((rig, model, plant): Made, seconds: f64, log: Option<&Path>) -> (End, 
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let masters = world.masters();
     let settings = log.map(|path| {
-        let settings = Settings { sink: Sink::File(path.into(), Limits::default()), cycles_per_block: 100, patient: true };
+        let settings =
+            Settings { sink: Sink::File(path.into(), Limits::default()), cycles_per_block: 100, patient: true };
         (settings, Sections::default().with("rig", "pair"))
     });
     let (mut hil, _) = Hil::new(&rig, model, world.clock(), masters, options, settings).unwrap();

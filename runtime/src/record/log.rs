@@ -23,10 +23,12 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 /// Kinds of blocks.
-const HEAD: u32 = 1;
-const MESSAGES: u32 = 2;
 const TAIL: u32 = 3;
 const PACKED: u32 = 4;
+const PACKED_HEAD: u32 = 5;
+/// Kinds that only older logs have: head and messages that are not packed.
+const HEAD: u32 = 1;
+const MESSAGES: u32 = 2;
 /// Name of the section that a file after the first has in its head: number of the part, hash of the first head.
 const PART: &str = "part";
 
@@ -150,6 +152,21 @@ pub struct Summary {
     pub removed: u64,
 }
 
+impl Summary {
+    /// Which files were written, and what became of older ones.
+    pub fn words(&self, first: &Path) -> String {
+        let size = parts::size(self.bytes);
+        let files = match u32::try_from(self.parts).unwrap_or(u32::MAX) {
+            0 | 1 => first.display().to_string(),
+            last => format!("{} … {}", first.display(), parts::path(first, last).display()),
+        };
+        match self.removed {
+            0 => format!("{files} ({size})"),
+            removed => format!("{files} ({size}); {removed} old logs were removed to make room"),
+        }
+    }
+}
+
 impl Log {
     /// Begins a log.
     ///
@@ -159,7 +176,7 @@ impl Log {
         let (queue, end) = queue(QUEUE);
         let shared = Arc::new(Shared::default());
         let mut carrier = Carrier::new(settings.sink, settings.cycles_per_block, end, shared.clone())?;
-        carrier.keep(HEAD, head.bytes())?;
+        carrier.keep_head(&head.bytes())?;
         let thread = std::thread::Builder::new().name("fric log".into()).spawn(move || carrier.carry())?;
         Ok(Log { queue, shared, patient: settings.patient, lost: 0, dropped: 0, thread: Some(thread) })
     }
@@ -291,39 +308,35 @@ impl Parts {
         self.writer = BlockWriter::new(parts::create(&self.first, self.number)?)?;
         let part = format!("{} {:08x}", self.number, blocks::mark(&self.head));
         let head = Sections::read(&self.head).unwrap_or_default().with(PART, part);
-        self.write(HEAD, &head.bytes())?;
+        self.write(PACKED_HEAD, &packed::pack_bytes(&head.bytes()))?;
         Ok(())
     }
 
     /// Appends a block; returns its bytes in the file.
     fn write(&mut self, kind: u32, bytes: &[u8]) -> io::Result<u64> {
-        if kind == HEAD && self.number == 1 {
-            self.head = bytes.to_vec();
-        }
         self.writer.write(kind, bytes)?;
         let added = bytes.len() as u64 + blocks::OVERHEAD;
         self.bytes += added;
         Ok(added)
     }
 
-    /// Makes room where all logs together may have so many bytes; looks at the disk. Returns the bytes that are free and how
-    /// many old logs were removed.
-    fn make_room(&self) -> io::Result<(u64, u64)> {
-        let path = parts::path(&self.first, self.number);
-        // While this file grows to its full length, all together stay within `keep`.
-        let removed = match self.limits.keep {
-            Some(keep) if self.bytes < self.limits.part / 2 => {
-                parts::remove_oldest(&path, keep.saturating_sub(self.limits.part).max(self.bytes))?
-            }
-            _ => 0,
-        };
-        let free = parts::free(&path)?;
+    /// Removes old logs where all together may have so many bytes; returns how many.
+    fn make_room(&self) -> io::Result<u64> {
+        // Room for this file: its part, and as much again for its head and for what it grows by until the next state.
+        let room = |keep: u64| keep.saturating_sub(2 * self.limits.part);
+        let current = parts::path(&self.first, self.number);
+        self.limits.keep.map_or(Ok(0), |keep| parts::remove_oldest(&current, room(keep)))
+    }
+
+    /// Bytes that are free on the disk; an error where a log must not take more.
+    fn free(&self) -> io::Result<u64> {
+        let free = parts::free(&parts::path(&self.first, self.number))?;
         if free < self.limits.reserve {
-            let (free, reserve) = (free >> 20, self.limits.reserve >> 20);
+            let (free, reserve) = (free / 1_000_000, self.limits.reserve / 1_000_000);
             let why = format!("the disk has {free} MB free, and the last {reserve} MB are left to others");
             return Err(io::Error::new(io::ErrorKind::StorageFull, why));
         }
-        Ok((free, removed))
+        Ok(free)
     }
 }
 
@@ -335,16 +348,22 @@ impl Carrier {
         };
         shared.parts.store(1, Ordering::Relaxed);
         let (block, tail) = (Vec::new(), Vec::new());
-        let mut carrier = Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, tail };
+        let carrier = Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, tail };
         carrier.make_room()?;
+        carrier.look_at_disk()?;
         Ok(carrier)
     }
 
-    fn make_room(&mut self) -> io::Result<()> {
+    fn make_room(&self) -> io::Result<()> {
         if let Out::File(parts) = &self.out {
-            let (free, removed) = parts.make_room()?;
-            self.shared.free.store(free, Ordering::Relaxed);
-            self.shared.removed.fetch_add(removed, Ordering::Relaxed);
+            self.shared.removed.fetch_add(parts.make_room()?, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+
+    fn look_at_disk(&self) -> io::Result<()> {
+        if let Out::File(parts) = &self.out {
+            self.shared.free.store(parts.free()?, Ordering::Relaxed);
         }
         Ok(())
     }
@@ -404,7 +423,7 @@ impl Carrier {
     fn close(&mut self) -> io::Result<()> {
         self.cycles = 0;
         let block = std::mem::take(&mut self.block);
-        if block.is_empty() { Ok(()) } else { self.keep(MESSAGES, block) }
+        if block.is_empty() { Ok(()) } else { self.keep(PACKED, packed::pack(&block)) }
     }
 
     /// Ends this file and begins the next one.
@@ -414,21 +433,25 @@ impl Carrier {
         parts.next()?;
         self.shared.written.fetch_add(parts.bytes, Ordering::Relaxed);
         self.shared.parts.fetch_add(1, Ordering::Relaxed);
-        Ok(())
+        self.make_room()
+    }
+
+    fn keep_head(&mut self, head: &[u8]) -> io::Result<()> {
+        if let Out::File(parts) = &mut self.out {
+            parts.head = head.to_vec();
+        }
+        self.keep(PACKED_HEAD, packed::pack_bytes(head))
     }
 
     fn keep(&mut self, kind: u32, bytes: Vec<u8>) -> io::Result<()> {
-        let (kind, bytes) = if kind == MESSAGES { (PACKED, packed::pack(&bytes)) } else { (kind, bytes) };
         match &mut self.out {
             Out::File(parts) => {
                 let added = parts.write(kind, &bytes)?;
                 self.shared.written.fetch_add(added, Ordering::Relaxed);
-                if kind == PACKED {
-                    self.make_room()?;
-                }
+                self.look_at_disk()?;
             }
             Out::Ring { head, blocks, most, .. } => match kind {
-                HEAD => *head = bytes,
+                PACKED_HEAD => *head = bytes,
                 PACKED => {
                     blocks.push_back(bytes);
                     if blocks.len() > *most {
@@ -442,14 +465,15 @@ impl Carrier {
     }
 
     /// Writes a black box.
-    fn write_out(&mut self) -> io::Result<()> {
-        let Out::Ring { path, head, blocks, .. } = &self.out else { return Ok(()) };
+    fn write_out(&self) -> io::Result<()> {
+        let Out::Ring { path, head, blocks: kept, .. } = &self.out else { return Ok(()) };
         let mut writer = BlockWriter::new(File::create(path)?)?;
-        writer.write(HEAD, head)?;
-        for block in blocks {
-            writer.write(PACKED, block)?;
+        let all = [(PACKED_HEAD, head)].into_iter().chain(kept.iter().map(|block| (PACKED, block)));
+        for (kind, bytes) in all.chain([(TAIL, &self.tail)]) {
+            writer.write(kind, bytes)?;
+            self.shared.written.fetch_add(bytes.len() as u64 + blocks::OVERHEAD, Ordering::Relaxed);
         }
-        writer.write(TAIL, &self.tail)
+        Ok(())
     }
 }
 
@@ -497,7 +521,12 @@ impl Reader {
         let blocks = BlockReader::new(BufReader::new(file)).map_err(|error| error.to_string())?;
         let Some(mut blocks) = blocks else { return Err("it is not a log of fric".into()) };
         let first = blocks.block().map_err(|error| error.to_string())?;
-        let head = first.filter(|block| block.kind == HEAD).and_then(|block| Sections::read(&block.bytes));
+        let bytes = first.and_then(|Block { kind, bytes }| match kind {
+            PACKED_HEAD => packed::unpack_bytes(&bytes, BLOCK_LONGEST as usize),
+            HEAD => Some(bytes),
+            _ => None,
+        });
+        let head = bytes.and_then(|bytes| Sections::read(&bytes));
         let Some(head) = head else { return Err("its head is cut off or damaged".into()) };
         Ok((blocks, head))
     }
@@ -749,7 +778,8 @@ mod tests {
         std::fs::write(&second, bytes).unwrap();
         // The same parts after another head.
         let other = folder.path().join("other.friclog");
-        let mut log = Log::begin(settings(Sink::File(other.clone(), limits)), &Sections::default().with("a", "b")).unwrap();
+        let mut log =
+            Log::begin(settings(Sink::File(other.clone(), limits)), &Sections::default().with("a", "b")).unwrap();
         log.push(CYCLE, &[1]);
         drop(log);
         std::fs::copy(&second, parts::path(&other, 2)).unwrap();

@@ -11,13 +11,16 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+/// So little free space is told while a rig runs: some hours of a log at 1 kHz.
+const LITTLE: u64 = 1_000_000_000;
+
 /// The ending of logs.
 pub const ENDING: &str = "friclog";
 
 /// How large a log may become.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Limits {
-    /// Bytes after which a part is followed by the next one.
+    /// Bytes after which a part is followed by the next one; at most a quarter of `keep`.
     pub part: u64,
     /// Bytes that all logs in the folder may have together: the oldest files are removed. None: all are kept.
     pub keep: Option<u64>,
@@ -26,10 +29,43 @@ pub struct Limits {
 }
 
 impl Default for Limits {
-    /// Parts of 256 MB, all of them kept, 64 MB left free.
+    /// Parts of 256 MB, all of them kept; 64 MB of the disk are left to others.
     fn default() -> Limits {
-        Limits { part: 256 << 20, keep: None, reserve: 64 << 20 }
+        Limits { part: 256_000_000, keep: None, reserve: 64_000_000 }
     }
+}
+
+/// A number of bytes as one types it: `256MB`, `10 GB`, `1.5 TB`; powers of 1000.
+///
+/// # Errors
+/// What is wrong with it, in words.
+pub fn bytes(text: &str) -> Result<u64, String> {
+    let text = text.trim();
+    let (number, unit) = text.split_at(text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len()));
+    let factor = match unit {
+        "kB" | "KB" => 1e3,
+        "MB" => 1e6,
+        "GB" => 1e9,
+        "TB" => 1e12,
+        _ => return Err("write a size with its unit, such as 256MB or 10GB".into()),
+    };
+    match number.trim().parse::<f64>() {
+        Ok(number) if number > 0.0 && number * factor <= 1e18 => Ok((number * factor).round() as u64),
+        _ => Err(format!("`{number}` is no size: write 256MB or 10GB")),
+    }
+}
+
+/// Bytes in words: `12.3 MB`, `45.2 GB`.
+pub fn size(bytes: u64) -> String {
+    match bytes as f64 {
+        bytes if bytes < 1e9 => format!("{:.1} MB", bytes * 1e-6),
+        bytes => format!("{:.1} GB", bytes * 1e-9),
+    }
+}
+
+/// What to say of the space that is free for a log: nothing where there is enough, or none is known (0).
+pub fn warning(free: u64) -> Option<String> {
+    (0 < free && free < LITTLE).then(|| format!("the log has {} left on its disk", size(free)))
 }
 
 /// The path of part `number` (from 1) of the log whose first part is `first`.
@@ -156,6 +192,17 @@ mod tests {
         assert!(!named("a.friclog").exists() && !named("b.friclog").exists() && named("c.friclog").exists());
         assert_eq!(remove_oldest(&named("now.friclog"), 0).unwrap(), 1);
         assert!(named("now.friclog").exists() && named("notes.txt").exists());
+    }
+
+    #[test]
+    fn sizes_have_units() {
+        assert_eq!(
+            ["256MB", " 1.5 GB ", "2TB", "1kB"].map(bytes),
+            [256_000_000, 1_500_000_000, 2_000_000_000_000, 1000].map(Ok)
+        );
+        for wrong in ["", "12", "MB", "-1 MB", "0 GB", "nan GB", "inf TB", "1e20 TB", "3 mB", "3 MBs"] {
+            assert!(bytes(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]
