@@ -49,11 +49,11 @@ pub mod can;
 
 pub mod bench_rt;
 
+pub mod safety;
+
 pub mod canopen;
 
 pub mod drive;
-
-pub mod safety;
 
 pub mod hil;
 

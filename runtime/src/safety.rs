@@ -277,11 +277,14 @@ pub enum Protection {
     Latch,
     Narrow,
     Report,
+    Kept,
+    Followed,
+    Silence,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 12] = [
+    pub const ALL: [(&'static str, Protection); 15] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -294,6 +297,9 @@ impl Protection {
         ("latch", Protection::Latch),
         ("narrow", Protection::Narrow),
         ("report", Protection::Report),
+        ("kept", Protection::Kept),
+        ("followed", Protection::Followed),
+        ("silence", Protection::Silence),
     ];
 }
 
@@ -660,6 +666,20 @@ impl Supervisor {
     fn on(&self, protection: Protection) -> bool {
         self.missing != Some(protection)
     }
+}
+
+/// Whether a protection outside of the supervisor is there: always, but for a test of the tests.
+#[cfg(not(feature = "mutants"))]
+#[inline(always)]
+pub fn is_present(_: Protection) -> bool {
+    true
+}
+
+/// Whether a protection outside of the supervisor is there: all but the one that `FRIC_MUTANT` takes away.
+#[cfg(feature = "mutants")]
+pub fn is_present(protection: Protection) -> bool {
+    static MISSING: std::sync::OnceLock<Option<Protection>> = std::sync::OnceLock::new();
+    *MISSING.get_or_init(missing) != Some(protection)
 }
 
 /// The protection that `FRIC_MUTANT` takes away.

@@ -15,6 +15,7 @@ use super::trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 use crate::can::Frame;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{Nmt, NmtState};
+use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use std::fmt;
 
@@ -163,6 +164,10 @@ const MODE_NS: u64 = 1_000_000_000;
 const ENABLE_NS: u64 = 5_000_000_000;
 /// Angle by which a shaft is turned from outside, rad.
 const BY_HAND: f64 = 0.2;
+/// Time in which a drive must show that it obeys a stop, ns: then our life sign ends, and it stops by its own time-out.
+const OBEYS_NS: u64 = 20_000_000;
+/// How often such a drive is told by network management, ns.
+const INSISTS_NS: u64 = 10_000_000;
 /// How long our life sign goes on at rest before it stops.
 const CALM_NS: u64 = 50_000_000;
 
@@ -690,7 +695,8 @@ impl Fieldbus {
                 }
                 self.within(MODE_NS, lasted_ns, Drive::wrong_mode);
             }
-            Step::AwaitEnable | Step::AwaitArm | Step::Armed | Step::Stopped | Step::Refused => {}
+            Step::AwaitEnable | Step::AwaitArm | Step::Armed => {}
+            Step::Stopped | Step::Refused => self.insist(now_ns, lasted_ns, send),
             Step::Enable | Step::Reenable => self.enable(lasted_ns, send),
             Step::TimeoutTest => self.test_timeouts(now_ns, lasted_ns, send),
             Step::SignTest => self.test_signs(),
@@ -712,6 +718,23 @@ impl Fieldbus {
             match worst {
                 Some(at) => self.refuse(Some(at), Why::Missed(self.missed[at], self.answers)),
                 None => self.go(Step::Mode),
+            }
+        }
+    }
+
+    /// A drive that does not obey a stop may not hear us: nothing reaches it, or only its set-points do not. It is told by
+    /// network management, and our life sign ends: its own time-out, which the start-up has tested, stops it.
+    fn insist(&mut self, now_ns: u64, lasted_ns: u64, send: Send) {
+        if lasted_ns < OBEYS_NS || !is_present(Protection::Silence) {
+            return;
+        }
+        for at in 0..self.nodes.len() {
+            let Node::Drive(drive) = &self.nodes[at] else { continue };
+            if drive.disobeys() {
+                self.silent_since_ns.get_or_insert(now_ns);
+                if lasted_ns % INSISTS_NS < self.period_ns {
+                    send(self.places[at], Nmt::PreOperational.frame(drive.node()));
+                }
             }
         }
     }

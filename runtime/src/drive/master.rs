@@ -536,6 +536,15 @@ impl Drive {
         self.ticks = self.ticks.wrapping_add(1);
     }
 
+    /// Whether it has torque although it was told to stop, and is not on the way.
+    pub(super) fn disobeys(&self) -> bool {
+        match self.goal {
+            Goal::Enabled => false,
+            Goal::Stopped => self.state() == State::Enabled,
+            Goal::Off => matches!(self.state(), State::Enabled | State::QuickStop),
+        }
+    }
+
     /// The command for the next `end`, SI.
     pub fn command(&mut self, value: f64) {
         self.command = value;

@@ -324,6 +324,52 @@ fn row_7_nobody_acknowledges_and_a_queue_that_is_full() {
     assert!(matches!(within(stand.trips(now), 4 * MS), Cause::Bus(0) | Cause::Lost(_)));
 }
 
+/// Every frame that the rig sends while it is under way: SYNC, set-points, its heartbeat.
+const SENT: [u32; 4] = [0x080, 0x203, 0x204, 0x77F];
+
+#[test]
+fn row_7_a_queue_that_is_full_for_one_frame() {
+    for id in SENT {
+        let mut stand = Stand::armed(|_, _| ());
+        let now = stand.now();
+        stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Full).id(id).from(now));
+        // The heartbeat goes out each other period and a half.
+        let cause = within(stand.trips(now), if id == 0x77F { 6 * MS } else { 2 * MS });
+        assert_eq!(cause, Cause::Bus(0), "{id:03X}");
+    }
+    // One frame that is not taken, while the rig stops already, is not a reason to forget the stop.
+    let mut stand = Stand::armed(|_, _| ());
+    let now = stand.now();
+    stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Full).id(0x204).from(now).times(1));
+    assert_eq!(within(stand.stops(now), 2 * MS), Cause::Bus(0));
+}
+
+#[test]
+fn row_14_commands_that_are_lost_on_the_way() {
+    for (id, node) in [(0x203, 0), (0x204, 1)] {
+        let mut stand = Stand::armed(|_, model| param(model, 0, 1.5));
+        let now = stand.now();
+        stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Drop).id(id).from(now));
+        let (mut apart, limit) = (None, now + 1_000 * MS);
+        while stand.cause.is_none() {
+            stand.cycle();
+            let output = stand.rig.outputs.iter().position(|output| output.signal.node == node).unwrap();
+            let torque = stand.world.bench().shaft(node).torque;
+            let differs = (torque - stand.last[output]).abs() > 0.2;
+            apart = if differs { apart.or(Some(stand.now())) } else { None };
+            assert!(apart.is_none_or(|since| stand.now() <= since + 12 * MS), "{id:03X}: apart since {apart:?} ns");
+            assert!(stand.now() < limit, "{id:03X}: nobody noticed");
+        }
+        assert!(
+            matches!(stand.cause, Some((Cause::NotFollowing(at) | Cause::Drive(at), _)) if at == node),
+            "{:?}",
+            stand.cause
+        );
+        // It hears neither the stop; without our life sign it stops by itself.
+        stand.stops(stand.now());
+    }
+}
+
 #[test]
 fn row_8_a_bus_that_goes_off_does_not_come_back_to_motion() {
     let mut stand = Stand::armed(|_, _| ());

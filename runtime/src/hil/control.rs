@@ -5,6 +5,7 @@
 //! bits. It allocates in [`Control::new`] only.
 
 use super::coupling::{Coupling, Verdict};
+use super::followed::{self, Followed};
 use crate::drive::profiles;
 use crate::lookahead::Wired;
 use crate::safety::{Cause, DriveLimits, Order, OutputLimits, Patience, Refused, Seen, Supervisor};
@@ -153,6 +154,9 @@ pub struct Control {
     seen_at: Vec<(Option<usize>, Option<usize>)>,
     seen: Vec<Seen>,
     paired: Vec<Paired>,
+    followed: Vec<Followed>,
+    /// The drives were told to follow in the cycle before.
+    follows: bool,
     requests: Vec<f64>,
     /// What a change of parameters left between the old and the new request, and the ticks it still lasts.
     offsets: Vec<f64>,
@@ -258,6 +262,13 @@ impl Control {
             Some(Paired { speed, position, most, before: None, odd: 0 }).filter(|_| !refreshed)
         });
         let paired = paired.collect();
+        let odd = if options.count_overruns { ODD.max(ticks(ODD_NS)) } else { ODD };
+        let followed = outputs.iter().enumerate().filter_map(|(output, limits)| {
+            let answer = followed::answer(rig, output)?;
+            let signal = watched.iter().position(|watched| watched.signal == answer)?;
+            Followed::new(rig, output, signal, limits).map(|followed| followed.patient(odd))
+        });
+        let followed = followed.collect();
         let signals: Vec<Signal> = watched.iter().map(|watched| watched.signal).collect();
         let mut coupling = Coupling::new(rig, look, &signals, &model);
         coupling.stops_for(options.needs_look, options.energy_stops);
@@ -269,13 +280,15 @@ impl Control {
             supervisor,
             coupling,
             watched,
-            odd: if options.count_overruns { ODD.max(ticks(ODD_NS)) } else { ODD },
+            odd,
             inputs,
             outputs: rig.outputs.iter().map(|output| output.slot).collect(),
             stops: rig.stops.iter().map(|stop| stop.slot).collect(),
             seen: vec![Seen::default(); seen_at.len()],
             seen_at,
             paired,
+            followed,
+            follows: false,
             requests: rig.outputs.iter().map(|output| output.safe).collect(),
             offsets: vec![0.0; rig.outputs.len()],
             blend: (0, ticks(options.blend_ns).max(1)),
@@ -339,6 +352,7 @@ impl Control {
         told.causes.iter().for_each(|cause| self.supervisor.trip(*cause));
         self.read(told.readings, told.ticks, told.source);
         self.compare(told);
+        self.compare_commands(told);
         let missed = told.ticks.saturating_sub(1);
         let most = match self.overrun {
             Overrun::Stop => 0,
@@ -365,6 +379,7 @@ impl Control {
         if computes {
             self.coupling.sent(self.supervisor.permitted());
         }
+        self.follows = armed && order == Order::Follow;
         order
     }
 
@@ -418,6 +433,23 @@ impl Control {
             pair.odd = if agrees { 0 } else { pair.odd + 1 };
             if pair.odd >= self.odd {
                 self.supervisor.trip(Cause::Implausible(pair.position));
+            }
+        }
+    }
+
+    /// Trips where a drive has not done what it was told for too long. Permitted outputs are still those of the cycle before.
+    fn compare_commands(&mut self, told: &Told) {
+        for followed in &mut self.followed {
+            let answer = &self.watched[followed.signal];
+            let sent = self.supervisor.permitted()[followed.output];
+            let judged = followed.is_early() || self.running;
+            if !self.follows || !judged {
+                followed.rest(if followed.is_early() { sent } else { answer.last }, sent);
+                continue;
+            }
+            let fresh = (answer.since == Some(0)).then_some(answer.last);
+            if followed.judge(told.ticks, sent, fresh) {
+                self.supervisor.trip(Cause::NotFollowing(followed.node));
             }
         }
     }
@@ -529,6 +561,8 @@ impl Control {
             let (from, late_ns) = pair.before.unwrap_or_default();
             words.extend([u64::from(pair.before.is_some()), from.to_bits(), late_ns.into(), pair.odd.into()]);
         }
+        self.followed.iter().for_each(|followed| followed.save(words));
+        words.push(self.follows.into());
         self.supervisor.save(words);
         self.coupling.save(words);
     }
@@ -553,6 +587,8 @@ impl Control {
             pair.before = known.then_some(before);
             pair.odd = u32::try_from(words.next()?).ok()?;
         }
+        self.followed.iter_mut().try_for_each(|followed| followed.restore(&mut words))?;
+        self.follows = words.next()? != 0;
         self.supervisor.restore(&mut words)?;
         self.coupling.restore(&mut words)?;
         words.next().is_none().then_some(())
@@ -679,6 +715,9 @@ mod tests {
             if speed.value.abs() < 100.0 {
                 self.readings[position].value += speed.value * 1e-3 * f64::from(ticks);
             }
+            // The drive does what it was told.
+            let torque = at(What::Torque);
+            self.readings[torque].value = self.control.supervisor().permitted()[0];
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
             let told = Told { ticks, late_ns: 0, readings: &self.readings, source, wanted, causes, set };
             self.control.cycle(&told);

@@ -18,7 +18,7 @@ use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
 use crate::lookahead::Wired;
 use crate::queue::{Receiver, Sender, queue};
 use crate::record::log::{self, Log, Sections};
-use crate::safety::{Cause, Clamps, Order, Seen, Supervisor};
+use crate::safety::{Cause, Clamps, Order, Protection, Seen, Supervisor, is_present};
 use abi::rig::{Rig, Signal};
 use abi::{Instance, Slot};
 use std::io;
@@ -33,6 +33,8 @@ const OVERLOAD: u32 = 3;
 const STATE_EVERY: u64 = 1000;
 /// Parameters that can be changed at once.
 pub const SET_MOST: usize = 16;
+/// Causes that may come in one cycle, beside those of buses and nodes.
+const CAUSES: usize = 40;
 /// Time in which drives must lose their torque once they are told to.
 const REST_NS: u64 = 1_000_000_000;
 
@@ -138,7 +140,7 @@ struct Wires {
     acknowledged: bool,
     /// Words of the frames of this cycle.
     frames: Vec<u64>,
-    /// What went wrong in this cycle.
+    /// What went wrong since causes were judged last: a frame that is not taken after that counts in the next cycle.
     causes: Vec<Cause>,
     lossy: bool,
     lost: u64,
@@ -280,7 +282,8 @@ impl Hil {
                 watchdog: None,
                 acknowledged: false,
                 frames: Vec::with_capacity(1 << 14),
-                causes: Vec::with_capacity(16),
+                // Each bus, each node twice, as many foreign frames as there are places for troubles, and a few more.
+                causes: Vec::with_capacity(CAUSES + rig.buses.len() + 2 * rig.nodes.len()),
                 lossy: false,
                 lost: 0,
                 refused: 0,
@@ -408,7 +411,9 @@ impl Hil {
         let ticks = u32::try_from(missed + 1).unwrap_or(u32::MAX);
 
         self.wires.frames.clear();
-        self.wires.causes.clear();
+        if !is_present(Protection::Kept) {
+            self.wires.causes.clear();
+        }
         self.wires.lossy = false;
         self.operate();
         self.wires.drain(&mut self.fieldbus);
@@ -424,6 +429,7 @@ impl Hil {
         self.gather();
         self.cycle.late_ns = u32::try_from(late_ns).unwrap_or(u32::MAX);
         let order = self.compute(ticks);
+        self.wires.causes.clear();
         let computed_ns = self.wires.clock.now_ns();
         self.tell(order);
         let Hil { fieldbus, wires, .. } = self;
@@ -614,6 +620,7 @@ impl Hil {
             return self.refuse(format!("`{name}` does not tell a signal that is needed ({:?})", missing.what));
         }
         self.cycle = trace::Cycle::new(shape);
+        self.cycle.causes.reserve(self.wires.causes.capacity());
         if let Some((settings, head)) = self.log_wanted.take() {
             let head = head.with("settings", trace::settings_to_bytes(&bounds, &self.options.control));
             let head = head.with("drives", self.identities());

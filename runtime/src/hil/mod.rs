@@ -5,6 +5,7 @@
 
 pub mod coupling;
 pub mod standard;
+pub mod followed;
 pub mod control;
 pub mod trace;
 pub mod replay;

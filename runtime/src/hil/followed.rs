@@ -1,0 +1,261 @@
+//! Whether a drive does what it was told: its reading of the commanded quantity, compared with the commands sent to it.
+//!
+//! In: permitted commands, readings. Out: whether a drive has not followed for too long. Knows neither bus nor model.
+//!
+//! The commands of the last ticks, taken together, bound what a first-order lag after any dead time up to the drive's own
+//! can have reached: its output stays between two envelopes. Each is the extreme command of the window, or the envelope
+//! of the tick before as far as it has decayed towards that:
+//!
+//!   high(k) = max(u, high(k−1) + s·(u − high(k−1)))     u = greatest command of the window
+//!   s       = T / (T + τ)  ≤  1 − e^(−T/τ)              never faster than the lag itself
+//!
+//! A reading outside of the envelopes by more than a tolerance is one that no command explains.
+
+use crate::drive::profiles;
+use crate::safety::{OutputLimits, Protection, is_present};
+use abi::rig::{Kind, Mode, Rig, Signal, What};
+
+/// Dead time beyond the drive's own for which a command may be under way, s: a late cycle, a busy bus.
+const SLACK: f64 = 1e-3;
+/// How much slower than told the lag of a drive may be.
+const SLOWER: f64 = 1.5;
+/// Tolerance of a torque, as part of the rated torque: offset and noise of a drive's own measurement.
+const TORQUE_PART: f64 = 0.03;
+/// Ticks without a break outside of the envelopes after which a torque is not followed.
+const TORQUE_TICKS: u32 = 5;
+/// Time constant that a loop for speed or position may have, s, and the time it may need for a large step, ns: what the
+/// drive and its load make of a set-point is not in the text of a rig.
+const LOOP: f64 = 0.1;
+const LOOP_NS: u64 = 1_000_000_000;
+/// Tolerance of a speed or a position, as part of half the range of its command.
+const LOOP_PART: f64 = 0.1;
+/// Most ticks that an envelope is carried over at once: after so many it has decayed, whatever the lag.
+const MOST_TICKS: u32 = 1000;
+
+/// The watch of one drive.
+pub struct Followed {
+    /// Index of its node.
+    pub node: usize,
+    /// Its command among the outputs.
+    pub output: usize,
+    /// Its answer among the signals.
+    pub signal: usize,
+    /// It is judged in the start-up too.
+    early: bool,
+    /// Commands of the last ticks, and where the next one goes.
+    window: Vec<f64>,
+    at: usize,
+    /// How far an envelope decays in a tick.
+    share: f64,
+    low: f64,
+    high: f64,
+    tolerance: f64,
+    patience: u32,
+    /// Ticks without a break outside of the envelopes.
+    outside: u32,
+}
+
+/// The signal that tells what a drive makes of its command; none where it has none.
+pub fn answer(rig: &Rig, output: usize) -> Option<Signal> {
+    let signal = rig.outputs[output].signal;
+    let node = &rig.nodes[signal.node];
+    let Kind::Cia402(drive) = &node.kind else { return None };
+    let what = match drive.mode {
+        Mode::Torque => What::Torque,
+        Mode::Speed => What::Speed,
+        Mode::Position => What::Position,
+    };
+    node.moves.then_some(Signal { node: signal.node, what })
+}
+
+impl Followed {
+    /// The watch of an output whose answer is at this place among the signals.
+    pub fn new(rig: &Rig, output: usize, signal: usize, limits: &OutputLimits) -> Option<Followed> {
+        let at = answer(rig, output)?;
+        let node = &rig.nodes[at.node];
+        let Kind::Cia402(drive) = &node.kind else { return None };
+        let period = rig.period_ns as f64 * 1e-9;
+        let profile = profiles::find(&drive.profile)?;
+        let torque = drive.mode == Mode::Torque;
+        let half = 0.5 * (limits.high - limits.low);
+        let tolerance = match drive.mode {
+            Mode::Torque => TORQUE_PART * drive.rated_torque + 2.0 * drive.rated_torque / profile.full_torque as f64,
+            Mode::Speed => LOOP_PART * half + 4.0 * drive.speed_unit,
+            Mode::Position => LOOP_PART * half + 4.0 * drive.count,
+        };
+        // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late.
+        let dead = node.delay + SLACK + 2.0 * profile.refresh_ns as f64 * 1e-9;
+        let lag = SLOWER * node.lag + if torque { 0.0 } else { LOOP };
+        let patience = if torque { TORQUE_TICKS } else { ticks(LOOP_NS, rig.period_ns) };
+        Some(Followed {
+            node: at.node,
+            output,
+            signal,
+            early: torque,
+            window: vec![0.0; (dead / period) as usize + 2],
+            at: 0,
+            share: period / (period + lag),
+            low: 0.0,
+            high: 0.0,
+            tolerance,
+            patience,
+            outside: 0,
+        })
+    }
+
+    /// The same, with so many ticks at least.
+    pub fn patient(self, least: u32) -> Followed {
+        Followed { patience: self.patience.max(least), ..self }
+    }
+
+    /// Whether it is judged while the start-up asks for the outputs.
+    pub fn is_early(&self) -> bool {
+        self.early
+    }
+
+    /// Nothing was commanded yet, and this is what it tells.
+    pub fn rest(&mut self, told: f64, idle: f64) {
+        self.window.fill(idle);
+        (self.low, self.high, self.outside) = (told.min(idle), told.max(idle), 0);
+    }
+
+    /// So many ticks have passed with this command. True: what the drive told in this tick, if it did, has been outside of
+    /// the envelopes for too long.
+    pub fn judge(&mut self, ticks: u32, sent: f64, told: Option<f64>) -> bool {
+        for _ in 0..ticks.min(MOST_TICKS) {
+            self.window[self.at] = sent;
+            self.at = if self.at + 1 == self.window.len() { 0 } else { self.at + 1 };
+            let (mut least, mut greatest) = (sent, sent);
+            for command in &self.window {
+                least = least.min(*command);
+                greatest = greatest.max(*command);
+            }
+            self.low = least.min(self.low + (least - self.low) * self.share);
+            self.high = greatest.max(self.high + (greatest - self.high) * self.share);
+        }
+        let Some(told) = told else { return false };
+        let follows = self.low - self.tolerance <= told && told <= self.high + self.tolerance;
+        self.outside = if follows { 0 } else { self.outside.saturating_add(1) };
+        self.outside >= self.patience && is_present(Protection::Followed)
+    }
+
+    /// All that the next cycle depends on, as words: appended.
+    pub fn save(&self, words: &mut Vec<u64>) {
+        words.extend(self.window.iter().chain([&self.low, &self.high]).map(|x| x.to_bits()));
+        words.extend([self.at as u64, self.outside.into()]);
+    }
+
+    /// Takes over what [`Followed::save`] gave. None if it does not fit.
+    pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
+        for x in self.window.iter_mut().chain([&mut self.low, &mut self.high]) {
+            *x = f64::from_bits(words.next()?);
+        }
+        self.at = usize::try_from(words.next()?).ok().filter(|at| *at < self.window.len())?;
+        self.outside = u32::try_from(words.next()?).ok()?;
+        Some(())
+    }
+}
+
+fn ticks(ns: u64, period_ns: u64) -> u32 {
+    u32::try_from(ns.div_ceil(period_ns)).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::chance::Chance;
+    use crate::hil::bench;
+
+    fn watch(delay: f64, lag: f64) -> Followed {
+        let (mut rig, _) = bench::rig();
+        (rig.nodes[0].delay, rig.nodes[0].lag) = (delay, lag);
+        let limits =
+            OutputLimits { low: -1.0, high: 1.0, slew: f64::INFINITY, safe: 0.0, drive: Some(0), torque: true };
+        Followed::new(&rig, 0, 0, &limits).unwrap()
+    }
+
+    /// A drive that gets the commands until tick `lost` and keeps the last one from then on; each acts from its tick plus
+    /// the dead time on (ms), through a lag (ms), and the torque is told in steps of 4 mN·m at each tick. The tick in which
+    /// the watch trips, and the first tick from which on what is told was further than 0.3 N·m from what was sent.
+    fn run(
+        watch: &mut Followed,
+        (dead, lag): (f64, f64),
+        mut command: impl FnMut(u32) -> f64,
+        lost: u32,
+    ) -> (Option<u32>, Option<u32>) {
+        let (mut got, mut sent, mut torque, mut apart) = (Vec::new(), 0.0f64, 0.0, None);
+        watch.rest(0.0, 0.0);
+        for k in 0..400u32 {
+            for part in 0..50 {
+                let act = f64::from(k) - 1.0 + f64::from(part) / 50.0 - dead;
+                let acts: f64 = if act < 0.0 { 0.0 } else { got.get(act as usize).copied().unwrap_or(sent) };
+                torque = if lag > 0.0 { torque + (acts - torque) * (0.02 / (lag + 0.02)) } else { acts };
+            }
+            let told = (torque / 4e-3).round() * 4e-3;
+            apart = if (told - sent).abs() > 0.3 { apart.or(Some(k)) } else { None };
+            if watch.judge(u32::from(k > 0), sent, Some(told)) {
+                return (Some(k), apart);
+            }
+            sent = command(k);
+            got.push(if k < lost { sent } else { got.last().copied().unwrap_or(0.0) });
+        }
+        (None, apart)
+    }
+
+    /// Commands that change every some ticks, by chance.
+    fn steps(mut random: Chance) -> impl FnMut(u32) -> f64 {
+        let (every, mut held) = (1 + random.below(20) as u32, 0.0);
+        move |k| {
+            if k.is_multiple_of(every) {
+                held = random.between(-1.0, 1.0);
+            }
+            held
+        }
+    }
+
+    #[test]
+    fn no_dead_time_and_no_lag_up_to_those_of_the_text_is_taken_for_not_following() {
+        for seed in 0..300 {
+            let mut random = Chance(seed);
+            let text = (random.between(0.0, 6.0), random.between(0.0, 5.0));
+            let is = (random.between(0.0, text.0 + 0.99), random.between(0.0, 1.5 * text.1));
+            let found = run(&mut watch(text.0 * 1e-3, text.1 * 1e-3), is, steps(random), u32::MAX).0;
+            assert_eq!(found, None, "seed {seed}: {text:?} ms in the text, {is:?} ms in truth");
+        }
+    }
+
+    #[test]
+    fn a_drive_that_keeps_an_old_torque_is_found_in_time() {
+        let mut found = 0;
+        for seed in 0..300 {
+            let mut random = Chance(seed);
+            let (dead, lag) = (random.between(0.0, 6.0), random.between(0.0, 3.0));
+            let lost = 100 + random.below(100) as u32;
+            // It stays where it was; the command goes to one end.
+            let end = if random.below(2) == 0 { -1.0 } else { 1.0 };
+            let mut before = steps(random);
+            let command = |k: u32| if k < lost { before(k) } else { end };
+            let (tripped, apart) = run(&mut watch(dead * 1e-3, lag * 1e-3), (dead, lag), command, lost);
+            let Some(apart) = apart else { continue };
+            found += 1;
+            let within = (dead + 8.0 * lag + 1.0) as u32 + 2 + TORQUE_TICKS;
+            let tripped = tripped.unwrap_or_else(|| panic!("seed {seed}: never, apart since {apart}"));
+            assert!(tripped <= apart.max(lost) + within, "seed {seed}: {tripped}, apart since {apart}, lost at {lost}");
+        }
+        assert!(found > 200, "{found} cases");
+    }
+
+    #[test]
+    fn what_is_saved_goes_on_as_before() {
+        let (mut first, mut second) = (watch(0.8e-3, 0.6e-3), watch(0.8e-3, 0.6e-3));
+        for k in 0..40 {
+            let mut words = Vec::new();
+            first.save(&mut words);
+            assert_eq!(second.restore(&mut words.iter().copied()), Some(()));
+            assert_eq!(watch(0.8e-3, 0.6e-3).restore(&mut words[1..].iter().copied()), None);
+            let (sent, told) = (f64::from(k % 7) * 0.1, f64::from(k % 11) * 0.1);
+            assert_eq!(first.judge(1, sent, Some(told)), second.judge(1, sent, Some(told)), "tick {k}");
+            assert_eq!((first.low, first.high, first.outside), (second.low, second.high, second.outside));
+        }
+    }
+}
