@@ -83,6 +83,21 @@ pub struct Node {
     pub timeout_ns: u64,
 }
 
+impl Node {
+    /// Whether a command for this signal moves the node, unless it is 0: torque, speed or position of a drive with a profile; of
+    /// one described by frames what has the dimension of a force, a torque, a speed, an acceleration or a current.
+    pub fn is_moved_by(&self, what: What) -> bool {
+        self.moves
+            && match (&self.kind, what) {
+                (Kind::Cia402(_), _) => true,
+                (Kind::Frames(messages), What::Field(message, field)) => {
+                    messages[message].fields[field].unit.dimension.moves()
+                }
+                (Kind::Frames(_), _) => false,
+            }
+    }
+}
+
 /// How a node speaks.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Kind {

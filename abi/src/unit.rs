@@ -131,6 +131,21 @@ impl Dimension {
         Dimension([kg, kg + kg, s, a, k])
     }
 
+    /// Whether a command of this kind moves what it acts on, unless it is 0: force, torque, velocity, angular velocity,
+    /// acceleration, current.
+    pub fn moves(self) -> bool {
+        let kinds: [[i32; 5]; 7] = [
+            [1, 1, -2, 0, 0],
+            [1, 2, -2, 0, 0],
+            [0, 1, -1, 0, 0],
+            [0, 0, -1, 0, 0],
+            [0, 1, -2, 0, 0],
+            [0, 0, -2, 0, 0],
+            [0, 0, 0, 1, 0],
+        ];
+        kinds.iter().any(|exponents| Dimension::of(*exponents) == self)
+    }
+
     /// Whether it is that of a pure number.
     pub fn is_none(self) -> bool {
         self == Dimension::NONE

@@ -335,23 +335,27 @@ impl Reader<'_, '_> {
             }
             (rig::Kind::Frames(_), _) => ((f64::NEG_INFINITY, f64::INFINITY), String::new()),
         };
-        let mut refuse = |message: String, label: String, help: String| {
-            self.diagnostics.push(Diagnostic::error("E0802", message).label(send.span, label).help(help));
+        let mut refuse = |code, message: String, label: String, help: String| {
+            self.diagnostics.push(Diagnostic::error(code, message).label(send.span, label).help(help));
         };
         let range = format!("{} .. {}", shown(carried.0), shown(carried.1));
         if low > high {
             let message = format!("the limit of `{text}` is empty");
-            refuse(message, format!("{} .. {}", shown(low), shown(high)), "the lower end comes first".into());
+            refuse("E0802", message, format!("{} .. {}", shown(low), shown(high)), "the lower end comes first".into());
         } else if send.limit.is_some() && (low < carried.0 || high > carried.1) {
             let message = format!("the limit of `{text}` does not fit what carries it");
-            refuse(message, because, format!("it carries {range}: narrow the limit"));
+            refuse("E0802", message, because, format!("it carries {range}: narrow the limit"));
         } else if safe < low.max(carried.0) || safe > high.min(carried.1) {
             let message = format!("the safe value of `{text}` lies outside of its limit");
-            refuse(message, shown(safe), "give a safe value within the limit".into());
+            refuse("E0802", message, shown(safe), "give a safe value within the limit".into());
+        } else if safe != 0.0 && node.is_moved_by(signal.what) {
+            let message = format!("the safe value of `{text}` would move it before it is armed");
+            let zero = if send.unit.text.is_empty() { "0".to_string() } else { format!("0 {}", send.unit) };
+            refuse("E0808", message, format!("{} is not 0", shown(safe)), format!("write `safe {text} = {zero}`"));
         }
         if slew <= 0.0 {
             let message = format!("a slew of {} never gets anywhere", units::three_digits(slew));
-            refuse(message, "not positive".into(), "give the greatest change per second".into());
+            refuse("E0802", message, "not positive".into(), "give the greatest change per second".into());
         }
         // Without a limit of its own a command keeps to what the drive allows.
         let (low, high) = match (&node.kind, send.limit) {
