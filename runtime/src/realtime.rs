@@ -98,6 +98,30 @@ pub fn enter(wishes: &Wishes) -> RealTime {
     RealTime { refused, priority_set, cores_before, _awake: awake }
 }
 
+/// Sets up the calling thread as one that must run although the thread that started it hangs: on any core but that one's if
+/// there is another, and before it as far as the system lets it.
+pub fn stand_by(priority: i32) {
+    if let Some(now) = cores() {
+        // SAFETY: all bytes 0 is an empty set.
+        let mut others: libc::cpu_set_t = unsafe { std::mem::zeroed() };
+        for core in 0..8 * size_of::<libc::cpu_set_t>() {
+            // SAFETY: the core lies within both sets.
+            unsafe {
+                if !libc::CPU_ISSET(core, &now) {
+                    libc::CPU_SET(core, &mut others);
+                }
+            }
+        }
+        // SAFETY: the set was read by the kernel, and is counted only.
+        if unsafe { libc::CPU_COUNT(&now) } == 1 {
+            // A set without a core of this machine is refused, and it stays where it is.
+            // SAFETY: the set is valid and outlives the call; 0 is the calling thread.
+            unsafe { libc::sched_setaffinity(0, size_of::<libc::cpu_set_t>(), &others) };
+        }
+    }
+    let _ = fifo(priority);
+}
+
 impl RealTime {
     /// What was not granted; nothing is what a real drive needs.
     pub fn refused(&self) -> &[Refusal] {

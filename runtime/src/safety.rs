@@ -280,11 +280,19 @@ pub enum Protection {
     Kept,
     Followed,
     Silence,
+    Behind,
+    Rounding,
+    Wrap,
+    Table,
+    OwnStack,
+    Permission,
+    Idle,
+    Deadline,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 15] = [
+    pub const ALL: [(&'static str, Protection); 23] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -300,6 +308,14 @@ impl Protection {
         ("kept", Protection::Kept),
         ("followed", Protection::Followed),
         ("silence", Protection::Silence),
+        ("behind", Protection::Behind),
+        ("rounding", Protection::Rounding),
+        ("wrap", Protection::Wrap),
+        ("table", Protection::Table),
+        ("own-stack", Protection::OwnStack),
+        ("permission", Protection::Permission),
+        ("idle", Protection::Idle),
+        ("deadline", Protection::Deadline),
     ];
 }
 

@@ -397,6 +397,12 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
                 line += &format!(", stopped after {} ms", value::significant(ns as f64 * 1e-6, 3));
             }
         }
+        line += &match status.deadline_ms {
+            Some(ms) => format!("; misses set-points after {ms} ms"),
+            None => {
+                "; has no deadline for set-points (object 1400:5): while it stands, lost ones are not noticed".into()
+            }
+        };
         terminal.line(&line);
     }
     terminal.line("  checks passed: nothing was armed");

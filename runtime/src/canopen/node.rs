@@ -135,6 +135,14 @@ impl Node {
         node
     }
 
+    /// The same without event timers of RPDOs (objects 1400:5 and following), which not every device has.
+    pub fn without_deadlines(&mut self) {
+        for i in 0..PDOS as u16 {
+            self.objects.remove(Object(0x1400 + i, 5));
+            self.factory.remove(Object(0x1400 + i, 5));
+        }
+    }
+
     /// Its number.
     pub fn id(&self) -> u8 {
         self.id

@@ -76,6 +76,8 @@ pub struct Bench {
     applied: Vec<Link>,
     /// For each node: where the plant gives its position and its speed.
     seen: Vec<(Option<abi::Slot>, Option<abi::Slot>)>,
+    /// Whether the plant takes the speed or the position of a node.
+    holds: Vec<bool>,
     /// Signals of devices that the plant gives.
     felt: Vec<Link>,
     /// Angular acceleration of a drive without a plant, rad/s² per N·m.
@@ -144,12 +146,17 @@ impl Bench {
             let signal = Signal { node, what };
             rig.plant.seen.iter().find(|(seen, _)| *seen == signal).map(|(_, slot)| *slot)
         };
+        let holds = |node| {
+            let held = |signal: &Signal| signal.node == node && matches!(signal.what, What::Speed | What::Position);
+            rig.plant.applied.iter().any(|(signal, _)| held(signal))
+        };
         let mut bench = Bench {
             buses: rig.nodes.iter().map(|node| node.bus).collect(),
             shafts: vec![Shaft::default(); bodies.len()],
             bodies,
             applied: rig.plant.applied.iter().map(link).collect(),
             seen: (0..rig.nodes.len()).map(|node| (seen(node, What::Position), seen(node, What::Speed))).collect(),
+            holds: (0..rig.nodes.len()).map(holds).collect(),
             felt: rig
                 .plant
                 .seen
@@ -316,6 +323,9 @@ impl Bench {
                     let value = match (&self.bodies[link.signal.node], link.signal.what) {
                         (Body::Drive(drive), What::Torque) => drive.applied(),
                         (Body::Drive(drive), What::Speed) => drive.speed(),
+                        (Body::Drive(drive), What::Position) => {
+                            self.shafts[link.signal.node].position + drive.speed() * h
+                        }
                         (Body::Device(device), What::Field(message, field)) => {
                             let held = plant.get(link.slot);
                             held + (device.values[message][field] - held) * device.share(h)
@@ -342,7 +352,7 @@ impl Bench {
     /// What the plant shows at the nodes. `h`: since the last look, s.
     fn look(&mut self, h: f64) {
         let Some(plant) = &self.plant else { return };
-        for (shaft, (position, speed)) in self.shafts.iter_mut().zip(&self.seen) {
+        for (node, (shaft, (position, speed))) in self.shafts.iter_mut().zip(&self.seen).enumerate() {
             let last = *shaft;
             match (position.map(|slot| plant.get(slot)), speed.map(|slot| plant.get(slot))) {
                 (Some(position), Some(speed)) => (shaft.position, shaft.speed) = (position, speed),
@@ -354,7 +364,13 @@ impl Bench {
                     shaft.speed = speed;
                     shaft.position += (last.speed + speed) / 2.0 * h;
                 }
-                (None, None) => {}
+                // Nobody reads a drive that holds its shaft: it turns as it is held.
+                (None, None) => {
+                    if let (Body::Drive(drive), true) = (&self.bodies[node], self.holds[node]) {
+                        shaft.speed = drive.speed();
+                        shaft.position += (last.speed + shaft.speed) / 2.0 * h;
+                    }
+                }
             }
         }
         for link in &self.felt {

@@ -60,9 +60,12 @@ impl Device {
             for &(_, field, value) in safe.iter().filter(|(message, ..)| *message == at) {
                 safe_values[field] = value;
             }
+            // A drive hears from us each tick from the first one on: nothing but its safe values.
+            let begins = if moves && message.send { safe_values.clone() } else { Vec::new() };
+            let start = |(k, field): (usize, &abi::rig::Field)| begins.get(k).copied().unwrap_or(field.start);
             Line {
                 message: message.clone(),
-                values: message.fields.iter().map(|field| Reading::none(field.start)).collect(),
+                values: message.fields.iter().enumerate().map(start).map(Reading::none).collect(),
                 safe: safe_values,
                 sent: [0; 8],
                 due_ns: 0,

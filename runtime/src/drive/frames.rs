@@ -3,6 +3,8 @@
 //! In: a [`Field`] and the data of a frame. Out: its value, SI, and back. Source of the numbering of bits: the DBC
 //! format, little-endian ("Intel") and big-endian ("Motorola").
 
+use super::units::beyond;
+use crate::safety::{Protection, is_present};
 use abi::rig::{Field, Format, Message};
 
 /// Where the k-th bit of a field lies, k counted from its least significant one: byte, and bit in the byte.
@@ -62,15 +64,17 @@ pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-/// Puts a value, SI, into the data of a frame: rounded to the nearest step, clamped to what the bits can hold.
+/// Puts a value, SI, into the data of a frame: rounded towards zero, so that what travels is never greater than what was
+/// permitted, and clamped to what the bits can hold. Where the steps leave 0 out, by their offset, the nearest step to 0 may
+/// be greater than a value between them.
 pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
     let steps = (value - field.offset) / field.scale;
     let unused = 64 - u32::from(field.bits);
     let raw = match field.format {
         // A cast of a float clamps, and makes 0 of what is no number.
-        Format::Unsigned => (steps.round() as u64).min(u64::MAX >> unused),
-        Format::Signed => (steps.round() as i64).clamp(i64::MIN >> unused, i64::MAX >> unused) as u64,
-        Format::Float32 => u64::from((steps as f32).to_bits()),
+        Format::Unsigned => (whole(field, steps, value) as u64).min(u64::MAX >> unused),
+        Format::Signed => (whole(field, steps, value) as i64).clamp(i64::MIN >> unused, i64::MAX >> unused) as u64,
+        Format::Float32 => u64::from(single(field, steps, value).to_bits()),
         Format::Float64 => steps.to_bits(),
     };
     for k in 0..field.bits {
@@ -79,6 +83,27 @@ pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
             *byte = *byte & !(1 << bit) | ((raw >> k & 1) as u8) << bit;
         }
     }
+}
+
+/// The value of so many steps, SI, and whether it is greater than the permitted one.
+fn is_beyond(field: &Field, steps: f64, value: f64) -> bool {
+    let size = value.abs() + field.offset.abs();
+    beyond(steps * field.scale + field.offset, value, size) && is_present(Protection::Rounding)
+}
+
+/// The nearest whole number of steps, or its neighbour towards 0 SI where it is greater than the value and the neighbour is not.
+fn whole(field: &Field, steps: f64, value: f64) -> f64 {
+    let nearest = steps.round();
+    let towards = nearest - (value * field.scale).signum();
+    if is_beyond(field, nearest, value) && !is_beyond(field, towards, value) { towards } else { nearest }
+}
+
+/// The same with the steps that 32 bits of a float have.
+fn single(field: &Field, steps: f64, value: f64) -> f32 {
+    let nearest = steps as f32;
+    let towards = if value * field.scale > 0.0 { nearest.next_down() } else { nearest.next_up() };
+    let moves = is_beyond(field, nearest.into(), value) && !is_beyond(field, towards.into(), value);
+    if moves { towards } else { nearest }
 }
 
 /// Puts the values of all fields, SI, into the data of a frame: of those that share bits, the ones whose switch has their
@@ -108,6 +133,7 @@ pub fn fill(message: &Message, value: impl Fn(usize) -> f64, data: &mut [u8; 8])
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::chance::Chance;
     use abi::unit::Unit;
 
     fn field(start_bit: u16, bits: u16, big_endian: bool, format: Format) -> Field {
@@ -166,6 +192,38 @@ mod tests {
                     assert_eq!(value(field.clone(), &data), Some(wanted), "{bits} bits {format:?}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn what_travels_is_never_greater_than_what_was_permitted() {
+        let mut random = Chance(5);
+        for case in 0..50_000 {
+            let (bits, format) = [
+                (8, Format::Signed),
+                (16, Format::Signed),
+                (12, Format::Unsigned),
+                (32, Format::Float32),
+                (64, Format::Float64),
+            ][random.below(5) as usize];
+            let mut field = field(0, bits, false, format);
+            field.scale = 10f64.powf(random.between(-6.0, 3.0)) * [1.0, -1.0][random.below(2) as usize];
+            let most = 2f64.powi(i32::from(bits.min(16)) - 1) - 1.0;
+            let sign = if format == Format::Unsigned { field.scale.signum() } else { 1.0 };
+            let share = random.between(if format == Format::Unsigned { 0.0 } else { -1.0 }, 1.0);
+            // Offsets by whole steps: 0 is one of the values that can travel.
+            field.offset =
+                if format == Format::Unsigned { 0.0 } else { field.scale * f64::from(random.below(5) as u32) };
+            let value = share * sign * (most - 8.0) * field.scale.abs();
+            let mut data = [0; 8];
+            write(&field, value, &mut data);
+            let wire = read(&message(vec![field.clone()]), 0, &data).unwrap();
+            let slack = 8.0 * f64::EPSILON * (value.abs() + field.offset.abs());
+            assert!(wire.abs() <= value.abs() + slack, "case {case}: {value} became {wire} ({field:?})");
+            assert!(
+                (value - wire).abs() <= field.scale.abs() + slack,
+                "case {case}: {value} became {wire} ({field:?})"
+            );
         }
     }
 

@@ -3,7 +3,7 @@
 //! In: its frames, SYNCs, permitted commands. Out: its signals, the frames that configure and command it, what it did
 //! that it wasn't told to. The order of the start-up, which concerns all drives of a rig, is [`super::fieldbus`]'s.
 
-use super::profiles::{Life, Path, Profile};
+use super::profiles::{self, Life, Path, Profile};
 use super::script::{Entry, Keep, Progress, Question, Script, Watching};
 use super::state::{Goal, State, control, status, towards};
 use super::trouble::{Reading, TroubleKind, Why};
@@ -13,6 +13,7 @@ use crate::canopen::pdo::{Direction, Mapped, Pdo};
 use crate::canopen::sdo::Client;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{NmtState, Object, Send, Type};
+use crate::safety::{Protection, is_present};
 use abi::rig::{Cia402, Mode, What};
 
 const STATUS: Object = Object(0x6041, 0);
@@ -81,6 +82,10 @@ pub struct Status {
     pub timeout: Option<(u32, Life)>,
     /// What the time-out test measured, ns.
     pub timeout_measured_ns: Option<u64>,
+    /// Time after which it misses set-points, ms; none where it has no object 1400:5.
+    pub deadline_ms: Option<u32>,
+    /// It has proved that it is one of our own simulated drives.
+    pub simulated: bool,
     /// Answers of an earlier SYNC, or doubled ones.
     pub surplus: u64,
 }
@@ -145,6 +150,8 @@ pub struct Drive {
     ticks: u32,
     command: f64,
     not_following: u32,
+    /// The last command had no place in the 32 bits of a position.
+    wraps: bool,
     guard_due_ns: u64,
     surplus: u64,
     /// When our life sign stopped, for the time-out test.
@@ -238,6 +245,7 @@ impl Drive {
             ticks: 0,
             command: 0.0,
             not_following: 0,
+            wraps: false,
             guard_due_ns: 0,
             surplus: 0,
             timeout_measured_ns: None,
@@ -252,6 +260,11 @@ impl Drive {
         wanted.clamp(self.profile.timeout_ms.0, self.profile.timeout_ms.1)
     }
 
+    /// Time after which it misses set-points, ms: that of our life sign.
+    fn deadline_ms(&self) -> i64 {
+        self.setting.watchdog_ns.div_ceil(1_000_000).clamp(1, 65_535) as i64
+    }
+
     fn identity_list(&self) -> Vec<Entry> {
         let identity = |sub| Object(0x1018, sub);
         let mut list = vec![
@@ -260,6 +273,7 @@ impl Drive {
             Entry::ReadIf(identity(2), Type::U32, Keep::Product),
             Entry::ReadIf(identity(3), Type::U32, Keep::Revision),
             Entry::ReadIf(identity(4), Type::U32, Keep::Serial),
+            Entry::TextIf(Object(0x1008, 0), profiles::SIMULATED.1, Keep::Name),
             Entry::ReadIf(Object(0x6502, 0), Type::U32, Keep::Modes),
         ];
         if self.profile.torque.is_some() {
@@ -285,6 +299,13 @@ impl Drive {
             }
             let compare = |(object, value, bits): (Object, u32, u32)| Entry::Compare(object, value.into(), bits.into());
             list.extend(pdo.read_back().into_iter().map(compare));
+        }
+        // The drive notices that its set-points stay away although our life sign comes.
+        let (deadline, ms) = (Object(self.command_pdo.communication(), 5), self.deadline_ms());
+        if is_present(Protection::Deadline) {
+            list.push(Entry::WriteOr(deadline, ms, 2, 2));
+            list.push(Entry::Compare(deadline, ms, 0xFFFF));
+            list.push(Entry::Read(deadline, Type::U16, Keep::Deadline));
         }
         if self.profile.fixed.is_none() {
             // Mode shown and error code, sent when they change: where a drive has a third PDO.
@@ -328,7 +349,7 @@ impl Drive {
             Entry::WriteOr(Object(0x1006, 0), (self.setting.period_ns / 1000) as i64, 4, 0),
         ]);
         if let Some(most) = self.config.max_torque {
-            let most = (most / self.torque.step).round() as i64;
+            let most = self.torque.command(most);
             list.push(Entry::WriteOr(Object(0x6072, 0), most, 2, 1));
             list.push(Entry::Compare(Object(0x6072, 0), most, 0xFFFF));
         }
@@ -376,6 +397,8 @@ impl Drive {
         self.identity.rewind();
         self.configuration.rewind();
         self.mode_script = Script::new(Vec::new(), 0);
+        self.identity.kept.fill(None);
+        self.configuration.kept.fill(None);
         (self.booted, self.heard_ns, self.nmt, self.word) = (false, None, NmtState::BootUp, None);
         (self.goal, self.resets, self.mode_shown, self.error_code) = (Goal::Off, false, None, 0);
         (self.command, self.not_following, self.watching) = (0.0, 0, None);
@@ -475,6 +498,12 @@ impl Drive {
         self.state() == State::Enabled && self.mode_is_right() && (follows || !cyclic)
     }
 
+    fn is_simulated(&self) -> bool {
+        let (vendor, _, serial) = profiles::SIMULATED;
+        let is = |keep, number: i64| self.identity.get(keep) == Some(number);
+        is(Keep::Vendor, vendor.into()) && is(Keep::Serial, serial.into()) && is(Keep::Name, 1)
+    }
+
     /// All that is known of it.
     pub fn status(&self) -> Status {
         let identity = [Keep::Vendor, Keep::Product, Keep::Revision, Keep::Serial];
@@ -494,6 +523,8 @@ impl Drive {
             identity: identity.map(|keep| self.identity.get(keep).map(|number| number as u32)),
             timeout,
             timeout_measured_ns: self.timeout_measured_ns,
+            deadline_ms: self.configuration.get(Keep::Deadline).map(|ms| ms as u32),
+            simulated: self.is_simulated(),
             surplus: self.surplus,
         }
     }
@@ -570,6 +601,13 @@ impl Drive {
             self.heard_ns = None;
             tell(TroubleKind::HeartbeatLost);
         }
+        if self.config.mode == Mode::Position && self.goal == Goal::Enabled && self.state() == State::Enabled {
+            let (_, whole) = self.counter.number(self.target.command(self.command));
+            if !whole && !self.wraps {
+                tell(TroubleKind::Wraps);
+            }
+            self.wraps = !whole;
+        }
         if self.goal == Goal::Enabled && self.state() == State::Enabled && !self.following() {
             self.not_following = self.not_following.saturating_add(1);
             match self.mode_shown {
@@ -587,8 +625,8 @@ impl Drive {
         let mut data = [0; 8];
         data[..2].copy_from_slice(&word.to_le_bytes());
         let number = match self.config.mode {
-            Mode::Torque | Mode::Speed => self.target.number(command),
-            Mode::Position => self.counter.number(self.target.number(command)).into(),
+            Mode::Torque | Mode::Speed => self.target.command(command),
+            Mode::Position => self.counter.number(self.target.command(command)).0.into(),
         };
         let length = self.command_pdo.length();
         data[2..length].copy_from_slice(&number.to_le_bytes()[..length - 2]);

@@ -23,6 +23,10 @@ pub enum Life {
     Guarding,
 }
 
+/// How the drives that this program simulates say who they are: vendor 0, which no maker has, this device name (object 1008),
+/// and this serial number (1018:4), "fric" in ASCII. What only simulated drives bear is granted to nobody else.
+pub const SIMULATED: (u32, &str, u32) = (0, "fric simulated", 0x6672_6963);
+
 /// One signal of a drive: where it is commanded, where it is read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Path {

@@ -11,6 +11,8 @@ pub enum Entry {
     Read(Object, Type, Keep),
     /// The same, where the drive has it.
     ReadIf(Object, Type, Keep),
+    /// Reads a text, where the drive has it; keeps 1 if it is this one, else 0.
+    TextIf(Object, &'static str, Keep),
     /// Writes a number of so many bytes.
     Write(Object, i64, u8),
     /// Writes it where the drive takes it; where not, passes over so many entries behind this one.
@@ -44,10 +46,12 @@ pub enum Keep {
     QuickStop,
     ModeShown,
     Error,
+    Name,
+    Deadline,
 }
 
 /// Number of [`Keep`]s.
-pub const KEPT: usize = Keep::Error as usize + 1;
+pub const KEPT: usize = Keep::Deadline as usize + 1;
 
 /// What the owner is asked in between.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -140,6 +144,7 @@ impl Script {
             match entry {
                 Entry::Read(object, ..)
                 | Entry::ReadIf(object, ..)
+                | Entry::TextIf(object, ..)
                 | Entry::Compare(object, ..)
                 | Entry::Watched(object, _) => {
                     client.read(object, now_ns, send);
@@ -165,7 +170,7 @@ impl Script {
                     return Progress::Busy;
                 }
                 match entry {
-                    Entry::ReadIf(..) if aborted => self.next(0),
+                    Entry::ReadIf(..) | Entry::TextIf(..) if aborted => self.next(0),
                     Entry::WriteOr(.., further) if aborted => self.next(further),
                     Entry::Watch(_, _, further) if aborted => {
                         if self.timeout_ms >= 1000 {
@@ -189,6 +194,11 @@ impl Script {
         match entry {
             Entry::Read(_, kind, keep) | Entry::ReadIf(_, kind, keep) => {
                 self.kept[keep as usize] = Some(kind.number(data));
+            }
+            Entry::TextIf(_, text, keep) => {
+                // Some devices fill their texts up with zeros.
+                let told = data.split(|byte| *byte == 0).next().unwrap_or_default();
+                self.kept[keep as usize] = Some((told == text.as_bytes()).into());
             }
             Entry::Compare(object, wanted, bits) => {
                 if let Some(why) = differs(object, wanted & bits, Type::U64.number(data) & bits) {

@@ -5,7 +5,7 @@
 //! drive's units. Its time-outs work. [`Effect`]s make it fail.
 
 use super::hooks::Effect;
-use super::profiles::{Life, Path, Profile};
+use super::profiles::{self, Life, Path, Profile};
 use super::state::{Machine, State, Times, status};
 use super::units::Scale;
 use crate::can::Frame;
@@ -42,6 +42,8 @@ pub struct Behaviour {
     pub least_consumer_ms: u16,
     /// Modes it offers, as object 6502; none: those of its profile.
     pub modes: Option<u32>,
+    /// Its set-points have a deadline: object 1400:5.
+    pub deadline: bool,
 }
 
 impl Default for Behaviour {
@@ -62,6 +64,7 @@ impl Default for Behaviour {
             speed: 400.0,
             least_consumer_ms: 1,
             modes: None,
+            deadline: true,
         }
     }
 }
@@ -219,6 +222,9 @@ impl SimulatedDrive {
         };
         let objects = drive.dictionary();
         drive.node = Node::new(config.node, objects, behaviour.boot_ns, behaviour.least_consumer_ms);
+        if !behaviour.deadline {
+            drive.node.without_deadlines();
+        }
         drive.take_parameters();
         drive
     }
@@ -268,7 +274,9 @@ impl SimulatedDrive {
         }
         let device = i64::from(profile.sort) << 16 | i64::from(profile.device);
         objects.add(Entry::number(Object(0x1000, 0), "device type", U32, Constant, device));
-        objects.add(Entry::text(Object(0x1008, 0), "device name", Constant, "fric simulated", 14));
+        let (_, name, serial) = profiles::SIMULATED;
+        objects.add(Entry::text(Object(0x1008, 0), "device name", Constant, name, name.len()));
+        objects.add(Entry::number(Object(0x1018, 4), "serial number", U32, Constant, serial.into()));
         objects.add(Entry::number(Object(0x60C2, 0), "interpolation time", U8, Constant, 2));
         objects.add(Entry::number(Object(0x60C2, 1), "value", U8, ReadWrite, 1));
         objects.add(Entry::number(Object(0x60C2, 2), "exponent", I8, ReadWrite, -3));

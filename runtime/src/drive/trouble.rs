@@ -57,6 +57,8 @@ pub enum TroubleKind {
     Mode(i8),
     /// It is enabled but does not follow commands.
     NotFollowing,
+    /// A position command has no place in the 32 bits of its number.
+    Wraps,
     /// A frame of it is shorter than agreed.
     Short(u32),
     /// A frame that only a master sends and that we didn't: its identifier.
@@ -76,6 +78,9 @@ impl fmt::Display for TroubleKind {
             TroubleKind::Nmt(state) => write!(f, "it is {state}"),
             TroubleKind::Mode(mode) => write!(f, "it shows mode {mode}"),
             TroubleKind::NotFollowing => f.write_str("it is enabled but does not follow commands"),
+            TroubleKind::Wraps => {
+                f.write_str("a position command lies beyond its 32 bits of counts: it would turn the other way")
+            }
             TroubleKind::Short(id) => write!(f, "frame 0x{id:03X} is shorter than agreed"),
             TroubleKind::ForeignMaster(id) if id & 0x780 == 0x700 => stranger(f, *id),
             TroubleKind::ForeignMaster(id) => write!(f, "somebody else sends frame 0x{id:03X}: a second master"),

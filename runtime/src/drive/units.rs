@@ -1,4 +1,9 @@
 //! SI values and the whole numbers that drives speak.
+//!
+//! What is measured is rounded to the nearest number; what is commanded towards zero, so that no command on the wire is
+//! greater than the value that was permitted.
+
+use crate::safety::{Protection, is_present};
 
 /// How a signal is told in whole numbers: one step of it, SI, and its least and greatest number.
 #[derive(Clone, Copy, PartialEq, Debug)]
@@ -22,10 +27,26 @@ impl Scale {
         ((value / self.step).round() as i64).clamp(self.low, self.high)
     }
 
+    /// The number for a command: the greatest one, towards zero, whose value is not greater than this. What is no number gives
+    /// 0, what doesn't fit the nearest that does.
+    pub fn command(&self, value: f64) -> i64 {
+        let number = self.number(value);
+        if beyond(self.value(number), value, value) && is_present(Protection::Rounding) {
+            return (number - number.signum()).clamp(self.low, self.high);
+        }
+        number
+    }
+
     /// The value of a number, SI.
     pub fn value(&self, number: i64) -> f64 {
         number as f64 * self.step
     }
+}
+
+/// Whether a value on the wire is greater than the permitted one, by more than the rounding of a product or sum of numbers of
+/// this size.
+pub fn beyond(wire: f64, permitted: f64, size: f64) -> bool {
+    wire.abs() > permitted.abs() + 2.0 * f64::EPSILON * size.abs()
 }
 
 /// A position told in 32 bits, continued beyond them.
@@ -55,15 +76,24 @@ impl Counter {
         self.total
     }
 
-    /// The number that stands for so many counts since the origin, for a drive that takes positions.
-    pub fn number(&self, total: i64) -> i32 {
-        self.last.unwrap_or(0).wrapping_add((total - self.total) as i32)
+    /// The number that stands for so many counts since the origin, for a drive that takes positions. A number that has no
+    /// place in 32 bits is not wrapped, since a drive would turn the other way: then it is the last one on the way there,
+    /// and false.
+    pub fn number(&self, total: i64) -> (i32, bool) {
+        let way = total.saturating_sub(self.total);
+        if !is_present(Protection::Wrap) {
+            return (self.last.unwrap_or(0).wrapping_add(way as i32), true);
+        }
+        let number = i64::from(self.last.unwrap_or(0)).saturating_add(way);
+        let nearest = number.clamp(i32::MIN.into(), i32::MAX.into());
+        (nearest as i32, nearest == number)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::chance::Chance;
 
     #[test]
     fn torque_is_told_in_thousandths_of_rated_torque() {
@@ -87,6 +117,54 @@ mod tests {
             counter.read(truth as i32);
             assert_eq!(counter.total(), truth - (i64::from(i32::MAX) - 5));
         }
-        assert_eq!(counter.number(counter.total() + 7), (truth + 7) as i32);
+        let last = i64::from(truth as i32);
+        assert_eq!(counter.number(counter.total() + 7), ((last + 7) as i32, true));
+    }
+
+    #[test]
+    fn a_position_command_never_wraps() {
+        let mut random = Chance(7);
+        let mut wrapped = 0;
+        for case in 0..20_000 {
+            let mut counter = Counter::default();
+            let mut random_i32 = || random.between(-2_147_483_648.0, 2_147_483_647.0) as i32;
+            counter.read(random_i32());
+            counter.rest();
+            let last = i64::from(random_i32());
+            counter.read(last as i32);
+            let way = random.between(-1e10, 1e10) as i64;
+            let (number, whole) = counter.number(counter.total() + way);
+            let moved = i64::from(number) - last;
+            assert!(moved == 0 || moved.signum() == way.signum(), "case {case}: {way} from {last} became {number}");
+            assert_eq!(whole, moved == way, "case {case}: {way} from {last} became {number}");
+            wrapped += u32::from(!whole);
+        }
+        assert!(wrapped > 1000, "{wrapped}");
+        assert!(!Counter::default().number(i64::MAX).1 && !Counter::default().number(i64::MIN).1);
+    }
+
+    #[test]
+    fn a_command_on_the_wire_is_never_greater_than_what_is_permitted_and_never_a_step_less() {
+        let mut random = Chance(11);
+        for case in 0..100_000 {
+            let step = 10f64.powf(random.between(-9.0, 3.0)) * [1.0, -1.0][random.below(2) as usize];
+            let bits = [8, 16, 32][random.below(3) as usize];
+            let scale = Scale::signed(step, bits);
+            // Any value, one on a step, and those beside it.
+            let most = 2f64.powi(bits as i32 - 1) - 1.0;
+            let value = match random.below(3) {
+                0 => random.between(-1.0, 1.0) * most * step,
+                1 => (random.between(-1.0, 1.0) * most).round() * step,
+                _ => ((random.between(-1.0, 1.0) * most).round() * step).next_up(),
+            };
+            let wire = scale.value(scale.command(value));
+            let slack = 4.0 * f64::EPSILON * value.abs();
+            assert!(wire.abs() <= value.abs() + slack, "case {case}: {value} in steps of {step} became {wire}");
+            assert!(wire * value >= 0.0, "case {case}: {value} became {wire}");
+            assert!((value - wire).abs() <= step.abs() + slack, "case {case}: {value} became {wire}");
+        }
+        let tight = Scale::signed(3.0 / 1000.0, 16);
+        assert_eq!((tight.command(0.2), tight.command(-0.2), tight.command(0.3)), (66, -66, 100));
+        assert_eq!((tight.command(f64::NAN), tight.command(f64::INFINITY)), (0, 32767));
     }
 }

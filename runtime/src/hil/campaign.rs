@@ -371,6 +371,68 @@ fn row_14_commands_that_are_lost_on_the_way() {
 }
 
 #[test]
+fn row_14_set_points_that_stay_away_from_a_drive_that_stands() {
+    // No torque is asked for, so that nothing but the deadline can tell.
+    for id in [0x203, 0x204] {
+        let mut stand = Stand::armed(|_, model| param(model, 0, 0.0));
+        let now = stand.now();
+        stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Drop).id(id).from(now));
+        assert_eq!(within(stand.stops(now), 8 * MS), Cause::Drive(usize::from(id == 0x204)));
+        let status = stand.hil.fieldbus().status(0).unwrap();
+        assert_eq!(status.deadline_ms, Some(5));
+    }
+}
+
+#[test]
+fn row_14_a_drive_that_tells_another_torque_than_it_was_told() {
+    for factor in [0.0, 0.5, -1.0] {
+        let mut stand = Stand::armed(|_, model| param(model, 0, 1.5));
+        let since = stand.effect(1, Effect::TorqueToldScale(factor), None);
+        assert_eq!(within(stand.stops(since), 700 * MS), Cause::NotFollowing(1), "times {factor}");
+    }
+}
+
+#[test]
+fn row_13_a_drive_that_is_not_ours_gets_no_permission() {
+    type Change = fn(&mut crate::canopen::ObjectDictionary);
+    let ours: [Change; 4] = [
+        |_| (),
+        |objects| objects.set(crate::canopen::Object(0x1018, 1), 0x17F),
+        |objects| objects.set(crate::canopen::Object(0x1018, 4), 1),
+        |objects| objects.remove(crate::canopen::Object(0x1008, 0)),
+    ];
+    for (k, change) in ours.into_iter().enumerate() {
+        let options = Options { only_simulated: Some("--arm is for simulated drives only".into()), ..quick() };
+        let mut stand = Stand::new(options, 1, |_, _| ());
+        stand.reach(Step::Identity);
+        change(stand.world.bench().drive(1).unwrap().objects());
+        while stand.hil.ended().is_none() && stand.hil.step() != Step::Armed {
+            stand.cycle();
+        }
+        match stand.hil.ended() {
+            None => assert_eq!(k, 0),
+            Some(End::Refused(why)) => assert!(k > 0 && why.contains("`servo` has not proved"), "{k}: {why}"),
+            Some(end) => panic!("{k}: {end:?}"),
+        }
+        assert_eq!(stand.hil.is_misuse(), k > 0);
+    }
+}
+
+#[test]
+fn row_13_a_safe_value_that_would_move_a_drive_before_arming() {
+    let mut stand = Stand::new(quick(), 1, |rig, _| rig.outputs[1].safe = 0.5);
+    let end = loop {
+        stand.cycle();
+        let torque = stand.world.bench().shaft(0).torque;
+        assert!(torque.abs() < 1e-9, "{torque} N·m before arming");
+        if let Some(end) = stand.hil.ended() {
+            break end.clone();
+        }
+    };
+    assert!(matches!(&end, End::Refused(why) if why.contains("before it is armed")), "{end:?}");
+}
+
+#[test]
 fn row_8_a_bus_that_goes_off_does_not_come_back_to_motion() {
     let mut stand = Stand::armed(|_, _| ());
     let now = stand.now();
@@ -711,7 +773,8 @@ impl Stand {
 fn mutants_are_caught() {
     let passes = |mutant: Option<&str>| {
         let mut tests = std::process::Command::new(std::env::current_exe().unwrap());
-        tests.args(["hil::campaign::row", "hil::campaign::nothing"]).env_remove("FRIC_MUTANT");
+        tests.args(["hil::campaign::row", "hil::campaign::nothing", "hil::control", "hil::followed", "hil::emergency"]);
+        tests.args(["drive::units", "drive::frames"]).env_remove("FRIC_MUTANT");
         mutant.map(|name| tests.env("FRIC_MUTANT", name));
         tests.output().unwrap().status.success()
     };

@@ -8,7 +8,9 @@ use super::coupling::{Coupling, Verdict};
 use super::followed::{self, Followed};
 use crate::drive::profiles;
 use crate::lookahead::Wired;
-use crate::safety::{Cause, DriveLimits, Order, OutputLimits, Patience, Refused, Seen, Supervisor};
+use crate::safety::{
+    Cause, DriveLimits, Order, OutputLimits, Patience, Protection, Refused, Seen, Supervisor, is_present,
+};
 use abi::rig::{Kind, Mode, Overrun, Rig, Signal, What};
 use abi::{Function, Instance, Slot};
 
@@ -140,6 +142,8 @@ pub struct Control {
     step: f64,
     steps: u64,
     overrun: Overrun,
+    /// Ticks missed and not made good for: each cycle in time makes good for one.
+    behind: u32,
     supervisor: Supervisor,
     coupling: Coupling,
     watched: Vec<Watched>,
@@ -276,6 +280,7 @@ impl Control {
             shadow: model.clone(),
             step: period / f64::from(rig.steps.max(1)),
             steps: u64::from(rig.steps.max(1)),
+            behind: 0,
             overrun: if options.count_overruns { Overrun::Hold(u32::MAX) } else { rig.overrun },
             supervisor,
             coupling,
@@ -358,8 +363,14 @@ impl Control {
             Overrun::Stop => 0,
             Overrun::Hold(most) => most,
         };
-        if armed && missed > most {
-            self.supervisor.trip(Cause::Overrun(missed));
+        self.behind = match missed {
+            _ if !armed => 0,
+            0 => self.behind.saturating_sub(1),
+            _ => self.behind.saturating_add(missed),
+        };
+        let behind = if is_present(Protection::Behind) { self.behind } else { missed };
+        if armed && behind > most {
+            self.supervisor.trip(Cause::Overrun(behind));
         }
         let computes = told.source == Source::Model && self.supervisor.is_armed();
         match told.source {
@@ -393,9 +404,9 @@ impl Control {
                 let change = (reading.value - watched.last).abs();
                 let credible = match watched.since {
                     Some(since) if judged => change <= watched.jump * f64::from(since),
-                    _ => reading.value.is_finite(),
+                    _ => true,
                 };
-                if credible {
+                if credible && reading.value.is_finite() {
                     (watched.last, watched.since, watched.odd) = (reading.value, Some(0), 0);
                 } else {
                     watched.odd += 1;
@@ -562,7 +573,7 @@ impl Control {
             words.extend([u64::from(pair.before.is_some()), from.to_bits(), late_ns.into(), pair.odd.into()]);
         }
         self.followed.iter().for_each(|followed| followed.save(words));
-        words.push(self.follows.into());
+        words.extend([u64::from(self.follows), self.behind.into()]);
         self.supervisor.save(words);
         self.coupling.save(words);
     }
@@ -589,6 +600,7 @@ impl Control {
         }
         self.followed.iter_mut().try_for_each(|followed| followed.restore(&mut words))?;
         self.follows = words.next()? != 0;
+        self.behind = u32::try_from(words.next()?).ok()?;
         self.supervisor.restore(&mut words)?;
         self.coupling.restore(&mut words)?;
         words.next().is_none().then_some(())
@@ -650,6 +662,13 @@ fn output_limits(
                 "drive `{name}`: its command has no bounds: give a `limit`, or `travel` for a position"
             ));
         }
+    }
+    // Before arming drives are enabled at their safe values: another one than 0 would move them before any sign was tested.
+    if safe != 0.0 && rig.nodes[signal.node].is_moved_by(signal.what) && is_present(Protection::Idle) {
+        let name = &rig.nodes[signal.node].name;
+        return Err(format!(
+            "the command of `{name}`: its safe value is {safe}, and would move it before it is armed: make it 0"
+        ));
     }
     Ok(OutputLimits { low, high, slew, safe, drive, torque })
 }
@@ -744,10 +763,46 @@ mod tests {
         let torque = way.cycle(3, &[]);
         assert!((torque + 10.0 * 2.0 * 4e-3).abs() < 1e-12, "{torque}");
         way.cycle(4, &[]);
-        assert_eq!(way.control.supervisor().cause(), Some(Cause::Overrun(3)));
+        assert_eq!(way.control.supervisor().cause(), Some(Cause::Overrun(5)));
         let mut strict = Way::new(|_| ());
         strict.cycle(2, &[]);
         assert_eq!(strict.control.supervisor().cause(), Some(Cause::Overrun(1)));
+    }
+
+    #[test]
+    fn ticks_missed_again_and_again_stop_the_rig_and_cycles_in_time_make_good_for_them() {
+        for most in 1..6 {
+            let cause = |ticks: &mut dyn FnMut(u32) -> u32| {
+                let mut way = Way::new(|rig| rig.overrun = Overrun::Hold(most));
+                (0..200).find(|k| {
+                    way.cycle(ticks(*k), &[]);
+                    way.control.supervisor().cause().is_some()
+                })
+            };
+            assert_eq!(cause(&mut |_| 2), Some(most), "one missed in each cycle, {most} borne");
+            assert_eq!(cause(&mut |k| 1 + k % 2), None, "one missed in each other cycle");
+            assert_eq!(cause(&mut |k| if k % (most + 1) == 0 { 1 + most } else { 1 }), None, "made good for");
+            assert_eq!(cause(&mut |k| if k % most == 0 { 2 + most } else { 1 }), Some(0));
+        }
+    }
+
+    #[test]
+    fn a_reading_that_is_infinite_is_not_believed() {
+        for bad in [f64::INFINITY, f64::NEG_INFINITY, f64::NAN] {
+            let mut way = Way::new(|_| ());
+            way.set(What::Speed, 1.0);
+            way.cycle(1, &[]);
+            let at = way.control.signals().position(|signal| signal.what == What::Torque).unwrap();
+            for cycle in 1..=3 {
+                assert_eq!(way.control.supervisor().cause(), None, "cycle {cycle}");
+                way.readings[at].value = bad;
+                let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
+                let told = Told { ticks: 1, late_ns: 0, readings: &way.readings, source, wanted, causes, set: &[] };
+                way.control.cycle(&told);
+                assert!(way.control.watched[at].last.is_finite());
+            }
+            assert_eq!(way.control.supervisor().cause(), Some(Cause::Implausible(at)));
+        }
     }
 
     #[test]

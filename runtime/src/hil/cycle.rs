@@ -81,7 +81,8 @@ pub struct Options {
     pub arms_itself: bool,
     /// Stop when the start-up is through: nothing is armed.
     pub checks_only: bool,
-    /// Refuse drives that are not simulated: why. They say vendor 0.
+    /// Refuse drives that have not proved to be simulated ones of ours (vendor, device name, serial number): why. Drives
+    /// described by frames cannot.
     pub only_simulated: Option<String>,
     /// From SYNC to the computing, ns; none: as the rig's kind of drives needs it.
     pub collect_ns: Option<u64>,
@@ -216,6 +217,8 @@ pub type Operator = Sender<Command>;
 
 /// A rig under way.
 pub struct Hil {
+    /// Above the buses: the stop frames are taken back before their descriptors close.
+    table: Option<emergency::Table>,
     rig: Rig,
     options: Options,
     wires: Wires,
@@ -273,6 +276,7 @@ impl Hil {
         let due_ns = clock.now_ns() + rig.period_ns;
         let empty = Shape { signals: 0, outputs: 0, drives: 0, recorded: 0 };
         let hil = Hil {
+            table: None,
             rig: rig.clone(),
             left: options.duration_ns.map(|ns| ns.div_ceil(rig.period_ns)),
             options,
@@ -380,14 +384,16 @@ impl Hil {
         self.misuse
     }
 
-    /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere.
-    pub fn prepare_emergency(&self) {
+    /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere; they are taken
+    /// back when this rig is dropped.
+    pub fn prepare_emergency(&mut self) {
         let buses = self.wires.buses.iter().enumerate();
         let ready = buses.flat_map(|(i, bus)| {
             let frames = self.fieldbus.stop_frames(i).iter().chain(self.fieldbus.off_frames(i));
             frames.filter_map(|frame| bus.prepare(*frame))
         });
-        emergency::prepare(ready.collect());
+        let ready = ready.collect();
+        self.table = Some(emergency::prepare(ready));
     }
 
     /// Runs until it ends.
@@ -525,7 +531,7 @@ impl Hil {
             let node = trouble.node.unwrap_or_default();
             let cause = match trouble.kind {
                 TroubleKind::ForeignMaster(id) => Cause::Foreign(0, id),
-                TroubleKind::NotFollowing | TroubleKind::Mode(_) => Cause::NotFollowing(node),
+                TroubleKind::NotFollowing | TroubleKind::Mode(_) | TroubleKind::Wraps => Cause::NotFollowing(node),
                 // A frame that is too short is one that did not come.
                 TroubleKind::Short(_) => continue,
                 TroubleKind::Emergency(_)
@@ -601,12 +607,18 @@ impl Hil {
             Bounds { torque: limits.map(|limits| limits.torque), speed: limits.map(|limits| limits.speed) }
         });
         let bounds: Vec<Bounds> = bounds.collect();
-        let real = |node: &usize| self.fieldbus.status(*node).is_some_and(|status| status.identity[0] != Some(0));
+        // A drive described by frames announces nothing, so it proves nothing; a device does not move.
+        let stranger = |node: &usize| match self.fieldbus.status(*node) {
+            Some(status) => !status.simulated,
+            None => self.rig.nodes[*node].moves,
+        };
         if let Some(why) = &self.options.only_simulated
-            && let Some(node) = (0..self.rig.nodes.len()).find(real)
+            && let Some(node) = (0..self.rig.nodes.len()).find(stranger)
+            && is_present(Protection::Permission)
         {
             self.misuse = true;
-            return self.refuse(format!("{why}, and `{}` is none", self.rig.nodes[node].name));
+            let name = &self.rig.nodes[node].name;
+            return self.refuse(format!("{why}, and `{name}` has not proved to be one of ours"));
         }
         let look = self.options.look.clone();
         let control = match Control::new(&self.rig, self.model.clone(), look, &bounds, self.options.control) {

@@ -83,8 +83,10 @@ impl Followed {
             Mode::Speed => LOOP_PART * half + 4.0 * drive.speed_unit,
             Mode::Position => LOOP_PART * half + 4.0 * drive.count,
         };
-        // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late.
-        let dead = node.delay + SLACK + 2.0 * profile.refresh_ns as f64 * 1e-9;
+        // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late; one that waits for
+        // SYNC takes it with the next one.
+        let waits = if drive.at_sync { period } else { 0.0 };
+        let dead = node.delay + SLACK + waits + 2.0 * profile.refresh_ns as f64 * 1e-9;
         let lag = SLOWER * node.lag + if torque { 0.0 } else { LOOP };
         let patience = if torque { TORQUE_TICKS } else { ticks(LOOP_NS, rig.period_ns) };
         Some(Followed {
