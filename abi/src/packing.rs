@@ -4,6 +4,7 @@ use crate::encode::{Encode, Malformed, Reader};
 use crate::plan::{Method, Series};
 use crate::rig::{
     Bus, Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, Stop, What,
+    Within,
 };
 use crate::{encode_enums, encode_structs};
 
@@ -20,7 +21,8 @@ encode_structs! {
         plant,
     }
     Bus { name, address, bit_rate }
-    Node { name, bus, kind, moves, delay, lag, timeout_ns }
+    Node { name, bus, kind, moves, delay, lag, timeout_ns, within }
+    Within { max_speed, travel, max_power }
     Cia402 {
         node, rated_torque, mode, count, speed_unit, max_torque, max_speed, travel, max_power, at_sync, profile,
     }
@@ -153,6 +155,7 @@ mod tests {
             delay: 1e-3,
             lag: 0.0,
             timeout_ns: 3_000_000,
+            within: Within { max_speed: Some(100.0), travel: Some((-1.0, 1.0)), max_power: None },
         };
         let signal = |node, what| Signal { node, what };
         let series = Series { label: "x".into(), slot: Slot(9), unit: Unit::parse("mm").unwrap(), boolean: false };

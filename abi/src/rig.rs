@@ -8,7 +8,7 @@
 use crate::description::Slot;
 use crate::instance::Instance;
 use crate::series::{Method, Series};
-use crate::unit::Unit;
+use crate::unit::{Angle, Dimension, Unit};
 use std::fmt;
 
 /// One rig.
@@ -81,9 +81,67 @@ pub struct Node {
     pub lag: f64,
     /// Age at which a signal of it is lost; 0 where the rig names none.
     pub timeout_ns: u64,
+    /// What it must not exceed, where it is a drive that speaks in frames.
+    pub within: Within,
+}
+
+/// What a drive that speaks in frames must not exceed, SI; one with a profile has arguments of its own.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Within {
+    /// Greatest speed, rad/s.
+    pub max_speed: Option<f64>,
+    /// Permitted positions, rad, as it tells them.
+    pub travel: Option<(f64, f64)>,
+    /// Greatest power, W; none: greatest torque times greatest speed.
+    pub max_power: Option<f64>,
 }
 
 impl Node {
+    /// The signal by which it tells its torque, its speed or its position. Of a drive that speaks in frames: the one of that
+    /// name, else the only one that it could be by its unit.
+    pub fn tells(&self, what: What) -> Option<What> {
+        let Kind::Frames(messages) = &self.kind else { return Some(what) };
+        let (name, dimension) = match what {
+            What::Torque => ("torque", Dimension::of([1, 2, -2, 0, 0])),
+            What::Speed => ("speed", Dimension::of([0, 0, -1, 0, 0])),
+            What::Position => ("position", Dimension::NONE),
+            What::Enabled | What::Fault | What::Limited | What::Field(..) => return None,
+        };
+        let fits = |field: &Field| {
+            let unit = &field.unit;
+            unit.dimension == dimension && (what == What::Torque || unit.angle == Angle::Angle)
+        };
+        let mut all = messages.iter().enumerate().filter(|(_, message)| !message.send).flat_map(|(m, message)| {
+            message.fields.iter().enumerate().filter(|(_, field)| fits(field)).map(move |(f, field)| (m, f, field))
+        });
+        let first = all.next()?;
+        let found = std::iter::once(first).chain(all).collect::<Vec<_>>();
+        let named = found.iter().find(|(_, _, field)| field.name == name);
+        named.or(found.first().filter(|_| found.len() == 1)).map(|(m, f, _)| What::Field(*m, *f))
+    }
+
+    /// What a command for this signal asks for: torque, speed or position of a drive; none where it is something else.
+    pub fn asks_for(&self, what: What) -> Option<What> {
+        match (&self.kind, what) {
+            (Kind::Cia402(drive), _) => Some(match drive.mode {
+                Mode::Torque => What::Torque,
+                Mode::Speed => What::Speed,
+                Mode::Position => What::Position,
+            }),
+            (Kind::Frames(messages), What::Field(message, field)) => {
+                let unit = &messages[message].fields[field].unit;
+                let angle = unit.angle == Angle::Angle;
+                match unit.dimension {
+                    torque if torque == Dimension::of([1, 2, -2, 0, 0]) => Some(What::Torque),
+                    speed if angle && speed == Dimension::of([0, 0, -1, 0, 0]) => Some(What::Speed),
+                    none if angle && none.is_none() => Some(What::Position),
+                    _ => None,
+                }
+            }
+            (Kind::Frames(_), _) => None,
+        }
+    }
+
     /// Whether a command for this signal moves the node, unless it is 0: torque, speed or position of a drive with a profile; of
     /// one described by frames what has the dimension of a force, a torque, a speed, an acceleration or a current.
     pub fn is_moved_by(&self, what: What) -> bool {

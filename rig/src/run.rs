@@ -15,7 +15,7 @@ use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options, look_ahead};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
-use runtime::hil::{emergency, words as told};
+use runtime::hil::{emergency, watches, words as told};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
@@ -173,6 +173,9 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         1e9 / rig.period_ns as f64,
         if simulated { "simulated drives" } else { "drives on their buses" }
     ));
+    for lack in watches::lacking(&rig) {
+        words::print(&format!("  note: {lack}\n"));
+    }
     let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator));
     let end = hil.run();
     let seen =

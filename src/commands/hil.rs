@@ -19,7 +19,7 @@ use runtime::hil::control::PATIENT_NS;
 use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
 use runtime::hil::identify::{self, Identification};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
-use runtime::hil::{cycle, emergency, words};
+use runtime::hil::{cycle, emergency, watches, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
@@ -423,6 +423,9 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
     terminal.line(&format!("{}  {} Hz, {kind}", terminal.styled(Style::Bold, &rig.name), value::significant(rate, 4)));
     for note in notes {
         terminal.line(&format!("  note: {note}"));
+    }
+    for lack in watches::lacking(rig) {
+        terminal.line(&format!("  note: {lack}"));
     }
     if !refusals.is_empty() {
         terminal.line("  not real time on this host:");

@@ -1,6 +1,6 @@
 //! A whole rig: two drives in torque mode, pulsed one after the other, and the drives themselves.
 
-use abi::rig::{Bus as BusOf, Cia402, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What};
+use abi::rig::{Bus as BusOf, Cia402, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
 use abi::series::Method;
 use runtime::can::socketcan::SocketCan;
 use runtime::can::{Bus, Options, Received};
@@ -25,7 +25,16 @@ fn drive(name: &str, node: u8, period_ns: u64) -> Node {
         profile: "cia402".into(),
     };
     let (delay, lag, timeout_ns) = (0.8e-9 * period_ns as f64, 0.6e-3, 3 * period_ns);
-    Node { name: name.into(), bus: 0, kind: Kind::Cia402(cia402), moves: true, delay, lag, timeout_ns }
+    Node {
+        name: name.into(),
+        bus: 0,
+        kind: Kind::Cia402(cia402),
+        moves: true,
+        delay,
+        lag,
+        timeout_ns,
+        within: Within::default(),
+    }
 }
 
 /// The rig and its program, with this period.

@@ -327,6 +327,10 @@ impl Describer<'_> {
         for (name, value) in &statement.args {
             match value {
                 ast::DriveArg::Expr(expr) => args.push(bind(&name.text, name.span, expr)),
+                ast::DriveArg::Range(low, high) if statement.moves && name.text == "travel" => {
+                    args.push(bind("travel_low", name.span, low));
+                    args.push(bind("travel_high", name.span, high));
+                }
                 ast::DriveArg::Range(low, high) => self.no_range(name, low.span.to(high.span)),
             }
         }
@@ -340,9 +344,27 @@ impl Describer<'_> {
             }
         };
         let mut body: Vec<ast::Statement> = body.into_iter().map(ast::Statement::Declaration).collect();
+        let taken = |body: &[ast::Statement], name: &str| {
+            body.iter().any(|one| matches!(one, ast::Statement::Declaration(d) if d.name.text == name))
+        };
+        // What a drive must not exceed; what it does not tell is not watched.
+        let within = [
+            ("speed_max", "rad/s", false),
+            ("power_max", "W", false),
+            ("travel_low", "rad", true),
+            ("travel_high", "rad", false),
+        ];
+        for (name, unit, below) in within.into_iter().filter(|_| statement.moves) {
+            if !taken(&body, name) {
+                let value = infinite(below, device.name.span);
+                let mut one = declared(DeclarationKind::Param, name, Some(unit), Some(value), device.name.span);
+                let above = |span| ast::Range::Bound(BinaryOp::Greater, number(0.0, None, span));
+                one.range = (unit != "rad").then(|| above(device.name.span));
+                body.push(ast::Statement::Declaration(one));
+            }
+        }
         for name in ["delay", "lag", "timeout"] {
-            let taken = body.iter().any(|one| matches!(one, ast::Statement::Declaration(d) if d.name.text == name));
-            if !taken {
+            if !taken(&body, name) {
                 let zero = number(0.0, None, device.name.span);
                 let at_least = ast::Range::Bound(BinaryOp::GreaterEqual, number(0.0, None, device.name.span));
                 let mut one = declared(DeclarationKind::Param, name, Some("s"), Some(zero), device.name.span);
@@ -508,6 +530,18 @@ fn bind(name: &str, span: Span, value: &Expr) -> ast::Bind {
 
 fn number(value: f64, unit: Option<UnitText>, span: Span) -> Expr {
     Expr { kind: ExprKind::Number { value, unit }, span }
+}
+
+/// `inf`, or `-inf`: of any unit.
+fn infinite(below: bool, span: Span) -> Expr {
+    let name = Name { text: "inf".into(), span };
+    let path = ast::Path { segments: vec![ast::Segment { name, index: None }], span };
+    let above = Expr { kind: ExprKind::Path(path), span };
+    let kind = match below {
+        true => ExprKind::Unary(ast::UnaryOp::Negate, Box::new(above)),
+        false => return above,
+    };
+    Expr { kind, span }
 }
 
 fn declared(kind: DeclarationKind, name: &str, unit: Option<&str>, value: Option<Expr>, span: Span) -> Declaration {

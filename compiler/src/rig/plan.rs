@@ -280,6 +280,18 @@ impl Reader<'_, '_> {
                 .label(statement.kind.span, format!("{} s", param("delay")));
             self.report(error.help("a command that acts so late drives nothing: is the unit right?"));
         }
+        let framed = statement.moves && !matches!(description.speaks, Speaks::Cia402 { .. });
+        let within = match framed {
+            false => rig::Within::default(),
+            true => {
+                let travel = (param("travel_low"), param("travel_high"));
+                rig::Within {
+                    max_speed: finite(param("speed_max")),
+                    travel: (travel.0.is_finite() || travel.1.is_finite()).then_some(travel),
+                    max_power: finite(param("power_max")),
+                }
+            }
+        };
         let node = rig::Node {
             name: description.name.text.clone(),
             bus: bus.unwrap_or(0),
@@ -288,6 +300,7 @@ impl Reader<'_, '_> {
             delay: param("delay"),
             lag: param("lag"),
             timeout_ns,
+            within,
         };
         Some((node, laid))
     }

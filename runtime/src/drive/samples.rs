@@ -3,7 +3,9 @@
 use super::{Bench, Fieldbus, Options, Step};
 use crate::can::Frame;
 use crate::models::Model;
-use abi::rig::{Bus, Cia402, Field, Format, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, What};
+use abi::rig::{
+    Bus, Cia402, Field, Format, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within,
+};
 use abi::unit::Unit;
 use abi::{Function, Instance, Slot};
 
@@ -33,6 +35,7 @@ pub fn drive(name: &str, node: u8, mode: Mode) -> Node {
         delay: 0.8e-3,
         lag: 0.6e-3,
         timeout_ns: 3_000_000,
+        within: Within::default(),
     }
 }
 
@@ -66,6 +69,7 @@ fn panel() -> Node {
         delay: 0.0,
         lag: 0.0,
         timeout_ns: 100_000_000,
+        within: Within::default(),
     }
 }
 

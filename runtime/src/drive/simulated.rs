@@ -42,8 +42,6 @@ pub struct Behaviour {
     pub least_consumer_ms: u16,
     /// Modes it offers, as object 6502; none: those of its profile.
     pub modes: Option<u32>,
-    /// Its set-points have a deadline: object 1400:5.
-    pub deadline: bool,
 }
 
 impl Default for Behaviour {
@@ -64,7 +62,6 @@ impl Default for Behaviour {
             speed: 400.0,
             least_consumer_ms: 1,
             modes: None,
-            deadline: true,
         }
     }
 }
@@ -222,9 +219,6 @@ impl SimulatedDrive {
         };
         let objects = drive.dictionary();
         drive.node = Node::new(config.node, objects, behaviour.boot_ns, behaviour.least_consumer_ms);
-        if !behaviour.deadline {
-            drive.node.without_deadlines();
-        }
         drive.take_parameters();
         drive
     }
@@ -314,6 +308,12 @@ impl SimulatedDrive {
     /// Its objects, for tests that change what it says of itself.
     pub fn objects(&mut self) -> &mut ObjectDictionary {
         &mut self.node.objects
+    }
+
+    /// Takes its deadlines for set-points away (objects 1400:5 and following), which not every drive has: before it is
+    /// configured.
+    pub fn without_deadlines(&mut self) {
+        self.node.without_deadlines();
     }
 
     /// Its state.

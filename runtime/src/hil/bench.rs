@@ -2,7 +2,7 @@
 
 use crate::models::Model;
 use abi::plan::{Method, Series};
-use abi::rig::{Bus, Cia402, Input, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What};
+use abi::rig::{Bus, Cia402, Input, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
 use abi::unit::Unit;
 use abi::{Function, Instance};
 
@@ -31,6 +31,7 @@ pub fn drive(name: &str, node: u8) -> Node {
         delay: 0.8e-3,
         lag: 0.6e-3,
         timeout_ns: 3 * PERIOD_NS,
+        within: Within::default(),
     }
 }
 

@@ -384,6 +384,30 @@ fn row_14_set_points_that_stay_away_from_a_drive_that_stands() {
 }
 
 #[test]
+fn row_14_a_drive_that_hears_neither_set_points_nor_the_stop() {
+    for (kind, id) in [FaultKind::Drop, FaultKind::Full].into_iter().flat_map(|kind| [(kind, 0x203), (kind, 0x204)]) {
+        // Without a deadline of its own it goes on with its last torque: the stop takes the way of its set-points.
+        let mut stand = Stand::new(quick(), 1, |_, model| param(model, 0, 1.5));
+        (0..2).for_each(|node| stand.world.bench().drive(node).unwrap().without_deadlines());
+        stand.reach(Step::Armed);
+        stand.goes_on(300 * MS);
+        assert_eq!(stand.hil.fieldbus().status(1).unwrap().deadline_ms, None);
+        let (now, node) = (stand.now(), usize::from(id == 0x204));
+        stand.world.bus(0).plant(MASTER, Fault::new(kind).id(id).from(now));
+        while stand.hil.ended().is_none() {
+            stand.cycle();
+            // A millisecond for the slew, the time to obey, the drive's time-out; then it brakes on its own ramp.
+            let late = stand.cause.is_some_and(|(_, at)| stand.now() > at + (1 + 20 + 10) * MS);
+            let state = stand.world.bench().drive(node).unwrap().state();
+            let obeys = state != crate::drive::state::State::Enabled;
+            assert!(!late || obeys, "{kind:?} {id:03X}: {state} after {:?}", stand.cause);
+            assert!(stand.now() < now + 3_000 * MS, "{kind:?} {id:03X}: {:?}", stand.cause);
+        }
+        stand.at_rest();
+    }
+}
+
+#[test]
 fn row_14_a_drive_that_tells_another_torque_than_it_was_told() {
     for factor in [0.0, 0.5, -1.0] {
         let mut stand = Stand::armed(|_, model| param(model, 0, 1.5));
@@ -420,16 +444,14 @@ fn row_13_a_drive_that_is_not_ours_gets_no_permission() {
 
 #[test]
 fn row_13_a_safe_value_that_would_move_a_drive_before_arming() {
-    let mut stand = Stand::new(quick(), 1, |rig, _| rig.outputs[1].safe = 0.5);
-    let end = loop {
-        stand.cycle();
-        let torque = stand.world.bench().shaft(0).torque;
-        assert!(torque.abs() < 1e-9, "{torque} N·m before arming");
-        if let Some(end) = stand.hil.ended() {
-            break end.clone();
-        }
-    };
-    assert!(matches!(&end, End::Refused(why) if why.contains("before it is armed")), "{end:?}");
+    for safe in [0.5, -1e-9] {
+        let (mut rig, model, plant) = bench::pair();
+        rig.outputs[1].safe = safe;
+        let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+        let masters = world.masters();
+        let refused = Hil::new(&rig, model, world.clock(), masters, quick(), None).err().unwrap();
+        assert!(refused.contains("`load`") && refused.contains("before it is armed"), "{refused}");
+    }
 }
 
 #[test]

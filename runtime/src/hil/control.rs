@@ -5,13 +5,12 @@
 //! bits. It allocates in [`Control::new`] only.
 
 use super::coupling::{Coupling, Verdict};
-use super::followed::{self, Followed};
+use super::followed::Followed;
+use super::watches::{self, bounds_of};
 use crate::drive::profiles;
 use crate::lookahead::Wired;
-use crate::safety::{
-    Cause, DriveLimits, Order, OutputLimits, Patience, Protection, Refused, Seen, Supervisor, is_present,
-};
-use abi::rig::{Kind, Mode, Overrun, Rig, Signal, What};
+use crate::safety::{Cause, Order, Patience, Protection, Seen, Supervisor, is_present};
+use abi::rig::{Kind, Overrun, Rig, Signal, What};
 use abi::{Function, Instance, Slot};
 
 /// A value as it was read.
@@ -187,16 +186,17 @@ impl Control {
         options: Options,
     ) -> Result<Control, String> {
         assert_eq!(rig.predict, look.as_ref().map(|wired| wired.node), "the look ahead of rig {}", rig.name);
+        watches::may_start(rig)?;
         let period = rig.period_ns as f64 * 1e-9;
         let ticks = |ns: u64| u32::try_from(ns.div_ceil(rig.period_ns)).unwrap_or(u32::MAX);
         let moving: Vec<usize> = (0..rig.nodes.len()).filter(|i| rig.nodes[*i].moves).collect();
         let mut drives = Vec::new();
         for i in &moving {
-            drives.push(drive_limits(rig, *i, bounds)?);
+            drives.push(watches::drive_limits(rig, *i, bounds)?);
         }
         let mut outputs = Vec::new();
         for output in &rig.outputs {
-            outputs.push(output_limits(rig, output, &moving, bounds)?);
+            outputs.push(watches::output_limits(rig, output, &moving, bounds)?);
         }
         let patience = Patience {
             ramp: ticks(options.ramp_ns),
@@ -204,7 +204,7 @@ impl Control {
             standstill: ticks(options.standstill_ns),
         };
         let supervisor = Supervisor::new(&outputs, &drives, patience, rig.period_ns)
-            .map_err(|refused| refusal(rig, &moving, refused))?;
+            .map_err(|refused| watches::refusal(rig, &moving, refused))?;
 
         // What a drive that holds speed or position gives for it is its own affair: all it has.
         let strongest = |node: &usize| match outputs.iter().find(|o| o.torque && moving[o.drive.unwrap_or(0)] == *node)
@@ -245,10 +245,9 @@ impl Control {
         let inputs = rig.inputs.iter().map(|input| (watch(input.signal, input.start, input.needed), input.slot));
         let inputs = inputs.collect();
         let seen_at = moving.iter().map(|node| {
-            let mut measured = |what| {
-                let speaks = matches!(rig.nodes[*node].kind, Kind::Cia402(_));
-                speaks.then(|| watch(Signal { node: *node, what }, 0.0, true))
-            };
+            // A drive described by frames may tell more slowly than the rig reads: without a `timeout` it is never lost.
+            let needed = matches!(rig.nodes[*node].kind, Kind::Cia402(_)) || rig.nodes[*node].timeout_ns > 0;
+            let mut measured = |what| watches::told(rig, *node, what).map(|signal| watch(signal, 0.0, needed));
             measured(What::Torque);
             (measured(What::Speed), measured(What::Position))
         });
@@ -268,7 +267,7 @@ impl Control {
         let paired = paired.collect();
         let odd = if options.count_overruns { ODD.max(ticks(ODD_NS)) } else { ODD };
         let followed = outputs.iter().enumerate().filter_map(|(output, limits)| {
-            let answer = followed::answer(rig, output)?;
+            let answer = watches::answer(rig, &rig.outputs[output])?;
             let signal = watched.iter().position(|watched| watched.signal == answer)?;
             Followed::new(rig, output, signal, limits).map(|followed| followed.patient(odd))
         });
@@ -604,93 +603,6 @@ impl Control {
         self.supervisor.restore(&mut words)?;
         self.coupling.restore(&mut words)?;
         words.next().is_none().then_some(())
-    }
-}
-
-/// Greatest torque and speed of a node: as the rig says, else as the drive says.
-fn bounds_of(rig: &Rig, node: usize, bounds: &[Bounds]) -> Bounds {
-    let read = bounds.get(node).copied().unwrap_or_default();
-    match &rig.nodes[node].kind {
-        Kind::Cia402(drive) => {
-            Bounds { torque: drive.max_torque.or(read.torque), speed: drive.max_speed.or(read.speed) }
-        }
-        Kind::Frames(_) => read,
-    }
-}
-
-/// What supervises a drive.
-fn drive_limits(rig: &Rig, node: usize, bounds: &[Bounds]) -> Result<DriveLimits, String> {
-    let name = &rig.nodes[node].name;
-    let Kind::Cia402(drive) = &rig.nodes[node].kind else {
-        let all = (f64::NEG_INFINITY, f64::INFINITY);
-        return Ok(DriveLimits { speed: f64::INFINITY, travel: all, power: f64::INFINITY });
-    };
-    let Bounds { torque, speed } = bounds_of(rig, node, bounds);
-    let speed = speed.filter(|speed| speed.is_finite() && *speed > 0.0).ok_or_else(|| {
-        format!("drive `{name}`: no greatest speed is known: give `speed_max`; the drive does not say (object 6080)")
-    })?;
-    let torque = torque.filter(|torque| torque.is_finite() && *torque > 0.0).ok_or_else(|| {
-        format!("drive `{name}`: no greatest torque is known: give `T_max`; the drive does not say (object 6072)")
-    })?;
-    let travel = drive.travel.unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
-    Ok(DriveLimits { speed, travel, power: drive.max_power.unwrap_or(torque * speed) })
-}
-
-/// Limits of an output: those of the rig, within those of the drive.
-fn output_limits(
-    rig: &Rig,
-    output: &abi::rig::Output,
-    moving: &[usize],
-    bounds: &[Bounds],
-) -> Result<OutputLimits, String> {
-    let abi::rig::Output { signal, low, high, slew, safe, .. } = *output;
-    let drive = moving.iter().position(|node| *node == signal.node);
-    let (mut low, mut high, mut torque) = (low, high, false);
-    if let Kind::Cia402(described) = &rig.nodes[signal.node].kind {
-        let most = bounds_of(rig, signal.node, bounds);
-        torque = described.mode == Mode::Torque;
-        let (least, greatest) = match described.mode {
-            Mode::Torque => (most.torque.map(|most| -most), most.torque),
-            Mode::Speed => (most.speed.map(|most| -most), most.speed),
-            Mode::Position => (described.travel.map(|travel| travel.0), described.travel.map(|travel| travel.1)),
-        };
-        low = low.max(least.unwrap_or(f64::NEG_INFINITY));
-        high = high.min(greatest.unwrap_or(f64::INFINITY));
-        if !(low.is_finite() && high.is_finite()) {
-            let name = &rig.nodes[signal.node].name;
-            return Err(format!(
-                "drive `{name}`: its command has no bounds: give a `limit`, or `travel` for a position"
-            ));
-        }
-    }
-    // Before arming drives are enabled at their safe values: another one than 0 would move them before any sign was tested.
-    if safe != 0.0 && rig.nodes[signal.node].is_moved_by(signal.what) && is_present(Protection::Idle) {
-        let name = &rig.nodes[signal.node].name;
-        return Err(format!(
-            "the command of `{name}`: its safe value is {safe}, and would move it before it is armed: make it 0"
-        ));
-    }
-    Ok(OutputLimits { low, high, slew, safe, drive, torque })
-}
-
-/// Why the limits of a rig cannot be kept, in words.
-fn refusal(rig: &Rig, moving: &[usize], refused: Refused) -> String {
-    let output = |i: usize| {
-        let node: &str = &rig.nodes[rig.outputs[i].signal.node].name;
-        format!("the command of `{node}`")
-    };
-    match refused {
-        Refused::Range(i) => {
-            let abi::rig::Output { low, high, safe, .. } = rig.outputs[i];
-            format!("{}: its safe value {safe} is not within its limits {low} .. {high}", output(i))
-        }
-        Refused::Slew(i) => format!("{}: its slew is not above 0, so it could never be stopped", output(i)),
-        Refused::Unbounded(i) => format!("{}: it has no bounds: give a `limit`", output(i)),
-        Refused::NoDrive(i) => format!("{}: there is no such drive", output(i)),
-        Refused::Wider(i) => format!("{}: limits can only be narrowed", output(i)),
-        Refused::Drive(i) => {
-            format!("drive `{}`: a limit is negative or no number", rig.nodes[moving[i]].name)
-        }
     }
 }
 

@@ -11,7 +11,7 @@
 use super::control::{Bounds, Control, Reading, Source, Told};
 use super::counts::Counts;
 use super::trace::{self, Passed, Shape};
-use super::{control, emergency};
+use super::{control, emergency, watches};
 use crate::can::{Bus, Event, Frame, Received};
 use crate::clock::Clock;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
@@ -266,6 +266,7 @@ impl Hil {
         log: Option<(log::Settings, Sections)>,
     ) -> Result<(Hil, Operator), String> {
         assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
+        watches::may_start(rig)?;
         let fieldbus = Fieldbus::new(rig, options.start)?;
         let (operator, commands) = queue(64);
         if rig.predict.is_some() && options.look.is_none() {

@@ -11,9 +11,10 @@
 //!
 //! A reading outside of the envelopes by more than a tolerance is one that no command explains.
 
+use super::watches;
 use crate::drive::profiles;
 use crate::safety::{OutputLimits, Protection, is_present};
-use abi::rig::{Kind, Mode, Rig, Signal, What};
+use abi::rig::{Kind, Mode, Rig, What};
 
 /// Dead time beyond the drive's own for which a command may be under way, s: a late cycle, a busy bus.
 const SLACK: f64 = 1e-3;
@@ -29,6 +30,8 @@ const LOOP: f64 = 0.1;
 const LOOP_NS: u64 = 1_000_000_000;
 /// Tolerance of a speed or a position, as part of half the range of its command.
 const LOOP_PART: f64 = 0.1;
+/// Longest time for which a command may be under way, s: the window is looked through in each cycle.
+const MOST_DEAD: f64 = 0.25;
 /// Most ticks that an envelope is carried over at once: after so many it has decayed, whatever the lag.
 const MOST_TICKS: u32 = 1000;
 
@@ -55,38 +58,38 @@ pub struct Followed {
     outside: u32,
 }
 
-/// The signal that tells what a drive makes of its command; none where it has none.
-pub fn answer(rig: &Rig, output: usize) -> Option<Signal> {
-    let signal = rig.outputs[output].signal;
-    let node = &rig.nodes[signal.node];
-    let Kind::Cia402(drive) = &node.kind else { return None };
-    let what = match drive.mode {
-        Mode::Torque => What::Torque,
-        Mode::Speed => What::Speed,
-        Mode::Position => What::Position,
-    };
-    node.moves.then_some(Signal { node: signal.node, what })
-}
-
 impl Followed {
     /// The watch of an output whose answer is at this place among the signals.
     pub fn new(rig: &Rig, output: usize, signal: usize, limits: &OutputLimits) -> Option<Followed> {
-        let at = answer(rig, output)?;
+        let (commanded, at) = (rig.outputs[output].signal, watches::answer(rig, &rig.outputs[output])?);
         let node = &rig.nodes[at.node];
-        let Kind::Cia402(drive) = &node.kind else { return None };
+        let asked = node.asks_for(commanded.what)?;
         let period = rig.period_ns as f64 * 1e-9;
-        let profile = profiles::find(&drive.profile)?;
-        let torque = drive.mode == Mode::Torque;
+        let torque = asked == What::Torque;
         let half = 0.5 * (limits.high - limits.low);
-        let tolerance = match drive.mode {
-            Mode::Torque => TORQUE_PART * drive.rated_torque + 2.0 * drive.rated_torque / profile.full_torque as f64,
-            Mode::Speed => LOOP_PART * half + 4.0 * drive.speed_unit,
-            Mode::Position => LOOP_PART * half + 4.0 * drive.count,
+        let (tolerance, late) = match &node.kind {
+            Kind::Cia402(drive) => {
+                let profile = profiles::find(&drive.profile)?;
+                let unit = drive.rated_torque / profile.full_torque as f64;
+                let tolerance = match drive.mode {
+                    Mode::Torque => TORQUE_PART * drive.rated_torque + 2.0 * unit,
+                    Mode::Speed => LOOP_PART * half + 4.0 * drive.speed_unit,
+                    Mode::Position => LOOP_PART * half + 4.0 * drive.count,
+                };
+                // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late; one that
+                // waits for SYNC takes it with the next one.
+                let waits = if drive.at_sync { period } else { 0.0 };
+                (tolerance, waits + 2.0 * profile.refresh_ns as f64 * 1e-9)
+            }
+            Kind::Frames(messages) => {
+                let What::Field(message, field) = at.what else { return None };
+                let message = &messages[message];
+                // What it tells may be as old as its frames are apart.
+                let apart_ns = if message.period_ns > 0 { message.period_ns } else { node.timeout_ns };
+                (LOOP_PART * half + 4.0 * message.fields[field].scale.abs(), apart_ns as f64 * 1e-9)
+            }
         };
-        // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late; one that waits for
-        // SYNC takes it with the next one.
-        let waits = if drive.at_sync { period } else { 0.0 };
-        let dead = node.delay + SLACK + waits + 2.0 * profile.refresh_ns as f64 * 1e-9;
+        let dead = (node.delay + SLACK + late).min(MOST_DEAD);
         let lag = SLOWER * node.lag + if torque { 0.0 } else { LOOP };
         let patience = if torque { TORQUE_TICKS } else { ticks(LOOP_NS, rig.period_ns) };
         Some(Followed {

@@ -5,6 +5,7 @@
 
 pub mod coupling;
 pub mod standard;
+pub mod watches;
 pub mod followed;
 pub mod control;
 pub mod trace;
