@@ -15,19 +15,32 @@ impl Ratio {
     /// 1
     pub const ONE: Ratio = Ratio { num: 1, den: 1 };
 
+    /// Stands for every fraction whose lowest terms do not fit 32 bits. Exponents of physics are small: whoever makes one
+    /// from a text asks [`Ratio::is_beyond`].
+    pub const BEYOND: Ratio = Ratio { num: i32::MAX, den: 1 };
+
     /// `num / den`, `den` not 0.
     ///
     /// # Panics
-    /// If the lowest terms do not fit 32 bits: exponents of physics are small.
+    /// If `den` is 0.
     pub fn new(num: i64, den: i64) -> Ratio {
         assert!(den != 0, "{num}/0 is no fraction");
         let (mut a, mut b) = (num.unsigned_abs(), den.unsigned_abs());
         while b != 0 {
             (a, b) = (b, a % b);
         }
-        let divisor = (a.max(1) as i64) * den.signum();
-        let fit = |n: i64| i32::try_from(n).unwrap_or_else(|_| panic!("exponent {num}/{den} is beyond reason"));
-        Ratio { num: fit(num / divisor), den: fit(den / divisor) }
+        let divisor = i128::from(a.max(1)) * i128::from(den.signum());
+        // The least number has no opposite, so it is left out.
+        let fit = |n: i64| i32::try_from(i128::from(n) / divisor).ok().filter(|n| *n != i32::MIN);
+        match (fit(num), fit(den)) {
+            (Some(num), Some(den)) => Ratio { num, den },
+            _ => Ratio::BEYOND,
+        }
+    }
+
+    /// Whether it stands for fractions that are too large to be told apart.
+    pub fn is_beyond(self) -> bool {
+        self == Ratio::BEYOND
     }
 
     /// The whole number `n`.
@@ -57,6 +70,9 @@ impl Ratio {
 impl std::ops::Add for Ratio {
     type Output = Ratio;
     fn add(self, o: Ratio) -> Ratio {
+        if self.is_beyond() || o.is_beyond() {
+            return Ratio::BEYOND;
+        }
         let (a, b, c, d) = (self.num as i64, self.den as i64, o.num as i64, o.den as i64);
         Ratio::new(a * d + c * b, b * d)
     }
@@ -65,6 +81,9 @@ impl std::ops::Add for Ratio {
 impl std::ops::Neg for Ratio {
     type Output = Ratio;
     fn neg(self) -> Ratio {
+        if self.is_beyond() {
+            return self;
+        }
         Ratio { num: -self.num, den: self.den }
     }
 }
@@ -72,6 +91,12 @@ impl std::ops::Neg for Ratio {
 impl std::ops::Mul for Ratio {
     type Output = Ratio;
     fn mul(self, o: Ratio) -> Ratio {
+        if self.is_zero() || o.is_zero() {
+            return Ratio::ZERO;
+        }
+        if self.is_beyond() || o.is_beyond() {
+            return Ratio::BEYOND;
+        }
         Ratio::new(self.num as i64 * o.num as i64, self.den as i64 * o.den as i64)
     }
 }
@@ -144,6 +169,11 @@ impl Dimension {
             [0, 0, 0, 1, 0],
         ];
         kinds.iter().any(|exponents| Dimension::of(*exponents) == self)
+    }
+
+    /// Whether one of its exponents is too large to be told from others.
+    pub fn is_beyond(self) -> bool {
+        self.0.iter().any(|exponent| exponent.is_beyond())
     }
 
     /// Whether it is that of a pure number.
@@ -238,6 +268,9 @@ const UNITS: &[(&str, f64, [i32; 5], bool, Angle)] = &[
 /// Prefixes; `c` goes with `m` only.
 const PREFIXES: &[(&str, f64)] = &[("G", 1e9), ("M", 1e6), ("k", 1e3), ("m", 1e-3), ("u", 1e-6), ("n", 1e-9)];
 
+/// Greatest exponent of a factor as written: nobody measures in m^100.
+const MOST_EXPONENT: u32 = 99;
+
 impl Unit {
     /// A pure number.
     pub fn none() -> Unit {
@@ -290,6 +323,10 @@ impl Unit {
             }
         }
         take(&mut atom, sign)?;
+        // One that cannot be told from 0 or from infinity measures nothing.
+        if !unit.scale.is_normal() || unit.dimension.is_beyond() {
+            return Err(text.to_string());
+        }
         unit.text = joined(&parts);
         if unit.angle == Angle::Silent && unit.dimension == Dimension::of([0, 0, -1, 0, 0]) {
             unit.angle = Angle::Rate;
@@ -358,7 +395,10 @@ impl fmt::Display for Unit {
 /// One factor of a unit: the unit without its exponent, its text, its exponent.
 fn parse_atom(atom: &str) -> Result<(Unit, String, i32), String> {
     let (word, exponent) = match atom.split_once('^') {
-        Some((word, exponent)) => (word, exponent.parse::<i32>().map_err(|_| atom.to_string())?),
+        Some((word, exponent)) => {
+            let exponent = exponent.parse::<i32>().ok().filter(|exponent| exponent.unsigned_abs() <= MOST_EXPONENT);
+            (word, exponent.ok_or_else(|| atom.to_string())?)
+        }
         None => (atom, 1),
     };
     if word == "1" {
@@ -456,6 +496,34 @@ mod tests {
     fn shown(text: &str) -> (f64, String) {
         let unit = Unit::parse(text).unwrap();
         (unit.scale, unit.text)
+    }
+
+    /// No exponent is a reason to panic or to take long: it is exact, or beyond what can be told.
+    #[test]
+    fn exponents_are_exact_or_beyond() {
+        let large = [1, -1, 2, 12, 99_999, -99_999, i64::from(i32::MAX), i64::from(i32::MIN), i64::MAX, i64::MIN];
+        let all: Vec<Ratio> = large.iter().flat_map(|num| large.iter().map(|den| Ratio::new(*num, *den))).collect();
+        for a in &all {
+            assert!(a.parts().1 > 0 && (-*a).parts().1 > 0);
+            for b in &all {
+                let exact = |num: i128, den: i128| (num, den);
+                let ((p, q), (r, s)) = (a.parts(), b.parts());
+                let [p, q, r, s] = [p, q, r, s].map(i128::from);
+                for (found, (num, den)) in [(*a + *b, exact(p * s + r * q, q * s)), (*a * *b, exact(p * r, q * s))] {
+                    let (n, d) = found.parts();
+                    let holds = found.is_beyond() || i128::from(n) * den == num * i128::from(d);
+                    assert!(holds, "{a:?}, {b:?}: {found:?}");
+                }
+            }
+        }
+        assert_eq!(Ratio::new(99_999, 1) * Ratio::new(99_999, 1), Ratio::BEYOND);
+        assert_eq!(Ratio::BEYOND * Ratio::ZERO, Ratio::ZERO);
+        for text in
+            ["m^2000000000", "m^-2147483648", "1/m^-2147483648", "km^99·km^99·km^99·km^99", "1/km^99/km^99/km^99/km^99"]
+        {
+            assert!(Unit::parse(text).is_err(), "{text}");
+        }
+        assert_eq!(Unit::parse("m^99").unwrap().dimension.0[1], Ratio::whole(99));
     }
 
     #[test]

@@ -494,6 +494,13 @@ impl Visit {
             Node::Call(Builtin::Sqrt, args) if !prover.interval(args[0]).is_not_negative() => {
                 diagnostics.push(domain(prover, files, args[0], "`sqrt`", "negative", ">= 0", "abs"));
             }
+            // The time in which a chirp sweeps, and for which noise keeps a value.
+            Node::Call(Builtin::Chirp, args) if !prover.interval(args[3]).is_positive() => {
+                diagnostics.push(domain(prover, files, args[3], "`chirp`", "zero or negative", "> 0", "max"));
+            }
+            Node::Call(Builtin::Noise, args) if !prover.interval(args[1]).is_positive() => {
+                diagnostics.push(domain(prover, files, args[1], "`noise`", "zero or negative", "> 0", "max"));
+            }
             Node::Call(Builtin::Log, args) if !prover.interval(args[0]).is_positive() => {
                 diagnostics.push(domain(prover, files, args[0], "`log`", "zero or negative", "> 0", "max"));
             }

@@ -64,12 +64,19 @@ fn walk(
     checker.declare();
     for index in 0..system.nodes.len() {
         let found = checker.node(ExprId(index as u32));
+        let found = checker.within_reason(ExprId(index as u32), found);
         checker.types.push(found);
     }
     checker.definitions();
     checker.statements();
     let found = std::mem::take(&mut checker.found);
     (checker.finish(), found)
+}
+
+/// E0105 for exponents that cannot be told from others.
+fn too_large(message: &str, span: Span) -> Diagnostic {
+    let error = Diagnostic::error("E0105", message).label(span, "a quantity to this power");
+    error.help("make the base a pure number first: divide it by a quantity of its kind")
 }
 
 /// A dimension with unknowns in it: `base · Π unknown^exponent`.
@@ -122,6 +129,16 @@ struct Checker<'a> {
 }
 
 impl Checker<'_> {
+    /// E0105 for an exponent that grew too large to be told from others.
+    fn within_reason(&mut self, id: ExprId, found: Kind) -> Kind {
+        let beyond = |term: &Term| term.base.is_beyond() || term.unknowns.iter().any(|(_, e)| e.is_beyond());
+        if !matches!(&found, Kind::Real(term) if beyond(term)) {
+            return found;
+        }
+        self.diagnostics.push(too_large("the exponents of the unit of this are beyond reason", self.system.span(id)));
+        Kind::Unknown
+    }
+
     fn fresh(&mut self) -> Term {
         self.unknowns.push(None);
         Term { base: Dimension::NONE, unknowns: vec![(self.unknowns.len() as u32 - 1, Ratio::ONE)] }
@@ -576,7 +593,20 @@ impl Checker<'_> {
             }
         };
         match builtin {
-            Builtin::Abs | Builtin::Floor => Kind::Real(terms[0].clone()),
+            Builtin::Abs => Kind::Real(terms[0].clone()),
+            Builtin::Floor => {
+                if !self.unify(&terms[0], &none) {
+                    // To whole numbers of what? SI would be a guess.
+                    let (unit, text) = (self.shown(&terms[0]), self.text(args[0]));
+                    let message = format!("`floor` needs a pure number, not {}", self.described(&terms[0]));
+                    let error = Diagnostic::error("E0104", message)
+                        .label(self.system.span(args[0]), format!("whole numbers of {unit}, or of what?"))
+                        .help(format!("say of what: `(1 {unit}) * floor({text} / (1 {unit}))`"));
+                    self.diagnostics.push(error);
+                    return Kind::Unknown;
+                }
+                Kind::Real(none)
+            }
             Builtin::Sign => Kind::Real(none),
             Builtin::Sqrt => Kind::Real(none.times(&terms[0], Ratio::new(1, 2))),
             Builtin::Min | Builtin::Max | Builtin::Hypot | Builtin::Clamp | Builtin::Atan2 => {
@@ -939,6 +969,7 @@ impl Checker<'_> {
         };
         let mut units = Vec::with_capacity(self.vars.len());
         let mut lost: Vec<VarId> = Vec::new();
+        let mut beyond: Option<VarId> = None;
         for (k, (var, kind)) in self.system.vars.iter().zip(&self.vars).enumerate() {
             let unit = match (&var.unit, base(&self, kind)) {
                 (Some((unit, _)), _) => unit.clone(),
@@ -954,6 +985,9 @@ impl Checker<'_> {
                     if !known && defined && matches!(var.kind, VarKind::Output | VarKind::Let | VarKind::State) {
                         lost.push(VarId(k as u32));
                     }
+                    if dimension.is_beyond() {
+                        beyond = beyond.or(Some(VarId(k as u32)));
+                    }
                     match &var.shown {
                         Some(unit) if unit.dimension == dimension => unit.clone(),
                         _ => Unit::si(dimension),
@@ -962,6 +996,10 @@ impl Checker<'_> {
                 (None, None) => Unit::none(),
             };
             units.push(unit);
+        }
+        // What follows from the first is no mistake of its own.
+        if let Some(id) = beyond {
+            self.diagnostics.push(too_large("the exponents of its unit are beyond reason", self.system.var(id).span));
         }
         let holes: Vec<(Span, Dimension)> = (0..self.system.nodes.len())
             .filter(|&k| self.system.nodes[k] == Node::Hole)

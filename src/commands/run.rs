@@ -91,6 +91,19 @@ fn experiment(
         }
     }
 
+    if cases.iter().all(|case| case.experiment.plots.is_empty()) {
+        let asked = [(args.plot.is_some(), "--plot"), (args.csv.is_some(), "--csv")];
+        if let Some((_, option)) = asked.into_iter().find(|(asked, _)| *asked) {
+            terminal.error(&format!(
+                "{}: {option} has nothing to write: `{name}` records nothing; add `plot` with what to record, such as `plot x, v`",
+                place(loaded, name)
+            ));
+            return End::Failed;
+        }
+        if talking && args.out.is_some() {
+            terminal.line("  nothing to write: the experiment has no `plot`");
+        }
+    }
     let done = done(cases, stages, !talking);
     let crossed: Option<Vec<Crossed>> = match args.cross {
         true => cross(loaded, name, options, &done.cases, terminal),
