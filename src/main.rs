@@ -24,6 +24,7 @@ mod results;
 mod sign;
 mod stability;
 mod terminal;
+mod unfinished;
 mod value;
 mod vary;
 

@@ -367,6 +367,54 @@ fn a_sweep_has_the_same_bytes_however_it_is_run() {
     assert!(!folder.0.join(".cut.csv.unfinished").exists());
 }
 
+/// Two sweeps into one table; one that goes on where rows were lost or changed.
+#[test]
+fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
+    let folder = Folder::new("alone");
+    let read = |name: &str| fs::read(folder.0.join(name)).unwrap();
+    let long = |runs: &'static str, out: &'static str| {
+        with(&["--runs", runs, "-q", "--for", "60s", "--threads", "1", "--out", out])
+    };
+    let (_, err) = folder.run(&long("20", "whole.csv"), 0);
+    assert_eq!(err, "");
+    let mut child = folder.fric(&long("100000", "live.csv")).stdout(Stdio::null()).spawn().unwrap();
+    let begin = Instant::now();
+    let enough = |rows: usize| {
+        fs::read(folder.0.join("live.csv")).is_ok_and(|all| all.split(|b| *b == b'\n').count() > rows + 2)
+    };
+    while !enough(20) {
+        assert!(begin.elapsed() < Duration::from_secs(120) && child.try_wait().unwrap().is_none());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    for more in [&[][..], &["--resume"]] {
+        let (_, err) = folder.run(&[&long("100000", "live.csv")[..], more].concat(), 1);
+        assert!(err.contains("another sweep writes live.csv: wait until it has ended"), "{err}");
+    }
+    // Killed, the table is free; its rows are those of the shorter sweep, and it is made into one that was interrupted.
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let begun = folder.0.join(".live.csv.unfinished");
+    let asked = fs::read_to_string(&begun).unwrap();
+    assert!(asked.contains("runs 0..500000 of 500000"), "{asked}");
+    let asked = asked.replace("runs 0..500000 of 500000", "runs 0..100 of 100");
+    let rows: Vec<Vec<u8>> = read("live.csv").split_inclusive(|b| *b == b'\n').take(16).map(<[u8]>::to_vec).collect();
+    assert_eq!(rows.concat(), read("whole.csv")[..rows.concat().len()]);
+    let without = [&rows[..8], &rows[9..]].concat();
+    let doubled = [&rows[..9], &rows[8..]].concat();
+    let mut changed = rows.clone();
+    let at = changed[8].len() - 4;
+    changed[8].truncate(at);
+    changed[8].push(b'\n');
+    for (name, rows) in [("lost", without), ("doubled", doubled), ("changed", changed)] {
+        fs::write(folder.0.join("live.csv"), rows.concat()).unwrap();
+        fs::write(&begun, &asked).unwrap();
+        let (_, err) = folder.run(&[&long("20", "live.csv")[..], &["--resume"]].concat(), 0);
+        assert!(err.contains("is missing or not as it was written: rows from "), "{name}: {err}");
+        assert_eq!(read("live.csv"), read("whole.csv"), "{name}");
+        assert!(!begun.exists());
+    }
+}
+
 #[test]
 fn each_run_is_checked_and_measured_with_its_own_values() {
     let folder = Folder::new("checked");

@@ -1,8 +1,8 @@
 //! `fric sweep`: many runs of one experiment under other parameters, one row each.
 //!
 //! Rows are appended in the order of the runs as they are done, so a file that was interrupted is the beginning of the
-//! whole one, and shards written one behind the other are the whole. A neighbour of the file, `.NAME.unfinished`, holds
-//! what the sweep was asked for until it is complete: nobody goes on with another one.
+//! whole one, and shards written one behind the other are the whole. Until it is complete, [`Unfinished`] keeps others from
+//! writing it and knows what was asked for: nobody goes on with another sweep, or with rows that are not as they were.
 
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
@@ -10,6 +10,7 @@ use crate::compile::{self, Changes, Fitted, Loaded, Options, Stopwatch, Varying}
 use crate::parquet::{self, Holds};
 use crate::plot::{self, Axis, Curve, Figure, Panel};
 use crate::terminal::{Style, Terminal};
+use crate::unfinished::{Hash, Mark, Unfinished};
 use crate::value::{self, count, significant};
 use crate::vary::{Dice, Vary};
 use crate::{project, results};
@@ -20,7 +21,7 @@ use runtime::engine::{self, Cause, Continue, Failure, Outcome};
 use runtime::lanes::{self, Next};
 use runtime::sweep::{self, Desk, Ticket};
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{self, BufWriter, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -115,6 +116,13 @@ struct Table {
     draws: u64,
     seed: u64,
     columns: Vec<Column>,
+}
+
+/// What rows are appended to, and how far it is written.
+struct Writing<'a> {
+    file: &'a mut File,
+    unfinished: &'a mut Unfinished,
+    mark: Mark,
 }
 
 /// A run of a sweep.
@@ -347,10 +355,13 @@ impl Table {
         let out = &args.out;
         let rows = rows_of(out);
         let told = |what: &str, error: io::Error| format!("cannot {what} {}: {error}", out.display());
-        let marker = out.with_file_name(format!(".{}.unfinished", name_of(out)));
-        let before = fs::read_to_string(&marker).ok();
-        let done = match (args.resume, &before) {
-            (true, Some(before)) if *before != asked => {
+        project::make_folder_of(out).map_err(|error| told("write", error))?;
+        let mut unfinished = Unfinished::claim(out)?;
+        let before = unfinished.before().map(str::to_string);
+        let dice = Dice::new(self.seed);
+        let mut mark = Mark { rows: 0, bytes: 0, hash: Hash::EMPTY };
+        match (args.resume, &before) {
+            (true, Some(before)) if *before != asked.trim_end() => {
                 return Err(format!(
                     "{} was begun with other settings or another text:\n{}now:\n{}give the same, or remove it",
                     out.display(),
@@ -358,7 +369,18 @@ impl Table {
                     indented(&asked)
                 ));
             }
-            (true, Some(_)) => kept(&rows, &header).map_err(|error| told("read", error))?,
+            (true, Some(_)) => {
+                let fits = |k: u64, row: &str| self.is_row(range.start + k, row, &dice);
+                let sound = unfinished.sound(&rows, &header, &fits).map_err(|error| told("read", error))?;
+                mark = sound.mark;
+                if let Some(fault) = sound.fault {
+                    terminal.report(&format!(
+                        "{fault} of {} is missing or not as it was written: rows from {} on are computed again\n",
+                        rows.display(),
+                        range.start + mark.rows
+                    ));
+                }
+            }
             (true, None) if out.exists() => {
                 return Err(format!("{} is complete or was not made by a sweep: nothing to resume", out.display()));
             }
@@ -368,20 +390,21 @@ impl Table {
                     out.display()
                 ));
             }
-            (true | false, _) => 0,
-        };
-        project::make_folder_of(out).map_err(|error| told("write", error))?;
-        let mut file = if done > 0 {
+            (true | false, _) => {}
+        }
+        let mut file = if mark.rows > 0 {
             OpenOptions::new().append(true).open(&rows).map_err(|error| told("write", error))?
         } else {
-            fs::write(&marker, &asked).map_err(|error| told("write", error))?;
+            unfinished.begin(&asked).map_err(|error| told("write", error))?;
             let mut file = File::create(&rows).map_err(|error| told("write", error))?;
             file.write_all(&header).map_err(|error| told("write", error))?;
+            mark = Mark { rows: 0, bytes: header.len() as u64, hash: Hash::EMPTY.and(&header) };
             file
         };
         let threads = args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
-        let from = range.start + done;
-        let written = self.append(args, &mut file, from..range.end, threads).map_err(|error| told("write", error))?;
+        let from = range.start + mark.rows;
+        let into = Writing { file: &mut file, unfinished: &mut unfinished, mark };
+        let written = self.append(args, into, from..range.end, threads, &dice).map_err(|error| told("write", error))?;
         let reached = from + written;
         let wall = begin.elapsed().as_secs_f64();
         if reached < range.end {
@@ -398,7 +421,7 @@ impl Table {
         if rows != *out {
             self.convert(&rows, shard == 1, out).map_err(|error| told("write", error))?;
         }
-        let _ = fs::remove_file(&marker);
+        unfinished.finish();
         if let Some(path) = &args.plot {
             let figure = self.figure(args, &summary)?;
             let png = path.extension().is_some_and(|extension| extension == "png");
@@ -428,8 +451,31 @@ impl Table {
         Ok(End::Fine)
     }
 
+    /// Whether a line of the table can be the row of a run: its number, what was varied, and as many cells as there are
+    /// columns, numbers where measures stand.
+    fn is_row(&self, run: u64, row: &str, dice: &Dice) -> bool {
+        let mut reader = csv::ReaderBuilder::new().has_headers(false).flexible(true).from_reader(row.as_bytes());
+        let mut record = csv::StringRecord::new();
+        if !reader.read_record(&mut record).is_ok_and(|found| found) || record.len() != self.columns.len() {
+            return false;
+        }
+        let (at, values) = self.values(run, dice);
+        let mut varied = self.vary.iter().zip(&values);
+        self.columns.iter().zip(&record).all(|(column, cell)| match column.kind {
+            ColumnKind::Run => cell == run.to_string(),
+            ColumnKind::Case => cell == self.cases[at].label,
+            ColumnKind::Varied => {
+                varied.next().is_some_and(|(vary, value)| cell == runtime::show::plain(vary.unit.from_si(*value)))
+            }
+            ColumnKind::Measure(..) => cell.is_empty() || cell.parse::<f64>().is_ok(),
+            ColumnKind::Verdict(_) => matches!(cell, "" | "true" | "false"),
+            ColumnKind::Status => !cell.is_empty(),
+        })
+    }
+
     /// Appends rows; returns how many.
-    fn append(&self, args: &Sweep, file: &mut File, range: Range<u64>, threads: usize) -> io::Result<u64> {
+    fn append(&self, args: &Sweep, into: Writing, range: Range<u64>, threads: usize, dice: &Dice) -> io::Result<u64> {
+        let Writing { file, unfinished, mut mark } = into;
         let stopped = Arc::new(AtomicBool::new(false));
         let flag = stopped.clone();
         // A second Ctrl-C ends the process at once; what is written is whole rows but for the last, which --resume drops.
@@ -444,17 +490,19 @@ impl Table {
         if let Ok(style) = ProgressStyle::with_template(template) {
             bar.set_style(style.progress_chars("━╸ "));
         }
-        let dice = Dice::new(self.seed);
         let mut writer = BufWriter::new(file);
         let (mut written, mut failed) = (0, None);
         let mut flushed = Instant::now();
         let each = (range.end - range.start) / threads.max(1) as u64;
-        let worker = |desk: &Desk<Vec<u8>>| self.work(desk, &dice, &stopped, each);
+        let worker = |desk: &Desk<Vec<u8>>| self.work(desk, dice, &stopped, each);
         sweep::ordered(range, threads, &worker, &mut |_, row: Vec<u8>| {
             let mut put = || {
                 writer.write_all(&row)?;
+                let Mark { rows, bytes, hash } = mark;
+                mark = Mark { rows: rows + 1, bytes: bytes + row.len() as u64, hash: hash.and(&row) };
                 if flushed.elapsed() > Duration::from_millis(200) {
                     writer.flush()?;
+                    unfinished.note(mark)?;
                     flushed = Instant::now();
                     bar.set_position(written + 1);
                 }
@@ -482,10 +530,8 @@ impl Table {
 
     /// What a sweep must have in common with one that it goes on with.
     fn asked(&self, args: &Sweep, loaded: &Loaded, range: &Range<u64>) -> String {
-        // FNV-1a.
-        let hash = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
         let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
-        let texts = texts.flat_map(|file| file.text.bytes()).fold(0xcbf2_9ce4_8422_2325, hash);
+        let texts = texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()));
         let mut asked = format!("fric {}, texts {texts:016x}\n", env!("CARGO_PKG_VERSION"));
         let solver = results::solver(&self.cases[0].experiment.solver);
         asked += &format!("{} with {solver} for {} s\n", args.experiment, self.cases[0].experiment.duration);
@@ -607,32 +653,6 @@ fn line(cells: impl Iterator<Item = String>) -> Vec<u8> {
     let mut writer = csv::Writer::from_writer(Vec::new());
     writer.write_record(cells).expect("writing to memory does not fail");
     writer.into_inner().expect("writing to memory does not fail")
-}
-
-/// Number of whole rows behind the header; what follows the last one is cut off. None where the header is another.
-fn kept(path: &Path, header: &[u8]) -> io::Result<u64> {
-    let Ok(mut file) = OpenOptions::new().read(true).write(true).open(path) else { return Ok(0) };
-    let mut begin = vec![0; header.len()];
-    if file.read_exact(&mut begin).is_err() || begin != header {
-        return Ok(0);
-    }
-    let (mut rows, mut at, mut end) = (0, header.len() as u64, header.len() as u64);
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        let length = file.read(&mut buffer)?;
-        if length == 0 {
-            break;
-        }
-        for byte in &buffer[..length] {
-            at += 1;
-            if *byte == b'\n' {
-                (rows, end) = (rows + 1, at);
-            }
-        }
-    }
-    file.set_len(end)?;
-    file.seek(SeekFrom::End(0))?;
-    Ok(rows)
 }
 
 fn name_of(path: &Path) -> String {
@@ -765,20 +785,5 @@ impl Summary {
             out += &format!("  {} run{}: {kind}\n", count(*number), if *number == 1 { "" } else { "s" });
         }
         out
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_row_cut_short_is_dropped() {
-        let path = std::env::temp_dir().join(format!("fric-kept-{}.csv", std::process::id()));
-        fs::write(&path, "run,a\n0,1\n1,2\n2,").unwrap();
-        assert_eq!(kept(&path, b"run,a\n").unwrap(), 2);
-        assert_eq!(fs::read_to_string(&path).unwrap(), "run,a\n0,1\n1,2\n");
-        assert_eq!(kept(&path, b"run,b\n").unwrap(), 0);
-        fs::remove_file(&path).unwrap();
     }
 }

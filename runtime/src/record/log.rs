@@ -10,6 +10,7 @@
 //! enough (see [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
 
 use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK_LONGEST};
+use super::claim::Claim;
 use super::packed;
 use super::parts::{self, Limits};
 use crate::queue::{Receiver, Sender, queue};
@@ -285,6 +286,8 @@ struct Parts {
     first: PathBuf,
     limits: Limits,
     writer: BlockWriter<File>,
+    /// Nobody else writes a log of this name.
+    _claim: Option<Claim>,
     /// Number of the file being written, from 1.
     number: u32,
     /// Bytes in it.
@@ -297,8 +300,9 @@ impl Parts {
         if let Some(keep) = limits.keep {
             limits.part = limits.part.min(keep / 4);
         }
+        let claim = Claim::on(&first)?;
         let writer = BlockWriter::new(parts::create(&first, 1)?)?;
-        Ok(Parts { first, limits, writer, number: 1, bytes: 0, head: Vec::new() })
+        Ok(Parts { _claim: claim, first, limits, writer, number: 1, bytes: 0, head: Vec::new() })
     }
 
     /// Begins the next file, with the head and the number of the part.
@@ -467,6 +471,7 @@ impl Carrier {
     /// Writes a black box.
     fn write_out(&self) -> io::Result<()> {
         let Out::Ring { path, head, blocks: kept, .. } = &self.out else { return Ok(()) };
+        let _claim = Claim::on(path)?;
         let mut writer = BlockWriter::new(File::create(path)?)?;
         let all = [(PACKED_HEAD, head)].into_iter().chain(kept.iter().map(|block| (PACKED, block)));
         for (kind, bytes) in all.chain([(TAIL, &self.tail)]) {
@@ -813,6 +818,26 @@ mod tests {
         let limits = Limits { reserve: u64::MAX, ..Limits::default() };
         let begun = Log::begin(settings(Sink::File(folder.path().join("a.friclog"), limits)), &head());
         assert_eq!(begun.err().unwrap().kind(), io::ErrorKind::StorageFull);
+    }
+
+    #[test]
+    fn one_writes_a_log_and_the_other_changes_nothing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log");
+        let mut first = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
+        (0..25).for_each(|k| first.push(CYCLE, &[k]));
+        let why = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).err().unwrap().to_string();
+        assert!(why.contains("another process writes this file"), "{why}");
+        // Also once it goes on in another file and the first is gone.
+        std::fs::remove_file(&path).unwrap();
+        assert!(Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).is_err() && !path.exists());
+        std::fs::write(&path, []).unwrap();
+        first.end(&Sections::default().with("end", "as asked"), false).unwrap();
+        // It is free again, and nobody waits for a device.
+        assert!(Log::begin(settings(Sink::File(path, Limits::default())), &head()).is_ok());
+        let null = || Log::begin(settings(Sink::File("/dev/null".into(), Limits::default())), &head());
+        let both = (null(), null());
+        assert!(both.0.is_ok() && both.1.is_ok());
     }
 
     #[test]

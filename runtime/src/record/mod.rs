@@ -4,6 +4,7 @@
 //! and maximum of every column, and no fewer than 1,000 of them if there were that many. Measures do not read it.
 
 pub mod blocks;
+pub mod claim;
 pub mod csv;
 mod packed;
 pub mod parts;

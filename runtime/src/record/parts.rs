@@ -6,6 +6,7 @@
 //! The first part bears the name that was asked for, `rtfs.friclog`; those that follow have their number before the
 //! ending, `rtfs.2.friclog`, `rtfs.3.friclog`, …
 
+use super::claim::is_locked;
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -97,6 +98,8 @@ pub fn following(this: &Path, number: u32) -> PathBuf {
 /// Those of the files.
 pub fn create(first: &Path, number: u32) -> io::Result<File> {
     let file = File::create(path(first, number))?;
+    // Others that make room leave it: see `remove_oldest`. A device cannot be locked, and need not be.
+    let _ = file.try_lock();
     if number == 1 {
         for old in (2..).map(|number| path(first, number)).take_while(|old| old.is_file()) {
             fs::remove_file(old)?;
@@ -106,7 +109,7 @@ pub fn create(first: &Path, number: u32) -> io::Result<File> {
 }
 
 /// Removes the oldest logs in the folder of `current` until all together have `keep` bytes at most. The current part
-/// stays. Returns how many files were removed.
+/// stays, and so does one that another process writes. Returns how many files were removed.
 ///
 /// # Errors
 /// Those of the files.
@@ -130,7 +133,7 @@ pub fn remove_oldest(current: &Path, keep: u64) -> io::Result<u64> {
         if total <= keep {
             break;
         }
-        if path.file_name() != current.file_name() {
+        if path.file_name() != current.file_name() && !is_locked(&path) {
             fs::remove_file(&path)?;
             (total, removed) = (total - bytes, removed + 1);
         }
@@ -188,6 +191,19 @@ mod tests {
             file.set_modified(now - Duration::from_secs(100 * age)).unwrap();
         }
         assert_eq!(remove_oldest(&named("now.friclog"), 400).unwrap(), 0);
+        // One that somebody writes is left, however old.
+        let written = File::open(named("a.friclog")).unwrap();
+        written.try_lock().unwrap();
+        assert_eq!(remove_oldest(&named("now.friclog"), 399).unwrap(), 1);
+        assert!(named("a.friclog").exists() && !named("b.friclog").exists());
+        drop(written);
+        fs::write(named("b.friclog"), [0; 100]).unwrap();
+        File::options()
+            .write(true)
+            .open(named("b.friclog"))
+            .unwrap()
+            .set_modified(now - Duration::from_secs(200))
+            .unwrap();
         assert_eq!(remove_oldest(&named("now.friclog"), 299).unwrap(), 2);
         assert!(!named("a.friclog").exists() && !named("b.friclog").exists() && named("c.friclog").exists());
         assert_eq!(remove_oldest(&named("now.friclog"), 0).unwrap(), 1);

@@ -1,0 +1,112 @@
+//! The right to write a file, for one process at a time.
+//!
+//! In: a path. Out: a locked file, or that somebody else has it. The lock lies on a neighbour where the file itself may be
+//! renamed or removed meanwhile; the system lets go of it however the process ends.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// Opens a file, made if there is none, and locks it; none if somebody else has locked it.
+///
+/// # Errors
+/// Those of the file.
+pub fn open_alone(path: &Path) -> io::Result<Option<File>> {
+    loop {
+        let file = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Ok(None),
+            Err(TryLockError::Error(error)) => return Err(error),
+        }
+        // One that has ended in the meantime took its file away: a lock on that keeps nobody out.
+        let ours = file.metadata()?;
+        if fs::metadata(path).is_ok_and(|there| (there.dev(), there.ino()) == (ours.dev(), ours.ino())) {
+            return Ok(Some(file));
+        }
+    }
+}
+
+/// Whether somebody has locked a file.
+pub fn is_locked(path: &Path) -> bool {
+    let file = File::open(path);
+    file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
+}
+
+/// The right to write a file and what is named after it.
+pub struct Claim {
+    lock: PathBuf,
+    _file: File,
+}
+
+impl Claim {
+    /// Takes it: by a neighbour, `.NAME.lock`, which goes with it. None for a pipe or a device, which keeps nothing that
+    /// could be spoilt.
+    ///
+    /// # Errors
+    /// If another process has it, or those of the neighbour.
+    pub fn on(path: &Path) -> io::Result<Option<Claim>> {
+        if fs::metadata(path).is_ok_and(|found| !found.is_file()) {
+            return Ok(None);
+        }
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let lock = path.with_file_name(format!(".{name}.lock"));
+        match open_alone(&lock)? {
+            Some(file) => Ok(Some(Claim { lock, _file: file })),
+            None => {
+                let why = "another process writes this file; give this one another name";
+                Err(io::Error::new(io::ErrorKind::ResourceBusy, why))
+            }
+        }
+    }
+}
+
+/// The neighbour goes before the lock on it.
+impl Drop for Claim {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.lock);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_has_it_until_it_goes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.friclog");
+        let first = Claim::on(&path).unwrap();
+        let why = Claim::on(&path).err().unwrap();
+        assert_eq!(why.kind(), io::ErrorKind::ResourceBusy);
+        assert!(Claim::on(&folder.path().join("b.friclog")).unwrap().is_some());
+        drop(first);
+        assert!(Claim::on(&path).unwrap().is_some());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left behind");
+        assert!(Claim::on(Path::new("/dev/null")).unwrap().is_none());
+    }
+
+    /// Many at once, again and again: never two of them.
+    #[test]
+    fn never_two_have_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        let (inside, taken) = (std::sync::atomic::AtomicU32::new(0), std::sync::atomic::AtomicU32::new(0));
+        let order = std::sync::atomic::Ordering::SeqCst;
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    for _ in 0..300 {
+                        let Ok(claim) = Claim::on(&path) else { continue };
+                        assert_eq!(inside.fetch_add(1, order), 0);
+                        taken.fetch_add(1, order);
+                        inside.fetch_sub(1, order);
+                        drop(claim);
+                    }
+                });
+            }
+        });
+        assert!(taken.load(order) >= 300, "{taken:?}");
+    }
+}
