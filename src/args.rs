@@ -764,9 +764,16 @@ pub struct Deploy {
     /// What of the text is changed
     #[command(flatten)]
     pub set: Set,
-    /// Sign the package with a secret key
+    /// Sign the package with this secret key [default: a key of yours, made on first use; a rig that trusts no key yet gets its
+    /// public one]
     #[arg(long, value_name = "FILE.key", value_hint = ValueHint::FilePath)]
     pub sign: Option<PathBuf>,
+    /// Don't sign it, and let it run on real buses there all the same; not where keys are trusted
+    #[arg(long, conflicts_with = "sign")]
+    pub allow_unsigned: bool,
+    /// Install it though it was signed before the one that is installed there
+    #[arg(long)]
+    pub allow_older: bool,
     /// Folder with the trusted keys there, where it is another than /etc/fric/trusted
     #[arg(long, value_name = "DIR")]
     pub trusted: Option<String>,
@@ -785,7 +792,7 @@ pub struct FetchLog {
     /// Where from
     #[command(flatten)]
     pub host: Host,
-    /// Which one [default: the newest]
+    /// Which one, with all its parts [default: the newest]
     pub log: Option<String>,
     /// All of them
     #[arg(long, conflicts_with = "log")]

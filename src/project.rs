@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::io::{self, Write};
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
 
 /// The library: dotted name of each file (`std.friction.lugre`) and its text, in the order of the names.
@@ -85,6 +86,10 @@ impl crate::compile::Sources for Disk {
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
         let folder = Path::new(from).parent().unwrap_or(Path::new(""));
         let path = tidy(&folder.join(path));
+        // Whoever names a text waits for a pipe on purpose; a text that names a pipe would have others wait for ever.
+        if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+            return Err("it is a pipe or a device, not a file".into());
+        }
         read(&path).map(|text| (path.display().to_string(), text))
     }
 }
@@ -162,19 +167,42 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
 /// Why not; a file of that name is then as it was.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     make_folder_of(path)?;
-    if fs::metadata(path).is_ok_and(|old| !old.is_file()) {
+    match fs::metadata(path) {
         // A pipe or a device takes what it is given; its name is not ours to take.
-        return fs::OpenOptions::new().write(true).open(path)?.write_all(bytes);
+        Ok(old) if !old.is_file() => fs::OpenOptions::new().write(true).open(path)?.write_all(bytes),
+        // Who may read the old file may read the new one, and nobody else at any moment.
+        Ok(old) => replace(path, bytes, 0o600, Some(old.permissions())),
+        Err(_) => replace(path, bytes, 0o666, None),
     }
+}
+
+/// Writes a file that only its owner may read, from its first byte on.
+///
+/// # Errors
+/// Why not, or that there is one of that name already.
+pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    }
+    if fs::symlink_metadata(path).is_ok() {
+        return Err(io::ErrorKind::AlreadyExists.into());
+    }
+    replace(path, bytes, 0o600, None)
+}
+
+/// Writes a neighbour with a mode, then gives it permissions and the name.
+fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permissions>) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
-    let written = fs::File::create(&neighbour)
+    // One of that name was left by a process that was killed, or is a trap: it is never written through.
+    let _ = fs::remove_file(&neighbour);
+    let written = fs::OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(mode)
+        .open(&neighbour)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
-        // Who may read the old file may read the new one.
-        .and_then(|()| match fs::metadata(path) {
-            Ok(old) => fs::set_permissions(&neighbour, old.permissions()),
-            Err(_) => Ok(()),
-        })
+        .and_then(|()| permissions.map_or(Ok(()), |permissions| fs::set_permissions(&neighbour, permissions)))
         .and_then(|()| fs::rename(&neighbour, path));
     if written.is_err() {
         let _ = fs::remove_file(&neighbour);
@@ -185,6 +213,55 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::{MetadataExt, PermissionsExt};
+
+    /// A secret, and a file that only its owner may read, are never readable by others: not even half of them, beside their
+    /// names, for a moment.
+    #[test]
+    fn what_is_secret_is_secret_from_its_first_byte() {
+        let folder = tempfile::tempdir().unwrap();
+        let (key, text) = (folder.path().join("keys/a.key"), folder.path().join("a.fric"));
+        fs::write(&text, "x").unwrap();
+        fs::set_permissions(&text, fs::Permissions::from_mode(0o600)).unwrap();
+        let over = std::sync::atomic::AtomicBool::new(false);
+        let open = std::thread::scope(|scope| {
+            let watch = scope.spawn(|| {
+                let mut open = Vec::new();
+                let look = |at: &Path, open: &mut Vec<_>| {
+                    for entry in fs::read_dir(at).into_iter().flatten().flatten() {
+                        let found = entry.metadata().ok().filter(|it| it.is_file() && it.mode() & 0o077 != 0);
+                        open.extend(found.map(|it| (entry.path(), it.mode())));
+                    }
+                };
+                while !over.load(std::sync::atomic::Ordering::Relaxed) {
+                    look(folder.path(), &mut open);
+                    look(&folder.path().join("keys"), &mut open);
+                }
+                open
+            });
+            let long = vec![b'k'; 1 << 16];
+            for _ in 0..100 {
+                write_secret(&key, &long).unwrap();
+                assert!(write_secret(&key, &long).is_err(), "a key is not written over");
+                fs::remove_file(&key).unwrap();
+                write(&text, &long).unwrap();
+            }
+            over.store(true, std::sync::atomic::Ordering::Relaxed);
+            watch.join().unwrap()
+        });
+        assert!(open.is_empty(), "{open:?}");
+        assert_eq!(fs::metadata(folder.path().join("keys")).unwrap().mode() & 0o777, 0o700);
+    }
+
+    #[test]
+    fn what_lies_at_the_name_of_the_neighbour_is_not_written_through() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, victim) = (folder.path().join("a"), folder.path().join("victim"));
+        fs::write(&victim, "as it was").unwrap();
+        std::os::unix::fs::symlink(&victim, folder.path().join(format!(".a.{}", std::process::id()))).unwrap();
+        write(&path, b"new").unwrap();
+        assert_eq!((fs::read(&path).unwrap(), fs::read(&victim).unwrap()), (b"new".to_vec(), b"as it was".to_vec()));
+    }
 
     #[test]
     fn what_is_no_text_is_refused_with_its_place() {

@@ -1,7 +1,9 @@
 //! Another computer, through the system's own ssh and scp: its keys, its agent, its configuration.
 //!
-//! In: a host and options, commands, files. Out: what the command printed, or why it failed. Knows no packages.
+//! In: a host and options, commands, files. Out: what the command printed, or why it failed. What another computer says is
+//! not to be trusted with a terminal: what would act on one arrives as an escape. Knows no packages.
 
+use abi::foreign::shown;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -62,7 +64,7 @@ impl Remote {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(failed)?;
         let lines = BufReader::new(child.stdout.take().expect("it is piped")).lines();
-        lines.map_while(Result::ok).for_each(|line| told(&line));
+        lines.map_while(Result::ok).for_each(|line| told(&shown(&line)));
         ended("ssh", child.wait_with_output().map_err(failed)?).map(|_| ())
     }
 
@@ -107,9 +109,9 @@ fn done(what: &str, command: &mut Command) -> Result<String, Failed> {
 
 /// What a command printed that has ended.
 fn ended(what: &str, output: Output) -> Result<String, Failed> {
-    let said = String::from_utf8_lossy(&output.stderr).trim().to_string();
+    let said = shown(String::from_utf8_lossy(&output.stderr).trim()).into_owned();
     match output.status.code() {
-        Some(0) => Ok(String::from_utf8_lossy(&output.stdout).into_owned()),
+        Some(0) => Ok(shown(&String::from_utf8_lossy(&output.stdout)).into_owned()),
         // ssh's own failures.
         Some(255) => Err(Failed::Unreachable(said)),
         Some(code) => Err(Failed::Exit(code, said)),

@@ -1,7 +1,7 @@
 //! Keys and signatures in the format of minisign. The only file that knows `minisign` and `ct_codecs`.
 //!
-//! In: files of keys, bytes. Out: a pair of keys as texts, a signature as text. A signature depends on the bytes and the
-//! key alone, so that a package that is built twice is signed alike.
+//! In: files of keys, bytes. Out: a pair of keys as texts, a signature as text. The signer mixes chance into each signature,
+//! so that its key does not leak by faults: two signatures of equal bytes differ, and both hold.
 
 use ct_codecs::{Base64, Decoder};
 use minisign::{KeyPair, PublicKey, SecretKey, SecretKeyBox};
@@ -18,21 +18,43 @@ pub fn new_pair() -> Result<(String, String), String> {
     Ok((secret.into_string(), public.into_string()))
 }
 
-/// Signs bytes with the secret key in a file. A key with a password asks for it on the terminal.
-///
-/// # Errors
-/// Why not, in words.
-pub fn sign(key: &Path, bytes: &[u8], comment: &str) -> Result<String, String> {
-    let text = std::fs::read_to_string(key).map_err(|error| format!("cannot read {}: {error}", key.display()))?;
-    let about = |error: minisign::PError| format!("{} is no secret key of minisign: {error}", key.display());
-    let boxed = || SecretKeyBox::from_string(&text).map_err(about);
-    let secret = match SecretKey::from_unencrypted_box(boxed()?).or_else(|why| unchecked(&text).ok_or(why)) {
-        Ok(secret) => secret,
-        Err(_) => SecretKey::from_box(boxed()?, None).map_err(about)?,
-    };
-    let public = PublicKey::from_secret_key(&secret).map_err(about)?;
-    let signature = minisign::sign(Some(&public), &secret, bytes, Some(comment), Some("signature of a fric package"));
-    Ok(signature.map_err(about)?.into_string())
+/// A secret key with its public one.
+pub struct Signing {
+    secret: SecretKey,
+    public: PublicKey,
+}
+
+impl Signing {
+    /// The secret key in a file. One with a password asks for it on the terminal.
+    ///
+    /// # Errors
+    /// Why it cannot be had, in words.
+    pub fn open(key: &Path) -> Result<Signing, String> {
+        let text = std::fs::read_to_string(key).map_err(|error| format!("cannot read {}: {error}", key.display()))?;
+        let about = |error: minisign::PError| format!("{} is no secret key of minisign: {error}", key.display());
+        let boxed = || SecretKeyBox::from_string(&text).map_err(about);
+        let secret = match SecretKey::from_unencrypted_box(boxed()?).or_else(|why| unchecked(&text).ok_or(why)) {
+            Ok(secret) => secret,
+            Err(_) => SecretKey::from_box(boxed()?, None).map_err(about)?,
+        };
+        let public = PublicKey::from_secret_key(&secret).map_err(about)?;
+        Ok(Signing { secret, public })
+    }
+
+    /// The public key in base64, as the last line of its file has it.
+    pub fn public(&self) -> String {
+        self.public.to_base64()
+    }
+
+    /// A signature of bytes. `comment` is signed with them.
+    ///
+    /// # Errors
+    /// Why not, in words.
+    pub fn sign(&self, bytes: &[u8], comment: &str) -> Result<String, String> {
+        let untrusted = Some("signature of a fric package");
+        let signature = minisign::sign(Some(&self.public), &self.secret, bytes, Some(comment), untrusted);
+        Ok(signature.map_err(|error| format!("cannot sign: {error}"))?.into_string())
+    }
 }
 
 /// A key without a password as the stock tool writes it: with zeros where its checksum would be.
@@ -48,7 +70,7 @@ fn unchecked(text: &str) -> Option<SecretKey> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use runtime::package::signature::Trusted;
+    use runtime::package::signature::{Signer, Trusted, comment};
 
     #[test]
     fn a_signature_is_that_of_its_bytes_and_key_and_of_no_others() {
@@ -59,15 +81,18 @@ mod tests {
         let (secret, public) = new_pair().unwrap();
         let (key, bytes) = (folder.join("a.key"), b"a package".as_slice());
         std::fs::write(&key, secret).unwrap();
-        let signed = sign(&key, bytes, "rig rtfs").unwrap();
+        let sign = |at_s| Signing::open(&key)?.sign(bytes, &comment("rig rtfs", at_s));
+        let signed = sign(1_764_000_000).unwrap();
         let none = Trusted::in_folder(&folder.join("nothing")).unwrap();
         assert_eq!(none.signer(bytes, None), Ok(None));
         std::fs::write(trusted.join("anna.pub"), &public).unwrap();
         let keys = Trusted::in_folder(&trusted).unwrap();
-        assert_eq!(keys.signer(bytes, Some(&signed)), Ok(Some("anna")));
-        // The signer mixes chance into each signature, so that its key does not leak by faults: a second one holds too.
-        let again = sign(&key, bytes, "rig rtfs").unwrap();
-        assert_eq!(keys.signer(bytes, Some(&again)), Ok(Some("anna")));
+        let anna = |at_s| Ok(Some(Signer { name: "anna".into(), signed_s: Some(at_s) }));
+        assert_eq!(keys.signer(bytes, Some(&signed)), anna(1_764_000_000));
+        assert_eq!(keys.signer(bytes, Some(&sign(1_764_000_001).unwrap())), anna(1_764_000_001));
+        // The time is part of what is signed.
+        let forged = signed.replace("timestamp:1764000000", "timestamp:1964000000");
+        assert!(forged != signed && keys.signer(bytes, Some(&forged)).is_err());
         let why = keys.signer(bytes, None).unwrap_err().to_string();
         assert!(why.starts_with("it is not signed, and this computer trusts anna only"), "{why}");
         for at in 0..bytes.len() {
@@ -93,6 +118,7 @@ mod tests {
         assert_eq!(why, "its signature is not that of anna, whom this computer trusts");
         std::fs::write(trusted.join("anna.pub"), "nonsense").unwrap();
         assert!(Trusted::in_folder(&trusted).is_err(), "a key that protects is not passed over");
-        assert!(sign(&trusted.join("anna.pub"), bytes, "").unwrap_err().contains("is no secret key of minisign"));
+        let why = Signing::open(&trusted.join("anna.pub")).err().unwrap();
+        assert!(why.contains("is no secret key of minisign"), "{why}");
     }
 }

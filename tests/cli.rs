@@ -468,3 +468,38 @@ fn an_experiment_can_be_changed_from_outside() {
     folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2m"], 1, "E01");
     folder.check(&["run", "pull.fric", "holds", "--set", "fr.Fc=2 N +"], 1, "--set");
 }
+
+#[test]
+fn files_that_would_hold_nothing_are_refused() {
+    let folder = Folder::new("nothing").with("pull.fric", PULL);
+    for option in ["--csv", "--plot"] {
+        let (_, err) = folder.check(&["run", "pull.fric", "breaks", option, "a.csv"], 1, "");
+        assert!(err.contains(&format!("{option} has nothing to write: `breaks` records nothing; add `plot`")), "{err}");
+    }
+    assert_eq!(folder.names("."), ["pull.fric"]);
+    folder.check(&["run", "pull.fric", "breaks", "--out", "a"], 1, "nothing to write: the experiment has no `plot`");
+}
+
+/// A text may be a pipe, for somebody writes to it; what a text names must be a file, or everybody waits.
+#[test]
+fn a_text_that_names_a_pipe_is_refused_at_once() {
+    let data = "model M { input v [m/s]  output y [m/s] = v }\n\
+                experiment e { data \"pipe\" (t [s], v [m/s])  run M(v = data.v) for 1 s  solver rk4 step 1 ms }\n";
+    let import = "import \"pipe\"\n";
+    let folder = Folder::new("pipe").with("data.fric", data).with("import.fric", import);
+    assert!(Command::new("mkfifo").arg(folder.0.join("pipe")).status().unwrap().success());
+    for text in ["data.fric", "import.fric"] {
+        let mut child = folder.fric(&["check", text]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let begun = std::time::Instant::now();
+        while child.try_wait().unwrap().is_none() {
+            if begun.elapsed().as_secs() > 60 {
+                let _ = child.kill();
+                panic!("{text}: it waits");
+            }
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        let output = child.wait_with_output().unwrap();
+        let told = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        assert!(output.status.code() == Some(1) && told.contains("it is a pipe or a device, not a file"), "{told}");
+    }
+}

@@ -4,6 +4,7 @@
 //! and writes that block and nothing else. Knows neither the language nor any solver.
 
 pub mod unit;
+pub mod foreign;
 pub mod description;
 pub mod pace;
 pub mod trial;
@@ -18,6 +19,7 @@ pub mod plan;
 pub mod encode;
 pub mod packing;
 pub mod image;
+pub mod fits;
 
 pub use description::{Description, Layout, Slot};
 pub use instance::Instance;

@@ -13,8 +13,8 @@ use runtime::hil::emergency;
 /// # Errors
 /// Why they cannot.
 pub fn drives(open: &Open, doors: &Doors, duration: Option<f64>, quiet: bool) -> Result<u8, String> {
-    let rig = open.rig()?;
-    let served = match Served::open(&rig, Some(open.program("plant")?), doors) {
+    let rig = &open.contents.rig;
+    let served = match Served::open(rig, Some(open.program("plant")?), doors) {
         Ok(served) => served,
         Err(Refused::Misused(why)) => {
             words::error(&why);
@@ -23,12 +23,12 @@ pub fn drives(open: &Open, doors: &Doors, duration: Option<f64>, quiet: bool) ->
         Err(Refused::Failed(why)) => return Err(why),
     };
     emergency::guard();
-    words::report(&format!("{}\n", served.describe(&rig)));
+    words::report(&format!("{}\n", served.describe(rig)));
     let mut told = |line: &str| {
         if !quiet {
             words::print(&format!("{line}\n"));
         }
     };
-    served.serve(&rig, duration, &|| emergency::asked().is_some(), &mut told);
+    served.serve(rig, duration, &|| emergency::asked().is_some(), &mut told);
     Ok(0)
 }

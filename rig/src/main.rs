@@ -11,6 +11,8 @@ mod packed;
 
 mod store;
 
+mod trust;
+
 mod doctor;
 
 mod run;
@@ -53,6 +55,8 @@ enum Command {
     Rollback(Store),
     /// Say what is installed, and what runs
     Status(Status),
+    /// Show the keys that are trusted, or register one: packages must then be signed
+    Trust(Register),
     /// Print the target that packages must be built for
     Target,
 }
@@ -67,10 +71,33 @@ struct Check {
 }
 
 #[derive(clap::Args, Debug)]
-struct Trust {
+struct Keys {
     /// Folder with the public keys that are trusted; with one in it, packages must be signed
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath, default_value = runtime::package::signature::TRUSTED)]
     trusted: PathBuf,
+}
+
+#[derive(clap::Args, Debug)]
+struct Trust {
+    #[command(flatten)]
+    keys: Keys,
+    /// Run it on real buses though no trusted key has signed it; where keys are trusted, one of them must have
+    #[arg(long)]
+    allow_unsigned: bool,
+}
+
+#[derive(clap::Args, Debug)]
+struct Register {
+    /// Name of the key; without it, those that are trusted are shown
+    #[arg(requires = "key")]
+    name: Option<String>,
+    /// The public key: the last line of a file that ends in .pub
+    key: Option<String>,
+    /// Only if no key is trusted yet
+    #[arg(long, requires = "name")]
+    first: bool,
+    #[command(flatten)]
+    keys: Keys,
 }
 
 #[derive(clap::Args, Debug)]
@@ -135,7 +162,7 @@ struct Drives {
     #[arg(long, short)]
     quiet: bool,
     #[command(flatten)]
-    trust: Trust,
+    keys: Keys,
 }
 
 #[derive(clap::Args, Debug)]
@@ -152,6 +179,9 @@ struct Install {
     /// The package
     #[arg(value_name = "FILE.fricpkg", value_hint = ValueHint::FilePath)]
     package: PathBuf,
+    /// Install it though it was signed before the one that is installed
+    #[arg(long)]
+    allow_older: bool,
     #[command(flatten)]
     store: Store,
     #[command(flatten)]
@@ -165,6 +195,8 @@ struct Start {
     hash: Option<String>,
     #[command(flatten)]
     store: Store,
+    #[command(flatten)]
+    trust: Trust,
 }
 
 #[derive(clap::Args, Debug)]
@@ -200,9 +232,28 @@ fn address(text: &str) -> Result<(String, String), String> {
     Ok((bus.into(), address.into()))
 }
 
+/// A package that may run here, on the buses that it names.
+fn opened(package: &std::path::Path, trust: &Trust) -> Result<packed::Open, String> {
+    let open = packed::open(package, &trust.keys.trusted)?;
+    let may = open.may_run(&open.contents.rig.buses, false, trust.allow_unsigned);
+    may.map_err(|why| format!("{}: {why}", package.display()))?;
+    Ok(open)
+}
+
+/// Makes a package the current one.
+fn installed(args: &Install) -> Result<String, String> {
+    let open = opened(&args.package, &args.trust)?;
+    let store = store::Store::at(&args.store.dir);
+    if let Some(current) = store.current().filter(|_| !args.allow_older) {
+        let newer = packed::not_older(&open, &current, &args.trust.keys.trusted);
+        newer.map_err(|why| format!("{}: {why}", args.package.display()))?;
+    }
+    store.install(&open.package.rig, &open.bytes, open.signature.as_deref())
+}
+
 /// Serves the drives of a package.
 fn served(args: &Drives) -> Result<u8, String> {
-    let open = packed::open(&args.package, &args.trust.trusted)?;
+    let open = packed::open(&args.package, &args.keys.trusted)?;
     let doors = Doors {
         buses: args.bus.clone(),
         pty: args.pty.clone(),
@@ -218,7 +269,8 @@ fn served(args: &Drives) -> Result<u8, String> {
 fn ran(args: &Run) -> Result<u8, String> {
     let wanted = run::Wanted {
         package: args.package.as_deref(),
-        trusted: &args.trust.trusted,
+        trusted: &args.trust.keys.trusted,
+        allow_unsigned: args.trust.allow_unsigned,
         dir: &args.store.dir,
         sim: args.sim,
         fast: args.fast,
@@ -245,17 +297,23 @@ fn ended(code: Result<u8, String>) -> ExitCode {
 fn main() -> ExitCode {
     let args = Args::parse();
     let done = match &args.command {
-        Command::Check(check) => packed::open(&check.package, &check.trust.trusted).map(|open| open.describe()),
+        Command::Check(check) => opened(&check.package, &check.trust).map(|open| open.describe()),
         Command::Run(run) => return ended(ran(run)),
         Command::Drives(drives) => return ended(served(drives)),
-        Command::Start(start) => run::start(&start.store.dir, start.hash.as_deref()),
+        Command::Start(start) => {
+            let trust = run::Trust { trusted: &start.trust.keys.trusted, allow_unsigned: start.trust.allow_unsigned };
+            run::start(&start.store.dir, start.hash.as_deref(), trust)
+        }
         Command::Say(say) => run::say(&say.store.dir, &say.what),
         Command::Doctor => Ok(doctor::doctor()),
-        Command::Install(install) => packed::open(&install.package, &install.trust.trusted)
-            .and_then(|open| store::Store::at(&install.store.dir).install(&open)),
+        Command::Install(install) => installed(install),
         Command::Rollback(store) => store::Store::at(&store.dir).rollback(),
         Command::Status(status) if status.follow => run::follow(&status.store.dir),
         Command::Status(status) => store::Store::at(&status.store.dir).status(),
+        Command::Trust(Register { name: Some(name), key: Some(key), first, keys }) => {
+            trust::register(&keys.trusted, name, key, *first)
+        }
+        Command::Trust(Register { keys, .. }) => trust::keys(&keys.trusted),
         Command::Target => Ok(format!("{}\n", runtime::package::here())),
     };
     match done {

@@ -3,11 +3,12 @@
 //! In: a file, trusted keys. Out: an [`Open`] package, or why it is refused.
 
 use abi::Instance;
-use abi::encode::Encode;
-use abi::image::Image;
-use abi::rig::Rig;
-use runtime::package::signature::{Trusted, beside};
+use abi::rig::Bus;
+use runtime::package::contents::Contents;
+use runtime::package::signature::{Signer, Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
+use runtime::record::log::Sections;
+use runtime::show::utc;
 use std::fs;
 use std::path::Path;
 
@@ -20,10 +21,30 @@ pub struct Open {
     pub bytes: Vec<u8>,
     /// The text of its signature, if there is one beside it.
     pub signature: Option<String>,
-    /// Its content.
+    /// What was asked to be packed, and for whom.
     pub package: Package,
+    /// Its parts.
+    pub contents: Contents,
     /// Who signed it, if signatures are asked for.
-    pub signer: Option<String>,
+    pub signer: Option<Signer>,
+}
+
+/// The bytes of a package and the text of its signature, if there is one beside it.
+fn read(path: &Path) -> Result<(Vec<u8>, Option<String>), String> {
+    let about = |why: &dyn std::fmt::Display| format!("{}: {why}", path.display());
+    let found = fs::metadata(path).map_err(|error| about(&error))?;
+    if !found.is_file() {
+        return Err(about(&"it is no file"));
+    }
+    if found.len() > MOST_BYTES {
+        return Err(about(&format!("{} bytes are more than any package has", found.len())));
+    }
+    let bytes = fs::read(path).map_err(|error| about(&error))?;
+    match fs::read_to_string(beside(path)) {
+        Ok(text) => Ok((bytes, Some(text))),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok((bytes, None)),
+        Err(error) => Err(format!("{}: {error}", beside(path).display())),
+    }
 }
 
 /// Reads and verifies a package.
@@ -32,39 +53,62 @@ pub struct Open {
 /// Why it is refused, in words.
 pub fn open(path: &Path, trusted: &Path) -> Result<Open, String> {
     let about = |why: &dyn std::fmt::Display| format!("{}: {why}", path.display());
-    let size = fs::metadata(path).map_err(|error| about(&error))?.len();
-    if size > MOST_BYTES {
-        return Err(about(&format!("{size} bytes are more than any package has")));
-    }
-    let bytes = fs::read(path).map_err(|error| about(&error))?;
-    let signature = match fs::read_to_string(beside(path)) {
-        Ok(text) => Some(text),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
-        Err(error) => return Err(format!("{}: {error}", beside(path).display())),
-    };
+    let (bytes, signature) = read(path)?;
     // First who made it, then what it is: nothing of an unknown maker is looked into.
     let keys = Trusted::in_folder(trusted)?;
-    let signer = keys.signer(&bytes, signature.as_deref()).map_err(|why| about(&why))?.map(str::to_string);
+    let signer = keys.signer(&bytes, signature.as_deref()).map_err(|why| about(&why))?;
     let package = Package::read(&bytes).map_err(|why| about(&why))?;
     package.fits(VERSION).map_err(|why| about(&why))?;
-    for name in ["control", "plant"] {
-        let bytes = package.section(name).map_err(|why| about(&why))?;
-        let image = Image::read(bytes).map_err(|why| about(&format!("its program `{name}`: {why}")))?;
+    let contents = package.contents().map_err(|why| about(&why))?;
+    for (name, image) in [("control", &contents.control), ("plant", &contents.plant)] {
         image.fits().map_err(|why| about(&format!("its program `{name}`: {why}")))?;
     }
-    let open = Open { bytes, signature, package, signer };
-    open.rig().map_err(|why| about(&why))?;
-    Ok(open)
+    Ok(Open { bytes, signature, package, contents, signer })
+}
+
+/// Refuses a package that was signed before another one.
+///
+/// # Errors
+/// If the one at `current` is signed by a trusted key and this one was signed earlier, or does not say when.
+pub fn not_older(open: &Open, current: &Path, trusted: &Path) -> Result<(), String> {
+    let Ok((bytes, signature)) = read(current) else { return Ok(()) };
+    let installed = Trusted::in_folder(trusted)?.signer(&bytes, signature.as_deref()).ok().flatten();
+    let Some(since) = installed.and_then(|signer| signer.signed_s) else { return Ok(()) };
+    let signed = open.signer.as_ref().and_then(|signer| signer.signed_s);
+    if bytes == open.bytes || signed.is_some_and(|signed| signed >= since) {
+        return Ok(());
+    }
+    let when =
+        signed.map_or("its signature does not say when".into(), |signed| format!("it was signed at {}", utc(signed)));
+    Err(format!(
+        "it is older than the package that is installed: {when}, and that one at {}; --allow-older installs it all the \
+         same, `fric-rig rollback` goes back to the package before the current one",
+        utc(since)
+    ))
 }
 
 impl Open {
-    /// The plan of the rig.
+    /// Refuses to run what no trusted key has signed where a real drive may be moved.
     ///
     /// # Errors
-    /// Why its section makes no sense.
-    pub fn rig(&self) -> Result<Rig, String> {
-        let bytes = self.package.section("rig").map_err(|why| why.to_string())?;
-        Rig::from_bytes(bytes).map_err(|why| format!("the plan of its rig: {why}"))
+    /// If no trusted key signed it, not all of these buses are simulated, and `allowed` does not say that it may run.
+    pub fn may_run(&self, buses: &[Bus], simulated: bool, allowed: bool) -> Result<(), String> {
+        let real = buses.iter().find(|bus| !bus.address.starts_with("sim:"));
+        let Some(bus) = real.filter(|_| self.signer.is_none() && !simulated && !allowed) else { return Ok(()) };
+        let lacks = match self.signature {
+            Some(_) => "this computer trusts no key that could have signed it",
+            None => "it is not signed",
+        };
+        Err(format!(
+            "{lacks}, and bus `{}` is {}: only rigs whose buses are all `sim:` run so. `fric deploy` signs a package and \
+             registers its key here, `fric-rig trust NAME KEY` registers one by hand; --allow-unsigned runs it all the same",
+            bus.name, bus.address
+        ))
+    }
+
+    /// The head of its logs.
+    pub fn head(&self) -> Sections {
+        self.contents.head.clone()
     }
 
     /// One of its programs, ready to start: `control` or `plant`.
@@ -83,7 +127,8 @@ impl Open {
     pub fn describe(&self) -> String {
         let Package { fric, target, rig, sections } = &self.package;
         let signer = match (&self.signer, &self.signature) {
-            (Some(name), _) => format!("signed by {name}"),
+            (Some(Signer { name, signed_s: Some(at) }), _) => format!("signed by {name} at {}", utc(*at)),
+            (Some(Signer { name, signed_s: None }), _) => format!("signed by {name}"),
             (None, Some(_)) => "signed; no key is trusted here, so the signature was not checked".into(),
             (None, None) => "not signed; no key is trusted here".into(),
         };

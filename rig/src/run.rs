@@ -6,7 +6,6 @@
 use crate::packed::{self, Open};
 use crate::store::Store;
 use crate::words;
-use abi::encode::Encode;
 use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
@@ -41,6 +40,8 @@ pub struct Wanted<'a> {
     pub package: Option<&'a Path>,
     /// Folder of the public keys that are trusted.
     pub trusted: &'a Path,
+    /// It may run on real buses though no trusted key has signed it.
+    pub allow_unsigned: bool,
     /// Packages, logs, state.
     pub dir: &'a Path,
     /// Simulated buses, drives and devices.
@@ -118,7 +119,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     if wanted.fast && wanted.duration.is_none() && !wanted.check {
         return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
     }
-    let mut rig = open.rig()?;
+    let mut rig = open.contents.rig.clone();
     for (bus, address) in wanted.buses {
         let Some(known) = rig.buses.iter_mut().find(|known| known.name == *bus) else {
             let names: Vec<&str> = rig.buses.iter().map(|bus| bus.name.as_str()).collect();
@@ -126,6 +127,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         };
         known.address.clone_from(address);
     }
+    open.may_run(&rig.buses, wanted.sim, wanted.allow_unsigned)?;
     let control = open.program("control")?;
     let log = log(wanted, open, &rig)?;
     let path = match &log.0.sink {
@@ -218,8 +220,7 @@ fn buses(rig: &Rig, time: &Simulation) -> Result<Vec<Box<dyn Bus>>, String> {
 
 /// Where the recording goes, and its head: all that a replay needs.
 fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), String> {
-    let head = open.package.section("head").map_err(|why| why.to_string())?;
-    let mut head = Sections(Vec::from_bytes(head).map_err(|why| format!("the head of its logs: {why}"))?);
+    let mut head = open.head();
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     let repeatable = wanted.fast && wanted.sim;
     let started =
@@ -398,11 +399,20 @@ const TELLS: Duration = Duration::from_secs(10);
 /// What the rig says when it goes back.
 const NOT_STARTED: &str = "the new package does not start: ";
 
+/// Whom a rig that is started trusts.
+#[derive(Clone, Copy)]
+pub struct Trust<'a> {
+    /// As [`Wanted::trusted`].
+    pub trusted: &'a Path,
+    /// As [`Wanted::allow_unsigned`].
+    pub allow_unsigned: bool,
+}
+
 /// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be it.
 ///
 /// # Errors
 /// What the rig said if it ended within its first second, or runs another package than the current one.
-pub fn start(dir: &Path, hash: Option<&str>) -> Result<String, String> {
+pub fn start(dir: &Path, hash: Option<&str>, trust: Trust) -> Result<String, String> {
     let store = Store::at(dir);
     let Some(current) = store.current_target() else {
         return Err(format!("nothing is installed in {}", dir.display()));
@@ -418,7 +428,8 @@ pub fn start(dir: &Path, hash: Option<&str>) -> Result<String, String> {
         let file = fs::File::create(&out).map_err(about)?;
         let program = std::env::current_exe().map_err(about)?;
         let mut command = std::process::Command::new(program);
-        command.arg("run").arg("--dir").arg(dir).stdin(std::process::Stdio::null());
+        command.arg("run").arg("--dir").arg(dir).arg("--trusted").arg(trust.trusted);
+        command.args(trust.allow_unsigned.then_some("--allow-unsigned")).stdin(std::process::Stdio::null());
         command.stdout(file.try_clone().map_err(about)?).stderr(file);
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         child = Some(command.spawn().map_err(about)?);

@@ -10,7 +10,6 @@
 //! A package is written under another name, flushed to the disk and renamed; a link is made under another name and
 //! renamed over the old one. So after a power cut there is the old state or the new one.
 
-use crate::packed::Open;
 use runtime::package::hash;
 use runtime::package::signature::EXTENSION as SIGNATURE;
 use std::fs::{self, File, TryLockError};
@@ -43,34 +42,34 @@ impl Store {
         Path::new("packages").join(format!("{name}.{}", runtime::package::EXTENSION))
     }
 
-    /// Makes a verified package the current one.
+    /// Makes a verified package the current one. `rig`: its name; `signature`: the text beside it.
     ///
     /// # Errors
     /// Why not; what was current then still is.
-    pub fn install(&self, open: &Open) -> Result<String, String> {
+    pub fn install(&self, rig: &str, bytes: &[u8], signature: Option<&str>) -> Result<String, String> {
         let packages = self.dir.join("packages");
         let about = |path: &Path, error: io::Error| format!("cannot write {}: {error}", path.display());
         for folder in [&packages, &self.dir.join("log")] {
             fs::create_dir_all(folder).map_err(|error| about(folder, error))?;
         }
-        let target = Store::target(&hash(&open.bytes));
+        let target = Store::target(&hash(bytes));
         let path = self.dir.join(&target);
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        whole(&path, &open.bytes).map_err(|error| about(&path, error))?;
-        let signature = packages.join(format!("{name}.{SIGNATURE}"));
+        whole(&path, bytes).map_err(|error| about(&path, error))?;
+        let beside = packages.join(format!("{name}.{SIGNATURE}"));
         // Where it has none, an older signature of the same bytes does no harm.
-        if let Some(text) = &open.signature {
-            whole(&signature, text.as_bytes()).map_err(|error| about(&signature, error))?;
+        if let Some(text) = signature {
+            whole(&beside, text.as_bytes()).map_err(|error| about(&beside, error))?;
         }
         let before = fs::read_link(self.dir.join("current")).ok();
         if before.as_deref() == Some(&target) {
-            return Ok(format!("{} is the current package already\n", open.package.rig));
+            return Ok(format!("{rig} is the current package already\n"));
         }
         if let Some(before) = &before {
             self.link("previous", before)?;
         }
         self.link("current", &target)?;
-        Ok(format!("{} is the current package: {name}\n", open.package.rig))
+        Ok(format!("{rig} is the current package: {name}\n"))
     }
 
     /// Makes the package before the current one current again.
@@ -152,6 +151,11 @@ impl Store {
         fs::read_link(self.dir.join("current")).ok()
     }
 
+    /// The file of the current package.
+    pub fn current(&self) -> Option<PathBuf> {
+        self.current_target().map(|target| self.dir.join(target))
+    }
+
     /// Whether there is a package before the current one to go back to.
     pub fn took_over(&self) -> bool {
         self.before().is_some()
@@ -193,7 +197,9 @@ impl Store {
 fn whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let fresh = path.with_file_name(format!(".{name}.{}", std::process::id()));
-    let mut file = File::create(&fresh)?;
+    // One of that name was left by a process that was killed.
+    let _ = fs::remove_file(&fresh);
+    let mut file = File::create_new(&fresh)?;
     let written = file.write_all(bytes).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&fresh, path));
     if written.is_err() {
         let _ = fs::remove_file(&fresh);
@@ -206,9 +212,12 @@ mod tests {
     use super::*;
     use runtime::package::Package;
 
-    fn packed(rig: &str) -> Open {
-        let package = Package { rig: rig.into(), ..Package::default() };
-        Open { bytes: package.to_bytes(), signature: None, package, signer: None }
+    fn packed(rig: &str) -> Vec<u8> {
+        Package { rig: rig.into(), ..Package::default() }.to_bytes()
+    }
+
+    fn install(store: &Store, rig: &str) -> String {
+        store.install(rig, &packed(rig), None).unwrap()
     }
 
     fn current(dir: &Path) -> Package {
@@ -221,12 +230,12 @@ mod tests {
         let store = Store::at(dir.path());
         assert!(store.status().unwrap_err().starts_with("nothing is installed in "));
         assert!(store.rollback().unwrap_err().starts_with("there is no package before"));
-        store.install(&packed("one")).unwrap();
+        install(&store, "one");
         assert_eq!(current(dir.path()).rig, "one");
         assert!(store.rollback().is_err(), "there was none before the first");
-        store.install(&packed("two")).unwrap();
+        install(&store, "two");
         assert_eq!(current(dir.path()).rig, "two");
-        assert!(store.install(&packed("two")).unwrap().ends_with("already\n"));
+        assert!(install(&store, "two").ends_with("already\n"));
         store.rollback().unwrap();
         assert_eq!(current(dir.path()).rig, "one");
         store.rollback().unwrap();
@@ -256,13 +265,13 @@ mod tests {
     fn what_was_interrupted_leaves_what_was_current() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::at(dir.path());
-        store.install(&packed("one")).unwrap();
+        install(&store, "one");
         // Half a copy, and a link that was not renamed any more.
-        let half = packed("two").bytes;
+        let half = packed("two");
         fs::write(dir.path().join("packages/.half.fricpkg.1"), &half[..half.len() / 2]).unwrap();
         symlink("packages/.half.fricpkg.1", dir.path().join(format!(".current.{}", std::process::id()))).unwrap();
         assert_eq!(current(dir.path()).rig, "one");
-        store.install(&packed("three")).unwrap();
+        install(&store, "three");
         assert_eq!(current(dir.path()).rig, "three");
     }
 }

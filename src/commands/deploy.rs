@@ -8,9 +8,11 @@ use super::End;
 use crate::args::{Deploy, FetchLog, Host};
 use crate::project;
 use crate::remote::{Failed, Remote};
+use crate::sign::{self, Signing};
 use crate::terminal::Terminal;
+use abi::foreign::is_component;
 use runtime::package::signature::{EXTENSION as SIGNATURE, beside};
-use runtime::package::{Package, hash};
+use runtime::package::{MOST_BYTES, Package, hash};
 use std::fs;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -31,47 +33,152 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     let remote = Remote::new(host, options);
     let target = remote.run(&[rig, "target"]).map_err(|why| no_rig(&remote, rig, &why))?.trim().to_string();
     terminal.line(&format!("{host} is {target}"));
-    let (bytes, signature) = packed(args, &target, terminal)?;
+    let key = signing(args, terminal)?;
+    let Packed { bytes, signature } = packed(args, &target, key.as_ref(), terminal)?;
     let package = Package::read(&bytes).map_err(|why| why.to_string())?;
     if package.target != target {
         return Err(format!("the package is for {}, and {host} is {target}: build it for that", package.target));
     }
-    // Beside what is installed, under a name of its own.
+    let contents = package.contents().map_err(|why| why.to_string())?;
+    let simulated = contents.rig.buses.iter().all(|bus| bus.address.starts_with("sim:"));
+    let trusted: Vec<&str> = args.trusted.iter().flat_map(|folder| ["--trusted", folder.as_str()]).collect();
+    if let Some(key) = &key {
+        register(args, &remote, key, &trusted, simulated, terminal)?;
+    }
+    // Beside what is installed, in a folder of its own that nobody else can have made or can write to.
     let name = format!("{}-{}.{}", package.rig, &hash(&bytes)[..12], runtime::package::EXTENSION);
-    let folder = format!("{dir}/incoming");
-    let arrived = format!("{folder}/{name}");
     let staging = Staging::new(&name, &bytes, signature.as_deref())?;
     let failed = |what: &str| {
         let host = host.clone();
         let what = what.to_string();
         move |why: Failed| format!("{host}: {what}: {}; what was installed there is as it was", why.words())
     };
-    remote.run(&["mkdir", "-p", &folder]).map_err(failed("no folder for packages"))?;
-    remote.send(&staging.files(), &folder).map_err(failed("the copy did not arrive"))?;
-    let trusted: Vec<&str> = args.trusted.iter().flat_map(|folder| ["--trusted", folder.as_str()]).collect();
-    let check = [&[rig.as_str(), "check", &arrived], &trusted[..]].concat();
-    let checked = remote.run(&check).map_err(failed("the package is refused"))?;
+    let incoming = format!("{dir}/incoming");
+    remote.run(&["mkdir", "-p", &incoming]).map_err(failed("no folder for packages"))?;
+    let made = remote.run(&["mktemp", "-d", "-p", &incoming, "XXXXXXXXXX"]);
+    let folder = made.map_err(failed("no folder for packages"))?.trim().to_string();
+    let arrived = There { remote: &remote, folder };
+    let path = format!("{}/{name}", arrived.folder);
+    remote.send(&staging.files(), &arrived.folder).map_err(failed("the copy did not arrive"))?;
+    let allowed = args.allow_unsigned.then_some("--allow-unsigned");
+    let with = |words: &[&str]| -> Vec<String> {
+        words.iter().chain(&trusted).copied().chain(allowed).map(str::to_string).collect()
+    };
+    let run = |words: &[String]| remote.run(&words.iter().map(String::as_str).collect::<Vec<_>>());
+    let checked = run(&with(&[rig, "check", &path])).map_err(failed("the package is refused"))?;
     terminal.print(&checked);
     if let Ok(found) = remote.run(&[rig, "doctor"]) {
         terminal.print(&found);
     }
-    let install = [&[rig.as_str(), "install", &arrived, "--dir", dir], &trusted[..]].concat();
-    let installed = remote.run(&install).map_err(failed("it could not be installed"))?;
+    let mut install = with(&[rig, "install", &path, "--dir", dir]);
+    install.extend(args.allow_older.then(|| "--allow-older".into()));
+    let installed = run(&install).map_err(failed("it could not be installed"))?;
     terminal.print(&installed);
     // What has been installed is kept under its hash; the copy has done its work.
-    let signed = format!("{arrived}.{SIGNATURE}");
-    let _ = remote.run(&["rm", "-f", &arrived, &signed]);
+    drop(arrived);
     if args.start {
-        start(args, &remote, &hash(&bytes), terminal)?;
+        start(args, &remote, &with(&[rig, "start", "--hash", &hash(&bytes), "--dir", dir]), terminal)?;
     }
     Ok(())
 }
 
+/// A folder on the other computer, removed when it goes.
+struct There<'a> {
+    remote: &'a Remote,
+    folder: String,
+}
+
+impl Drop for There<'_> {
+    fn drop(&mut self) {
+        let _ = self.remote.run(&["rm", "-rf", "--", &self.folder]);
+    }
+}
+
+/// The key to sign with: the one that is named, else one of whoever deploys, made on first use. None where nothing is to be
+/// signed.
+fn signing(args: &Deploy, terminal: &mut Terminal) -> Result<Option<Named>, String> {
+    let signed = is_package(&args.file) && beside(&args.file).exists();
+    if let Some(path) = &args.sign {
+        let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+        return Ok(Some(Named { name, key: Signing::open(path)? }));
+    }
+    if args.allow_unsigned || signed {
+        return Ok(None);
+    }
+    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let folder = variable("XDG_CONFIG_HOME").or_else(|| variable("HOME").map(|home| home.join(".config")));
+    let folder = folder.ok_or("no home to keep a key in: name one with --sign, `fric key new` makes it")?.join("fric");
+    let path = folder.join("deploy.key");
+    if !path.exists() {
+        let (secret, public) = sign::new_pair().map_err(|why| format!("cannot make a key: {why}"))?;
+        project::write_secret(&path, secret.as_bytes())
+            .and_then(|()| project::write(&path.with_extension("pub"), public.as_bytes()))
+            .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        terminal.line(&format!("made a key to sign packages with: {}, keep it to yourself", path.display()));
+    }
+    let key = Signing::open(&path)?;
+    // Two people may have one name: a piece of the key tells theirs apart.
+    let letters = |text: &str| text.chars().filter(char::is_ascii_alphanumeric).take(32).collect::<String>();
+    let user = variable("USER").map(|user| letters(&user.to_string_lossy())).filter(|user| !user.is_empty());
+    let name = format!("{}-{}", user.unwrap_or("fric".into()), &hash(key.public().as_bytes())[..8]);
+    Ok(Some(Named { name, key }))
+}
+
+/// A key and the name under which a rig's computer knows it.
+struct Named {
+    name: String,
+    key: Signing,
+}
+
+/// Has the rig's computer trust a key, if it trusts none yet; says so.
+fn register(
+    args: &Deploy,
+    remote: &Remote,
+    Named { name, key }: &Named,
+    trusted: &[&str],
+    simulated: bool,
+    terminal: &mut Terminal,
+) -> Result<(), String> {
+    let Host { host, rig, .. } = &args.host;
+    let public = key.public();
+    let known = remote.run(&[&[rig.as_str(), "trust"], trusted].concat());
+    let known = known.map_err(|why| format!("{host}: the keys that it trusts are not known: {}", why.words()))?;
+    let names: Vec<&str> = known.lines().filter_map(|line| Some(line.split_once(' ')?.0)).collect();
+    if known.lines().any(|line| line.split_once(' ').is_some_and(|(_, key)| key == public)) {
+        return Ok(());
+    }
+    let by_hand = [&["sudo", rig.as_str(), "trust", name, public.as_str()], trusted].concat().join(" ");
+    if !names.is_empty() {
+        return Err(format!(
+            "{host} trusts {} only, and not your key {name}: whoever looks after it registers it there with\n  {by_hand}",
+            names.join(", ")
+        ));
+    }
+    match remote.run(&[&[rig.as_str(), "trust", name, &public, "--first"], trusted].concat()) {
+        Ok(said) => {
+            terminal.print(&format!("{host}: {said}"));
+            Ok(())
+        }
+        Err(why) if simulated => {
+            terminal.line(&format!(
+                "{host}: your key {name} is not registered: {}; a rig on simulated buses runs all the same, a real one \
+                 needs\n  {by_hand}",
+                why.words()
+            ));
+            Ok(())
+        }
+        Err(why) => Err(format!(
+            "{host}: your key {name} could not be registered: {}; do it there, once, with\n  {by_hand}",
+            why.words()
+        )),
+    }
+}
+
 /// Starts what has been installed, and tells its state; if it refuses, the computer itself goes back to what was there.
-fn start(args: &Deploy, remote: &Remote, hash: &str, terminal: &mut Terminal) -> Result<(), String> {
+fn start(args: &Deploy, remote: &Remote, words: &[String], terminal: &mut Terminal) -> Result<(), String> {
     let Host { host, rig, dir, .. } = &args.host;
-    let said =
-        remote.run(&[rig, "start", "--hash", hash, "--dir", dir]).map_err(|why| format!("{host}: {}", why.words()))?;
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let said = remote.run(&words).map_err(|why| format!("{host}: {}", why.words()))?;
     terminal.print(&said);
     if args.follow || std::io::stdout().is_terminal() {
         // Whoever has seen enough presses Ctrl-C: what was asked for is done.
@@ -98,53 +205,65 @@ fn no_rig(remote: &Remote, rig: &str, why: &Failed) -> String {
     }
 }
 
-/// The package and its signature: read, or built for the computer.
-fn packed(args: &Deploy, target: &str, terminal: &mut Terminal) -> Result<(Vec<u8>, Option<String>), String> {
-    let path = &args.file;
-    if path.extension().is_some_and(|extension| extension == runtime::package::EXTENSION) {
-        if args.name.is_some() || args.sign.is_some() || !args.set.all.is_empty() {
-            return Err(format!("{} is a package: it goes as it was built, signed and set", path.display()));
-        }
-        let bytes = fs::read(path).map_err(|error| format!("cannot read {}: {error}", path.display()))?;
-        return Ok((bytes, fs::read_to_string(beside(path)).ok()));
-    }
-    let wanted = super::pack::Wanted {
-        name: args.name.as_deref(),
-        target,
-        features: &[],
-        set: &args.set,
-        key: args.sign.as_deref(),
-    };
-    super::pack::packed(path, &wanted, terminal)
+/// A package and its signature.
+struct Packed {
+    bytes: Vec<u8>,
+    signature: Option<String>,
 }
 
-/// A folder of this computer with the files to send, removed when it goes.
+fn is_package(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == runtime::package::EXTENSION)
+}
+
+/// The package and its signature: read, or built for the computer.
+fn packed(args: &Deploy, target: &str, key: Option<&Named>, terminal: &mut Terminal) -> Result<Packed, String> {
+    let path = &args.file;
+    let key = key.map(|named| &named.key);
+    if !is_package(path) {
+        let wanted = super::pack::Wanted { name: args.name.as_deref(), target, features: &[], set: &args.set, key };
+        let (bytes, signature) = super::pack::packed(path, &wanted, terminal)?;
+        return Ok(Packed { bytes, signature });
+    }
+    if args.name.is_some() || !args.set.all.is_empty() {
+        return Err(format!("{} is a package: it goes as it was built and set", path.display()));
+    }
+    let about = |why: &dyn std::fmt::Display| format!("{}: {why}", path.display());
+    let found = fs::metadata(path).map_err(|error| about(&error))?;
+    if !found.is_file() || found.len() > MOST_BYTES {
+        return Err(about(&"it is no file of the size of a package"));
+    }
+    let bytes = fs::read(path).map_err(|error| about(&error))?;
+    let package = Package::read(&bytes).map_err(|why| about(&why))?;
+    let signature = match key {
+        Some(key) => Some(super::pack::signed(key, &package, &bytes)?),
+        None => fs::read_to_string(beside(path)).ok(),
+    };
+    Ok(Packed { bytes, signature })
+}
+
+/// A folder of this computer with the files to send: new, open to nobody else, removed when it goes.
 struct Staging {
-    folder: PathBuf,
+    _folder: tempfile::TempDir,
     paths: Vec<PathBuf>,
 }
 
 impl Staging {
     fn new(name: &str, bytes: &[u8], signature: Option<&str>) -> Result<Staging, String> {
-        let folder = std::env::temp_dir().join(format!("fric-deploy-{}", std::process::id()));
-        let mut staging = Staging { folder, paths: Vec::new() };
-        let files = [(name.to_string(), bytes), (format!("{name}.{SIGNATURE}"), signature.unwrap_or("").as_bytes())];
-        for (name, bytes) in files.into_iter().take(1 + usize::from(signature.is_some())) {
-            let path = staging.folder.join(&name);
+        let folder = tempfile::Builder::new().prefix("fric-deploy-").tempdir();
+        let folder = folder.map_err(|error| format!("no folder for the package: {error}"))?;
+        let mut paths = Vec::new();
+        let beside = format!("{name}.{SIGNATURE}");
+        for (name, bytes) in [(name, Some(bytes)), (&beside, signature.map(str::as_bytes))] {
+            let Some(bytes) = bytes else { continue };
+            let path = folder.path().join(name);
             project::write(&path, bytes).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
-            staging.paths.push(path);
+            paths.push(path);
         }
-        Ok(staging)
+        Ok(Staging { _folder: folder, paths })
     }
 
     fn files(&self) -> Vec<&Path> {
         self.paths.iter().map(PathBuf::as_path).collect()
-    }
-}
-
-impl Drop for Staging {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.folder);
     }
 }
 
@@ -159,15 +278,22 @@ pub fn fetch_log(args: &FetchLog, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let all: Vec<&str> = listed.lines().filter(|name| name.ends_with(".friclog")).collect();
+    // A name that leaves its folder, here or there, or is more than a name is none of a log.
+    let (all, odd): (Vec<&str>, Vec<&str>) =
+        listed.lines().filter(|name| name.ends_with(".friclog")).partition(|name| is_component(name));
+    for name in odd {
+        terminal.error(&format!("{host} says that it has a log `{name}`: that is no name of one, it stays there"));
+    }
+    // A long log lies in several files, of which the newest comes first.
+    let whole = |name: &str| all.iter().rev().copied().filter(|other| of_log(other) == of_log(name)).collect();
     let wanted: Vec<&str> = match &args.log {
-        Some(name) if all.contains(&name.as_str()) => vec![name],
+        Some(name) if all.contains(&name.as_str()) => whole(name),
         Some(name) => {
             terminal.error(&format!("{host} has no log `{name}`; it has {}", all.join(", ")));
             return End::Failed;
         }
         None if args.all => all,
-        None => all.into_iter().take(1).collect(),
+        None => all.first().map(|newest| whole(newest)).unwrap_or_default(),
     };
     if wanted.is_empty() {
         terminal.error(&format!("{host} has no log in {folder}"));
@@ -175,14 +301,34 @@ pub fn fetch_log(args: &FetchLog, terminal: &mut Terminal) -> End {
     }
     for name in wanted {
         let to = args.out.join(name);
-        let fetched = project::make_folder_of(&to)
-            .map_err(|error| error.to_string())
-            .and_then(|()| remote.fetch(&format!("{folder}/{name}"), &to).map_err(|why| why.words()));
-        if let Err(why) = fetched {
+        if let Err(why) = fetched(&remote, &format!("{folder}/{name}"), &to) {
             terminal.error(&format!("cannot fetch {name}: {why}"));
             return End::Failed;
         }
         terminal.line(&format!("wrote {}", to.display()));
     }
     End::Fine
+}
+
+/// The log that a file is a part of: `rtfs` for `rtfs.friclog` and for `rtfs.2.friclog`.
+fn of_log(name: &str) -> &str {
+    let stem = name.strip_suffix(".friclog").unwrap_or(name);
+    match stem.rsplit_once('.') {
+        Some((log, part)) if !part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit()) => log,
+        _ => stem,
+    }
+}
+
+/// Copies a file here: whole or not at all.
+fn fetched(remote: &Remote, from: &str, to: &Path) -> Result<(), String> {
+    let about = |error: std::io::Error| error.to_string();
+    project::make_folder_of(to).map_err(about)?;
+    let folder = to.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let staging = tempfile::Builder::new().prefix(".fetching-").tempdir_in(folder).map_err(about)?;
+    let part = staging.path().join("log");
+    remote.fetch(from, &part).map_err(|why| why.words())?;
+    if !fs::symlink_metadata(&part).map_err(about)?.is_file() {
+        return Err("it is no file".into());
+    }
+    fs::rename(&part, to).map_err(about)
 }

@@ -5,13 +5,13 @@ use crate::args::Inspect;
 use crate::project;
 use crate::terminal::{Style, Terminal};
 use crate::value::{count, significant};
-use abi::encode::Encode;
+use abi::foreign::shown;
 use abi::image::Image;
 use abi::rig::Rig;
 use abi::{Description, Function};
-use runtime::package::signature::{Trusted, beside};
+use runtime::package::signature::{Signer, Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
-use runtime::record::log::Sections;
+use runtime::show::utc;
 use std::fs;
 
 pub fn inspect(args: &Inspect, terminal: &mut Terminal) -> End {
@@ -35,12 +35,14 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
     }
     let bytes = fs::read(path).map_err(|error| about(&error))?;
     let package = Package::read(&bytes).map_err(|why| about(&why))?;
+    let contents = package.contents().map_err(|why| about(&why))?;
     let signature = fs::read_to_string(beside(path)).ok();
     let signed = match &args.trusted {
         Some(folder) => {
             let keys = Trusted::in_folder(folder)?;
             match keys.signer(&bytes, signature.as_deref()).map_err(|why| about(&why))? {
-                Some(name) => format!("signed by {name}"),
+                Some(Signer { name, signed_s: Some(at) }) => format!("signed by {name} at {}", utc(at)),
+                Some(Signer { name, signed_s: None }) => format!("signed by {name}"),
                 None => return Err(format!("{} has no public key", folder.display())),
             }
         }
@@ -59,23 +61,17 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
         let size = count(section.bytes.len() as u64);
         out += &format!("  {:width$}  {size:>9} bytes  {}\n", section.name, &hash(&section.bytes)[..16]);
     }
-    for name in ["control", "plant"] {
-        let bytes = package.section(name).map_err(|why| about(&why))?;
-        let image = Image::read(bytes).map_err(|why| about(&format!("its program `{name}`: {why}")))?;
-        out += &format!("\n  {name}: {}\n", program(&image));
+    for (name, image) in [("control", &contents.control), ("plant", &contents.plant)] {
+        out += &format!("\n  {name}: {}\n", program(image));
     }
-    let plan = package.section("rig").map_err(|why| about(&why))?;
-    let plan = Rig::from_bytes(plan).map_err(|why| about(&format!("the plan of its rig: {why}")))?;
-    out += &format!("\n  {}\n", planned(&plan));
-    let head = package.section("head").map_err(|why| about(&why))?;
-    let head = Vec::from_bytes(head).map_err(|why| about(&format!("the head of its logs: {why}")))?;
-    for set in Sections(head).text("set").unwrap_or_default().lines() {
-        out += &format!("  set {set}\n");
+    out += &format!("\n  {}\n", planned(&contents.rig));
+    for set in contents.head.text("set").unwrap_or_default().lines() {
+        out += &format!("  set {}\n", shown(set));
     }
     if args.sources {
         for section in sections {
             if let Some(name) = section.name.strip_prefix("source/") {
-                out += &format!("\n--- {name}\n{}", String::from_utf8_lossy(&section.bytes));
+                out += &format!("\n--- {name}\n{}", shown(&String::from_utf8_lossy(&section.bytes)));
             }
         }
     }

@@ -4,8 +4,6 @@ use super::End;
 use crate::args::KeyNew;
 use crate::terminal::Terminal;
 use crate::{project, sign};
-use std::fs;
-use std::os::unix::fs::PermissionsExt;
 
 pub fn new(args: &KeyNew, terminal: &mut Terminal) -> End {
     let secret = args.name.with_extension("key");
@@ -23,8 +21,7 @@ pub fn new(args: &KeyNew, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let written = project::write(&secret, secret_text.as_bytes())
-        .and_then(|()| fs::set_permissions(&secret, fs::Permissions::from_mode(0o600)))
+    let written = project::write_secret(&secret, secret_text.as_bytes())
         .and_then(|()| project::write(&public, public_text.as_bytes()));
     if let Err(error) = written {
         terminal.error(&format!("cannot write {}: {error}", secret.display()));
@@ -32,7 +29,7 @@ pub fn new(args: &KeyNew, terminal: &mut Terminal) -> End {
     }
     terminal.line(&format!(
         "wrote {}: keep it to yourself; `fric build --sign {}` signs with it\n\
-         wrote {}: put it into {} on the rig's computer",
+         wrote {}: `fric deploy --sign` registers it on a rig that trusts no key yet; else it goes into {} there",
         secret.display(),
         secret.display(),
         public.display(),

@@ -4,14 +4,16 @@ use super::{End, chosen_rig, load_from};
 use crate::args::{Build, Set};
 use crate::compile::{self, Stopwatch};
 use crate::kept::Keeping;
+use crate::sign::Signing;
 use crate::terminal::Terminal;
-use crate::{project, report, sign};
+use crate::{project, report};
 use abi::encode::Encode;
 use abi::image::Feature;
-use runtime::package::signature::beside;
+use runtime::package::signature::{beside, comment};
 use runtime::package::{Package, here};
 use runtime::record::log::Sections;
 use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// `fric build RIG.fric -o NAME.fricpkg`
 pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
@@ -21,14 +23,17 @@ pub(super) fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error("a rig has its own step and solver: change them in its text");
         return End::Misused;
     }
-    let wanted = Wanted {
-        name: args.name.as_deref(),
-        target: &target,
-        features: &args.features,
-        set: &args.stepped.set,
-        key: args.sign.as_deref(),
-    };
-    let (bytes, signature) = match packed(&args.file, &wanted, terminal) {
+    let built = args.sign.as_deref().map(Signing::open).transpose().and_then(|key| {
+        let wanted = Wanted {
+            name: args.name.as_deref(),
+            target: &target,
+            features: &args.features,
+            set: &args.stepped.set,
+            key: key.as_ref(),
+        };
+        packed(&args.file, &wanted, terminal)
+    });
+    let (bytes, signature) = match built {
         Ok(packed) => packed,
         Err(why) => {
             terminal.error(&why);
@@ -63,8 +68,8 @@ pub(super) struct Wanted<'a> {
     pub features: &'a [Feature],
     /// Parameters and slots that are changed.
     pub set: &'a Set,
-    /// The secret key to sign with.
-    pub key: Option<&'a Path>,
+    /// The key to sign with.
+    pub key: Option<&'a Signing>,
 }
 
 /// The bytes of a package and its signature.
@@ -109,9 +114,22 @@ pub(super) fn packed(
         }
     }
     let bytes = package.to_bytes();
-    let comment = format!("rig {}, {target}, fric {}", package.rig, package.fric);
-    let signature = key.map(|key| sign::sign(key, &bytes, &comment)).transpose()?;
+    // What is refused where it is to run is not handed out.
+    Package::read(&bytes)
+        .and_then(|package| package.contents())
+        .map_err(|why| format!("the package would be refused, which is a mistake of fric: {why}"))?;
+    let signature = key.map(|key| signed(key, &package, &bytes)).transpose()?;
     Ok((bytes, signature))
+}
+
+/// A signature of a package, made now.
+///
+/// # Errors
+/// Why there is none.
+pub(super) fn signed(key: &Signing, package: &Package, bytes: &[u8]) -> Result<String, String> {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let what = format!("rig {}, {}, fric {}", package.rig, package.target, package.fric);
+    key.sign(bytes, &comment(&what, now.as_secs()))
 }
 
 /// The name of a text without what depends on where it lay: the same rig packs to the same bytes anywhere.

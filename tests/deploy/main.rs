@@ -5,8 +5,10 @@
 mod debian;
 #[path = "../agreement/emulator.rs"]
 mod emulator;
+mod fuzz;
 mod package;
 mod ssh;
+mod trust;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -80,7 +82,14 @@ fn folder(name: &str) -> PathBuf {
 }
 
 fn fric(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fric")).current_dir(folder).args(args).output().unwrap()
+    // Keys that are made on first use belong to the test.
+    let config = folder.join("config");
+    Command::new(env!("CARGO_BIN_EXE_fric"))
+        .current_dir(folder)
+        .args(args)
+        .env("XDG_CONFIG_HOME", config)
+        .output()
+        .unwrap()
 }
 
 fn said(output: &Output) -> String {

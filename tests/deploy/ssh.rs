@@ -109,6 +109,9 @@ impl There {
         all.extend(more.iter().map(|word| word.to_string()));
         all.extend(self.sshd.options.iter().cloned());
         all.extend(["--rig".into(), FRIC_RIG.display().to_string(), "--dir".into(), self.dir.display().to_string()]);
+        if command == "deploy" && !more.contains(&"--trusted") {
+            all.extend(["--trusted".into(), self.folder.join("known").display().to_string()]);
+        }
         all
     }
 
@@ -199,6 +202,10 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     // With a trusted key there, what is not signed is refused, and nothing is installed.
     fine(&folder, &["key", "new", "trusted/anna"]);
     let refused = there.over_ssh("deploy", &["rig.fric", "--trusted", &trusted]);
+    let told = said(&refused);
+    assert!(!refused.status.success() && told.contains("made a key to sign packages with"), "{told}");
+    assert!(told.contains(" trusts anna only, and not your key ") && told.contains(" trust "), "{told}");
+    let refused = there.over_ssh("deploy", &["rig.fric", "--trusted", &trusted, "--allow-unsigned"]);
     assert!(!refused.status.success() && said(&refused).contains("it is not signed"), "{}", said(&refused));
     assert!(said(&refused).contains("what was installed there is as it was") && there.current().is_none());
     let nothing = there.local(&["run"]);
@@ -223,6 +230,7 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     // One that is whole and does not start gives way to the one before.
     let refused = there.over_ssh("deploy", &["bad.fric", "--start"]);
     assert!(!refused.status.success(), "{}", said(&refused));
+    assert!(said(&refused).contains(": registered key "), "{}", said(&refused));
     assert!(said(&refused).contains("it does not start") && said(&refused).contains("back to "), "{}", said(&refused));
     assert_eq!(there.current().as_ref(), Some(&first));
 
@@ -275,6 +283,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     let there = There::new(folder.clone());
 
     let told = there.deploys(&["rig.fric", "--start"]);
+    assert!(told.contains("made a key to sign packages with") && told.contains(": registered key "), "{told}");
     assert!(told.contains("fits this computer") && told.contains("started, process "), "{told}");
     let first = there.current().unwrap();
     let name = |path: &Path| path.display().to_string();
@@ -286,6 +295,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
 
     // Another package while drives have torque: installed, and not taken over.
     let told = there.deploys(&["other.fric", "--start"]);
+    assert!(!told.contains("made a key") && !told.contains("registered"), "only the first time: {told}");
     assert!(told.contains("it takes the package over as soon as no drive has torque"), "{told}");
     let second = there.current().unwrap();
     assert_ne!(first, second);
@@ -341,6 +351,7 @@ fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
         let words = there.words("deploy", &["next.fric", "--start"]);
         let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
         command.current_dir(&folder).args(words).stdout(Stdio::null()).stderr(Stdio::null());
+        command.env("XDG_CONFIG_HOME", folder.join("config"));
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         let mut child = command.spawn().unwrap();
         // Spread over its whole time by the golden ratio, and a little beyond.
@@ -375,8 +386,13 @@ fn a_started_rig_is_followed_until_it_ends() {
     let there = There::new(folder.clone());
     let words = there.words("deploy", &["rig.fric", "--start", "--follow"]);
     let log = fs::File::create(folder.join("followed")).unwrap();
-    let mut child =
-        Command::new(env!("CARGO_BIN_EXE_fric")).current_dir(&folder).args(words).stdout(log).spawn().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fric"))
+        .current_dir(&folder)
+        .env("XDG_CONFIG_HOME", folder.join("config"))
+        .args(words)
+        .stdout(log)
+        .spawn()
+        .unwrap();
     let told = || fs::read_to_string(folder.join("followed")).unwrap();
     let package = || there.current().map_or("nothing".into(), |current| format!("{}: ", current.display()));
     let begun = Instant::now();

@@ -14,9 +14,11 @@
 //! ```
 //! The hash finds every change that befell a file. Who made it is said by a signature beside it, see [`signature`].
 
+pub mod contents;
 pub mod signature;
 
 use abi::encode::{Encode, Malformed, Reader};
+use abi::foreign::{is_name, is_plain};
 use abi::image::{sha256, sha256_without};
 use std::fmt;
 
@@ -214,9 +216,15 @@ impl Package {
         let mut reader = Reader::new(&bytes[HASH.end..]);
         let mut text = || String::decode(&mut reader);
         let mut package = Package { fric: text()?, target: text()?, rig: text()?, sections: Vec::new() };
+        package.named()?;
         let mut expected = None;
         for _ in 0..count {
             let name = String::decode(&mut reader)?;
+            // Names become those of files, and are shown: `source/std.friction.lugre.fric`.
+            let inside = |part: &str| is_plain(part) && !matches!(part, "" | "." | "..") && !part.contains('\\');
+            if !name.split('/').all(inside) {
+                return Err(Refusal::Malformed(format!("a section is called {name:?}")));
+            }
             let (offset, length) = (u64::decode(&mut reader)?, u64::decode(&mut reader)?);
             let hash: &[u8] = reader.take(32)?;
             // Sections lie one behind the other, so that every byte belongs to exactly one.
@@ -238,6 +246,18 @@ impl Package {
             return Err(Refusal::Malformed("there is more behind the last section".into()));
         }
         Ok(package)
+    }
+
+    /// Whether its texts are what they should be: its rig has a name that can be part of a file's, the rest is shown.
+    fn named(&self) -> Result<(), Refusal> {
+        let Package { fric, target, rig, .. } = self;
+        if !is_name(rig) {
+            return Err(Refusal::Malformed(format!("its rig is called {rig:?}, which is no name")));
+        }
+        match [fric, target].into_iter().find(|text| !is_plain(text)) {
+            Some(text) => Err(Refusal::Malformed(format!("it says that it was made by or for {text:?}"))),
+            None => Ok(()),
+        }
     }
 
     /// Whether this machine and this version can run it.
@@ -272,7 +292,7 @@ mod tests {
         let bytes = package().to_bytes();
         assert_eq!(Package::read(&bytes), Ok(package()));
         assert_eq!(bytes, package().to_bytes());
-        let empty = Package::default();
+        let empty = Package { rig: "empty".into(), ..Package::default() };
         assert_eq!(Package::read(&empty.to_bytes()), Ok(empty));
         let names: Vec<String> = package().sections.into_iter().map(|section| section.name).collect();
         assert_eq!(names, ["control", "plant", "source/rtfs.fric"]);
@@ -319,6 +339,24 @@ mod tests {
         rehash(&mut other);
         let why = Package::read(&other).unwrap_err().to_string();
         assert!(why.contains("source/rtfs.fric") && why.contains("another hash"), "{why}");
+    }
+
+    /// What a package is called becomes part of a file's name, and what it says is shown.
+    #[test]
+    fn names_that_leave_a_folder_or_act_on_a_terminal_are_refused() {
+        let why = |package: &Package| Package::read(&package.to_bytes()).unwrap_err().to_string();
+        for rig in ["", "../../x", "/etc/x", "a\u{1b}[2J", ".x", "-x"] {
+            let told = why(&Package { rig: rig.into(), ..package() });
+            assert!(told.contains("which is no name") && is_plain(&told), "{rig:?}: {told}");
+        }
+        let told = why(&Package { fric: "1\u{1b}]0;x\u{7}".into(), ..package() });
+        assert!(told.contains("made by or for") && is_plain(&told), "{told}");
+        for name in ["source/../../x", "/control", "source//x", "a\u{7}", "source/..", "a\\b"] {
+            let mut package = package();
+            package.add(name, Vec::new());
+            let told = why(&package);
+            assert!(told.contains("a section is called") && is_plain(&told), "{name:?}: {told}");
+        }
     }
 
     #[test]

@@ -21,7 +21,53 @@ pub fn beside(package: &Path) -> PathBuf {
 }
 
 /// Keys that are trusted.
-pub struct Trusted(Vec<(String, PublicKey)>);
+pub struct Trusted(Vec<Key>);
+
+/// A public key that is trusted.
+struct Key {
+    /// The name of its file, without its ending.
+    name: String,
+    /// As it is written, in base64.
+    text: String,
+    key: PublicKey,
+}
+
+/// Who signed a package, and when.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Signer {
+    /// The name of the key.
+    pub name: String,
+    /// s since 1970, from the comment that is part of what is signed; none if it does not say.
+    pub signed_s: Option<u64>,
+}
+
+/// What stands before the time in the trusted comment of a signature: the stock tool writes it too.
+const TIMESTAMP: &str = "timestamp:";
+
+/// The trusted comment of a signature made now. The time lies here and not in the package, so that equal texts still give
+/// equal packages; it is signed as the package is.
+pub fn comment(what: &str, now_s: u64) -> String {
+    format!("{what}, {TIMESTAMP}{now_s}")
+}
+
+/// The time in a trusted comment.
+fn timestamp(comment: &str) -> Option<u64> {
+    let (_, rest) = comment.split_once(TIMESTAMP)?;
+    let digits = rest.find(|c: char| !c.is_ascii_digit()).map_or(rest, |end| &rest[..end]);
+    digits.parse().ok()
+}
+
+/// The base64 of a public key in the text of its file, or alone.
+///
+/// # Errors
+/// If it is no public key of minisign.
+pub fn public_key(text: &str) -> Result<String, String> {
+    let line = text.lines().map(str::trim).rfind(|line| !line.is_empty()).unwrap_or_default();
+    match PublicKey::from_base64(line) {
+        Ok(_) => Ok(line.to_string()),
+        Err(why) => Err(format!("it is no public key of minisign: {why}")),
+    }
+}
 
 impl Trusted {
     /// The keys in a folder, by the names of their files. There are none if there is no folder.
@@ -44,9 +90,10 @@ impl Trusted {
             let key = PublicKey::decode(&text)
                 .map_err(|why| format!("{} is no public key of minisign: {why}", path.display()))?;
             let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-            keys.push((name, key));
+            let text = public_key(&text).map_err(|why| format!("{}: {why}", path.display()))?;
+            keys.push(Key { name, text, key });
         }
-        keys.sort_by(|a, b| a.0.cmp(&b.0));
+        keys.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(Trusted(keys))
     }
 
@@ -55,27 +102,30 @@ impl Trusted {
         self.0.is_empty()
     }
 
-    /// The name of the key that signed some bytes; none if no key is trusted.
+    /// The names of the keys and the keys in base64, in the order of the names.
+    pub fn keys(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.0.iter().map(|key| (key.name.as_str(), key.text.as_str()))
+    }
+
+    /// The key that signed some bytes; none if no key is trusted.
     ///
     /// # Errors
     /// If keys are trusted and none of them signed it.
-    pub fn signer(&self, bytes: &[u8], signature: Option<&str>) -> Result<Option<&str>, Refusal> {
+    pub fn signer(&self, bytes: &[u8], signature: Option<&str>) -> Result<Option<Signer>, Refusal> {
         if self.is_empty() {
             return Ok(None);
         }
-        let names = || self.0.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
+        let names = || self.0.iter().map(|key| key.name.as_str()).collect::<Vec<_>>().join(", ");
         let Some(text) = signature else {
             return Err(Refusal::Signature(format!(
-                "it is not signed, and this computer trusts {} only: build it with `--sign KEY`",
+                "it is not signed, and this computer trusts {} only: `fric deploy` signs it, or `fric build --sign KEY`",
                 names()
             )));
         };
         let signature = Signature::decode(text)
             .map_err(|why| Refusal::Signature(format!("its signature cannot be read: {why}")))?;
-        for (name, key) in &self.0 {
-            if key.verify(bytes, &signature, false).is_ok() {
-                return Ok(Some(name));
-            }
+        if let Some(by) = self.0.iter().find(|key| key.key.verify(bytes, &signature, false).is_ok()) {
+            return Ok(Some(Signer { name: by.name.clone(), signed_s: timestamp(signature.trusted_comment()) }));
         }
         Err(Refusal::Signature(format!("its signature is not that of {}, whom this computer trusts", names())))
     }
