@@ -443,6 +443,59 @@ fn wrong_usage_is_told() {
     assert!(said.contains("not a log of fric"), "{said}");
 }
 
+const FRAMED: &str = "\
+import std.friction
+import std.plant
+
+device Drive {
+  param node = 5 in 1 .. 127
+  send torque   [N·m]   = 0 at 0x200 + node byte 0 as i16 scale 1 mN·m
+  read speed    [rad/s] = 0 at 0x180 + node byte 0 as i32 scale 0.001 rpm
+  read position [rad]   = 0 at 0x280 + node byte 0 as i32 scale 1 rev / 262144
+}
+
+rig bench {
+  run      rotary Servo(fr = rotary LuGre(sigma0 = 260 N·m/rad, sigma1 = 1.2 N·m·s/rad,
+                                     sigma2 = 0.018 N·m·s/rad, vs = 0.01 rad/s),
+                m = 0.012 kg·m^2)
+  rate     10 ms
+  bus      can0  = can(\"can0\", 1 Mbit/s)
+  drive    load  = Drive(can0, timeout = 10 s, speed_max = 100 rad/s)
+  hardware body {
+    load.torque  = F_motor - F_load  limit -2 N·m .. 2 N·m
+    v            = load.speed
+    x            = load.position
+  }
+  safe     load.torque = 0 N·m
+  allow    no-drive-timeout \"a relay cuts the power when the enabling signal stays away\"
+}
+";
+
+/// A drive described by frames announces nothing: it cannot prove to be simulated.
+#[test]
+fn options_for_simulated_drives_are_refused_to_a_drive_that_proves_nothing() {
+    let folder = folder("hil-permissions");
+    fs::write(folder.join("framed.fric"), FRAMED).unwrap();
+    let mut served = fric(&folder, &["drives", "framed.fric", "--tcp", "0"]);
+    let mut served = served.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut said = String::new();
+    let mut lines = std::io::BufReader::new(served.stderr.take().unwrap());
+    std::io::BufRead::read_line(&mut lines, &mut said).unwrap();
+    let port = said.split("port ").nth(1).and_then(|rest| rest.split(|c: char| !c.is_ascii_digit()).next());
+    let bus = format!("can0=socketcand:127.0.0.1:{}/can0", port.unwrap_or_else(|| panic!("{said}")));
+    for option in ["--arm", "--accept-jitter", "--count-overruns", "--accept-unstable"] {
+        let mut args = vec!["hil", "framed.fric", "--bus", &bus, option, "--for", "1s", "--no-log"];
+        if option != "--accept-unstable" {
+            args.push("--accept-unstable");
+        }
+        let told = fric(&folder, &args).output().unwrap();
+        let told = (told.status.code(), String::from_utf8_lossy(&told.stderr).into_owned());
+        assert!(told.0 == Some(2) && told.1.contains("`load` has not proved to be one of ours"), "{option}: {told:?}");
+    }
+    served.kill().unwrap();
+    served.wait().unwrap();
+}
+
 /// A run at the pace of the wall that counts what this machine misses, once its log is there.
 fn under_way(folder: &Path, log: &str) -> std::process::Child {
     let example = example();

@@ -323,6 +323,7 @@ fn run(
     if let Some(asked) = asked {
         options.duration_ns = Some(asked.duration_ns);
         options.control.ramp_ns = 0;
+        options.control.measures = true;
     }
     let real_time = (!fast)
         .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));

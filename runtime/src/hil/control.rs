@@ -114,13 +114,15 @@ pub struct Options {
     pub needs_look: bool,
     /// A contact that gives back more energy than it can hold stops the rig; otherwise that is counted.
     pub energy_stops: bool,
+    /// Dead time and lag of the drives are being measured: those of the rig's text count for nothing.
+    pub measures: bool,
 }
 
 impl Default for Options {
     fn default() -> Options {
         let (ramp_ns, clamped_ns, standstill_ns, blend_ns) = (100_000_000, 5_000_000_000, 1_000_000_000, 100_000_000);
-        let (count_overruns, needs_look, energy_stops) = (false, false, false);
-        Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops }
+        let (count_overruns, needs_look, energy_stops, measures) = (false, false, false, false);
+        Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops, measures }
     }
 }
 
@@ -269,7 +271,7 @@ impl Control {
         let followed = outputs.iter().enumerate().filter_map(|(output, limits)| {
             let answer = watches::answer(rig, &rig.outputs[output])?;
             let signal = watched.iter().position(|watched| watched.signal == answer)?;
-            Followed::new(rig, output, signal, limits).map(|followed| followed.patient(odd))
+            Followed::new(rig, output, signal, limits, options.measures).map(|followed| followed.patient(odd))
         });
         let followed = followed.collect();
         let signals: Vec<Signal> = watched.iter().map(|watched| watched.signal).collect();

@@ -18,6 +18,8 @@ use abi::rig::{Kind, Mode, Rig, What};
 
 /// Dead time beyond the drive's own for which a command may be under way, s: a late cycle, a busy bus.
 const SLACK: f64 = 1e-3;
+/// Dead time and lag that a drive may have which are being measured, s.
+const UNKNOWN: f64 = 20e-3;
 /// How much slower than told the lag of a drive may be.
 const SLOWER: f64 = 1.5;
 /// Tolerance of a torque, as part of the rated torque: offset and noise of a drive's own measurement.
@@ -59,8 +61,8 @@ pub struct Followed {
 }
 
 impl Followed {
-    /// The watch of an output whose answer is at this place among the signals.
-    pub fn new(rig: &Rig, output: usize, signal: usize, limits: &OutputLimits) -> Option<Followed> {
+    /// The watch of an output whose answer is at this place among the signals. `measures`: its times are not known yet.
+    pub fn new(rig: &Rig, output: usize, signal: usize, limits: &OutputLimits, measures: bool) -> Option<Followed> {
         let (commanded, at) = (rig.outputs[output].signal, watches::answer(rig, &rig.outputs[output])?);
         let node = &rig.nodes[at.node];
         let asked = node.asks_for(commanded.what)?;
@@ -89,8 +91,9 @@ impl Followed {
                 (LOOP_PART * half + 4.0 * message.fields[field].scale.abs(), apart_ns as f64 * 1e-9)
             }
         };
-        let dead = (node.delay + SLACK + late).min(MOST_DEAD);
-        let lag = SLOWER * node.lag + if torque { 0.0 } else { LOOP };
+        let unknown = if measures { UNKNOWN } else { 0.0 };
+        let dead = (node.delay + SLACK + late + unknown).min(MOST_DEAD);
+        let lag = SLOWER * node.lag + if torque { unknown } else { LOOP };
         let patience = if torque { TORQUE_TICKS } else { ticks(LOOP_NS, rig.period_ns) };
         Some(Followed {
             node: at.node,
@@ -176,7 +179,7 @@ mod tests {
         (rig.nodes[0].delay, rig.nodes[0].lag) = (delay, lag);
         let limits =
             OutputLimits { low: -1.0, high: 1.0, slew: f64::INFINITY, safe: 0.0, drive: Some(0), torque: true };
-        Followed::new(&rig, 0, 0, &limits).unwrap()
+        Followed::new(&rig, 0, 0, &limits, false).unwrap()
     }
 
     /// A drive that gets the commands until tick `lost` and keeps the last one from then on; each acts from its tick plus

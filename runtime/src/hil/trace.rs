@@ -305,8 +305,12 @@ pub fn hash(words: &[u64]) -> u64 {
 /// What a replay needs of the drives and of the options, as bytes for the head of a log.
 pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
     let number = |value: Option<f64>| value.unwrap_or(f64::NAN).to_bits();
-    let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops } = *options;
-    let flags = u64::from(count_overruns) | u64::from(needs_look) << 1 | u64::from(energy_stops) << 2;
+    let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops, measures } =
+        *options;
+    let flags = u64::from(count_overruns)
+        | u64::from(needs_look) << 1
+        | u64::from(energy_stops) << 2
+        | u64::from(measures) << 3;
     let mut words = vec![ramp_ns, clamped_ns, standstill_ns, blend_ns, flags];
     words.extend(bounds.iter().flat_map(|bounds| [number(bounds.torque), number(bounds.speed)]));
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
@@ -328,6 +332,7 @@ pub fn settings_from_bytes(bytes: &[u8]) -> Option<(Vec<Bounds>, Options)> {
         count_overruns: flags & 1 != 0,
         needs_look: flags & 2 != 0,
         energy_stops: flags & 4 != 0,
+        measures: flags & 8 != 0,
     };
     (rest.is_empty() && odd.is_empty()).then(|| (bounds.collect(), options))
 }
