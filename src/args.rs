@@ -360,7 +360,7 @@ pub struct Hil {
     /// Simulate buses, drives and devices in the process; arms itself
     #[arg(long)]
     pub sim: bool,
-    /// Simulated time: as fast as it computes, the same bits every time
+    /// Simulated time: as fast as it computes, the same bits every time; needs --for, --check or --identify
     #[arg(long)]
     pub fast: bool,
     /// Put another bus under the rig: `can0=socketcan:can1`, `can0=slcan:/dev/ttyACM0@1000000`

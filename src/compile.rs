@@ -227,6 +227,10 @@ pub struct PackedRig {
     pub control: Vec<u8>,
     /// That part alone.
     pub plant: Vec<u8>,
+    /// Which parameters may change while it runs, and what must hold of them: [`abi::live::Live`], encoded.
+    pub live: Vec<u8>,
+    /// What computes the numbers of that: an [`abi::image::Image`].
+    pub judge: Vec<u8>,
 }
 
 /// Compiles a rig for a target such as `aarch64-linux`. Of the changes only `set` counts.
@@ -253,15 +257,17 @@ pub fn packed_rig(
         found.extend(errors);
         None
     })?;
-    let image = |program: &compiler::program::Program, method| {
-        let functions = compiler::functions(program, method);
-        blob::image(&functions, &program.description, &program.params, processor, more)
+    let image = |program: &compiler::program::Program, functions: &[_]| {
+        blob::image(functions, &program.description, &program.params, processor, more)
             .map(|image| image.to_bytes())
             .map_err(|why| Some(why.to_string()))
     };
+    let functions = compiler::functions;
     Ok(PackedRig {
-        control: image(&ready.program, ready.rig.method)?,
-        plant: image(&ready.plant_program, Method::Expo)?,
+        control: image(&ready.program, &functions(&ready.program, ready.rig.method))?,
+        plant: image(&ready.plant_program, &functions(&ready.plant_program, Method::Expo))?,
+        judge: image(&ready.judge_program, &compiler::judging(&ready.judge_program))?,
+        live: ready.live.to_bytes(),
         rig: ready.rig.to_bytes(),
     })
 }

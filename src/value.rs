@@ -7,20 +7,8 @@ use abi::unit::Unit;
 /// # Errors
 /// What is wrong with it, in words.
 pub fn parse(text: &str) -> Result<(f64, Unit), String> {
-    let text = text.trim();
-    // The longest beginning that is a number: an `e` may be an exponent or the start of a unit.
-    let number = (1..=text.len())
-        .rev()
-        .filter(|end| text.is_char_boundary(*end))
-        .map(|end| &text[..end])
-        .find(|start| start.ends_with(|c: char| c.is_ascii_digit() || c == '.') && start.parse::<f64>().is_ok())
-        .ok_or_else(|| format!("`{text}` does not begin with a number"))?;
-    let value: f64 = number.parse().map_err(|_| format!("`{number}` is not a number"))?;
-    let unit = match text[number.len()..].trim() {
-        "" => Unit::none(),
-        unit => Unit::parse(unit).map_err(|part| format!("`{part}` is not a known unit"))?,
-    };
-    Ok((si(value, &unit), unit))
+    let (number, unit) = abi::unit::quantity(text).map_err(|why| why.to_string())?;
+    Ok((si(number, &unit), unit))
 }
 
 /// The value in SI of a number in a unit.

@@ -433,6 +433,9 @@ fn wrong_usage_is_told() {
     assert!(said.contains("can0") && said.contains("--sim"), "{said}");
     let said = run(&folder, &["hil", "--fast", &example], 2);
     assert!(said.contains("--fast needs --sim"), "{said}");
+    let said = run(&folder, &["hil", "--sim", "--fast", &example], 2);
+    assert!(said.contains("--fast needs --for"), "{said}");
+    assert!(!folder.join("out").exists(), "nothing was written");
     let said = run(&folder, &["hil", "--sim", "--bus", "can1=sim:x", &example], 2);
     assert!(said.contains("no bus `can1`; it has can0"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--inject", "load explodes at 3 s", &example], 2);
@@ -539,11 +542,20 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     say("set fr.Fs = -1 N·m");
     say("set fr.Fz = 1 N·m");
     say("set fr.Fs = 1 s");
+    say("set fr.vs = 0 rad/s");
+    say("set fr.Fs = 0.2 N·m");
+    say("set pid.Ts = 1.5 ms");
     say("stop");
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{said}");
-    for words in ["must lie in", "no parameter `fr.Fz`; did you mean `fr.F", "`fr.Fs` is a"] {
+    for words in [
+        "E0501: `Fs` is smaller than `Fc`: LuGre requires Fs >= Fc (`fr`)",
+        "no parameter `fr.Fz`; did you mean `fr.F",
+        "E0101: `fr.Fs` is a",
+        "E0502: `vs` of LuGre must be above 0 rad/s, not 0 rad/s (`fr.vs`)",
+        "only a start reads `pid.Ts`: a period follows from it; start with `--set pid.Ts=1.5 ms`",
+    ] {
         assert!(said.contains(words), "no `{words}` in {said}");
     }
     let said = run(&folder, &["replay", "log"], 0);

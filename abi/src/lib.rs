@@ -18,6 +18,7 @@ pub mod rig;
 pub mod plan;
 pub mod encode;
 pub mod packing;
+pub mod live;
 pub mod image;
 pub mod fits;
 

@@ -489,6 +489,64 @@ fn si_text(dimension: Dimension) -> String {
     text
 }
 
+/// Why a text is no quantity.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum NoQuantity {
+    /// It does not begin with a number.
+    Number(String),
+    /// What stands behind the number is no unit: the part that is not known.
+    Unit(String),
+}
+
+impl fmt::Display for NoQuantity {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            NoQuantity::Number(text) => write!(f, "`{text}` does not begin with a number"),
+            NoQuantity::Unit(part) => write!(f, "`{part}` is not a known unit"),
+        }
+    }
+}
+
+/// Reads `10us`, `2 N`, `1e-3`: a number as written, and its unit.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn quantity(text: &str) -> Result<(f64, Unit), NoQuantity> {
+    let text = text.trim();
+    // The longest beginning that is a number: an `e` may be an exponent or the start of a unit.
+    let starts = (1..=text.len()).rev().filter(|end| text.is_char_boundary(*end)).map(|end| &text[..end]);
+    let read = |start: &str| match start.ends_with(|c: char| c.is_ascii_digit() || c == '.') {
+        true => start.parse::<f64>().ok().map(|number| (number, start.len())),
+        false => None,
+    };
+    let (number, end) = starts.filter_map(read).next().ok_or_else(|| NoQuantity::Number(text.into()))?;
+    let unit = match text[end..].trim() {
+        "" => Unit::none(),
+        unit => Unit::parse(unit).map_err(NoQuantity::Unit)?,
+    };
+    Ok((number, unit))
+}
+
+/// A number with three digits, as messages show it.
+pub fn three_digits(x: f64) -> String {
+    if x == 0.0 || !x.is_finite() {
+        return format!("{x}");
+    }
+    // The exponent as the scientific form has it.
+    let scientific = format!("{x:e}");
+    let exponent: i32 = scientific.split_once('e').and_then(|(_, e)| e.parse().ok()).unwrap_or(0);
+    if !(-4..6).contains(&exponent) {
+        let text = format!("{x:.2e}");
+        let (mantissa, exponent) = text.split_once('e').expect("scientific form has an exponent");
+        let mantissa =
+            if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
+        return format!("{mantissa}e{exponent}");
+    }
+    let decimals = (2 - exponent).max(0) as usize;
+    let text = format!("{x:.decimals$}");
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

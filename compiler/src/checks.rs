@@ -5,7 +5,7 @@ use crate::lower::evaluate;
 use crate::source::Files;
 use crate::system::*;
 use crate::units::{Types, three_digits};
-use abi::unit::Unit;
+use abi::live::{self, shown};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -84,10 +84,10 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
             })
         };
         let (low, high) = (take(var.range.low), take(var.range.high));
-        if let (Some((least, _)), Some((most, _)), Some(range)) = (low, high, var.range_span)
-            && least > most
+        if live::is_empty(low, high)
+            && let Some(range) = var.range_span
         {
-            let error = Diagnostic::error("E0502", format!("nothing lies in the range of `{}`", var.name))
+            let error = Diagnostic::error("E0502", live::nothing_in_range(&var.name))
                 .label(range, "its lower bound is above its upper one");
             let turned = files.slice(range).split_once("..");
             diagnostics.push(match turned {
@@ -96,20 +96,12 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
             });
             continue;
         }
-        let below = low.is_some_and(|(low, strict)| value < low || (strict && value == low));
-        let above = high.is_some_and(|(high, strict)| value > high || (strict && value == high));
-        if !below && !above {
-            continue;
-        }
+        let Some(beyond) = live::beyond(value, low, high) else { continue };
         let unit = &types.units[id.0 as usize];
         let show = |x: f64| shown(x, unit);
-        let (bound, word) = match below {
-            true => (low, if low.is_some_and(|(_, strict)| strict) { "above" } else { "at least" }),
-            false => (high, if high.is_some_and(|(_, strict)| strict) { "below" } else { "at most" }),
-        };
-        let bound = show(bound.expect("a bound was broken").0);
+        let (word, bound) = (beyond.word, show(beyond.bound));
         let model = &system.instance(var.instance).model;
-        let message = format!("`{}` of {model} must be {word} {bound}, not {}", var.name, show(value));
+        let message = live::beyond_words(&var.name, model, unit, value, beyond);
         let place = match &var.definition {
             Definition::Value(_, Origin::Argument { bind, .. }) => *bind,
             _ => system.span(node),
@@ -122,12 +114,6 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
     }
 }
 
-/// A value in the unit it is shown in.
-fn shown(x: f64, unit: &Unit) -> String {
-    let number = three_digits(unit.from_si(x));
-    if unit.text.is_empty() { number } else { format!("{number} {unit}") }
-}
-
 /// Periods are positive and known before a run.
 fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
     let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
@@ -135,11 +121,11 @@ fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
         let open = mentioned(system, *expr)
             .iter()
             .any(|id| system.var(*id).kind == VarKind::Param && matches!(system.var(*id).definition, Definition::Free));
-        if value > 0.0 && value.is_finite() || open {
+        if live::is_period(value) || open {
             continue;
         }
         let what = if value.is_nan() { "not constant".to_string() } else { format!("{} s", three_digits(value)) };
-        let error = Diagnostic::error("E0502", "a period must be positive and known before the run")
+        let error = Diagnostic::error("E0502", live::NO_PERIOD)
             .label(system.span(*expr), what)
             .help("write a time or a param, such as `every 1 ms`");
         diagnostics.push(error);
@@ -150,14 +136,11 @@ fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
 pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>, diagnostics: &mut Vec<Diagnostic>) {
     let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
     for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
-        let ratio = value / step;
-        if (ratio - ratio.round()).abs() <= 1e-9 * ratio && ratio.round() >= 1.0 {
+        if live::is_multiple(value, step) {
             continue;
         }
-        let second = Unit::parse("s").expect("the second is known");
-        let (period, step) = (shown(value, &second), shown(step, &second));
-        let error = Diagnostic::error("E0701", format!("a period of {period} is no multiple of the step of {step}"));
-        let ticks = (system.span(*expr), format!("{} steps", three_digits(ratio)));
+        let error = Diagnostic::error("E0701", live::no_multiple(value, step));
+        let ticks = (system.span(*expr), format!("{} steps", three_digits(value / step)));
         // The first label is where the change is to be made: not in a library.
         let labels = match at.map(|at| (at, "the step".to_string())) {
             Some(step) if step.0.file != ticks.0.file => vec![step, ticks],
@@ -194,13 +177,7 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
         let condition = files.slice(require.span);
         let model = &info.model;
         let vars = mentioned(system, require.condition);
-        let message = match (&require.message, system.node(require.condition)) {
-            (Some(message), _) => message.clone(),
-            (None, Node::Binary(op, a, b)) if vars.len() == 2 => {
-                format!("`{}` {} `{}`", files.slice(system.span(*a)), broken(*op), files.slice(system.span(*b)))
-            }
-            _ => format!("`{condition}` does not hold"),
-        };
+        let message = unmet(system, files, require);
         let mut labels: Vec<(Span, String)> = Vec::new();
         let mut changed: Vec<&Var> = Vec::new();
         for &id in &vars {
@@ -249,6 +226,17 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
             help = format!("{help} Set {} as well, for example\n`{suggestion}`", kept.name);
         }
         diagnostics.push(error.help(help));
+    }
+}
+
+/// What is said of a `require` that does not hold.
+pub fn unmet(system: &System, files: &Files, require: &Require) -> String {
+    match (&require.message, system.node(require.condition)) {
+        (Some(message), _) => message.clone(),
+        (None, Node::Binary(op, a, b)) if mentioned(system, require.condition).len() == 2 => {
+            format!("`{}` {} `{}`", files.slice(system.span(*a)), broken(*op), files.slice(system.span(*b)))
+        }
+        (None, _) => format!("`{}` does not hold", files.slice(require.span)),
     }
 }
 

@@ -230,6 +230,12 @@ pub struct Ready {
     pub program: program::Program,
     /// The plant program before it was compiled.
     pub plant_program: program::Program,
+    /// Which parameters may change while it runs, and what must hold of them.
+    pub live: abi::live::Live,
+    /// What computes the numbers of that from a block of parameters.
+    pub judge: Instance,
+    /// The same before it was compiled.
+    pub judge_program: program::Program,
     /// What the user should know: a processor without what machine code needs.
     pub notes: Vec<String>,
 }
@@ -246,13 +252,30 @@ pub fn rig(
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<Ready, Vec<Diagnostic>> {
     let lowered = lowered_rig(loaded, sources, name, options, warnings)?;
-    let rig::Lowered { rig, control, plant } = lowered;
-    let both = [(&control, rig.method), (&plant, Method::Expo)].map(|(program, method)| {
-        let (code, notes) = code(&functions(program, method), &program.description, options.interpret);
+    let rig::Lowered { rig, control, plant, live, judge } = lowered;
+    let make = |program: &program::Program, functions: &[(Function, ir::Func)]| {
+        let (code, notes) = code(functions, &program.description, options.interpret);
         (Instance::new(Arc::new(program.description.clone()), code, &program.params), notes)
-    });
-    let [(control_made, notes), (plant_made, _)] = both;
-    Ok(Ready { rig, control: control_made, plant: plant_made, program: control, plant_program: plant, notes })
+    };
+    let (control_made, notes) = make(&control, &functions(&control, rig.method));
+    let (plant_made, _) = make(&plant, &functions(&plant, Method::Expo));
+    let (judge_made, _) = make(&judge, &judging(&judge));
+    Ok(Ready {
+        rig,
+        control: control_made,
+        plant: plant_made,
+        program: control,
+        plant_program: plant,
+        live,
+        judge: judge_made,
+        judge_program: judge,
+        notes,
+    })
+}
+
+/// The one function of a judge.
+pub fn judging(judge: &program::Program) -> Vec<(Function, ir::Func)> {
+    vec![(Function::Outputs, math::expand(&judge.outputs))]
 }
 
 /// A rig up to its programs.

@@ -138,6 +138,56 @@ pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usiz
     (crate::math::expand(&emit.build.finish()), from + exprs.len())
 }
 
+/// Number of parameters that depend on no other: those that have a slot.
+pub fn independent(system: &System) -> u32 {
+    independent_params(system).iter().map(|free| u32::from(*free)).sum()
+}
+
+/// What [`of_params`] computes.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Sought {
+    /// The value of a quantity: of a parameter that depends on no other what its slot holds.
+    Var(VarId),
+    /// An expression.
+    Expr(ExprId),
+}
+
+/// A program that computes these values from parameters alone, each into an output slot in their order, and the slot of
+/// each parameter that depends on no other. What is not constant while a model runs is NaN, as in [`evaluate`].
+pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program, Vec<(VarId, Slot)>) {
+    let mut pool = crate::math::POOL.to_vec();
+    let tables = Lookup::place_all(&system.tables, &mut pool);
+    let mut plan = Plan::new(system, types, &[], tables);
+    plan.description.pool = Arc::from(pool);
+    let mut emit = Emit::new(&plan, "of params", Phase::Start);
+    emit.inline_params = true;
+    emit.loads_params = true;
+    let count = |len: usize| u32::try_from(len).expect("there are fewer slots");
+    let params = plan.description.layout.params;
+    let layout = Layout::new([params.len, 0, 0, 0, 0, count(sought.len()), 0, 0, 0, 0]);
+    for (k, one) in sought.iter().enumerate() {
+        let value = match one {
+            Sought::Var(id) => emit.stored(*id),
+            Sought::Expr(expr) => {
+                let value = emit.value(*expr);
+                emit.as_number(value, types.boolean[expr.0 as usize])
+            }
+        };
+        emit.build.store(layout.outputs.slot(k), value);
+    }
+    let description =
+        Description { name: "judge".into(), layout, pool: plan.description.pool.clone(), ..Description::default() };
+    let own = system.var_ids().filter_map(|id| match plan.places[id.0 as usize] {
+        Place::Slot(slot) if params.contains(slot) => Some((id, slot)),
+        Place::Slot(_) | Place::Computed => None,
+    });
+    let slots = own.collect();
+    let outputs = emit.build.finish();
+    let program =
+        Program { description, params: evaluate_in(&plan, &plan.param_values), outputs, ..Program::default() };
+    (program, slots)
+}
+
 fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     if exprs.is_empty() {
         return Vec::new();
@@ -801,13 +851,17 @@ struct Emit<'a> {
     phase: Phase,
     build: Build,
     nodes: Vec<Option<Value>>,
+    /// Parameters count as their values, and what a run decides as NaN.
     inline_params: bool,
+    /// But parameters that depend on no other are read from their slots.
+    loads_params: bool,
 }
 
 impl<'a> Emit<'a> {
     fn new(plan: &'a Plan<'a>, name: &str, phase: Phase) -> Emit<'a> {
         let build = Build::new(name).with_pool(plan.description.pool.clone());
-        Emit { plan, phase, build, nodes: vec![None; plan.system.nodes.len()], inline_params: false }
+        let nodes = vec![None; plan.system.nodes.len()];
+        Emit { plan, phase, build, nodes, inline_params: false, loads_params: false }
     }
 
     /// The expression that a node hands on to, if it does not compute its value from its operands.
@@ -818,7 +872,7 @@ impl<'a> Emit<'a> {
                 let stored = matches!(self.plan.places[id.0 as usize], Place::Slot(_));
                 let var = system.var(*id);
                 let param = matches!(var.definition, Definition::Value(..));
-                if stored && param && !self.inline_params {
+                if stored && param && (!self.inline_params || self.loads_params) {
                     return None; // A parameter with a slot.
                 }
                 if self.inline_params && !param {
@@ -933,7 +987,7 @@ impl<'a> Emit<'a> {
 
     fn leaf(&mut self, id: VarId) -> Value {
         match self.plan.places[id.0 as usize] {
-            Place::Slot(slot) if !self.inline_params => {
+            Place::Slot(slot) if !self.inline_params || self.loads_params && self.is_param(slot) => {
                 let value = self.build.load(slot);
                 if self.plan.types.boolean_vars[id.0 as usize] { self.truth(value) } else { value }
             }
@@ -943,6 +997,10 @@ impl<'a> Emit<'a> {
                 if self.plan.types.boolean_vars[id.0 as usize] { self.truth(unknown) } else { unknown }
             }
         }
+    }
+
+    fn is_param(&self, slot: Slot) -> bool {
+        self.plan.description.layout.params.contains(slot)
     }
 
     /// A stored Boolean: not 0.

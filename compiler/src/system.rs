@@ -60,6 +60,8 @@ pub struct System {
     pub reset_places: Vec<(ExprId, Span)>,
     /// Instances that cannot be made rotary: reported, and their units fit everything.
     pub strangers: Vec<InstanceId>,
+    /// Paths of parameters that were read while parts were made: how many there are follows from them.
+    pub structural: Vec<String>,
 }
 
 /// An instance of a model.

@@ -5,6 +5,7 @@
 
 use crate::source::Files;
 use crate::system::*;
+pub use abi::unit::three_digits;
 use abi::unit::{Angle, Dimension, Ratio, Unit};
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
@@ -1070,26 +1071,6 @@ pub fn literal(system: &System, id: ExprId) -> Option<f64> {
         }
         _ => None,
     }
-}
-
-/// A number with three digits, as messages show it.
-pub fn three_digits(x: f64) -> String {
-    if x == 0.0 || !x.is_finite() {
-        return format!("{x}");
-    }
-    // The exponent as the scientific form has it.
-    let scientific = format!("{x:e}");
-    let exponent: i32 = scientific.split_once('e').and_then(|(_, e)| e.parse().ok()).unwrap_or(0);
-    if !(-4..6).contains(&exponent) {
-        let text = format!("{x:.2e}");
-        let (mantissa, exponent) = text.split_once('e').expect("scientific form has an exponent");
-        let mantissa =
-            if mantissa.contains('.') { mantissa.trim_end_matches('0').trim_end_matches('.') } else { mantissa };
-        return format!("{mantissa}e{exponent}");
-    }
-    let decimals = (2 - exponent).max(0) as usize;
-    let text = format!("{x:.decimals$}");
-    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
 }
 
 /// Which quantities are true or false: those defined by a condition.

@@ -45,7 +45,7 @@ enum Command {
     Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
     Drives(Drives),
-    /// Tell the rig that runs: enable, arm, stop or reset
+    /// Tell the rig that runs: enable, arm, set PATH = VALUE, stop or reset
     Say(Say),
     /// Say whether this computer can keep time, and what to change
     Doctor,
@@ -108,7 +108,7 @@ struct Run {
     /// Simulated buses, drives and devices; arms itself
     #[arg(long)]
     sim: bool,
-    /// Simulated time: as fast as it computes, the same bits every time
+    /// Simulated time: as fast as it computes, the same bits every time; needs --for or --check
     #[arg(long, requires = "sim")]
     fast: bool,
     /// Do the checks of the start-up and stop before arming
@@ -167,9 +167,9 @@ struct Drives {
 
 #[derive(clap::Args, Debug)]
 struct Say {
-    /// enable, arm, stop or reset
-    #[arg(value_parser = ["enable", "arm", "stop", "reset"])]
-    what: String,
+    /// enable, arm, stop, reset; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it acts as one or not at all
+    #[arg(value_name = "COMMAND", required = true, allow_negative_numbers = true)]
+    what: Vec<String>,
     #[command(flatten)]
     store: Store,
 }
@@ -251,6 +251,14 @@ fn installed(args: &Install) -> Result<String, String> {
     store.install(&open.package.rig, &open.bytes, open.signature.as_deref())
 }
 
+/// A command in one or several words.
+fn said(words: &[String]) -> Option<String> {
+    let what = words.join(" ");
+    let what = what.trim();
+    let known = ["enable", "arm", "stop", "reset"].contains(&what) || what.starts_with("set ");
+    (known && !what.contains('\n')).then(|| what.to_string())
+}
+
 /// Serves the drives of a package.
 fn served(args: &Drives) -> Result<u8, String> {
     let open = packed::open(&args.package, &args.keys.trusted)?;
@@ -298,13 +306,24 @@ fn main() -> ExitCode {
     let args = Args::parse();
     let done = match &args.command {
         Command::Check(check) => opened(&check.package, &check.trust).map(|open| open.describe()),
+        Command::Run(run) if run.fast && !run.check && run.duration.is_none() => {
+            // Nobody can say `stop` there, and hours of it fill a disk within minutes.
+            words::error("--fast needs --for: how much simulated time? For example `--for 60s`");
+            return ExitCode::from(2);
+        }
         Command::Run(run) => return ended(ran(run)),
         Command::Drives(drives) => return ended(served(drives)),
         Command::Start(start) => {
             let trust = run::Trust { trusted: &start.trust.keys.trusted, allow_unsigned: start.trust.allow_unsigned };
             run::start(&start.store.dir, start.hash.as_deref(), trust)
         }
-        Command::Say(say) => run::say(&say.store.dir, &say.what),
+        Command::Say(say) => match said(&say.what) {
+            Some(what) => run::say(&say.store.dir, &what),
+            None => {
+                words::error("say enable, arm, stop, reset or `set PATH = VALUE`");
+                return ExitCode::from(2);
+            }
+        },
         Command::Doctor => Ok(doctor::doctor()),
         Command::Install(install) => installed(install),
         Command::Rollback(store) => store::Store::at(&store.dir).rollback(),

@@ -4,6 +4,7 @@
 
 use abi::Instance;
 use abi::rig::Bus;
+use runtime::hil::live::Judge;
 use runtime::package::contents::Contents;
 use runtime::package::signature::{Signer, Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
@@ -60,7 +61,8 @@ pub fn open(path: &Path, trusted: &Path) -> Result<Open, String> {
     let package = Package::read(&bytes).map_err(|why| about(&why))?;
     package.fits(VERSION).map_err(|why| about(&why))?;
     let contents = package.contents().map_err(|why| about(&why))?;
-    for (name, image) in [("control", &contents.control), ("plant", &contents.plant)] {
+    let programs = [("control", &contents.control), ("plant", &contents.plant), ("judge", &contents.judge)];
+    for (name, image) in programs {
         image.fits().map_err(|why| about(&format!("its program `{name}`: {why}")))?;
     }
     Ok(Open { bytes, signature, package, contents, signer })
@@ -111,7 +113,15 @@ impl Open {
         self.contents.head.clone()
     }
 
-    /// One of its programs, ready to start: `control` or `plant`.
+    /// What judges sets of parameters while it runs.
+    ///
+    /// # Errors
+    /// Why it does not fit the control program.
+    pub fn judge(&self, control: &Instance) -> Result<Judge, String> {
+        Judge::new(self.contents.live.clone(), self.program("judge")?, control)
+    }
+
+    /// One of its programs, ready to start: `control`, `plant` or `judge`.
     ///
     /// # Errors
     /// Why it cannot be loaded.

@@ -12,14 +12,16 @@ use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
 use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
-use runtime::hil::cycle::{Command, End, Gauges, Hil, Operator, Options, look_ahead};
+use runtime::hil::cycle::{Command, End, Gauges, Hil, Options, look_ahead};
+use runtime::hil::live::Judge;
+use runtime::hil::operator::{Answer, Operator, Stamp, Stopper, Why};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, watches, words as told};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::fs;
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -129,6 +131,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     }
     open.may_run(&rig.buses, wanted.sim, wanted.allow_unsigned)?;
     let control = open.program("control")?;
+    let judge = open.judge(&control)?;
     let log = log(wanted, open, &rig)?;
     let path = match &log.0.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
@@ -164,6 +167,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         options.only_simulated = Some("this computer gives no real time: `fric-rig doctor` says why".into());
     }
     let (mut hil, operator) = Hil::new(&rig, control, clock, buses, options, Some(log))?;
+    hil.judged_by(judge.clone());
     if !fast {
         let watchdog = emergency::Watchdog::new(Duration::from_nanos(rig.watchdog_ns), emergency::send);
         hil.watched_by(watchdog.map_err(|error| format!("no watchdog: {error}"))?);
@@ -178,7 +182,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     for lack in watches::lacking(&rig) {
         words::print(&format!("  note: {lack}\n"));
     }
-    let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator));
+    let attendant = (!fast).then(|| Attendant::new(wanted, store, target, hil.gauges(), operator.by_the_wall(), judge));
     let end = hil.run();
     let seen =
         |flag: fn(&Attendant) -> &AtomicBool| attendant.as_ref().is_some_and(|it| flag(it).load(Ordering::Relaxed));
@@ -249,14 +253,22 @@ struct Attendant {
 }
 
 impl Attendant {
-    fn new(wanted: &Wanted, store: &Store, target: &Path, gauges: Arc<Gauges>, operator: Operator) -> Attendant {
+    fn new(
+        wanted: &Wanted,
+        store: &Store,
+        target: &Path,
+        gauges: Arc<Gauges>,
+        operator: Operator,
+        judge: Judge,
+    ) -> Attendant {
         let [over, replaced, waited] = [(); 3].map(|()| Arc::new(AtomicBool::new(false)));
-        let operator = Arc::new(Mutex::new(operator));
+        let stopper = operator.stopper();
+        let desk = Arc::new(Desk { operator: Mutex::new(operator), stopper: stopper.clone(), judge });
         let dir = wanted.dir.to_path_buf();
         let mut threads = Vec::new();
         {
             let [over, replaced, waited] = [&over, &replaced, &waited].map(Arc::clone);
-            let (dir, operator) = (dir.clone(), operator.clone());
+            let dir = dir.clone();
             let installed = wanted.package.is_none().then(|| store.clone());
             let target = target.to_path_buf();
             threads.push(std::thread::spawn(move || {
@@ -269,7 +281,7 @@ impl Attendant {
                         installed.as_ref().is_some_and(|store| store.current_target().as_ref() != Some(&target));
                     if other && idle && !replaced.swap(true, Ordering::Relaxed) {
                         // It ends with the cycle that takes the command: no drive has torque then.
-                        let _ = operator.lock().map(|mut operator| operator.push(Command::Stop));
+                        stopper.stop();
                     }
                     std::thread::sleep(LOOK);
                 }
@@ -284,7 +296,9 @@ impl Attendant {
                     if over.load(Ordering::Relaxed) {
                         break;
                     }
-                    answer(stream, &operator);
+                    // Who connects and says nothing keeps nobody waiting.
+                    let desk = desk.clone();
+                    std::thread::spawn(move || desk.attend(&stream));
                 }
             }));
         }
@@ -326,34 +340,83 @@ fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let _ = fs::write(&fresh, text).and_then(|()| fs::rename(&fresh, dir.join("state")));
 }
 
-/// Takes one command of the operator.
-fn answer(stream: UnixStream, operator: &Mutex<Operator>) {
-    let mut line = String::new();
-    let _ = stream.set_read_timeout(Some(Duration::from_secs(1)));
-    if BufReader::new(&stream).read_line(&mut line).is_err() {
-        return;
-    }
-    let command = match line.trim() {
-        "enable" => Command::Enable,
-        "arm" => Command::Arm,
-        "stop" => Command::Stop,
-        "reset" => Command::Reset,
-        _ => return,
-    };
-    let taken = operator.lock().map(|mut operator| operator.push(command)).unwrap_or(false);
-    let _ = (&stream).write_all(if taken { b"ok\n" } else { b"too much at once\n" });
+/// Where the commands of all who speak to the rig come together.
+struct Desk {
+    operator: Mutex<Operator>,
+    stopper: Stopper,
+    judge: Judge,
 }
+
+/// How long somebody who has connected may take to say what he wants.
+const SPEAKS: Duration = Duration::from_secs(1);
+
+impl Desk {
+    /// Takes one command and says what became of it.
+    fn attend(&self, stream: &UnixStream) {
+        let mut line = String::new();
+        let _ = stream.set_read_timeout(Some(SPEAKS));
+        if BufReader::new(stream.take(MOST_SAID)).read_line(&mut line).is_err() || line.trim().is_empty() {
+            return;
+        }
+        let said = self.carry_out(line.trim());
+        let _ = (&*stream).write_all(format!("{}\n", said.err().unwrap_or_else(|| "ok".into())).as_bytes());
+    }
+
+    /// `@NS COMMAND`: a command and when it was said, by the monotonic clock of this computer.
+    fn carry_out(&self, line: &str) -> Result<(), String> {
+        let stamped = line.strip_prefix('@').and_then(|rest| rest.split_once(' '));
+        let (stamp, said) = match stamped.and_then(|(ns, said)| Some((Stamp::Wall(ns.parse().ok()?), said))) {
+            Some(both) => both,
+            None => (Stamp::wall(), line),
+        };
+        let command = match said {
+            "enable" => Command::Enable,
+            "arm" => Command::Arm,
+            "reset" => Command::Reset,
+            // It waits for nobody, whoever else speaks.
+            "stop" => {
+                self.stopper.stop();
+                return Ok(());
+            }
+            _ => match said.strip_prefix("set ") {
+                Some(set) => Command::Set(self.judge.read(set)?),
+                None => return Err("say enable, arm, set PATH = VALUE, stop or reset".into()),
+            },
+        };
+        let operator = || self.operator.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let refused = |why: Why| match why {
+            Why::Set(objection) => format!("refused: {}", self.judge.words(&objection)),
+            why => format!("refused: {}", why.words()),
+        };
+        let ticket = operator().say_at(command, stamp).map_err(refused)?;
+        loop {
+            // Others speak meanwhile.
+            let answer = operator().answer(ticket);
+            match answer {
+                Some(Answer::Taken) => return Ok(()),
+                Some(Answer::Refused(why)) => return Err(refused(why)),
+                None => std::thread::sleep(Duration::from_millis(2)),
+            }
+        }
+    }
+}
+
+/// Most bytes of a command.
+const MOST_SAID: u64 = 1 << 16;
 
 /// Says something to the rig that runs.
 pub fn say(dir: &Path, what: &str) -> Result<String, String> {
     let about = |error: std::io::Error| format!("no rig runs in {}: {error}", dir.display());
+    let Stamp::Wall(now_ns) = Stamp::wall() else { unreachable!("that is what it gives") };
     let mut stream = UnixStream::connect(socket(dir)).map_err(about)?;
-    stream.write_all(format!("{what}\n").as_bytes()).map_err(about)?;
+    let _ = stream.set_read_timeout(Some(TELLS));
+    stream.write_all(format!("@{now_ns} {what}\n").as_bytes()).map_err(about)?;
     let mut line = String::new();
-    BufReader::new(&stream).read_line(&mut line).map_err(about)?;
+    if BufReader::new(&stream).read_line(&mut line).is_err() || line.trim().is_empty() {
+        return Err(format!("the rig in {} did not answer: {what} is not known to act", dir.display()));
+    }
     match line.trim() {
         "ok" => Ok(format!("{what}\n")),
-        "" => Err("it did not answer".into()),
         why => Err(why.into()),
     }
 }

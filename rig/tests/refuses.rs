@@ -54,7 +54,14 @@ fn what_is_no_package_of_this_computer_is_refused_with_the_reason() {
 #[test]
 fn wrong_usage_is_told_apart() {
     let folder = tempfile::tempdir().unwrap();
-    for args in [&["run", "--for", "10"][..], &["run", "--bus", "can0"], &["say", "dance"], &["run", "--fast"], &[]] {
+    for args in [
+        &["run", "--for", "10"][..],
+        &["run", "--bus", "can0"],
+        &["say", "dance"],
+        &["run", "--fast"],
+        &["run", "--sim", "--fast"],
+        &[],
+    ] {
         assert_eq!(rig(args, folder.path()).status.code(), Some(2), "{args:?}");
     }
 }

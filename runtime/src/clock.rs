@@ -56,8 +56,8 @@ impl Clock for Monotonic {
 
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// CLOCK_MONOTONIC.
-fn monotonic_ns() -> u64 {
+/// CLOCK_MONOTONIC: the same for every process of a machine.
+pub fn monotonic_ns() -> u64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: `now` is written by the call and outlives it.
     let done = unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut now) };

@@ -22,6 +22,11 @@ impl<T: Copy> Sender<T> {
         self.0.slots()
     }
 
+    /// Whether nobody will take anything any more.
+    pub fn is_abandoned(&self) -> bool {
+        self.0.is_abandoned()
+    }
+
     /// Hands a value over; false if there is no place for it.
     pub fn push(&mut self, value: T) -> bool {
         self.0.push(value).is_ok()

@@ -288,11 +288,13 @@ pub enum Protection {
     Permission,
     Idle,
     Deadline,
+    Judged,
+    Old,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 23] = [
+    pub const ALL: [(&'static str, Protection); 25] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -316,6 +318,8 @@ impl Protection {
         ("permission", Protection::Permission),
         ("idle", Protection::Idle),
         ("deadline", Protection::Deadline),
+        ("judged", Protection::Judged),
+        ("old", Protection::Old),
     ];
 }
 

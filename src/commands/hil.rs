@@ -6,8 +6,6 @@ use crate::compile::{self, Options, Ready, Stopwatch};
 use crate::kept::Keeping;
 use crate::terminal::{Style, Terminal};
 use crate::{project, report, stability, value};
-use abi::Description;
-use abi::description::Kind;
 use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
@@ -16,8 +14,10 @@ use runtime::clock::Clock;
 use runtime::drive::profiles::Life;
 use runtime::drive::sign::SignTest;
 use runtime::hil::control::PATIENT_NS;
-use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions, SET_MOST, Set};
+use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions};
 use runtime::hil::identify::{self, Identification};
+use runtime::hil::live::Judge;
+use runtime::hil::operator::{Answer, Operator, Why};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, watches, words};
 use runtime::realtime::{self, Wishes};
@@ -304,8 +304,12 @@ fn run(
     terminal: &mut Terminal,
 ) -> End {
     let Asked { log, pulses: asked, needs_look } = asked;
-    let Ready { rig, control, plant, notes, .. } = ready;
-    let description = control.description().clone();
+    let Ready { rig, control, plant, notes, live, judge, .. } = ready;
+    let judge = match asked {
+        // What gives torque pulses has no parameters.
+        Some(_) => None,
+        None => Some(Judge::new(live, judge, &control).expect("the compiler made them for each other")),
+    };
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
@@ -341,6 +345,9 @@ fn run(
             return End::Failed;
         }
     };
+    if let Some(judge) = &judge {
+        hil.judged_by(judge.clone());
+    }
     if !fast {
         let patience = Duration::from_nanos(rig.watchdog_ns);
         match emergency::Watchdog::new(patience, emergency::send) {
@@ -362,7 +369,7 @@ fn run(
         std::thread::spawn(move || view(&gauges, &rig, &over))
     });
     if !fast {
-        std::thread::spawn(move || prompt(operator, &description));
+        std::thread::spawn(move || prompt(operator.by_the_wall(), judge.as_ref()));
     }
     if let Some(asked) = asked {
         let rows = identify::rows(&mut hil, asked);
@@ -480,7 +487,11 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
                 code = End::Failed;
             }
         }
-        _ => {}
+        (Ok(None), _) if !args.quiet => terminal.line("  no log: it ended before there was anything to keep"),
+        (Ok(Some(_)), _) if !args.quiet => {
+            terminal.line("  no log: --no-log keeps the last ten seconds, and only where safety stops the rig");
+        }
+        (Ok(_), _) => {}
     }
     code
 }
@@ -525,53 +536,44 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
     }
 }
 
-/// Reads what the operator types, a line at a time.
-fn prompt(mut operator: runtime::hil::cycle::Operator, description: &Description) {
-    let terminal = Terminal::new();
+/// Reads what the operator types, a line at a time, and says what became of it.
+fn prompt(mut operator: Operator, judge: Option<&Judge>) {
+    let mut terminal = Terminal::new();
     for line in std::io::stdin().lock().lines() {
         let Ok(line) = line else { return };
         let line = line.trim();
         let command = match line {
             "" => continue,
-            "enable" => Ok(Command::Enable),
-            "arm" => Ok(Command::Arm),
-            "stop" | "quit" => Ok(Command::Stop),
-            "reset" => Ok(Command::Reset),
-            _ => match line.strip_prefix("set ") {
-                Some(set) => change(set, description).map(Command::Set),
-                None => Err("type enable, arm, set PATH = VALUE, stop or reset".to_string()),
+            "enable" => Command::Enable,
+            "arm" => Command::Arm,
+            "stop" | "quit" => Command::Stop,
+            "reset" => Command::Reset,
+            _ => match (line.strip_prefix("set "), judge) {
+                (Some(set), Some(judge)) => match judge.read(set) {
+                    Ok(set) => Command::Set(set),
+                    Err(why) => {
+                        terminal.error(&why);
+                        continue;
+                    }
+                },
+                (Some(_), None) => {
+                    terminal.error(&Why::Unjudged.words());
+                    continue;
+                }
+                (None, _) => {
+                    terminal.error("type enable, arm, set PATH = VALUE, stop or reset");
+                    continue;
+                }
             },
         };
-        match command {
-            Ok(command) if !operator.push(command) => terminal.error("too much at once: say it again"),
-            Ok(_) => {}
-            Err(why) => terminal.error(&why),
+        match operator.wait(command) {
+            Answer::Taken if matches!(command, Command::Set(_)) => terminal.line(&format!("  {line}")),
+            Answer::Taken => {}
+            Answer::Refused(Why::Set(objection)) => {
+                let why = judge.map_or_else(String::new, |judge| judge.words(&objection));
+                terminal.error(&format!("`{line}` is refused: {why}"));
+            }
+            Answer::Refused(why) => terminal.error(&format!("`{line}` is refused: {}", why.words())),
         }
     }
-}
-
-/// Reads `fr.Fs = 2 N, fr.Fc = 1.5 N`: one set, checked against units and ranges.
-fn change(text: &str, description: &Description) -> Result<Set, String> {
-    let mut values = Vec::new();
-    for one in text.split(',') {
-        let (path, value) = one.split_once('=').ok_or("write it as: set PATH = VALUE, for example set fr.Fs = 2 N")?;
-        let path = path.trim();
-        let params = || description.quantities.iter().filter(|quantity| quantity.kind == Kind::Param);
-        let Some(param) = params().find(|quantity| quantity.path == path) else {
-            let near = compile::nearest(path, params().map(|quantity| quantity.path.as_str()));
-            let help = near.map_or(String::new(), |near| format!("; did you mean `{near}`?"));
-            return Err(format!("there is no parameter `{path}`{help}"));
-        };
-        let (si, unit) = value::parse(value)?;
-        if unit.dimension != param.unit.dimension {
-            return Err(format!("`{path}` is {}, not {}", param.unit.dimension.describe(), unit.dimension.describe()));
-        }
-        let (low, high) = param.range;
-        if !(low <= si && si <= high) {
-            let bound = |si: f64| value::show(si, &param.unit, 6);
-            return Err(format!("`{path}` must lie in {} .. {}", bound(low), bound(high)));
-        }
-        values.push((param.slot, si));
-    }
-    Set::new(&values).ok_or_else(|| format!("at most {SET_MOST} parameters change at once"))
 }

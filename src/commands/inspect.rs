@@ -7,6 +7,7 @@ use crate::terminal::{Style, Terminal};
 use crate::value::{count, significant};
 use abi::foreign::shown;
 use abi::image::Image;
+use abi::live::{Live, Place};
 use abi::rig::Rig;
 use abi::{Description, Function};
 use runtime::package::signature::{Signer, Trusted, beside};
@@ -61,13 +62,15 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
         let size = count(section.bytes.len() as u64);
         out += &format!("  {:width$}  {size:>9} bytes  {}\n", section.name, &hash(&section.bytes)[..16]);
     }
-    for (name, image) in [("control", &contents.control), ("plant", &contents.plant)] {
+    let programs = [("control", &contents.control), ("plant", &contents.plant), ("judge", &contents.judge)];
+    for (name, image) in programs {
         out += &format!("\n  {name}: {}\n", program(image));
     }
     out += &format!("\n  {}\n", planned(&contents.rig));
     for set in contents.head.text("set").unwrap_or_default().lines() {
         out += &format!("  set {}\n", shown(set));
     }
+    out += &settable(&contents.live);
     if args.sources {
         for section in sections {
             if let Some(name) = section.name.strip_prefix("source/") {
@@ -84,6 +87,20 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
         out += &format!("\n  wrote {} files to {}\n", sections.len(), folder.display());
     }
     Ok(out)
+}
+
+/// Which parameters may change while the rig runs.
+fn settable(live: &Live) -> String {
+    let (mut may, mut start) = (String::new(), String::new());
+    for param in &live.params {
+        match &param.place {
+            Place::Live(..) => may += &format!(" {}", shown(&param.path)),
+            Place::Start(why) => start += &format!("\n    {}: {}", shown(&param.path), shown(why)),
+        }
+    }
+    let nothing = || " nothing".to_string();
+    let [may, start] = [may, start].map(|names| if names.is_empty() { nothing() } else { names });
+    format!("\n  may be set while it runs:{may}\n  only a start reads:{start}\n")
 }
 
 /// The plan of a rig: how often, on which buses, who is there.

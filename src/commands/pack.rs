@@ -97,6 +97,8 @@ pub(super) fn packed(
     package.add("rig", built.rig);
     package.add("control", built.control);
     package.add("plant", built.plant);
+    package.add("live", built.live);
+    package.add("judge", built.judge);
     // The head of every log of it, so that a recording can be computed again wherever it is brought.
     let root = loaded.files.get(loaded.root());
     let head = Sections::default()

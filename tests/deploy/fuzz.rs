@@ -63,7 +63,7 @@ fn changed(package: &Package, seed: u64) -> (Package, &'static str) {
     let mut package = package.clone();
     // The plan most of all. What a program says of itself is a promise about its code, which only a signature holds:
     // a change there must not upset who reads it, and is not run.
-    let section = ["rig", "rig", "rig", "rig", "rig", "rig", "head", "control", "plant", "name"][dice.below(10)];
+    let section = ["rig", "rig", "rig", "rig", "rig", "live", "head", "control", "plant", "name"][dice.below(10)];
     let at = |package: &Package| package.sections.iter().position(|it| it.name == section).unwrap();
     match section {
         "name" => {

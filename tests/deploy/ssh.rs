@@ -293,6 +293,19 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     there.says("arm");
     let (_, _, cycles) = there.wait("running", |state| state.2 > 20);
 
+    // Parameters change by what the package carries: whole, or refused in the words of a start.
+    there.says("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
+    for (set, why) in [
+        ("set fr.vs = 0 rad/s", "E0502: `vs` of LuGre must be above 0 rad/s"),
+        ("set fr.Fs = 0.29 N·m", "E0501: `Fs` is smaller than `Fc`"),
+        ("set pid.Ts = 1.5 ms", "only a start reads `pid.Ts`: a period follows from it"),
+        ("set fr.Fs = 0.5 N·m, fr.Fx = 1 N·m", "there is no parameter `fr.Fx`"),
+        ("arm", "it has no effect now: the rig is armed"),
+    ] {
+        let output = there.local(&["say", set]);
+        assert!(!output.status.success() && said(&output).contains(why), "{set}: {}", said(&output));
+    }
+
     // Another package while drives have torque: installed, and not taken over.
     let told = there.deploys(&["other.fric", "--start"]);
     assert!(!told.contains("made a key") && !told.contains("registered"), "only the first time: {told}");

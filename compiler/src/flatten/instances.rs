@@ -657,11 +657,11 @@ impl<'a> Flattener<'a> {
     }
 
     /// Value of simple arithmetic over numbers, constants and parameters.
-    pub(super) fn early(&self, expr: &'a Expr, env: &Env, depth: usize) -> Option<f64> {
+    pub(super) fn early(&mut self, expr: &'a Expr, env: &Env, depth: usize) -> Option<f64> {
         if depth > DEEPEST {
             return None;
         }
-        let value = |e: &'a Expr| self.early(e, env, depth + 1);
+        let mut value = |e: &'a Expr| self.early(e, env, depth + 1);
         match &expr.kind {
             ExprKind::Number { value, unit: None } => Some(*value),
             ExprKind::Unary(UnaryOp::Negate, a) => Some(-value(a)?),
@@ -686,9 +686,12 @@ impl<'a> Flattener<'a> {
                 if let Some(id) = env.instance {
                     let tree = self.tree(id);
                     if let Some(declaration) = declarations(tree.model).find(|d| d.name.text == name) {
-                        if let Some(arg) = tree.args.iter().find(|arg| arg.name == name) {
-                            let ArgValue::Expr(expr) = arg.value else { return None };
-                            return self.early(expr, &arg.env, depth + 1);
+                        let arg = tree.args.iter().find(|arg| arg.name == name);
+                        let arg = arg.map(|arg| (arg.value, arg.env.clone()));
+                        self.system.structural.push(joined(&self.system.instance(id).path, name));
+                        if let Some((value, env)) = arg {
+                            let ArgValue::Expr(expr) = value else { return None };
+                            return self.early(expr, &env, depth + 1);
                         }
                         let parameter = declaration.kind == DeclarationKind::Param;
                         return self.early(declaration.value.as_ref().filter(|_| parameter)?, env, depth + 1);

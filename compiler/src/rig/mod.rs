@@ -9,6 +9,7 @@ mod advice;
 mod cut;
 mod dbc;
 mod frames;
+mod live;
 mod nodes;
 mod plan;
 mod statements;
@@ -25,6 +26,7 @@ use crate::units::{self, Types};
 use crate::{causality, checks};
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
+use abi::live::{self as words, Live};
 use abi::rig::{self, Mode, Overrun, Rig, Signal, What};
 use abi::series::{Method, Series};
 use abi::unit::{Dimension, Unit};
@@ -139,6 +141,7 @@ pub struct Cut {
     applied: Vec<VarId>,
     seen: Vec<VarId>,
     seen_read: Vec<ExprId>,
+    judged: live::Judged,
     /// Where messages about the rig point.
     pub places: Places,
 }
@@ -151,6 +154,10 @@ pub struct Lowered {
     pub control: Program,
     /// The plant program.
     pub plant: Program,
+    /// Which parameters may change while it runs, and what must hold of them.
+    pub live: Live,
+    /// What computes the numbers of that from parameters, as `Outputs`.
+    pub judge: Program,
 }
 
 /// Places of a rig for messages.
@@ -644,35 +651,43 @@ impl<'a> Reader<'a, '_> {
         };
         let number = |at: usize| constants_values[at];
         let plan = self.plan(&system, &framed, &lists, &number, &param)?;
+        let mut fielded = Vec::new();
         for (send, output) in lists.sends.iter().zip(&plan.outputs) {
-            let value = evaluate(&system, &types, &[at(send.value)])[0];
             let (rig::Kind::Frames(messages), What::Field(m, f)) = (&plan.nodes[send.node].kind, output.signal.what)
             else {
                 continue;
             };
+            let (range, path) = (frames::carries(&messages[m].fields[f]), self.files.slice(send.path).to_string());
+            fielded.push(live::Command { path, unit: send.unit.clone(), value: at(send.value), range });
+        }
+        for live::Command { path, unit, value: expr, range } in &fielded {
             // NaN of what is not known before it runs.
-            let (low, high) = frames::carries(&messages[m].fields[f]);
-            if value < low || value > high {
-                let shown = |value: f64| units::three_digits(send.unit.from_si(value));
-                let message = format!("`{}` cannot be {}", self.files.slice(send.path), shown(value));
-                let error = Diagnostic::error("E0802", message)
-                    .label(system.span(at(send.value)), format!("its field carries {} .. {}", shown(low), shown(high)));
+            let value = evaluate(&system, &types, &[*expr])[0];
+            if value < range.0 || value > range.1 {
+                let [low, high] = [range.0, range.1].map(|end| units::three_digits(unit.from_si(end)));
+                let error = Diagnostic::error("E0802", words::cannot_be(path, unit, value))
+                    .label(system.span(*expr), format!("its field carries {low} .. {high}"));
                 self.report(error.help("send what fits, or describe the field with more bits or a coarser `scale`"));
             }
         }
-        checks::whole_periods(
-            &control,
-            &control_types,
-            plan.period_ns as f64 * 1e-9 / f64::from(plan.steps),
-            self.statements.rate.map(|(_, span)| span),
-            self.diagnostics,
-        );
-        checks::whole_periods(
-            &plant.system,
-            &plant_types,
-            plan.period_ns as f64 * 1e-9 / f64::from(PLANT_STEPS),
-            self.statements.rate.map(|(_, span)| span),
-            self.diagnostics,
+        let period = plan.period_ns as f64 * 1e-9;
+        let [control_step, plant_step] = [plan.steps, PLANT_STEPS].map(|steps| period / f64::from(steps));
+        let rate = self.statements.rate.map(|(_, span)| span);
+        checks::whole_periods(&control, &control_types, control_step, rate, self.diagnostics);
+        checks::whole_periods(&plant.system, &plant_types, plant_step, rate, self.diagnostics);
+        let periods = |system: &System, step| system.blocks.iter().map(move |block| (block.period, step)).collect();
+        let periods: Vec<(ExprId, f64)> = periods(&control, control_step);
+        let judged = live::judged(
+            &system,
+            &types,
+            self.files,
+            &live::Fixed {
+                part: (&path, &inside),
+                nodes: &framed.nodes,
+                plan: &exprs,
+                periods: &periods,
+                commands: &fielded,
+            },
         );
         let places = Places {
             name: self.rig.name.span,
@@ -702,6 +717,7 @@ impl<'a> Reader<'a, '_> {
             applied: plant.applied,
             seen: plant.seen,
             seen_read: plant.seen_read,
+            judged,
             places,
         };
         self.signals(&mut cut, &system, &framed, &gives, &at);

@@ -571,7 +571,8 @@ impl Cut {
         control.size_rings(period / f64::from(rig.steps));
         plant.size_rings(period / f64::from(super::PLANT_STEPS));
         warnings.extend(self.advice(&rig, &control, &plant));
-        super::Lowered { rig, control, plant }
+        let (live, judge) = self.judged.clone().finish(&control, &plant);
+        super::Lowered { rig, control, plant, live, judge }
     }
 
     /// What deserves a look, but for what the rig allows.

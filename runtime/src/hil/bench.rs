@@ -1,6 +1,8 @@
 //! A rig written by hand, for tests: a drive that acts as a spring on whatever turns its shaft.
 
+use super::live::Judge;
 use crate::models::Model;
+use abi::live::{Check, Live, Param, Place};
 use abi::plan::{Method, Series};
 use abi::rig::{Bus, Cia402, Input, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
 use abi::unit::Unit;
@@ -115,6 +117,51 @@ pub fn bristle() -> (Rig, Instance, Instance) {
     rig.outputs[1].slot = layout.outputs.slot(1);
     rig.record[0].slot = layout.outputs.slot(2);
     (rig, control, plant)
+}
+
+/// What must hold of the parameters of [`pair`]: the swing `T` lies in 0 .. 1 N·m, the damping `d` is above 0, and
+/// T ≥ 2 d by number. `end`, from which the model gives no number, is free.
+pub fn judge(control: &Instance) -> Judge {
+    let program = Model::new("judge")
+        .param(0.4)
+        .param(0.05)
+        .param(f64::INFINITY)
+        .output("zero", "N·m")
+        .output("most", "N·m")
+        .output("large enough", "1")
+        .body(Function::Outputs, |view| {
+            view.set_y(0, 0.0);
+            view.set_y(1, 1.0);
+            view.set_y(2, f64::from(view.p(0) >= 2.0 * view.p(1)));
+        })
+        .build();
+    let (inside, judged) = (&control.description().layout, &program.description().layout);
+    let unit = |text: &str| Unit::parse(text).expect("a unit that is known");
+    let param = |i, path: &str, text: &str| Param {
+        path: path.into(),
+        unit: unit(text),
+        boolean: false,
+        place: Place::Live(inside.params.slot(i), judged.params.slot(i)),
+    };
+    let range = |i: usize, path: &str, text: &str, strict, high: Option<usize>| Check::Range {
+        path: path.into(),
+        name: path.into(),
+        model: "Swing".into(),
+        unit: unit(text),
+        value: judged.params.slot(i),
+        low: Some((judged.outputs.slot(0), strict)),
+        high: high.map(|k| (judged.outputs.slot(k), false)),
+    };
+    let message = "`T` is smaller than `2 d`".into();
+    let live = Live {
+        params: vec![param(0, "T", "N·m"), param(1, "d", "N·m·s/rad"), param(2, "end", "s")],
+        checks: vec![
+            range(0, "T", "N·m", false, Some(1)),
+            range(1, "d", "N·m·s/rad", true, None),
+            Check::Require { message, value: judged.outputs.slot(2) },
+        ],
+    };
+    Judge::new(live, program, control).expect("both have three parameters")
 }
 
 /// Two drives on one shaft of 0.012 kg·m²: the servo swings it with 0.4 N·m at 1 Hz, the load brakes it like a damper of

@@ -7,6 +7,7 @@
 use super::bench;
 use super::control;
 use super::cycle::{Command, End, Hil, Operator, Options, look_ahead};
+use super::live::Set;
 use super::simulated::{BENCH, MASTER, Pace, World};
 use crate::can::sim::{Fault, Kind as FaultKind, Port};
 use crate::can::{Bus, Frame};
@@ -72,7 +73,9 @@ impl Stand {
         let mut world = World::new(&rig, Some(plant), Pace::Fast, seed).unwrap();
         let masters = world.masters();
         let log = log.map(|settings| (settings, Sections::default()));
-        let (hil, operator) = Hil::new(&rig, model, world.clock(), masters, options, log).unwrap();
+        let judge = bench::judge(&model);
+        let (mut hil, operator) = Hil::new(&rig, model, world.clock(), masters, options, log).unwrap();
+        hil.judged_by(judge);
         let power = cia402(&mut rig, 0).max_power.unwrap_or(f64::INFINITY);
         Stand { hil, operator, world, rig, cause: None, last: [0.0; 2], power }
     }
@@ -622,15 +625,17 @@ fn row_17_and_18_a_process_that_is_frozen_or_gone() {
 fn row_19_parameters_while_it_runs() {
     let mut stand = Stand::armed(|_, _| ());
     let slot = |i| stand.hil.control().unwrap().model().description().layout.params.slot(i);
-    let (amplitude, damping): (Slot, Slot) = (slot(0), slot(1));
+    let [amplitude, damping, end]: [Slot; 3] = [0, 1, 2].map(slot);
     for k in 0..200 {
         let values = [(amplitude, 0.3 + 0.1 * f64::from(k % 2)), (damping, 0.05 + 0.01 * f64::from(k % 3))];
-        stand.operator.push(Command::Set(super::cycle::Set::new(&values).unwrap()));
+        stand.operator.push(Command::Set(Set::new(&values).unwrap()));
         stand.goes_on(MS);
     }
-    stand.operator.push(Command::Set(super::cycle::Set::new(&[(amplitude, f64::NAN)]).unwrap()));
+    stand.operator.push(Command::Set(Set::new(&[(amplitude, f64::NAN)]).unwrap()));
+    // From now on the model would give no number.
+    stand.operator.push(Command::Set(Set::new(&[(end, 0.0)]).unwrap()));
     stand.goes_on(20 * MS);
-    assert_eq!(stand.hil.counts().refused_sets, 1);
+    assert_eq!(stand.hil.counts().refused_sets, 2);
 }
 
 #[test]
@@ -796,7 +801,7 @@ fn mutants_are_caught() {
     let passes = |mutant: Option<&str>| {
         let mut tests = std::process::Command::new(std::env::current_exe().unwrap());
         tests.args(["hil::campaign::row", "hil::campaign::nothing", "hil::control", "hil::followed", "hil::emergency"]);
-        tests.args(["drive::units", "drive::frames"]).env_remove("FRIC_MUTANT");
+        tests.args(["drive::units", "drive::frames", "hil::live_tests"]).env_remove("FRIC_MUTANT");
         mutant.map(|name| tests.env("FRIC_MUTANT", name));
         tests.output().unwrap().status.success()
     };

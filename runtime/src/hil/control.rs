@@ -168,7 +168,8 @@ pub struct Control {
     blend: (u32, u32),
     regimes: Vec<f64>,
     running: bool,
-    refused_sets: u32,
+    /// The status with which the set of the last cycle was refused, 0 if the model gave no number.
+    refused_set: Option<u64>,
 }
 
 impl Control {
@@ -300,7 +301,7 @@ impl Control {
             blend: (0, ticks(options.blend_ns).max(1)),
             regimes: vec![0.0; regimes.len as usize],
             running: false,
-            refused_sets: 0,
+            refused_set: None,
             model,
         })
     }
@@ -340,9 +341,10 @@ impl Control {
         &self.model
     }
 
-    /// Sets of parameters that were refused because the model could not go on with them.
-    pub fn refused_sets(&self) -> u32 {
-        self.refused_sets
+    /// Whether the set of the last cycle was refused since the model could not go on with it: with which status, 0 if it
+    /// gave no number.
+    pub fn refused_set(&self) -> Option<u64> {
+        self.refused_set
     }
 
     /// One cycle. Who asks for outputs must have armed the supervisor.
@@ -350,11 +352,7 @@ impl Control {
     pub fn cycle(&mut self, told: &Told) -> Order {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;
-        if told.source != Source::Model {
-            for (slot, value) in told.set {
-                self.model.set(*slot, *value);
-            }
-        }
+        self.refused_set = None;
         told.causes.iter().for_each(|cause| self.supervisor.trip(*cause));
         self.read(told.readings, told.ticks, told.source);
         self.compare(told);
@@ -374,6 +372,10 @@ impl Control {
             self.supervisor.trip(Cause::Overrun(behind));
         }
         let computes = told.source == Source::Model && self.supervisor.is_armed();
+        if !(computes && self.running) {
+            // Nothing is under way that a step could disturb.
+            told.set.iter().for_each(|(slot, value)| self.model.set(*slot, *value));
+        }
         match told.source {
             Source::Model if computes => self.advance(told),
             Source::StartUp => self.requests.copy_from_slice(told.wanted),
@@ -497,7 +499,8 @@ impl Control {
         let steps = self.steps * u64::from(told.ticks.max(1));
         let mut status = begin;
         if begin == 0 {
-            status = if told.set.is_empty() { self.model.advance(steps) } else { self.change(told.set, steps) };
+            let changes = self.running && !told.set.is_empty();
+            status = if changes { self.change(told.set, steps) } else { self.model.advance(steps) };
         }
         if status != 0 {
             self.supervisor.trip(Cause::Guard(status));
@@ -548,7 +551,7 @@ impl Control {
         let finite = self.model.block()[self.model.description().layout.states.range()].iter().all(|x| x.is_finite())
             && self.outputs.iter().all(|slot| self.model.get(*slot).is_finite());
         if old == 0 && (new != 0 || !finite) {
-            self.refused_sets += 1;
+            self.refused_set = Some(new);
             self.model.block_mut().copy_from_slice(self.shadow.block());
             return old;
         }
@@ -791,7 +794,7 @@ mod tests {
         let stiffness = way.control.model().description().layout.params.slot(0);
         let second = way.cycle(1, &[(stiffness, f64::NAN)]);
         assert!((second - 2.0 * first).abs() < 1e-12, "the old one holds: {second}");
-        assert_eq!((way.control.refused_sets(), way.control.supervisor().cause()), (1, None));
+        assert_eq!((way.control.refused_set(), way.control.supervisor().cause()), (Some(0), None));
     }
 
     #[test]

@@ -10,17 +10,19 @@
 
 use super::control::{Bounds, Control, Reading, Source, Told};
 use super::counts::Counts;
+use super::live::{Judge, Objection};
+use super::operator::{self, Answer, Commands, Why};
+pub use super::operator::{Command, Operator};
 use super::trace::{self, Passed, Shape};
 use super::{control, emergency, watches};
 use crate::can::{Bus, Event, Frame, Received};
 use crate::clock::Clock;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
 use crate::lookahead::Wired;
-use crate::queue::{Receiver, Sender, queue};
 use crate::record::log::{self, Log, Sections};
 use crate::safety::{Cause, Clamps, Order, Protection, Seen, Supervisor, is_present};
+use abi::Instance;
 use abi::rig::{Rig, Signal};
-use abi::{Instance, Slot};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -31,44 +33,10 @@ const MOST_FRAMES: usize = 64;
 const OVERLOAD: u32 = 3;
 /// Cycles between two states in the log.
 const STATE_EVERY: u64 = 1000;
-/// Parameters that can be changed at once.
-pub const SET_MOST: usize = 16;
 /// Causes that may come in one cycle, beside those of buses and nodes.
 const CAUSES: usize = 40;
 /// Time in which drives must lose their torque once they are told to.
 const REST_NS: u64 = 1_000_000_000;
-
-/// What an operator may ask for while the rig is under way.
-#[derive(Clone, Copy, PartialEq, Debug)]
-#[allow(clippy::large_enum_variant, reason = "a box would be freed in a cycle")]
-pub enum Command {
-    /// Power on, at zero command.
-    Enable,
-    /// The outputs to the model.
-    Arm,
-    /// A controlled stop.
-    Stop,
-    /// After a stop: start anew.
-    Reset,
-    /// New values of parameters, as one set.
-    Set(Set),
-}
-
-/// A set of parameters. Their ranges have been checked.
-#[derive(Clone, Copy, PartialEq, Debug)]
-pub struct Set {
-    slots: [(Slot, f64); SET_MOST],
-    len: usize,
-}
-
-impl Set {
-    /// A set of at most [`SET_MOST`] parameters; none if there are more.
-    pub fn new(values: &[(Slot, f64)]) -> Option<Set> {
-        let mut slots = [(Slot::TIME, 0.0); SET_MOST];
-        slots.get_mut(..values.len())?.copy_from_slice(values);
-        Some(Set { slots, len: values.len() })
-    }
-}
 
 /// How a rig is run.
 #[derive(Clone, PartialEq, Debug, Default)]
@@ -212,9 +180,6 @@ impl Wires {
     }
 }
 
-/// Where the operator's commands go in.
-pub type Operator = Sender<Command>;
-
 /// A rig under way.
 pub struct Hil {
     /// Above the buses: the stop frames are taken back before their descriptors close.
@@ -229,7 +194,11 @@ pub struct Hil {
     log_wanted: Option<(log::Settings, Sections)>,
     log: Option<Log>,
     gauges: Arc<Gauges>,
-    commands: Receiver<Command>,
+    commands: Commands,
+    /// Judges sets of parameters; none: none is taken.
+    judge: Option<Judge>,
+    /// The set that acts in this cycle.
+    set: Option<u64>,
     due_ns: u64,
     collect_ns: u64,
     k: u64,
@@ -268,7 +237,7 @@ impl Hil {
         assert_eq!(buses.len(), rig.buses.len(), "buses of rig {}", rig.name);
         watches::may_start(rig)?;
         let fieldbus = Fieldbus::new(rig, options.start)?;
-        let (operator, commands) = queue(64);
+        let (operator, commands) = operator::commands(rig.period_ns);
         if rig.predict.is_some() && options.look.is_none() {
             return Err(format!("rig `{}` looks ahead, and nothing does it", rig.name));
         }
@@ -301,6 +270,8 @@ impl Hil {
             log: None,
             gauges: Arc::new(Gauges { values, ..Gauges::default() }),
             commands,
+            judge: None,
+            set: None,
             due_ns,
             collect_ns: collect_ns.min(rig.period_ns),
             k: 0,
@@ -323,6 +294,11 @@ impl Hil {
     /// Stops the drives from a thread of its own if cycles stop.
     pub fn watched_by(&mut self, watchdog: emergency::Watchdog) {
         self.wires.watchdog = Some(watchdog);
+    }
+
+    /// Lets parameters change while the rig runs, as far as this judge allows.
+    pub fn judged_by(&mut self, judge: Judge) {
+        self.judge = Some(judge);
     }
 
     /// What to look at from elsewhere.
@@ -461,26 +437,26 @@ impl Hil {
         self.cycle.arms = false;
         self.cycle.resets = false;
         self.cycle.set.clear();
-        if self.over || emergency::asked().is_some() {
+        let now_ns = self.wires.clock.now_ns();
+        self.commands.begin(now_ns);
+        // A stop comes first: what was asked for beside it is over.
+        let stops = self.over || emergency::asked().is_some() | self.commands.takes_stop();
+        if stops {
             self.stop();
         }
-        while let Some(command) = self.commands.pop() {
-            match command {
-                Command::Enable => {
-                    self.fieldbus.request(Request::Enable);
+        while let Some(said) = self.commands.next(now_ns, false) {
+            let has_effect = match said.command {
+                _ if stops => {
+                    self.commands.answer(said.number, Answer::Refused(Why::Stopping));
+                    continue;
                 }
-                Command::Arm => {
-                    self.fieldbus.request(Request::Arm);
-                }
-                Command::Stop => self.stop(),
+                Command::Enable => self.fieldbus.request(Request::Enable),
+                Command::Arm => self.fieldbus.request(Request::Arm),
                 Command::Reset => self.reset(),
-                Command::Set(set) => {
-                    // Sets that come within one period act as one.
-                    if self.cycle.set.len() + set.len <= self.cycle.set.capacity() {
-                        self.cycle.set.extend_from_slice(&set.slots[..set.len]);
-                    }
-                }
-            }
+                Command::Stop | Command::Set(_) => unreachable!("neither comes this way"),
+            };
+            let answer = if has_effect { Answer::Taken } else { Answer::Refused(Why::NotNow(self.stage())) };
+            self.commands.answer(said.number, answer);
         }
         if self.options.checks_only && self.fieldbus.step() == Step::AwaitArm {
             self.checked = true;
@@ -496,6 +472,36 @@ impl Hil {
         }
     }
 
+    /// The next set of parameters: one a cycle, so that each is whole or refused by itself.
+    fn take_set(&mut self) {
+        self.set = None;
+        let Some(said) = self.commands.next(self.wires.clock.now_ns(), true) else { return };
+        let Command::Set(set) = said.command else { unreachable!("only a set was asked for") };
+        let refused = match (&self.control, &mut self.judge) {
+            (None, _) => Some(Why::NotNow(self.stage())),
+            (Some(_), None) => Some(Why::Unjudged),
+            (Some(control), Some(judge)) => judge.judge(control.model().block(), set.values()).err().map(Why::Set),
+        };
+        match refused {
+            Some(why) => {
+                self.counts.refused_sets += 1;
+                self.commands.answer(said.number, Answer::Refused(why));
+            }
+            None => {
+                self.cycle.set.extend_from_slice(set.values());
+                self.set = Some(said.number);
+            }
+        }
+    }
+
+    /// What a gauge shows of the start-up and of a stop.
+    fn stage(&self) -> u64 {
+        match self.order {
+            Order::Wait | Order::Follow => self.fieldbus.step() as u64,
+            order => 100 + trace::order_number(order),
+        }
+    }
+
     fn stop(&mut self) {
         match &self.control {
             Some(_) => self.wires.report(Cause::Asked),
@@ -503,9 +509,11 @@ impl Hil {
         }
     }
 
-    fn reset(&mut self) {
-        let Some(control) = &mut self.control else { return };
-        if control.supervisor_mut().reset() && self.fieldbus.request(Request::Reset) {
+    /// Whether it has an effect.
+    fn reset(&mut self) -> bool {
+        let Some(control) = &mut self.control else { return false };
+        let resets = control.supervisor_mut().reset() && self.fieldbus.request(Request::Reset);
+        if resets {
             self.cycle.resets = true;
             self.first_trouble = None;
             self.resting_ns = None;
@@ -515,6 +523,7 @@ impl Hil {
                 self.wires.acknowledged = false;
             }
         }
+        resets
     }
 
     /// What the nodes and buses have said against going on.
@@ -554,6 +563,7 @@ impl Hil {
         if self.control.is_none() && step >= Step::Configure && step < Step::Stopped {
             self.begin_control();
         }
+        self.take_set();
         let Some(control) = &mut self.control else { return Order::Wait };
         let cycle = &mut self.cycle;
         // Before the drives are enabled a bus may be silent: the start-up judges that.
@@ -591,6 +601,11 @@ impl Hil {
             causes: &cycle.causes,
             set: &cycle.set,
         });
+        if let Some(number) = self.set.take() {
+            let refused = control.refused_set().map(|status| Answer::Refused(Why::Set(Objection::Model(status))));
+            self.counts.refused_sets += u64::from(refused.is_some());
+            self.commands.answer(number, refused.unwrap_or(Answer::Taken));
+        }
         cycle.order = order;
         cycle.requests.copy_from_slice(control.requests());
         cycle.permitted.copy_from_slice(control.supervisor().permitted());
@@ -688,6 +703,7 @@ impl Hil {
 
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     fn count(&mut self, ticks: u32) {
+        let stage = self.stage();
         let counts = &mut self.counts;
         counts.all += 1;
         let armed = self.control.as_ref().is_some_and(|control| control.supervisor().is_armed());
@@ -716,7 +732,6 @@ impl Hil {
             }
         }
         counts.coupling = self.control.as_ref().and_then(|control| control.coupling().told());
-        counts.refused_sets = self.control.as_ref().map_or(0, |control| u64::from(control.refused_sets()));
         let gauges = &self.gauges;
         gauges.now_ns.store(self.due_ns, Ordering::Relaxed);
         gauges.cycles.store(counts.cycles, Ordering::Relaxed);
@@ -724,10 +739,6 @@ impl Hil {
         gauges.late_ns_max.fetch_max(if runs { self.cycle.late_ns.into() } else { 0 }, Ordering::Relaxed);
         gauges.missed.store(counts.missed, Ordering::Relaxed);
         gauges.log_free.store(self.log.as_ref().map_or(0, Log::free), Ordering::Relaxed);
-        let stage = match self.order {
-            Order::Wait | Order::Follow => self.fieldbus.step() as u64,
-            order => 100 + trace::order_number(order),
-        };
         gauges.stage.store(stage, Ordering::Relaxed);
         for (gauge, value) in gauges.values.iter().zip(self.cycle.permitted.iter().chain(&self.cycle.recorded)) {
             gauge.store(value.to_bits(), Ordering::Relaxed);

@@ -13,6 +13,8 @@ pub mod replay;
 pub mod emergency;
 pub mod counts;
 pub mod words;
+pub mod live;
+pub mod operator;
 pub mod cycle;
 pub mod identify;
 pub mod simulated;
@@ -25,3 +27,6 @@ mod tests;
 
 #[cfg(test)]
 mod campaign;
+
+#[cfg(test)]
+mod live_tests;

@@ -131,7 +131,7 @@ impl Cycle {
             permitted: vec![0.0; shape.outputs],
             clamps: vec![Clamps::default(); shape.outputs],
             causes: Vec::with_capacity(64),
-            set: Vec::with_capacity(64),
+            set: Vec::with_capacity(super::live::SET_MOST),
             recorded: vec![0.0; shape.recorded],
         }
     }

@@ -8,6 +8,7 @@ use super::{Package, Refusal};
 use crate::record::log::Sections;
 use abi::encode::Encode;
 use abi::image::Image;
+use abi::live::Live;
 use abi::rig::Rig;
 use abi::table::Function;
 
@@ -21,6 +22,10 @@ pub struct Contents {
     pub control: Image,
     /// The crossed-out part.
     pub plant: Image,
+    /// What judges sets of parameters while it runs.
+    pub judge: Image,
+    /// Which parameters may change then, and the conditions that the judge computes.
+    pub live: Live,
     /// What joins them.
     pub rig: Rig,
     /// The head of every log of it: names and texts.
@@ -33,10 +38,10 @@ impl Package {
     /// # Errors
     /// What in it is missing, makes no sense or does not fit the rest. Whether this computer can run it is not asked.
     pub fn contents(&self) -> Result<Contents, Refusal> {
-        let program = |name: &str| -> Result<Image, Refusal> {
+        let program = |name: &str, needed: &[Function]| -> Result<Image, Refusal> {
             let image = Image::read(self.section(name)?);
             let image = image.map_err(|why| Refusal::Malformed(format!("its program `{name}`: {why}")))?;
-            let lacks = NEEDED.into_iter().find(|function| image.entries[*function as usize].is_none());
+            let lacks = needed.iter().find(|function| image.entries[**function as usize].is_none());
             match lacks {
                 _ if !image.params.iter().all(|value| !value.is_nan()) => {
                     Err(Refusal::Malformed(format!("its program `{name}`: a parameter is no number")))
@@ -47,7 +52,14 @@ impl Package {
                 None => Ok(image),
             }
         };
-        let (control, plant) = (program("control")?, program("plant")?);
+        let (control, plant) = (program("control", &NEEDED)?, program("plant", &NEEDED)?);
+        let judge = program("judge", &[Function::Outputs])?;
+        let conditions = |why: String| Refusal::Malformed(format!("the conditions on its parameters: {why}"));
+        let live = Live::from_bytes(self.section("live")?).map_err(|why| conditions(why.to_string()))?;
+        let fault = live.fault(control.description.layout.params.range(), judge.description.layout.size());
+        if let Some(fault) = fault {
+            return Err(conditions(fault));
+        }
         let plan = |why: &dyn std::fmt::Display| Refusal::Malformed(format!("the plan of its rig: {why}"));
         let rig = Rig::from_bytes(self.section("rig")?).map_err(|why| plan(&why))?;
         rig.fits(&control.description, &plant.description).map_err(|why| plan(&why))?;
@@ -60,6 +72,6 @@ impl Package {
         if head.text("rig") != Some(self.rig.as_str()) {
             return Err(about("it is of another rig".into()));
         }
-        Ok(Contents { control, plant, rig, head })
+        Ok(Contents { control, plant, judge, live, rig, head })
     }
 }

@@ -1,0 +1,430 @@
+//! What a start checks of the parameters of a rig, as plain data: so that a set of parameters given later is judged by
+//! the same conditions and refused with the same words.
+//!
+//! A *judge* program computes the numbers of all conditions from a block of parameters; each [`Check`] names the slots
+//! of its numbers in that block. Only the compiler knows how they come about. It also says of each parameter whether the
+//! step reads it, so that it may change while the rig runs, or why only a start does.
+
+use crate::description::Slot;
+use crate::encode::{Encode, Malformed, Reader};
+use crate::encode_structs;
+use crate::unit::{Unit, three_digits};
+
+/// The parameters of a rig and the conditions on them.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Live {
+    /// Every parameter of the rig's text, in its order.
+    pub params: Vec<Param>,
+    /// In the order in which a start reports what is broken.
+    pub checks: Vec<Check>,
+}
+
+/// A parameter.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Param {
+    /// Dotted path: `fr.Fs`.
+    pub path: String,
+    /// The unit it is declared in.
+    pub unit: Unit,
+    /// Whether it is true or false.
+    pub boolean: bool,
+    /// Where it may change while the rig runs, or why it may not.
+    pub place: Place,
+}
+
+/// Whether a parameter may change while the rig runs.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Place {
+    /// Yes: its slot in the control program and the one in the judge.
+    Live(Slot, Slot),
+    /// No, only a start reads it: why, as a clause such as "a period follows from it".
+    Start(String),
+}
+
+/// A condition that a start checks.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Check {
+    /// E0502: a value lies in its declared range.
+    Range {
+        /// Dotted path.
+        path: String,
+        /// Own name.
+        name: String,
+        /// The model that declares it.
+        model: String,
+        /// For messages.
+        unit: Unit,
+        /// The value.
+        value: Slot,
+        /// Lower bound, and whether it is excluded.
+        low: Option<(Slot, bool)>,
+        /// Upper bound, and whether it is excluded.
+        high: Option<(Slot, bool)>,
+    },
+    /// E0501: a `require` holds.
+    Require {
+        /// What is said if it does not.
+        message: String,
+        /// Not 0 if it holds.
+        value: Slot,
+    },
+    /// E0502: a period is positive.
+    Period(Slot),
+    /// E0701: a period is a whole number of steps.
+    Multiple {
+        /// The period, s.
+        period: Slot,
+        /// The step, s.
+        step: f64,
+    },
+    /// E0802: a constant command fits the field that carries it.
+    Carried {
+        /// The command: `panel.lamp`.
+        path: String,
+        /// For messages.
+        unit: Unit,
+        /// Its value; NaN if it is not constant.
+        value: Slot,
+        /// Least and greatest value that the field carries.
+        range: (f64, f64),
+    },
+}
+
+/// Conditions of a later stage are looked at only if all before hold: a start ends with the first stage that fails.
+pub const STAGES: u8 = 2;
+
+/// The most numbers that a condition depends on.
+pub const NUMBERS: usize = 3;
+
+impl Check {
+    /// Its code, as `fric explain` takes it.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Check::Range { .. } | Check::Period(_) => "E0502",
+            Check::Require { .. } => "E0501",
+            Check::Multiple { .. } => "E0701",
+            Check::Carried { .. } => "E0802",
+        }
+    }
+
+    /// 0 for what is checked of values, 1 for what is checked of the rig.
+    pub fn stage(&self) -> u8 {
+        match self {
+            Check::Range { .. } | Check::Require { .. } | Check::Period(_) => 0,
+            Check::Multiple { .. } | Check::Carried { .. } => 1,
+        }
+    }
+
+    /// The slots of its numbers in the block of the judge.
+    pub fn slots(&self) -> [Option<Slot>; NUMBERS] {
+        match self {
+            Check::Range { value, low, high, .. } => [Some(*value), low.map(|it| it.0), high.map(|it| it.0)],
+            Check::Require { value, .. } | Check::Carried { value, .. } => [Some(*value), None, None],
+            Check::Period(period) | Check::Multiple { period, .. } => [Some(*period), None, None],
+        }
+    }
+
+    /// Its numbers; NaN where it has none.
+    pub fn numbers(&self, block: &[f64]) -> [f64; NUMBERS] {
+        self.slots().map(|slot| slot.map_or(f64::NAN, |slot| block[slot.index()]))
+    }
+
+    /// Whether it holds for its numbers.
+    pub fn holds(&self, numbers: [f64; NUMBERS]) -> bool {
+        let [value, low, high] = numbers;
+        match self {
+            Check::Range { low: below, high: above, .. } => {
+                let (low, high) = (bound(below, low), bound(above, high));
+                !is_empty(low, high) && beyond(value, low, high).is_none()
+            }
+            Check::Require { .. } => value != 0.0,
+            Check::Period(_) => is_period(value),
+            Check::Multiple { step, .. } => is_multiple(value, *step),
+            // NaN lies nowhere: a command that changes is watched elsewhere.
+            Check::Carried { range, .. } => !(value < range.0 || value > range.1),
+        }
+    }
+
+    /// What numbers for which it does not hold break, in words.
+    pub fn words(&self, numbers: [f64; NUMBERS]) -> String {
+        let [value, low, high] = numbers;
+        match self {
+            Check::Range { path, name, model, unit, low: below, high: above, .. } => {
+                let said = match beyond(value, bound(below, low), bound(above, high)) {
+                    Some(beyond) if !is_empty(bound(below, low), bound(above, high)) => {
+                        beyond_words(name, model, unit, value, beyond)
+                    }
+                    _ => nothing_in_range(name),
+                };
+                if path == name { said } else { format!("{said} (`{path}`)") }
+            }
+            Check::Require { message, .. } => message.clone(),
+            Check::Period(_) => NO_PERIOD.into(),
+            Check::Multiple { step, .. } => no_multiple(value, *step),
+            Check::Carried { path, unit, .. } => cannot_be(path, unit, value),
+        }
+    }
+}
+
+fn bound(declared: &Option<(Slot, bool)>, number: f64) -> Option<(f64, bool)> {
+    declared.map(|(_, strict)| (number, strict))
+}
+
+/// The bound of a range that a value breaks.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Beyond {
+    /// `above`, `at least`, `below`, `at most`.
+    pub word: &'static str,
+    /// The bound, SI.
+    pub bound: f64,
+}
+
+/// The bound that a value breaks; each bound with whether it is excluded.
+pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> Option<Beyond> {
+    let below = low.filter(|(bound, strict)| value < *bound || *strict && value == *bound);
+    let above = high.filter(|(bound, strict)| value > *bound || *strict && value == *bound);
+    match (below, above) {
+        (Some((bound, strict)), _) => Some(Beyond { word: if strict { "above" } else { "at least" }, bound }),
+        (None, Some((bound, strict))) => Some(Beyond { word: if strict { "below" } else { "at most" }, bound }),
+        (None, None) => None,
+    }
+}
+
+/// Whether the lower bound is above the upper one.
+pub fn is_empty(low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> bool {
+    matches!((low, high), (Some((low, _)), Some((high, _))) if low > high)
+}
+
+/// E0502: a value outside of its range.
+pub fn beyond_words(name: &str, model: &str, unit: &Unit, value: f64, beyond: Beyond) -> String {
+    let (bound, value) = (shown(beyond.bound, unit), shown(value, unit));
+    format!("`{name}` of {model} must be {} {bound}, not {value}", beyond.word)
+}
+
+/// E0502: a range whose lower bound is above its upper one.
+pub fn nothing_in_range(name: &str) -> String {
+    format!("nothing lies in the range of `{name}`")
+}
+
+/// E0502: what a period must be.
+pub const NO_PERIOD: &str = "a period must be positive and known before the run";
+
+/// Whether it can be a period.
+pub fn is_period(seconds: f64) -> bool {
+    seconds > 0.0 && seconds.is_finite()
+}
+
+/// Whether a period is a whole number of steps, but for rounding.
+pub fn is_multiple(period: f64, step: f64) -> bool {
+    let ratio = period / step;
+    (ratio - ratio.round()).abs() <= 1e-9 * ratio && ratio.round() >= 1.0
+}
+
+/// E0701: a period that is no whole number of steps.
+pub fn no_multiple(period: f64, step: f64) -> String {
+    let second = Unit::parse("s").expect("the second is known");
+    format!("a period of {} is no multiple of the step of {}", shown(period, &second), shown(step, &second))
+}
+
+/// E0802: a command that its field cannot carry.
+pub fn cannot_be(path: &str, unit: &Unit, value: f64) -> String {
+    format!("`{path}` cannot be {}", three_digits(unit.from_si(value)))
+}
+
+/// A value in SI with three digits, in a unit.
+pub fn shown(si: f64, unit: &Unit) -> String {
+    let number = three_digits(unit.from_si(si));
+    if unit.text.is_empty() { number } else { format!("{number} {unit}") }
+}
+
+impl Live {
+    /// The parameter of this path.
+    pub fn param(&self, path: &str) -> Option<&Param> {
+        self.params.iter().find(|param| param.path == path)
+    }
+
+    /// Where a slot of the control program lies in the judge, if it is that of a parameter that may change.
+    pub fn judged(&self, control: Slot) -> Option<Slot> {
+        self.places().find(|(slot, _)| *slot == control).map(|(_, judge)| judge)
+    }
+
+    /// Both slots of each parameter that may change.
+    pub fn places(&self) -> impl Iterator<Item = (Slot, Slot)> {
+        self.params.iter().filter_map(|param| match &param.place {
+            Place::Live(control, judge) => Some((*control, *judge)),
+            Place::Start(_) => None,
+        })
+    }
+
+    /// Why it cannot be of these programs: blocks of `control` slots, of which `params` are parameters, and of `judge`
+    /// slots.
+    pub fn fault(&self, params: std::ops::Range<usize>, judge: usize) -> Option<String> {
+        let slots = self.checks.iter().flat_map(|check| check.slots().into_iter().flatten());
+        if let Some(slot) = self.places().map(|(_, slot)| slot).chain(slots).find(|slot| slot.index() >= judge) {
+            return Some(format!("a condition names slot {} in a block of {judge} slots", slot.0));
+        }
+        let outside = self.places().find(|(slot, _)| !params.contains(&slot.index()));
+        outside.map(|(slot, _)| format!("slot {} of the control program is no parameter", slot.0))
+    }
+}
+
+encode_structs! {
+    Live { params, checks }
+    Param { path, unit, boolean, place }
+}
+
+impl Encode for Place {
+    fn encode(&self, out: &mut Vec<u8>) {
+        match self {
+            Place::Live(control, judge) => {
+                out.push(0);
+                (*control, *judge).encode(out);
+            }
+            Place::Start(why) => {
+                out.push(1);
+                why.encode(out);
+            }
+        }
+    }
+
+    fn decode(reader: &mut Reader) -> Result<Place, Malformed> {
+        match u8::decode(reader)? {
+            0 => <(Slot, Slot)>::decode(reader).map(|(control, judge)| Place::Live(control, judge)),
+            1 => String::decode(reader).map(Place::Start),
+            other => Err(Malformed(format!("{other} is no place of a parameter"))),
+        }
+    }
+}
+
+impl Encode for Check {
+    fn encode(&self, out: &mut Vec<u8>) {
+        match self {
+            Check::Range { path, name, model, unit, value, low, high } => {
+                out.push(0);
+                [path, name, model].into_iter().for_each(|text| text.encode(out));
+                unit.encode(out);
+                value.encode(out);
+                low.encode(out);
+                high.encode(out);
+            }
+            Check::Require { message, value } => {
+                out.push(1);
+                message.encode(out);
+                value.encode(out);
+            }
+            Check::Period(period) => {
+                out.push(2);
+                period.encode(out);
+            }
+            Check::Multiple { period, step } => {
+                out.push(3);
+                period.encode(out);
+                step.encode(out);
+            }
+            Check::Carried { path, unit, value, range } => {
+                out.push(4);
+                path.encode(out);
+                unit.encode(out);
+                value.encode(out);
+                range.encode(out);
+            }
+        }
+    }
+
+    fn decode(reader: &mut Reader) -> Result<Check, Malformed> {
+        let kind = u8::decode(reader)?;
+        let r = reader;
+        Ok(match kind {
+            0 => Check::Range {
+                path: Encode::decode(r)?,
+                name: Encode::decode(r)?,
+                model: Encode::decode(r)?,
+                unit: Encode::decode(r)?,
+                value: Encode::decode(r)?,
+                low: Encode::decode(r)?,
+                high: Encode::decode(r)?,
+            },
+            1 => Check::Require { message: Encode::decode(r)?, value: Encode::decode(r)? },
+            2 => Check::Period(Encode::decode(r)?),
+            3 => Check::Multiple { period: Encode::decode(r)?, step: Encode::decode(r)? },
+            4 => Check::Carried {
+                path: Encode::decode(r)?,
+                unit: Encode::decode(r)?,
+                value: Encode::decode(r)?,
+                range: Encode::decode(r)?,
+            },
+            other => return Err(Malformed(format!("{other} is no condition on parameters"))),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn live() -> Live {
+        let unit = Unit::parse("N·m").unwrap();
+        let param = |path: &str, place| Param { path: path.into(), unit: unit.clone(), boolean: false, place };
+        Live {
+            params: vec![
+                param("fr.Fc", Place::Live(Slot(4), Slot(3))),
+                param("Ts", Place::Start("a period follows from it".into())),
+            ],
+            checks: vec![
+                Check::Range {
+                    path: "fr.Fc".into(),
+                    name: "Fc".into(),
+                    model: "LuGre".into(),
+                    unit: unit.clone(),
+                    value: Slot(3),
+                    low: Some((Slot(5), true)),
+                    high: None,
+                },
+                Check::Require { message: "`Fs` is smaller than `Fc`".into(), value: Slot(6) },
+                Check::Period(Slot(7)),
+                Check::Multiple { period: Slot(7), step: 1e-3 },
+                Check::Carried { path: "panel.lamp".into(), unit, value: Slot(8), range: (0.0, 255.0) },
+            ],
+        }
+    }
+
+    #[test]
+    fn it_is_read_as_it_was_written_and_no_byte_upsets_the_reader() {
+        let bytes = live().to_bytes();
+        assert_eq!(Live::from_bytes(&bytes), Ok(live()));
+        for at in 0..bytes.len() {
+            assert!(Live::from_bytes(&bytes[..at]).is_err(), "cut at {at}");
+            for value in [0, 1, 0x7f, 0xff] {
+                let mut changed = bytes.clone();
+                changed[at] = value;
+                if let Ok(read) = Live::from_bytes(&changed) {
+                    assert_eq!(read.to_bytes(), changed, "byte {at} as {value}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn bounds_that_are_excluded_are_broken_by_themselves() {
+        for (value, low, high, word) in [
+            (0.0, Some((0.0, true)), None, Some("above")),
+            (0.0, Some((0.0, false)), None, None),
+            (-1.0, Some((0.0, false)), None, Some("at least")),
+            (1.0, None, Some((1.0, true)), Some("below")),
+            (2.0, Some((0.0, true)), Some((1.0, false)), Some("at most")),
+            (f64::NAN, Some((0.0, true)), Some((1.0, true)), None),
+        ] {
+            assert_eq!(beyond(value, low, high).map(|beyond| beyond.word), word, "{value} in {low:?} .. {high:?}");
+        }
+        let check = &live().checks[0];
+        assert!(!check.holds([0.0, 0.0, f64::NAN]) && check.holds([1e-9, 0.0, f64::NAN]));
+        assert_eq!(check.words([0.0, 0.0, f64::NAN]), "`Fc` of LuGre must be above 0 N·m, not 0 N·m (`fr.Fc`)");
+    }
+
+    #[test]
+    fn a_slot_outside_of_its_block_is_found() {
+        assert_eq!(live().fault(3..6, 9), None);
+        assert!(live().fault(3..6, 8).is_some_and(|why| why.contains("slot 8")));
+        assert!(live().fault(3..4, 9).is_some_and(|why| why.contains("no parameter")));
+    }
+}

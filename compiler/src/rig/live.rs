@@ -1,0 +1,248 @@
+//! Which parameters of a rig may change while it runs, and the conditions that they must meet then: those of a start.
+//!
+//! In: the system before its part is crossed out, the expressions from which the plan follows, and later both programs.
+//! Out: [`Live`] and the judge, a program that computes the numbers of all conditions from parameters. A parameter may
+//! change if the step reads it and nothing else does that only a start fixes: then a set gives exactly the program that
+//! a start with the same values would.
+
+use crate::checks::unmet;
+use crate::delays;
+use crate::lower::{self, Sought};
+use crate::program::Program;
+use crate::source::Files;
+use crate::system::*;
+use crate::units::Types;
+use abi::Slot;
+use abi::description::Kind as QuantityKind;
+use abi::live::{Check, Live, Param, Place};
+use abi::unit::Unit;
+
+/// What is known before the programs are.
+#[derive(Clone)]
+pub struct Judged {
+    params: Vec<Known>,
+    checks: Vec<Check>,
+    program: Program,
+    /// Paths of quantities with a declared range, and the parameters from which its bounds follow.
+    watched: Vec<(String, Vec<VarId>)>,
+    /// The crossed-out part.
+    part: String,
+}
+
+#[derive(Clone)]
+struct Known {
+    id: VarId,
+    path: String,
+    unit: Unit,
+    boolean: bool,
+    /// Its slot in the judge.
+    slot: Option<Slot>,
+    /// Why only a start reads it.
+    start: Option<String>,
+}
+
+/// A command that goes into a field of a frame.
+pub struct Command {
+    /// As written: `panel.lamp`.
+    pub path: String,
+    /// Its unit.
+    pub unit: Unit,
+    /// Its value.
+    pub value: ExprId,
+    /// What the field carries, SI.
+    pub range: (f64, f64),
+}
+
+/// What a start reads besides values.
+pub struct Fixed<'a> {
+    /// The crossed-out part: its path, and whether an instance belongs to it.
+    pub part: (&'a str, &'a [bool]),
+    /// Drives and devices.
+    pub nodes: &'a [InstanceId],
+    /// Numbers of the plan.
+    pub plan: &'a [ExprId],
+    /// Periods of sampled blocks, each with the step that must divide it, s.
+    pub periods: &'a [(ExprId, f64)],
+    /// Commands that go into fields of frames.
+    pub commands: &'a [Command],
+}
+
+/// Of a system whose values have been checked.
+pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> Judged {
+    let mut wanted = Wanted { all: Vec::new(), first: Slot::FIXED + lower::independent(system) };
+    let checks = conditions(system, types, files, fixed, &mut wanted);
+    let (program, slots) = lower::of_params(system, types, &wanted.all);
+    let (part, inside) = fixed.part;
+    let reasons: [(Vec<bool>, &str); 3] = [
+        (reached(system, &system.blocks.iter().map(|block| block.period).collect::<Vec<_>>()), "a period"),
+        (
+            reached(system, &system.delays.iter().map(|delay| delays::of(system, *delay).1).collect::<Vec<_>>()),
+            "a delay",
+        ),
+        (reached(system, fixed.plan), "a limit or another number of the rig"),
+    ];
+    let why = |id: VarId| {
+        let var = system.var(id);
+        let follows = |what: &str| Some(format!("{what} follows from it"));
+        if fixed.nodes.contains(&var.instance) {
+            return Some("it describes a drive or device".into());
+        }
+        if inside[var.instance.0 as usize] {
+            return Some(format!("it belongs to `{part}`, which the drives replace"));
+        }
+        if system.structural.contains(&var.path) {
+            return follows("the number of parts");
+        }
+        if let Some((_, what)) = reasons.iter().find(|(reached, _)| reached[id.0 as usize]) {
+            return follows(what);
+        }
+        match var.definition {
+            Definition::Value(value, _) if !slots.iter().any(|(own, _)| *own == id) => {
+                let text = files.slice(system.span(value)).split_whitespace().collect::<Vec<_>>().join(" ");
+                Some(format!("it follows from others, by `{text}`: change those"))
+            }
+            _ => None,
+        }
+    };
+    let params = system.var_ids().filter(|id| system.var(*id).kind == VarKind::Param).map(|id| Known {
+        id,
+        path: system.var(id).path.clone(),
+        unit: types.units[id.0 as usize].clone(),
+        boolean: types.boolean_vars[id.0 as usize],
+        slot: slots.iter().find(|(own, _)| *own == id).map(|(_, slot)| *slot),
+        start: why(id),
+    });
+    let watched = system.vars.iter().filter(|var| var.kind != VarKind::Param).filter_map(|var| {
+        let bounds: Vec<ExprId> = [var.range.low, var.range.high].into_iter().flatten().map(|it| it.0).collect();
+        let reached = reached(system, &bounds);
+        let from: Vec<VarId> = system.var_ids().filter(|id| reached[id.0 as usize]).collect();
+        (!from.is_empty()).then(|| (var.path.clone(), from))
+    });
+    Judged { params: params.collect(), watched: watched.collect(), checks, program, part: part.to_string() }
+}
+
+/// What the judge computes.
+struct Wanted {
+    all: Vec<Sought>,
+    /// The slot of the first.
+    first: u32,
+}
+
+impl Wanted {
+    fn slot(&mut self, expr: ExprId) -> Slot {
+        self.one(Sought::Expr(expr))
+    }
+
+    fn one(&mut self, sought: Sought) -> Slot {
+        self.all.push(sought);
+        Slot(self.first + self.all.len() as u32 - 1)
+    }
+}
+
+/// What a start checks of values, in its order.
+fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, wanted: &mut Wanted) -> Vec<Check> {
+    let mut checks = Vec::new();
+    for (id, unit) in system.var_ids().zip(&types.units) {
+        let var = system.var(id);
+        let value = match (&var.definition, var.kind) {
+            (Definition::Value(..), VarKind::Param | VarKind::Input) => Sought::Var(id),
+            (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => Sought::Expr(*initial),
+            _ => continue,
+        };
+        if var.range.low.is_none() && var.range.high.is_none() {
+            continue;
+        }
+        checks.push(Check::Range {
+            path: var.path.clone(),
+            name: var.name.clone(),
+            model: system.instance(var.instance).model.clone(),
+            unit: unit.clone(),
+            value: wanted.one(value),
+            low: var.range.low.map(|(bound, strict)| (wanted.slot(bound), strict)),
+            high: var.range.high.map(|(bound, strict)| (wanted.slot(bound), strict)),
+        });
+    }
+    checks.extend(system.blocks.iter().map(|block| Check::Period(wanted.slot(block.period))));
+    checks.extend(system.requires.iter().map(|require| {
+        let owner = system.instance(require.instance);
+        let (condition, unmet) = (files.slice(require.span), unmet(system, files, require));
+        let place = if owner.path.is_empty() { String::new() } else { format!(" (`{}`)", owner.path) };
+        let message = format!("{unmet}: {} requires {condition}{place}", owner.model);
+        Check::Require { message, value: wanted.slot(require.condition) }
+    }));
+    checks.extend(fixed.commands.iter().map(|Command { path, unit, value, range }| Check::Carried {
+        path: path.clone(),
+        unit: unit.clone(),
+        value: wanted.slot(*value),
+        range: *range,
+    }));
+    let multiples = fixed.periods.iter();
+    checks.extend(multiples.map(|(period, step)| Check::Multiple { period: wanted.slot(*period), step: *step }));
+    checks
+}
+
+/// Of each quantity whether one of the expressions depends on it, by way of others too.
+fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
+    let mut vars = vec![false; system.vars.len()];
+    let mut seen = std::collections::HashSet::new();
+    let mut stack = exprs.to_vec();
+    while let Some(id) = stack.pop() {
+        if !seen.insert(id) {
+            continue;
+        }
+        if let Node::Var(var) = system.node(id) {
+            vars[var.0 as usize] = true;
+            match system.var(*var).definition {
+                Definition::Value(value, _) | Definition::Held { value, .. } => stack.push(value),
+                Definition::Continuous { initial, rate, .. } => stack.extend([initial, rate]),
+                Definition::Sampled { initial, next, .. } => stack.extend([initial, next]),
+                Definition::Missing | Definition::Free => {}
+            }
+        }
+        stack.extend(system.node(id).operands());
+    }
+    vars
+}
+
+impl Judged {
+    /// With the slots of the control program. A parameter that nothing reads but the start, or the plant reads too, may
+    /// not change either.
+    pub fn finish(self, control: &Program, plant: &Program) -> (Live, Program) {
+        let steps = [&control.outputs, &control.derivatives].into_iter();
+        let others = [&control.tick, &control.transitions, &control.roots].into_iter().flatten();
+        let mut read: Vec<Slot> = steps.chain(others).flat_map(|func| func.loads()).collect();
+        read.sort_unstable();
+        let at_start = control.start.loads();
+        let guarded = |path: &str| control.description.guards.iter().any(|guard| guard.path == path);
+        let param = |program: &Program, path: &str| {
+            let found = program.description.quantity(path).filter(|quantity| quantity.kind == QuantityKind::Param);
+            found.map(|quantity| quantity.slot).filter(|slot| program.description.layout.params.contains(*slot))
+        };
+        let place = |known: &Known| {
+            let start = |why: String| Place::Start(why);
+            if let Some(why) = &known.start {
+                return start(why.clone());
+            }
+            let watched = self.watched.iter().find(|(path, from)| from.contains(&known.id) && guarded(path));
+            if let Some((path, _)) = watched {
+                return start(format!("the range of `{path}` that is watched follows from it"));
+            }
+            if param(plant, &known.path).is_some() {
+                return start(format!("`{}`, which the drives replace, depends on it", self.part));
+            }
+            match (param(control, &known.path), known.slot) {
+                (Some(slot), Some(judge)) if read.binary_search(&slot).is_ok() => Place::Live(slot, judge),
+                (Some(slot), _) if at_start.contains(&slot) => start("only values at the start follow from it".into()),
+                _ => start("nothing on the rig reads it".into()),
+            }
+        };
+        let params = self.params.iter().map(|known| Param {
+            path: known.path.clone(),
+            unit: known.unit.clone(),
+            boolean: known.boolean,
+            place: place(known),
+        });
+        let live = Live { params: params.collect(), checks: self.checks.clone() };
+        (live, self.program)
+    }
+}

@@ -1,0 +1,248 @@
+//! Parameters that change while a rig runs: what is typed becomes a set, and a set is judged by the conditions of a start.
+//!
+//! In: what the compiler says of the parameters ([`Live`]) with the program that computes the numbers of all conditions.
+//! Out: whether the rig would start with the values that a set leads to, and if not, in the words of a start. Judging
+//! allocates nothing, so that the cycle itself does it, with the values that the model has at that moment: however many
+//! sets wait, none is judged by values that another one changes.
+
+use crate::safety::{Protection, is_present};
+use abi::description::Guard;
+use abi::live::{Live, NUMBERS, Place};
+use abi::unit::{NoQuantity, Unit, quantity, three_digits};
+use abi::{Function, Instance, Slot};
+use std::sync::Arc;
+
+/// Parameters that can be changed at once.
+pub const SET_MOST: usize = 64;
+/// Conditions of a refused set that are told.
+pub const TOLD: usize = 3;
+
+/// New values of parameters, SI, which act as one.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Set {
+    slots: [(Slot, f64); SET_MOST],
+    len: usize,
+}
+
+impl Set {
+    /// Slots of the control program with their values; none if there are more than [`SET_MOST`].
+    pub fn new(values: &[(Slot, f64)]) -> Option<Set> {
+        let mut slots = [(Slot::TIME, 0.0); SET_MOST];
+        slots.get_mut(..values.len())?.copy_from_slice(values);
+        Some(Set { slots, len: values.len() })
+    }
+
+    /// Slots and values.
+    pub fn values(&self) -> &[(Slot, f64)] {
+        &self.slots[..self.len]
+    }
+}
+
+/// Why a set is refused.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Objection {
+    /// A slot that is not one of a parameter that may change.
+    NotLive(Slot),
+    /// A value is no finite number.
+    NotFinite(Slot),
+    /// Conditions do not hold: their indices with their numbers, and how many there are.
+    Broken([(u32, [f64; NUMBERS]); TOLD], u32),
+    /// The model could not go on: its status, 0 if it gave no number.
+    Model(u64),
+}
+
+/// Judges sets.
+#[derive(Clone)]
+pub struct Judge {
+    live: Arc<Live>,
+    program: Instance,
+    guards: Arc<[Guard]>,
+}
+
+impl Judge {
+    /// `program`: computes the numbers of all conditions from parameters, as its `Outputs`, if there are any; `control`:
+    /// the program whose parameters change.
+    ///
+    /// # Errors
+    /// What does not fit together, in words.
+    pub fn new(live: Live, program: Instance, control: &Instance) -> Result<Judge, String> {
+        let description = control.description();
+        match live.fault(description.layout.params.range(), program.block().len()) {
+            Some(fault) => Err(format!("the conditions on its parameters: {fault}")),
+            None if live.checks.iter().any(|_| !program.has(Function::Outputs)) => {
+                Err("the conditions on its parameters: nothing computes their numbers".into())
+            }
+            None => Ok(Judge { live: Arc::new(live), program, guards: Arc::from(description.guards.clone()) }),
+        }
+    }
+
+    /// What is known of the parameters.
+    pub fn live(&self) -> &Live {
+        &self.live
+    }
+
+    /// Judges a set. `present`: the block of the control program.
+    ///
+    /// # Errors
+    /// What a start with the same values would refuse.
+    pub fn judge(&mut self, present: &[f64], set: &[(Slot, f64)]) -> Result<(), Objection> {
+        for (control, judge) in self.live.places() {
+            self.program.set(judge, present[control.index()]);
+        }
+        for (slot, value) in set {
+            let Some(judge) = self.live.judged(*slot) else { return Err(Objection::NotLive(*slot)) };
+            if !value.is_finite() {
+                return Err(Objection::NotFinite(*slot));
+            }
+            self.program.set(judge, *value);
+        }
+        self.conditions()
+    }
+
+    /// Whether everything that a start checks of values holds for those in the block of the control program.
+    ///
+    /// # Errors
+    /// What does not.
+    pub fn holds(&mut self, present: &[f64]) -> Result<(), Objection> {
+        self.judge(present, &[])
+    }
+
+    fn conditions(&mut self) -> Result<(), Objection> {
+        if !is_present(Protection::Judged) {
+            return Ok(());
+        }
+        if !self.live.checks.is_empty() {
+            self.program.call(Function::Outputs);
+        }
+        let (mut broken, mut count) = ([(0, [0.0; NUMBERS]); TOLD], 0);
+        let mut stage = u8::MAX;
+        // A start ends with the first stage that fails.
+        for (k, check) in self.live.checks.iter().enumerate() {
+            let numbers = check.numbers(self.program.block());
+            if check.stage() > stage || check.holds(numbers) {
+                continue;
+            }
+            if check.stage() < stage {
+                (stage, count) = (check.stage(), 0);
+            }
+            if let Some(place) = broken.get_mut(count as usize) {
+                *place = (k as u32, numbers);
+            }
+            count += 1;
+        }
+        if count == 0 { Ok(()) } else { Err(Objection::Broken(broken, count)) }
+    }
+
+    /// Codes of what a set breaks, each once, as a start reports them.
+    pub fn codes(&self, objection: &Objection) -> Vec<&'static str> {
+        let Objection::Broken(broken, count) = objection else { return Vec::new() };
+        let mut codes: Vec<&str> =
+            broken.iter().take(*count as usize).map(|(k, _)| self.live.checks[*k as usize].code()).collect();
+        codes.sort_unstable();
+        codes.dedup();
+        codes
+    }
+
+    /// Why a set is refused, in words.
+    pub fn words(&self, objection: &Objection) -> String {
+        let path = |slot: Slot| {
+            let here = |place: &Place| matches!(place, Place::Live(control, _) if *control == slot);
+            let found = self.live.params.iter().find(|param| here(&param.place));
+            found.map_or_else(|| format!("slot {}", slot.0), |param| format!("`{}`", param.path))
+        };
+        match objection {
+            Objection::NotLive(slot) => format!("{} is no parameter that may change while the rig runs", path(*slot)),
+            Objection::NotFinite(slot) => format!("{} must be a finite number", path(*slot)),
+            Objection::Broken(broken, count) => {
+                let told = broken.iter().take(*count as usize).map(|(k, numbers)| {
+                    let check = &self.live.checks[*k as usize];
+                    format!("{}: {}", check.code(), check.words(*numbers))
+                });
+                let mut said = told.collect::<Vec<_>>().join("; ");
+                if *count as usize > TOLD {
+                    said += &format!("; and {} more", *count as usize - TOLD);
+                }
+                said
+            }
+            Objection::Model(0) => "the model gives no number with it, and goes on without".into(),
+            Objection::Model(status) => {
+                let guard = usize::try_from(*status).ok().and_then(|status| self.guards.get(status.wrapping_sub(1)));
+                let what = guard
+                    .map_or_else(|| format!("status {status}"), |guard| format!("`{}` leaves its range", guard.path));
+                format!("the model cannot go on with it ({what}), and goes on without")
+            }
+        }
+    }
+
+    /// Reads `fr.Fs = 2 N, fr.Fc = 1.5 N`: one set.
+    ///
+    /// # Errors
+    /// What is wrong with it, with the code that a start gives it where it has one.
+    pub fn read(&self, text: &str) -> Result<Set, String> {
+        let mut values: Vec<(Slot, f64)> = Vec::new();
+        for one in text.split(',') {
+            let (path, value) =
+                one.split_once('=').ok_or("write it as `set PATH = VALUE`, for example `set fr.Fs = 2 N`")?;
+            let (path, value) = (path.trim(), value.trim());
+            let Some(param) = self.live.param(path) else { return Err(self.unknown(path)) };
+            let slot = match &param.place {
+                Place::Live(slot, _) => *slot,
+                Place::Start(why) => {
+                    return Err(format!("only a start reads `{path}`: {why}; start with `--set {path}={value}`"));
+                }
+            };
+            if values.iter().any(|(other, _)| *other == slot) {
+                return Err(format!("`{path}` stands twice in this set"));
+            }
+            let si = match (param.boolean, value) {
+                (true, "true") => 1.0,
+                (true, "false") => 0.0,
+                (true, _) => return Err(format!("E0101: `{path}` is true or false, not `{value}`")),
+                (false, _) => in_unit(path, &param.unit, value)?,
+            };
+            values.push((slot, si));
+        }
+        Set::new(&values)
+            .ok_or_else(|| format!("at most {SET_MOST} parameters change at once, and these are {}", values.len()))
+    }
+
+    fn unknown(&self, path: &str) -> String {
+        let paths = self.live.params.iter().map(|param| param.path.as_str());
+        let near =
+            paths.map(|other| (distance(path, other), other)).min().filter(|(far, _)| *far <= 2.max(path.len() / 4));
+        let help = near.map_or(String::new(), |(_, near)| format!("; did you mean `{near}`?"));
+        format!("there is no parameter `{path}`{help}")
+    }
+}
+
+/// The value in SI of a number with a unit, for a parameter of another unit of the same kind.
+fn in_unit(path: &str, unit: &Unit, text: &str) -> Result<f64, String> {
+    let (number, given) = quantity(text).map_err(|why| match why {
+        NoQuantity::Number(_) => format!("`{path}` is set to a number with its unit: {why}"),
+        NoQuantity::Unit(_) => format!("E0102: {why}"),
+    })?;
+    if given.dimension == unit.dimension || number == 0.0 && given.text.is_empty() {
+        return Ok(given.to_si(number));
+    }
+    Err(match given.text.is_empty() {
+        true => format!("E0103: `{}` needs a unit: write `{} {unit}`", three_digits(number), three_digits(number)),
+        false => {
+            format!("E0101: `{path}` is {}, not {}", unit.dimension.describe(), given.dimension.describe())
+        }
+    })
+}
+
+/// Edit distance of two names: insertions, deletions and changes of a character.
+fn distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.chars().enumerate() {
+        let mut corner = std::mem::replace(&mut row[0], i + 1);
+        for (j, y) in b.iter().enumerate() {
+            let changed = corner + usize::from(x != *y);
+            corner = row[j + 1];
+            row[j + 1] = changed.min(corner + 1).min(row[j] + 1);
+        }
+    }
+    row[b.len()]
+}

@@ -1,0 +1,236 @@
+//! Commands and sets of parameters as many at once as somebody likes: each is answered once, and after each cycle
+//! everything holds that a start checks.
+
+use super::bench;
+use super::control;
+use super::cycle::{Hil, Options, look_ahead};
+use super::live::{Judge, Objection, Set};
+use super::operator::{Answer, Command, Operator, PLACES, Stamp, Ticket, Why};
+use super::simulated::{Pace, World};
+use crate::chance::Chance;
+use crate::drive::sign::SignTest;
+use crate::drive::{self, Step};
+use abi::Slot;
+use std::collections::HashMap;
+
+const MS: u64 = 1_000_000;
+
+struct Stand {
+    hil: Hil,
+    operator: Operator,
+    judge: Judge,
+    world: World,
+    slots: [Slot; 3],
+}
+
+impl Stand {
+    fn new(arms_itself: bool) -> Stand {
+        let (rig, model, plant) = bench::pair();
+        let start = drive::Options {
+            listen_ns: 5 * MS,
+            steady_ns: 20 * MS,
+            sign_test: SignTest::Skip,
+            timeout_test: false,
+            ..drive::Options::default()
+        };
+        let control = control::Options { ramp_ns: 10 * MS, ..control::Options::default() };
+        let look = look_ahead(&rig, &plant).unwrap();
+        let options = Options { control, start, arms_itself, look, ..Options::default() };
+        let judge = bench::judge(&model);
+        let slots = [0, 1, 2].map(|i| model.description().layout.params.slot(i));
+        let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+        let masters = world.masters();
+        let (mut hil, operator) = Hil::new(&rig, model, world.clock(), masters, options, None).unwrap();
+        hil.judged_by(judge.clone());
+        Stand { hil, operator, judge, world, slots }
+    }
+
+    fn reach(&mut self, step: Step) {
+        while self.hil.step() != step {
+            self.hil.cycle();
+            assert_eq!(self.hil.ended(), None, "before {step}");
+        }
+    }
+
+    fn present(&self) -> [f64; 3] {
+        let model = self.hil.control().unwrap().model();
+        self.slots.map(|slot| model.get(slot))
+    }
+
+    fn set(&self, values: &[(usize, f64)]) -> Command {
+        let values: Vec<(Slot, f64)> = values.iter().map(|(i, value)| (self.slots[*i], *value)).collect();
+        Command::Set(Set::new(&values).unwrap())
+    }
+}
+
+/// `FRIC_RUNS` says how many; `FRIC_SEED` names one.
+#[test]
+fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_taken() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
+    let runs = number("FRIC_RUNS").unwrap_or(30);
+    let mut counts: HashMap<&str, u64> = HashMap::new();
+    for seed in number("FRIC_SEED").map_or((0..runs).collect::<Vec<u64>>(), |seed| vec![seed]) {
+        let mut chance = Chance(seed);
+        let mut stand = Stand::new(true);
+        if chance.below(4) > 0 {
+            stand.reach(Step::Armed);
+        }
+        let mut open: Vec<(Ticket, Command)> = Vec::new();
+        let mut shadow: Option<[f64; 3]> = None;
+        for _ in 0..40 {
+            // Bursts that overfill the queue.
+            let burst = [0, 0, 1, 3, 90][chance.below(5) as usize];
+            for _ in 0..burst {
+                let command = match chance.below(12) {
+                    0 => Command::Enable,
+                    1 => Command::Arm,
+                    2 => Command::Reset,
+                    3 => stand.set(&[(0, f64::NAN)]),
+                    4 => Command::Set(Set::new(&[(Slot(2), 1.0)]).unwrap()),
+                    k if k < 8 => stand.set(&[(0, chance.between(-0.1, 1.1))]),
+                    k if k < 10 => stand.set(&[(1, chance.between(-0.05, 0.3))]),
+                    _ => stand.set(&[(0, chance.between(0.0, 1.0)), (1, chance.between(0.0, 0.5))]),
+                };
+                match stand.operator.say(command) {
+                    Ok(ticket) => open.push((ticket, command)),
+                    Err(why) => {
+                        assert_eq!(why, Why::Full, "seed {seed}");
+                        assert!(open.len() >= PLACES, "seed {seed}: full with {} under way", open.len());
+                        *counts.entry("full").or_default() += 1;
+                    }
+                }
+            }
+            let before = stand.hil.control().map(|_| stand.present());
+            stand.hil.cycle();
+            assert_eq!(stand.hil.ended(), None, "seed {seed}");
+            let mut taken = 0;
+            let present = stand.hil.control().map(|_| stand.present());
+            shadow = shadow.or(before).or(present);
+            open.retain(|(ticket, command)| {
+                let Some(answer) = stand.operator.answer(*ticket) else { return true };
+                assert_eq!(stand.operator.answer(*ticket), None, "seed {seed}: an answer is given once");
+                match (answer, command) {
+                    (Answer::Taken, Command::Set(set)) => {
+                        taken += 1;
+                        for (slot, value) in set.values() {
+                            let i = stand.slots.iter().position(|known| known == slot).unwrap();
+                            shadow.as_mut().unwrap()[i] = *value;
+                        }
+                        *counts.entry("taken").or_default() += 1;
+                    }
+                    (Answer::Refused(Why::Set(Objection::Broken(..))), Command::Set(_)) => {
+                        *counts.entry("broken").or_default() += 1;
+                    }
+                    (Answer::Refused(Why::Set(_) | Why::NotNow(_)), Command::Set(_)) => {
+                        *counts.entry("refused").or_default() += 1;
+                    }
+                    (Answer::Taken | Answer::Refused(Why::NotNow(_)), _) => *counts.entry("other").or_default() += 1,
+                    (answer, command) => panic!("seed {seed}: {} gave {answer:?}", command.name()),
+                }
+                false
+            });
+            assert!(taken <= 1, "seed {seed}: one set a cycle");
+            if let (Some(present), Some(shadow)) = (present, shadow) {
+                assert_eq!(present.map(f64::to_bits), shadow.map(f64::to_bits), "seed {seed}");
+                let block = stand.hil.control().unwrap().model().block().to_vec();
+                assert_eq!(stand.judge.holds(&block), Ok(()), "seed {seed}: {present:?}");
+                let [swing, damping, _] = present;
+                assert!((0.0..=1.0).contains(&swing) && damping > 0.0 && swing >= 2.0 * damping, "seed {seed}");
+            }
+        }
+        // Nothing more is said: everything that waits is answered.
+        for _ in 0..=PLACES {
+            stand.hil.cycle();
+            open.retain(|(ticket, _)| stand.operator.answer(*ticket).is_none());
+        }
+        assert_eq!(open.len(), 0, "seed {seed}: {} commands without an answer", open.len());
+    }
+    for answer in ["full", "taken", "broken", "refused", "other"] {
+        assert!(counts.get(answer).is_some_and(|n| *n > 10), "{answer}: {counts:?}");
+    }
+}
+
+#[test]
+fn a_stop_acts_at_once_however_much_waits() {
+    let mut stand = Stand::new(true);
+    stand.reach(Step::Armed);
+    let set = stand.set(&[(0, 0.5)]);
+    while stand.operator.say(set).is_ok() {}
+    stand.operator.stopper().stop();
+    stand.hil.cycle();
+    let cause = stand.hil.control().unwrap().supervisor().cause();
+    assert_eq!(cause, Some(crate::safety::Cause::Asked));
+    // As a command it needs no place either.
+    let mut other = Stand::new(true);
+    other.reach(Step::Armed);
+    let set = other.set(&[(0, 0.5)]);
+    while other.operator.say(set).is_ok() {}
+    let ticket = other.operator.say(Command::Stop).unwrap();
+    assert_eq!(other.operator.answer(ticket), Some(Answer::Taken));
+    other.hil.cycle();
+    assert_eq!(other.hil.control().unwrap().supervisor().cause(), Some(crate::safety::Cause::Asked));
+}
+
+#[test]
+fn what_was_asked_for_long_ago_is_refused_but_a_stop() {
+    let mut stand = Stand::new(false);
+    stand.reach(Step::AwaitEnable);
+    let old = Stamp::Rig(0);
+    // The rig is not late: whoever gave the command was.
+    while stand.world.clock().now_ns() < 1_100 * MS {
+        stand.hil.cycle();
+    }
+    let enable = stand.operator.say_at(Command::Enable, old).unwrap();
+    let set = stand.set(&[(0, 0.5)]);
+    let set = stand.operator.say_at(set, old).unwrap();
+    stand.hil.cycle();
+    for ticket in [enable, set] {
+        let answer = stand.operator.answer(ticket);
+        assert!(matches!(answer, Some(Answer::Refused(Why::Old(ns))) if ns > 1_000 * MS), "{answer:?}");
+    }
+    assert_eq!(stand.hil.step(), Step::AwaitEnable);
+    let fresh = stand.operator.say(Command::Enable).unwrap();
+    stand.hil.cycle();
+    assert_eq!(stand.operator.answer(fresh), Some(Answer::Taken));
+    let stop = stand.operator.say_at(Command::Stop, old).unwrap();
+    assert_eq!(stand.operator.answer(stop), Some(Answer::Taken));
+    stand.hil.cycle();
+    assert_eq!(stand.hil.control().unwrap().supervisor().cause(), Some(crate::safety::Cause::Asked));
+}
+
+#[test]
+fn a_set_while_the_rig_is_stopped_or_waits_is_taken() {
+    let mut stand = Stand::new(false);
+    stand.reach(Step::AwaitEnable);
+    let waits = stand.set(&[(0, 0.7)]);
+    let waits = stand.operator.say(waits).unwrap();
+    stand.hil.cycle();
+    assert_eq!((stand.operator.answer(waits), stand.present()[0]), (Some(Answer::Taken), 0.7));
+    let mut stand = Stand::new(true);
+    stand.reach(Step::Armed);
+    stand.operator.stopper().stop();
+    stand.hil.cycle();
+    let stopped = stand.set(&[(0, 0.9)]);
+    let stopped = stand.operator.say(stopped).unwrap();
+    stand.hil.cycle();
+    assert_eq!((stand.operator.answer(stopped), stand.present()[0]), (Some(Answer::Taken), 0.9));
+}
+
+#[test]
+fn without_a_judge_no_parameter_changes_and_after_the_end_that_is_said() {
+    let (rig, model, plant) = bench::pair();
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
+    let slot = model.description().layout.params.slot(0);
+    let (mut hil, mut operator) =
+        Hil::new(&rig, model, world.clock(), world.masters(), Options::default(), None).unwrap();
+    while hil.step() != Step::AwaitEnable {
+        hil.cycle();
+    }
+    let ticket = operator.say(Command::Set(Set::new(&[(slot, 0.5)]).unwrap())).unwrap();
+    let open = operator.say(Command::Enable).unwrap();
+    hil.cycle();
+    assert_eq!(operator.answer(ticket), Some(Answer::Refused(Why::Unjudged)));
+    drop(hil);
+    assert_eq!(operator.answer(open), Some(Answer::Refused(Why::Ended)));
+    assert_eq!(operator.say(Command::Arm), Err(Why::Ended));
+}
