@@ -472,8 +472,8 @@ fn an_experiment_can_be_changed_from_outside() {
 #[test]
 fn files_that_would_hold_nothing_are_refused() {
     let folder = Folder::new("nothing").with("pull.fric", PULL);
-    for option in ["--csv", "--plot"] {
-        let (_, err) = folder.check(&["run", "pull.fric", "breaks", option, "a.csv"], 1, "");
+    for (option, file) in [("--csv", "a.csv"), ("--plot", "a.svg")] {
+        let (_, err) = folder.check(&["run", "pull.fric", "breaks", option, file], 1, "");
         assert!(err.contains(&format!("{option} has nothing to write: `breaks` records nothing; add `plot`")), "{err}");
     }
     assert_eq!(folder.names("."), ["pull.fric"]);

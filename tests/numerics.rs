@@ -373,7 +373,7 @@ fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
     let folder = Folder::new("alone");
     let read = |name: &str| fs::read(folder.0.join(name)).unwrap();
     let long = |runs: &'static str, out: &'static str| {
-        with(&["--runs", runs, "-q", "--for", "60s", "--threads", "1", "--out", out])
+        with(&["--runs", runs, "-q", "--for", "160s", "--threads", "1", "--out", out])
     };
     let (_, err) = folder.run(&long("20", "whole.csv"), 0);
     assert_eq!(err, "");

@@ -15,6 +15,7 @@ use runtime::package::signature::{EXTENSION as SIGNATURE, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
 use std::fs;
 use std::io::IsTerminal;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -249,7 +250,8 @@ struct Staging {
 
 impl Staging {
     fn new(name: &str, bytes: &[u8], signature: Option<&str>) -> Result<Staging, String> {
-        let folder = tempfile::Builder::new().prefix("fric-deploy-").tempdir();
+        let private = fs::Permissions::from_mode(0o700);
+        let folder = tempfile::Builder::new().prefix("fric-deploy-").permissions(private).tempdir();
         let folder = folder.map_err(|error| format!("no folder for the package: {error}"))?;
         let mut paths = Vec::new();
         let beside = format!("{name}.{SIGNATURE}");

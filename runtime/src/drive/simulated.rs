@@ -611,7 +611,8 @@ impl SimulatedDrive {
             && !self.wrong.frozen
         {
             let counts = (self.shaft.0 * self.wrong.position_told.unwrap_or(1.0) / self.config.count).floor();
-            objects.set(path.actual.0, counts as i64 + self.offset);
+            // So many counts that they cannot be told apart: a drive of absurd resolution.
+            objects.set(path.actual.0, (counts as i64).saturating_add(self.offset));
         }
     }
 
@@ -674,7 +675,7 @@ impl SimulatedDrive {
             }
             10 => self.ramped = self.torque_scale.value(self.target) + self.parameters.offset,
             8 => {
-                let here = (self.shaft.0 / self.config.count).floor() as i64 + self.offset;
+                let here = ((self.shaft.0 / self.config.count).floor() as i64).saturating_add(self.offset);
                 let error = (self.target as i32).wrapping_sub(here as i32);
                 let speed = f64::from(error) * self.config.count * 60.0;
                 self.speed_wanted = speed.clamp(-self.behaviour.speed, self.behaviour.speed);
