@@ -290,11 +290,12 @@ pub enum Protection {
     Deadline,
     Judged,
     Old,
+    Late,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 25] = [
+    pub const ALL: [(&'static str, Protection); 26] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -320,6 +321,7 @@ impl Protection {
         ("deadline", Protection::Deadline),
         ("judged", Protection::Judged),
         ("old", Protection::Old),
+        ("late", Protection::Late),
     ];
 }
 
@@ -573,12 +575,13 @@ impl Supervisor {
             let (limits, last) = (self.outputs[i], self.permitted[i]);
             let mut clamps = Clamps::default();
             let mut value = *request;
-            if for_cycles < self.patience.ramp && self.on(Protection::Ramp) {
-                value = limits.safe + (value - limits.safe) * f64::from(for_cycles) / f64::from(self.patience.ramp);
-            }
             if self.on(Protection::Range) && !(limits.low <= value && value <= limits.high) {
                 clamps.add(Clamps::RANGE);
                 value = value.clamp(limits.low, limits.high);
+            }
+            if for_cycles < self.patience.ramp && self.on(Protection::Ramp) {
+                // Of what may act, not of what is asked for: a request beyond its range would come up sooner.
+                value = limits.safe + (value - limits.safe) * f64::from(for_cycles) / f64::from(self.patience.ramp);
             }
             let most = limits.slew * self.period;
             if self.on(Protection::Slew) && (value - last).abs() > most {

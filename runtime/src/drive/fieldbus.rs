@@ -168,6 +168,8 @@ const BY_HAND: f64 = 0.2;
 const OBEYS_NS: u64 = 20_000_000;
 /// How often such a drive is told by network management, ns.
 const INSISTS_NS: u64 = 10_000_000;
+/// Time in which a drive that has turned a shaft for a test brings it back, ns.
+const RETURN_NS: u64 = 500_000_000;
 /// How long our life sign goes on at rest before it stops.
 const CALM_NS: u64 = 50_000_000;
 
@@ -202,7 +204,10 @@ pub struct Fieldbus {
     answers: u32,
     /// The drive under test; the drive that turns it where it can't turn by itself.
     push: Option<(usize, Push, Option<usize>)>,
-    /// When SYNC and commands went out last.
+    /// Until then, from the begin of the step, the shaft comes back from a test.
+    returns_ns: u64,
+    /// Since when a drive that has torque has been told to give it up.
+    off_since_ns: Option<u64>,
     wanted: Vec<f64>,
     troubles: [Option<Trouble>; TROUBLES],
     lost_troubles: u64,
@@ -275,6 +280,8 @@ impl Fieldbus {
             refusal: None,
             answers: 0,
             push: None,
+            returns_ns: 0,
+            off_since_ns: None,
             troubles: [None; TROUBLES],
             lost_troubles: 0,
         };
@@ -493,7 +500,7 @@ impl Fieldbus {
         (self.step, self.since_ns, self.silent_since_ns) = (step, None, None);
         self.done.fill(false);
         self.wanted.fill(0.0);
-        self.push = None;
+        (self.push, self.returns_ns, self.off_since_ns) = (None, 0, None);
     }
 
     fn aim(&mut self, goal: Goal, resets: bool) {
@@ -699,7 +706,7 @@ impl Fieldbus {
             Step::Stopped | Step::Refused => self.insist(now_ns, lasted_ns, send),
             Step::Enable | Step::Reenable => self.enable(lasted_ns, send),
             Step::TimeoutTest => self.test_timeouts(now_ns, lasted_ns, send),
-            Step::SignTest => self.test_signs(),
+            Step::SignTest => self.test_signs(lasted_ns),
         }
     }
 
@@ -730,11 +737,20 @@ impl Fieldbus {
         }
         for at in 0..self.nodes.len() {
             let Node::Drive(drive) = &self.nodes[at] else { continue };
-            if drive.disobeys() {
-                self.silent_since_ns.get_or_insert(now_ns);
-                if lasted_ns % INSISTS_NS < self.period_ns {
-                    send(self.places[at], Nmt::PreOperational.frame(drive.node()));
-                }
+            if !drive.disobeys() {
+                continue;
+            }
+            // In "pre-operational" it takes no set-point, so none that takes its torque off either: a quick stop that does not
+            // end, since the shaft is fast or its sign is wrong, ends with a reset.
+            let resets = drive.is_to_be_off();
+            if resets && now_ns - *self.off_since_ns.get_or_insert(now_ns) < OBEYS_NS {
+                continue;
+            }
+            let booted = drive.nmt() == NmtState::BootUp;
+            self.silent_since_ns.get_or_insert(now_ns);
+            if lasted_ns % INSISTS_NS < self.period_ns && !booted {
+                let command = if resets { Nmt::ResetNode } else { Nmt::PreOperational };
+                send(self.places[at], command.frame(drive.node()));
             }
         }
     }
@@ -802,13 +818,17 @@ impl Fieldbus {
     }
 
     /// One drive after the other.
-    fn test_signs(&mut self) {
+    fn test_signs(&mut self, lasted_ns: u64) {
         let by_hand = self.options.sign_test == SignTest::ByHand;
         if self.push.is_none() {
             let next = (0..self.nodes.len()).find(|at| drive_of(&self.nodes[*at]).is_some() && !self.done[*at]);
             let Some(at) = next else {
                 return self.moved();
             };
+            // A drive that holds the shaft brings it back from the test before.
+            if lasted_ns < self.returns_ns {
+                return;
+            }
             let drive = drive_of(&self.nodes[at]).expect("found as one");
             if drive.reading(What::Position).is_none() {
                 // Nothing to compare with: the direction of a drive without a position is the operator's to check.
@@ -842,6 +862,7 @@ impl Fieldbus {
             Verdict::Right => {
                 if let Some(holder) = holder {
                     self.wanted[holder] = 0.0;
+                    self.returns_ns = lasted_ns + RETURN_NS;
                 }
                 (self.done[at], self.wanted[at], self.push) = (true, 0.0, None);
             }

@@ -576,6 +576,11 @@ impl Drive {
         }
     }
 
+    /// Whether its torque is to be off.
+    pub(super) fn is_to_be_off(&self) -> bool {
+        self.goal == Goal::Off
+    }
+
     /// The command for the next `end`, SI.
     pub fn command(&mut self, value: f64) {
         self.command = value;

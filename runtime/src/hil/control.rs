@@ -69,6 +69,11 @@ struct Watched {
     since: Option<u32>,
     /// Ticks without a break in which it was not credible.
     odd: u32,
+    /// It answers SYNC: what comes after the computing of its tick is not one movement with the rest. A device speaks when it
+    /// likes.
+    answers: bool,
+    /// Cycles without a break in which no answer came in time.
+    late: u32,
 }
 
 /// Ticks in which a value that is not credible is replaced by the one before.
@@ -242,7 +247,8 @@ impl Control {
                 }
                 _ => f64::INFINITY,
             };
-            watched.push(Watched { signal, timeout, jump, last: start, since: None, odd: 0 });
+            let answers = matches!(node.kind, Kind::Cia402(_));
+            watched.push(Watched { signal, timeout, jump, last: start, since: None, odd: 0, answers, late: 0 });
             watched.len() - 1
         };
         let inputs = rig.inputs.iter().map(|input| (watch(input.signal, input.start, input.needed), input.slot));
@@ -403,23 +409,27 @@ impl Control {
         let judged = source == Source::Model;
         for (i, (watched, reading)) in self.watched.iter_mut().zip(readings).enumerate() {
             watched.since = watched.since.map(|since| since.saturating_add(ticks));
-            if reading.age == 0 {
+            watched.late = if reading.age == 0 { 0 } else { watched.late.saturating_add(1) };
+            let newer = watched.since.is_none_or(|since| reading.age < since) && reading.age != Reading::NEVER;
+            if reading.age == 0 || !watched.answers && newer {
                 let change = (reading.value - watched.last).abs();
                 let credible = match watched.since {
                     Some(since) if judged => change <= watched.jump * f64::from(since),
                     _ => true,
                 };
                 if credible && reading.value.is_finite() {
-                    (watched.last, watched.since, watched.odd) = (reading.value, Some(0), 0);
+                    (watched.last, watched.since, watched.odd) = (reading.value, Some(reading.age), 0);
                 } else {
                     watched.odd += 1;
                 }
             }
             if source == Source::Nobody {
-                watched.odd = 0;
+                (watched.odd, watched.late) = (0, 0);
                 continue;
             }
-            if watched.timeout.is_some_and(|timeout| reading.age >= timeout) {
+            // An answer that is late in each tick is never believed: it is as good as lost.
+            let missing = if watched.answers && is_present(Protection::Late) { watched.late } else { 0 };
+            if watched.timeout.is_some_and(|timeout| reading.age.max(missing) >= timeout) {
                 self.supervisor.trip(Cause::Lost(i));
             }
             if watched.odd >= self.odd {
@@ -570,7 +580,7 @@ impl Control {
         words.extend([u64::from(self.blend.0), u64::from(self.running)]);
         for watched in &self.watched {
             let since = watched.since.map_or(u64::MAX, u64::from);
-            words.extend([watched.last.to_bits(), since, u64::from(watched.odd)]);
+            words.extend([watched.last.to_bits(), since, watched.odd.into(), watched.late.into()]);
         }
         for pair in &self.paired {
             let (from, late_ns) = pair.before.unwrap_or_default();
@@ -595,6 +605,7 @@ impl Control {
             let since = words.next()?;
             watched.since = if since == u64::MAX { None } else { Some(u32::try_from(since).ok()?) };
             watched.odd = u32::try_from(words.next()?).ok()?;
+            watched.late = u32::try_from(words.next()?).ok()?;
         }
         for pair in &mut self.paired {
             let known = words.next()? != 0;
