@@ -175,6 +175,17 @@ impl Bench {
         Ok(bench)
     }
 
+    /// The same with other steps of the shaft, ns, before any time has passed: coarse ones for very many runs.
+    #[cfg(test)]
+    pub fn in_steps_of(mut self, step_ns: u64) -> Bench {
+        assert_eq!(self.count, 0, "the shaft has turned already");
+        self.step_ns = step_ns;
+        if let Some(plant) = &mut self.plant {
+            self.status = plant.start(step_ns as f64 * 1e-9);
+        }
+        self
+    }
+
     /// Something that shall go wrong.
     pub fn hook(&mut self, hook: Hook) {
         self.hooks.push(Armed { hook, since_ns: None, until_ns: None, over: false });

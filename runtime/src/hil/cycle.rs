@@ -361,6 +361,12 @@ impl Hil {
         self.misuse
     }
 
+    /// The cycle before, as its log has it.
+    #[cfg(test)]
+    pub(super) fn last(&self) -> &trace::Cycle {
+        &self.cycle
+    }
+
     /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere; they are taken
     /// back when this rig is dropped.
     pub fn prepare_emergency(&mut self) {
@@ -780,10 +786,9 @@ impl Hil {
             return;
         }
         if let Some(refusal) = self.fieldbus.refusal() {
-            let why = self.fieldbus.explain(refusal);
             let since = *self.resting_ns.get_or_insert(now_ns);
             if self.fieldbus.at_rest() || now_ns - since > REST_NS {
-                self.end = Some(End::Refused(why));
+                self.end = Some(End::Refused(self.fieldbus.explain(refusal)));
             }
             return;
         }

@@ -30,3 +30,6 @@ mod campaign;
 
 #[cfg(test)]
 mod live_tests;
+
+#[cfg(test)]
+mod faults;

@@ -20,6 +20,8 @@ pub enum Kind {
     Duplicate,
     /// Sent after the next frame of the node.
     Reorder,
+    /// Sent with the data of the first frame that was struck: its producer has frozen. For a fault of one identifier.
+    Stale,
     /// The node finds its queue full.
     Full,
     /// The node doesn't get a frame of the others, and counts it as lost.
@@ -35,12 +37,14 @@ pub struct Fault {
     from_ns: u64,
     until_ns: u64,
     times: u32,
+    /// The first frame that a [`Kind::Stale`] has struck.
+    frozen: Option<Frame>,
 }
 
 impl Fault {
     /// It happens to every frame, always.
     pub fn new(kind: Kind) -> Fault {
-        Fault { kind, id: None, chance: 1.0, from_ns: 0, until_ns: u64::MAX, times: u32::MAX }
+        Fault { kind, id: None, chance: 1.0, from_ns: 0, until_ns: u64::MAX, times: u32::MAX, frozen: None }
     }
 
     /// Only to frames with this identifier.
@@ -67,6 +71,18 @@ impl Fault {
     pub fn times(self, times: u32) -> Fault {
         Fault { times, ..self }
     }
+
+    /// Whether it strikes this frame now; it is then counted.
+    fn strikes(&mut self, frame: &Frame, now_ns: u64, chance: &mut Chance) -> bool {
+        let due = self.times > 0
+            && (self.from_ns..self.until_ns).contains(&now_ns)
+            && self.id.is_none_or(|id| id == frame.id())
+            && (self.chance >= 1.0 || chance.fraction() < self.chance);
+        if due && self.times != u32::MAX {
+            self.times -= 1;
+        }
+        due
+    }
 }
 
 /// The faults of a node.
@@ -78,6 +94,15 @@ impl Faults {
         self.0.push(fault);
     }
 
+    /// The frame that leaves in place of this one: that of a producer that has frozen, or itself.
+    pub fn frozen(&mut self, frame: Frame, now_ns: u64, chance: &mut Chance) -> Frame {
+        let mut strikes = |fault: &mut Fault| fault.kind == Kind::Stale && fault.strikes(&frame, now_ns, chance);
+        match self.0.iter_mut().find_map(|fault| strikes(fault).then_some(fault)) {
+            Some(fault) => *fault.frozen.get_or_insert(frame),
+            None => frame,
+        }
+    }
+
     /// Whether one of a kind strikes this frame now; it is then counted.
     pub fn strike(
         &mut self,
@@ -87,15 +112,8 @@ impl Faults {
         is: impl Fn(Kind) -> bool,
     ) -> Option<Kind> {
         self.0.iter_mut().find_map(|fault| {
-            let due = is(fault.kind)
-                && fault.times > 0
-                && (fault.from_ns..fault.until_ns).contains(&now_ns)
-                && fault.id.is_none_or(|id| id == frame.id())
-                && (fault.chance >= 1.0 || chance.fraction() < fault.chance);
-            due.then(|| {
-                fault.times = fault.times.saturating_sub(u32::from(fault.times != u32::MAX));
-                fault.kind
-            })
+            let struck = is(fault.kind) && fault.strikes(frame, now_ns, chance);
+            struck.then_some(fault.kind)
         })
     }
 }

@@ -266,7 +266,8 @@ impl Line {
         let twice = struck(|kind| kind == Kind::Duplicate).is_some();
         let held_back = struck(|kind| kind == Kind::Reorder).is_some();
         let corrupt = struck(|kind| kind == Kind::Corrupt).is_some();
-        let frame = if corrupt { corrupted(&mut self.chance, frame) } else { frame };
+        let frame = node.faults.frozen(frame, now_ns, chance);
+        let frame = if corrupt { corrupted(chance, frame) } else { frame };
         if held_back && node.held.is_none() {
             node.held = Some(frame);
             return Ok(());

@@ -1,0 +1,598 @@
+//! What must hold at every tick of every run, whatever fails.
+//!
+//! In: a rig under way, the frames it has sent, the truth about drives and shaft. Out: the first property that is broken.
+//! The truth comes from the simulated bench and from the wire; of the rig itself only what it claims is believed: the step
+//! of its start-up, its order, its cause, the permitted outputs.
+
+use super::rigs::{FRAME_COMMAND, Made};
+use super::space::{Ill, MS, Script, What};
+use crate::can::Frame;
+use crate::canopen::Object;
+use crate::clock::Clock;
+use crate::drive::state::State;
+use crate::drive::{Effect, Step};
+use crate::hil::cycle::Hil;
+use crate::hil::simulated::World;
+use crate::safety::{Order, Reaction};
+use abi::rig::{Kind, Mode, Rig};
+use std::collections::VecDeque;
+
+/// Ticks over which outputs come up from their safe values.
+pub const RAMP: u64 = 10;
+/// Time for which an output may be outside its limits without a break.
+pub const CLAMPED_NS: u64 = 60 * MS;
+/// From a controlled stop to the quick stop, and from there to disabled, at most.
+pub const STANDSTILL_NS: u64 = 200 * MS;
+/// Time in which a drive that does not follow its permitted torque must have led to a stop, beyond delay and lag.
+const FOLLOW_NS: u64 = 30 * MS;
+/// The same for a drive that follows a speed or a position by itself.
+const SLOW_FOLLOW_NS: u64 = 1_300 * MS;
+/// Time in which a speed or an angle beyond its limit must have led to a stop: what is lost or not believed is held meanwhile.
+const BEYOND_NS: u64 = 10 * MS;
+/// Ticks for which a reading may be held, and some for its way.
+const SEEN: usize = 8;
+/// What a brake of the drive itself leaves.
+const BRAKE_NS: u64 = 5 * MS;
+/// The time after which a drive misses its set-points, and a slack for a late cycle.
+const DEADLINE_NS: u64 = 25 * MS;
+/// After the time-outs of a controlled stop: the drives' own time-out, their reaction, their lag.
+const OFF_NS: u64 = 80 * MS;
+
+/// A property.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Broken {
+    /// A torque on the wire is beyond its limit.
+    WireLimit,
+    /// A torque on the shaft is beyond its limit.
+    ShaftLimit,
+    /// A command is not within its limits or changes faster than its slew, or is not a number.
+    Permitted,
+    /// More power than permitted.
+    Power,
+    /// Outputs do not come up from their safe values.
+    Ramp,
+    /// A drive does something else than what is permitted, and no stop is under way.
+    Follow,
+    /// Torque before arming.
+    BeforeArm,
+    /// Torque after the bound of a stop, or more of it during the stop.
+    AfterStop,
+    /// A frame that the bus refused did not stop the rig in the cycle after it.
+    Refused,
+    /// A drive stays enabled although no set-point reaches it.
+    Deadline,
+    /// A tick missed in every cycle, more than the rig bears, and no stop is under way.
+    Overrun,
+    /// A position on the wire lies the other way round.
+    Wrapped,
+    /// A drive that is not simulated got what only simulated ones may have.
+    Permission,
+    /// The rig goes by a speed that the shaft does not have, and no stop is under way.
+    Blind,
+    /// Motion again after a stop without the operator.
+    Latch,
+    /// Too fast, and no stop is under way.
+    Speed,
+    /// Too far, and no stop is under way.
+    Travel,
+    /// Faster and faster against the torque, and no stop is under way.
+    RunAway,
+    /// A request outside its limits for too long, and no stop is under way.
+    Clamped,
+    /// The model gives no number, and no stop is under way.
+    NoNumber,
+    /// Limits were widened.
+    Widened,
+    /// A set of parameters was taken in part, or vanished.
+    Set,
+    /// The same readings give other outputs.
+    Replay,
+    /// A cycle asked something of the heap.
+    Heap,
+    /// A stop without a reason.
+    Needless,
+    /// It never ends.
+    Endless,
+    /// Our own code has failed.
+    Panic,
+}
+
+/// How a run has failed.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Violation {
+    pub broken: Broken,
+    pub at_ns: u64,
+    pub text: String,
+}
+
+/// What a node does about one output.
+struct Watched {
+    node: usize,
+    /// None: described by frames.
+    mode: Option<Mode>,
+    /// Greatest command, and greatest torque whatever it follows.
+    most: f64,
+    torque: f64,
+    slew: f64,
+    power: f64,
+    /// One step on the wire, SI.
+    step: f64,
+    /// From a command to its whole effect, ns.
+    window_ns: u64,
+    /// Permitted values with their times, the newest last.
+    history: VecDeque<(u64, f64)>,
+    last: f64,
+    /// Since when the drive does something else.
+    astray_ns: Option<u64>,
+    clamped_ns: Option<u64>,
+    /// When its drive last braked by itself.
+    braked_ns: u64,
+    /// Since when it has torque before arming.
+    loose_ns: Option<u64>,
+    /// When its last set-point was on the wire.
+    heard_ns: u64,
+    /// The position that its drive tells.
+    counts: i32,
+    /// Its set-points may be wrong in spite of their checksum.
+    garbled: bool,
+    /// A drive that hears nobody, or whose command cannot be heard back: nothing on the bus stops it.
+    deaf: bool,
+}
+
+/// Judges one program's run.
+pub struct Judge {
+    watched: Vec<Watched>,
+    travel: f64,
+    speed: f64,
+    /// The shaft when it was armed, rad.
+    origin: Option<f64>,
+    fast_ns: Option<u64>,
+    far_ns: Option<u64>,
+    /// Least speed since torque began to brake the shaft.
+    least: f64,
+    astray_power_ns: Option<u64>,
+    before: Step,
+    /// Cycles since arming.
+    armed: Option<u64>,
+    pushed_ns: u64,
+    /// The first cause, and when it was seen.
+    tripped_ns: Option<u64>,
+    ordered: bool,
+    /// Cycles since the bus refused a frame.
+    refused: Option<u32>,
+    /// Cycles in a row that missed a tick.
+    behind: u32,
+    hold: u32,
+    far: bool,
+    /// True speeds of the shaft, the newest last.
+    speeds: VecDeque<f64>,
+    blind_ns: Option<u64>,
+    /// What a drive tells may be wrong.
+    lies: bool,
+}
+
+impl Judge {
+    pub fn new(script: &Script, rig: &Rig) -> Judge {
+        let Made { rated, power, most, speed, travel, .. } = script.rig;
+        let watched = rig.outputs.iter().map(|output| {
+            let node = output.signal.node;
+            let (mode, step) = match &rig.nodes[node].kind {
+                Kind::Cia402(drive) => (Some(drive.mode), rated / 1000.0),
+                Kind::Frames(_) => (None, 1e-3),
+            };
+            let own = rig.nodes[node].delay + 8.0 * rig.nodes[node].lag;
+            let silent = |what: What| matches!(what, What::Node(at, Effect::Silent) if at == node);
+            let unheard = |what: What| match what {
+                What::Frame(_, FRAME_COMMAND, _) | What::Short(_) | What::Unplugged(_) | What::Alone(_) => true,
+                What::Down(_) | What::Babble(_) | What::Frozen(_) => true,
+                What::Frame(..) | What::Node(..) | What::Foreign(..) => false,
+            };
+            let deaf = script.faults.iter().any(|f| silent(f.what) || mode.is_none() && unheard(f.what));
+            Watched {
+                node,
+                mode,
+                most: output.high,
+                torque: most,
+                slew: output.slew,
+                power: if power > 0.0 { power } else { most * speed },
+                step,
+                window_ns: (own * 1e9) as u64 + 3 * MS,
+                history: VecDeque::with_capacity(512),
+                last: 0.0,
+                astray_ns: None,
+                clamped_ns: None,
+                braked_ns: 0,
+                loose_ns: None,
+                heard_ns: 0,
+                counts: 0,
+                garbled: script.faults.iter().any(|f| matches!(f.what, What::Frame(_, _, Ill::Corrupted))),
+                deaf,
+            }
+        });
+        Judge {
+            watched: watched.collect(),
+            travel: if travel > 0.0 { travel } else { f64::INFINITY },
+            speed,
+            origin: None,
+            fast_ns: None,
+            far_ns: None,
+            least: f64::INFINITY,
+            astray_power_ns: None,
+            before: Step::Listen,
+            armed: None,
+            pushed_ns: 0,
+            tripped_ns: None,
+            ordered: false,
+            refused: None,
+            behind: 0,
+            hold: script.rig.hold,
+            far: script.rig.far,
+            speeds: VecDeque::with_capacity(SEEN + 1),
+            blind_ns: None,
+            lies: script.faults.iter().any(|fault| lies(fault.what)),
+        }
+    }
+
+    /// A frame that was on the wire.
+    pub fn heard(&mut self, rig: &Rig, bus: usize, frame: &Frame, stamp_ns: u64) {
+        for watched in &mut self.watched {
+            let node = &rig.nodes[watched.node];
+            if let Kind::Cia402(drive) = &node.kind
+                && node.bus == bus
+                && frame.id() == 0x200 + u32::from(drive.node)
+            {
+                watched.heard_ns = stamp_ns;
+            }
+        }
+    }
+
+    /// When the rig first said that it stops.
+    pub fn tripped_ns(&self) -> Option<u64> {
+        self.tripped_ns
+    }
+
+    /// One tick. `sent`: the frames of this cycle, with their bus.
+    pub fn tick(
+        &mut self,
+        hil: &Hil,
+        world: &World,
+        rig: &Rig,
+        sent: &[(usize, Frame, bool)],
+    ) -> Result<(), Violation> {
+        let now_ns = world.simulation().now_ns();
+        let at = |broken, text: String| Violation { broken, at_ns: now_ns, text };
+        let (step, order) = (hil.step(), hil.order());
+        let cause = hil.control().and_then(|control| control.supervisor().cause());
+        if self.tripped_ns.is_none() && (cause.is_some() || matches!(step, Step::Refused | Step::Stopped)) {
+            self.tripped_ns = Some(now_ns);
+        }
+        let stops = self.tripped_ns.is_some();
+        if step == Step::Armed {
+            self.armed = Some(self.armed.map_or(0, |cycles| cycles + 1));
+        }
+        if step == Step::SignTest || self.before == Step::SignTest {
+            self.pushed_ns = now_ns;
+        }
+        self.judge_wire(rig, sent, step).map_err(|(broken, text)| at(broken, text))?;
+        self.before = step;
+        self.refused = self.refused.map(|cycles| cycles + 1);
+        if self.refused.is_some_and(|cycles| cycles >= 1) && !stops && step > Step::AwaitEnable {
+            return Err(at(Broken::Refused, "a frame was refused in the cycle before".into()));
+        }
+        if step > Step::AwaitEnable && sent.iter().any(|(.., taken)| !taken) {
+            self.refused = Some(0);
+        }
+        let missed = hil.last().ticks > 1 && self.armed.is_some() && !stops;
+        self.behind = if missed { self.behind + 1 } else { 0 };
+        if self.behind > self.hold + 1 {
+            return Err(at(Broken::Overrun, format!("{} cycles in a row missed a tick", self.behind)));
+        }
+
+        let moves = self.armed.is_some() && order == Order::Follow;
+        if self.ordered && matches!(order, Order::Follow | Order::Wait) {
+            return Err(at(Broken::Latch, format!("the drives are told {order:?} after a stop")));
+        }
+        self.ordered |= matches!(order, Order::QuickStop | Order::Disable);
+
+        if let Some(control) = hil.control() {
+            let (permitted, requests) = (control.supervisor().permitted(), control.requests());
+            let reaction = cause.map(|cause| cause.reaction());
+            for (i, watched) in self.watched.iter_mut().enumerate() {
+                let speed = hil.seen().get(watched.node).and_then(|seen| seen.speed).unwrap_or(0.0);
+                let cycles = self.armed.filter(|_| moves);
+                watched
+                    .judge_permitted(permitted[i], speed, cycles, reaction, rig.period_ns)
+                    .and_then(|()| watched.judge_request(requests[i], now_ns, moves && !stops))
+                    .map_err(|(broken, text)| at(broken, format!("output {i}: {text}")))?;
+                watched.note(now_ns, permitted[i]);
+            }
+        }
+        self.judge_drives(world, now_ns, step, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
+        self.judge_shaft(world, now_ns, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
+        self.judge_sight(hil, world, now_ns, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
+        self.judge_rest(world, now_ns)
+    }
+
+    /// What is believed of the shaft is what it did a moment ago.
+    fn judge_sight(&mut self, hil: &Hil, world: &World, now_ns: u64, moves: bool) -> Result<(), (Broken, String)> {
+        self.speeds.push_back(world.bench().shaft(0).speed);
+        if self.speeds.len() > SEEN {
+            self.speeds.pop_front();
+        }
+        let Some(speed) = hil.seen().first().and_then(|seen| seen.speed) else { return Ok(()) };
+        let (low, high) = self
+            .speeds
+            .iter()
+            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), speed| (low.min(*speed), high.max(*speed)));
+        let room = 0.3 + 0.02 * speed.abs();
+        let blind = moves && !self.lies && !(low - room <= speed && speed <= high + room);
+        self.blind_ns = if blind { self.blind_ns.or(Some(now_ns)) } else { None };
+        if self.blind_ns.is_some_and(|since| now_ns - since > BEYOND_NS) {
+            return Err((Broken::Blind, format!("{speed:.3} rad/s is believed, {low:.3} .. {high:.3} was")));
+        }
+        Ok(())
+    }
+
+    /// What was handed to the buses.
+    fn judge_wire(&self, rig: &Rig, sent: &[(usize, Frame, bool)], step: Step) -> Result<(), (Broken, String)> {
+        for (bus, frame, _) in sent {
+            for watched in &self.watched {
+                self.judge_way(watched, rig, *bus, frame)?;
+                let number = match (&rig.nodes[watched.node].kind, watched.mode) {
+                    (Kind::Cia402(drive), Some(Mode::Torque))
+                        if rig.nodes[watched.node].bus == *bus && frame.id() == 0x200 + u32::from(drive.node) =>
+                    {
+                        i16::from_le_bytes([frame.data()[2], frame.data()[3]])
+                    }
+                    (Kind::Frames(_), _) if frame.id() == FRAME_COMMAND => {
+                        i16::from_le_bytes([frame.data()[0], frame.data()[1]])
+                    }
+                    _ => continue,
+                };
+                let torque = f64::from(number) * watched.step;
+                if torque.abs() > watched.most * (1.0 + 1e-9) {
+                    return Err((
+                        Broken::WireLimit,
+                        format!("{torque} N·m to node {} of {}", watched.node, watched.most),
+                    ));
+                }
+                let tested = step == Step::SignTest || self.before == Step::SignTest;
+                if number != 0 && self.armed.is_none() && !tested {
+                    return Err((Broken::BeforeArm, format!("{torque} N·m to node {} while {step}", watched.node)));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A position on the wire, from where the shaft is, lies on the side where it is permitted.
+    fn judge_way(&self, watched: &Watched, rig: &Rig, bus: usize, frame: &Frame) -> Result<(), (Broken, String)> {
+        let node = &rig.nodes[watched.node];
+        let (Kind::Cia402(drive), Some(Mode::Position), true) = (&node.kind, watched.mode, self.far) else {
+            return Ok(());
+        };
+        if node.bus != bus || frame.id() != 0x200 + u32::from(drive.node) {
+            return Ok(());
+        }
+        if frame.data()[0] & 0x0F != 0x0F {
+            // A stop: its target is not followed.
+            return Ok(());
+        }
+        let bytes: [u8; 4] = frame.data()[2..6].try_into().expect("a position has four bytes");
+        let target = i32::from_le_bytes(bytes);
+        // As a drive takes it that does not count round.
+        let way = (f64::from(target) - f64::from(watched.counts)) * drive.count;
+        // The shaft turns by less than this while the command is under way.
+        if way.abs() > 100.0 && way.signum() != watched.last.signum() && watched.last != 0.0 {
+            return Err((Broken::Wrapped, format!("{way:.0} rad where {:.0} rad are permitted", watched.last)));
+        }
+        Ok(())
+    }
+
+    /// What the drives do.
+    fn judge_drives(&mut self, world: &World, now_ns: u64, step: Step, moves: bool) -> Result<(), (Broken, String)> {
+        let mut bench = world.bench();
+        for watched in &mut self.watched {
+            let node = watched.node;
+            let Some(drive) = bench.drive(node) else { continue };
+            let (torque, state) = (drive.torque(), drive.state());
+            let brakes = matches!(state, State::QuickStop | State::FaultReaction);
+            let alone = now_ns.saturating_sub(watched.heard_ns) > DEADLINE_NS;
+            if alone && !watched.deaf && state == State::Enabled {
+                return Err((Broken::Deadline, format!("node {node} is {state} without set-points")));
+            }
+            if step >= Step::Start && torque.abs() > watched.torque + watched.step {
+                return Err((Broken::ShaftLimit, format!("{torque} N·m of node {node}, which is {state}")));
+            }
+            if brakes {
+                watched.braked_ns = now_ns;
+            }
+            // A test of signs, or a ramp of the drive itself, ends with what its lag leaves.
+            let quiet = self.armed.is_none() && now_ns > self.pushed_ns.max(watched.braked_ns) + 20 * MS;
+            let loose = quiet && watched.mode == Some(Mode::Torque) && torque.abs() > watched.step;
+            watched.loose_ns = if loose { watched.loose_ns.or(Some(now_ns)) } else { None };
+            // A brake of the drive itself may end between two looks; what a frame says wrongly under a right checksum acts until
+            // the drive has told of it.
+            let patience_ns = if watched.garbled { FOLLOW_NS } else { BRAKE_NS };
+            let refused = self.tripped_ns.is_some();
+            if watched.loose_ns.is_some_and(|since| now_ns - since >= patience_ns) && !(refused && watched.garbled) {
+                return Err((Broken::BeforeArm, format!("{torque} N·m of node {node} while {step}")));
+            }
+            if watched.mode == Some(Mode::Position) {
+                watched.counts = drive.objects().get(Object(0x6064, 0)).unwrap_or(0) as i32;
+            }
+            let shaft = bench.shaft(node);
+            let origin = *self.origin.get_or_insert(shaft.position);
+            let (is, room, patience_ns) = match watched.mode {
+                None => continue,
+                Some(Mode::Torque) => (torque, 0.02 * watched.most + 50.0 * watched.step, FOLLOW_NS),
+                Some(Mode::Speed) => (shaft.speed, 0.2 * watched.most + 0.5, SLOW_FOLLOW_NS),
+                Some(Mode::Position) => (shaft.position - origin, 0.2 * watched.most + 0.05, SLOW_FOLLOW_NS),
+            };
+            let (low, high) = watched.lately(now_ns);
+            let astray = moves && !(low - room <= is && is <= high + room);
+            watched.astray_ns = if astray { watched.astray_ns.or(Some(now_ns)) } else { None };
+            if watched.astray_ns.is_some_and(|since| now_ns - since > patience_ns) && !watched.deaf {
+                let text =
+                    format!("node {node}, which is {state}, gives {is:.4} where {low:.4} .. {high:.4} was permitted");
+                return Err((Broken::Follow, text));
+            }
+        }
+        if self.armed.is_none() {
+            self.origin = None;
+        }
+        Ok(())
+    }
+
+    /// What the shaft does.
+    fn judge_shaft(&mut self, world: &World, now_ns: u64, moves: bool) -> Result<(), (Broken, String)> {
+        let bench = world.bench();
+        // The first node is a drive that tells its speed; both turn with one shaft.
+        let shaft = bench.shaft(0);
+        let since = |is: bool, since: Option<u64>| if is && moves { since.or(Some(now_ns)) } else { None };
+        self.fast_ns = since(shaft.speed.abs() > 1.05 * self.speed + 0.2, self.fast_ns);
+        let angle = shaft.position - self.origin.unwrap_or(shaft.position);
+        self.far_ns = since(angle.abs() > 1.05 * self.travel + 0.02, self.far_ns);
+        let power: f64 = (self.watched.iter())
+            .filter(|watched| matches!(watched.mode, Some(Mode::Torque) | None))
+            .map(|watched| watched.last * shaft.speed)
+            .sum();
+        self.least = if moves && power < 0.0 { self.least.min(shaft.speed.abs()) } else { shaft.speed.abs() };
+        let runs = shaft.speed.abs() > self.least + 0.15 * self.speed + 0.5;
+        self.astray_power_ns = since(runs, self.astray_power_ns);
+        let long = |since: Option<u64>| since.is_some_and(|since| now_ns - since > BEYOND_NS);
+        if long(self.fast_ns) {
+            return Err((Broken::Speed, format!("{:.3} rad/s, {} are permitted", shaft.speed, self.speed)));
+        }
+        if long(self.far_ns) {
+            return Err((Broken::Travel, format!("{angle:.4} rad, {} are permitted", self.travel)));
+        }
+        if long(self.astray_power_ns) {
+            return Err((Broken::RunAway, format!("from {:.3} to {:.3} rad/s", self.least, shaft.speed)));
+        }
+        Ok(())
+    }
+
+    /// Once the program has ended and the time-outs of the drives have passed.
+    pub fn judge_gone(&self, world: &World, now_ns: u64) -> Result<(), Violation> {
+        self.judge_powerless(world, now_ns)
+    }
+
+    /// Once the bound of a stop has passed.
+    pub fn judge_rest(&self, world: &World, now_ns: u64) -> Result<(), Violation> {
+        let bound_ns = 2 * STANDSTILL_NS + OFF_NS;
+        if self.tripped_ns.is_none_or(|since| now_ns <= since + bound_ns) {
+            return Ok(());
+        }
+        self.judge_powerless(world, now_ns)
+    }
+
+    fn judge_powerless(&self, world: &World, now_ns: u64) -> Result<(), Violation> {
+        let mut bench = world.bench();
+        let pushed = self.watched.iter().any(|watched| watched.mode.is_none() && watched.deaf);
+        for watched in self.watched.iter().filter(|watched| !watched.deaf) {
+            let Some(drive) = bench.drive(watched.node) else { continue };
+            let (torque, state) = (drive.torque(), drive.state());
+            // A drive described by frames that hears nobody pushes for ever; against it a quick stop does not come to its end, or leaves some torque for a moment.
+            if pushed && state != State::Enabled {
+                continue;
+            }
+            if state.powered() || torque.abs() > watched.step {
+                let text = format!("node {} is {state} with {torque:.4} N·m", watched.node);
+                return Err(Violation { broken: Broken::AfterStop, at_ns: now_ns, text });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether a fault makes a drive tell what is not so.
+fn lies(what: What) -> bool {
+    match what {
+        What::Node(_, effect) => matches!(
+            effect,
+            Effect::SpeedScale(_)
+                | Effect::EncoderScale(_)
+                | Effect::EncoderFrozen
+                | Effect::EncoderGlitch(_)
+                | Effect::EncoderLost(_)
+        ),
+        What::Frame(_, _, ill) => matches!(ill, Ill::Corrupted | Ill::Stale),
+        _ => false,
+    }
+}
+
+impl Watched {
+    fn note(&mut self, now_ns: u64, permitted: f64) {
+        self.last = permitted;
+        if self.history.len() == self.history.capacity() {
+            self.history.pop_front();
+        }
+        self.history.push_back((now_ns, permitted));
+    }
+
+    /// Least and greatest value permitted while a command could have acted.
+    fn lately(&self, now_ns: u64) -> (f64, f64) {
+        let window_ns = match self.mode {
+            Some(Mode::Torque) | None => self.window_ns,
+            Some(Mode::Speed | Mode::Position) => self.window_ns + 60 * MS,
+        };
+        let mut bounds = (self.last, self.last);
+        for (at_ns, value) in self.history.iter().rev() {
+            bounds = (bounds.0.min(*value), bounds.1.max(*value));
+            if at_ns + window_ns < now_ns {
+                break;
+            }
+        }
+        bounds
+    }
+
+    /// `cycles`: since arming, while the drives follow. `reaction`: of the cause, once there is one.
+    fn judge_permitted(
+        &self,
+        value: f64,
+        speed: f64,
+        cycles: Option<u64>,
+        reaction: Option<Reaction>,
+        period_ns: u64,
+    ) -> Result<(), (Broken, String)> {
+        let Watched { most, slew, power, last, .. } = *self;
+        if !value.is_finite() || value.abs() > most {
+            return Err((Broken::Permitted, format!("{value} of {most}")));
+        }
+        let Some(cycles) = cycles else { return Ok(()) };
+        let step = slew * period_ns as f64 * 1e-9 * (1.0 + 1e-9);
+        // A shaft that gets faster takes torque away at once: the power wins over the slew.
+        let weak = value.abs() < last.abs() && (value * speed).abs() >= power * (1.0 - 1e-9);
+        if (value - last).abs() > step && !weak {
+            return Err((Broken::Permitted, format!("from {last} to {value}, {step} are permitted")));
+        }
+        if reaction.is_some() && value.abs() > last.abs() {
+            return Err((Broken::AfterStop, format!("from {last} to {value} during a stop")));
+        }
+        let torque = matches!(self.mode, Some(Mode::Torque));
+        if torque && reaction.is_none() && (value * speed).abs() > power * (1.0 + 1e-9) {
+            return Err((Broken::Power, format!("{value} N·m at {speed} rad/s, {power} W are permitted")));
+        }
+        if value.abs() > most * cycles as f64 / RAMP as f64 * (1.0 + 1e-9) && cycles < RAMP {
+            return Err((Broken::Ramp, format!("{value} in cycle {cycles}")));
+        }
+        Ok(())
+    }
+
+    fn judge_request(&mut self, request: f64, now_ns: u64, moves: bool) -> Result<(), (Broken, String)> {
+        if !moves {
+            self.clamped_ns = None;
+            return Ok(());
+        }
+        if !request.is_finite() {
+            return Err((Broken::NoNumber, format!("the model asks for {request}")));
+        }
+        let beyond = request.abs() > self.most;
+        self.clamped_ns = if beyond { self.clamped_ns.or(Some(now_ns)) } else { None };
+        if self.clamped_ns.is_some_and(|since| now_ns - since > CLAMPED_NS + 5 * MS) {
+            return Err((Broken::Clamped, format!("{request} is asked for, {} are permitted", self.most)));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,154 @@
+//! The fault space: generated rigs with generated faults, and properties that hold at every tick of each run.
+//!
+//! One seed is one run, deterministic in simulated time. A failure shrinks to a script that is printed as a test.
+//!
+//! `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` says how many there are, from `FRIC_FIRST=n` on; `FRIC_PAIRS=all` runs all
+//! combinations of two faults; with `FRIC_COUNT=1` failures are counted by property and the runs go on.
+
+mod rigs;
+mod space;
+mod heap;
+mod invariants;
+mod run;
+mod shrink;
+mod scripts;
+
+use invariants::Violation;
+use rigs::Sort;
+use space::{EVER, Fault, Ill, MS, Phase, Script, What};
+use std::collections::BTreeMap;
+
+/// Seeds in `cargo test`.
+const RUNS: u64 = 200;
+/// Each so many-th combination of two faults in `cargo test`.
+const STRIDE: usize = 40;
+
+/// Runs a script that must hold all properties.
+fn holds(script: &Script) {
+    if let Err(violation) = run::run(script) {
+        panic!("{}", told(script, violation));
+    }
+}
+
+/// A failure, shrunk, as a text that can be pasted.
+fn told(script: &Script, violation: Violation) -> String {
+    let (least, how) = shrink::shrink(script, violation, |script| run::run(script).map(drop));
+    let Violation { broken, at_ns, text } = how;
+    format!("{broken:?} after {:.3} ms: {text}\n{least}", at_ns as f64 / 1e6)
+}
+
+fn number(name: &str) -> Option<u64> {
+    std::env::var(name).ok().and_then(|text| text.parse().ok())
+}
+
+/// Runs scripts; stops at the first failure, or counts them.
+fn all(scripts: impl Iterator<Item = Script>) {
+    let counts_only = number("FRIC_COUNT").is_some();
+    let mut failed: BTreeMap<String, Vec<u64>> = BTreeMap::new();
+    let (mut runs, mut cycles, mut phases) = (0u64, 0u64, [0u64; Phase::ALL.len()]);
+    for script in scripts {
+        runs += 1;
+        match run::run(&script) {
+            Ok(passed) => {
+                cycles += passed.cycles;
+                phases.iter_mut().zip(passed.phases).for_each(|(all, one)| *all += u64::from(one));
+            }
+            Err(violation) if counts_only => {
+                let name = format!("{:?}", violation.broken);
+                let seeds = failed.entry(name).or_default();
+                if seeds.len() < 3 {
+                    println!("seed {}: {}\n", script.seed, told(&script, violation));
+                }
+                seeds.push(script.seed);
+            }
+            Err(violation) if std::env::var_os("FRIC_MUTANT").is_some() => {
+                println!("mutant caught with seed {}: {violation:?}", script.seed);
+                panic!("seed {}", script.seed);
+            }
+            Err(violation) => panic!("FRIC_SEED={} repeats it: {}", script.seed, told(&script, violation)),
+        }
+    }
+    println!("{runs} runs, {cycles} cycles; phases {phases:?}");
+    for (name, seeds) in &failed {
+        println!("{name}: {} of {runs}, seeds {:?}", seeds.len(), &seeds[..seeds.len().min(20)]);
+    }
+    assert!(failed.is_empty(), "{} properties are broken", failed.len());
+}
+
+#[test]
+fn random_faults_break_no_property() {
+    let (first, runs) = match number("FRIC_SEED") {
+        Some(seed) => (seed, 1),
+        None => (number("FRIC_FIRST").unwrap_or(0), number("FRIC_RUNS").unwrap_or(RUNS)),
+    };
+    all((first..first + runs).map(Script::of));
+}
+
+/// All faults of a small rig's frames, in one phase and for ever: as pairs.
+fn pairs(phase: Phase) -> Vec<[Fault; 2]> {
+    let (frames, often) = space::frames(Sort::One);
+    let whole = matches!(phase, Phase::StartUp | Phase::Enabling);
+    let frames = if whole { &frames[..] } else { &frames[..often] };
+    let fault = |what| Fault { what, phase, after: 3 * MS, lasts: EVER };
+    let single: Vec<Fault> =
+        (frames.iter()).flat_map(|(bus, id)| Ill::ALL.map(|ill| fault(What::Frame(*bus, *id, ill)))).collect();
+    let pair = |at: usize| single[at + 1..].iter().map(|other| [single[at], *other]).collect::<Vec<_>>();
+    (0..single.len()).flat_map(pair).collect()
+}
+
+#[test]
+fn two_faults_of_a_small_rig_break_no_property() {
+    let stride = if std::env::var_os("FRIC_PAIRS").is_some() { 1 } else { STRIDE };
+    let scripts = Phase::ALL.iter().flat_map(|phase| pairs(*phase)).step_by(stride);
+    all(scripts.enumerate().map(|(at, pair)| {
+        let again = pair[0].phase == Phase::Again;
+        Script { seed: at as u64, again, faults: pair.to_vec(), ..Script::plain(Sort::One) }
+    }));
+}
+
+#[test]
+fn every_sort_of_rig_runs_through_without_a_fault() {
+    for sort in Sort::ALL {
+        for tested in [false, true] {
+            let script = Script { tested, again: true, ..Script::plain(sort) };
+            let passed = run::run(&script).unwrap_or_else(|violation| panic!("{sort:?}: {}", told(&script, violation)));
+            let once = Phase::ALL.map(|phase| passed.phases[Phase::ALL.iter().position(|p| *p == phase).unwrap()]);
+            assert_eq!(once, [1; Phase::ALL.len()], "{sort:?} goes through all phases");
+        }
+    }
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits() {
+    for seed in 0..6 {
+        let script = Script::of(seed);
+        let [one, two] = [0, 1].map(|_| run::run(&script).map_err(|violation| violation.broken));
+        assert_eq!(one, two, "seed {seed}");
+    }
+}
+
+/// Protections of the process, not of a cycle: signal handlers, their stack and their table of frames. Tests of
+/// [`emergency`](crate::hil::emergency) hold them, with real signals.
+#[cfg(feature = "mutants")]
+const OUTSIDE: [&str; 2] = ["table", "own-stack"];
+
+/// Each protection taken away makes the fault space fail. `FRIC_ONLY=name` tries one alone.
+#[cfg(feature = "mutants")]
+#[test]
+fn mutants_are_caught_by_the_fault_space() {
+    let only = std::env::var("FRIC_ONLY").ok();
+    let all = crate::safety::Protection::ALL.iter().map(|(name, _)| *name).filter(|name| !OUTSIDE.contains(name));
+    let mut missed = Vec::new();
+    for name in all.filter(|name| only.as_deref().is_none_or(|only| only == *name)) {
+        let mut test = std::process::Command::new(std::env::current_exe().unwrap());
+        test.args(["hil::faults::random_faults", "--nocapture"]).env("FRIC_MUTANT", name);
+        let out = test.env("FRIC_RUNS", "4000").output().unwrap();
+        let text = [out.stdout, out.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+        let why = text.lines().find(|line| line.starts_with("mutant")).unwrap_or_default();
+        println!("{name}: {why}");
+        if out.status.success() {
+            missed.push(name);
+        }
+    }
+    assert!(missed.is_empty(), "nothing notices that these are missing: {missed:?}");
+}
