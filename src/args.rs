@@ -164,6 +164,17 @@ impl Changed {
     }
 }
 
+/// How far results may be off, and how they are shown.
+#[derive(clap::Args, Clone, Copy, Debug)]
+pub struct Trust {
+    /// Leave out the companion runs that estimate the numerical error of each measure
+    #[arg(long)]
+    pub no_error: bool,
+    /// Show up to this many significant digits [default: 6, and 9 where an error stands beside them]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=17))]
+    pub digits: Option<u8>,
+}
+
 /// `fric run`
 #[derive(clap::Args, Debug)]
 pub struct Run {
@@ -190,6 +201,9 @@ pub struct Run {
     /// Repeat it with another solver and say how far apart the two are
     #[arg(long)]
     pub cross: bool,
+    /// Numerical errors
+    #[command(flatten)]
+    pub trust: Trust,
     /// Print failures only
     #[arg(long, short, conflicts_with = "json")]
     pub quiet: bool,
@@ -207,6 +221,9 @@ pub struct Test {
     /// Repeat each with another solver: what is expected must hold there too
     #[arg(long)]
     pub cross: bool,
+    /// Numerical errors
+    #[command(flatten)]
+    pub trust: Trust,
     /// Print failures and the last line only
     #[arg(long, short)]
     pub quiet: bool,

@@ -6,6 +6,7 @@ use abi::lanes::Lanes;
 pub use abi::plan::Method;
 use abi::unit::Unit;
 use abi::{Description, Function, Slot};
+pub use compiler::alone::Alone;
 use compiler::backend::target::{self, Coder};
 use compiler::backend::unsupported::Unsupported;
 use compiler::backend::wide;
@@ -19,7 +20,7 @@ pub use compiler::resolve::{Lookup, Space};
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::stability::LONGEST as LONGEST_STEP;
 pub use compiler::unstable::two_digits_time;
-pub use compiler::vary::{Alone, Fitted, Varying};
+pub use compiler::vary::{Fitted, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
     dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,

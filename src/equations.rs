@@ -130,7 +130,7 @@ pub fn expression(expr: &Expr) -> String {
         }
         ExprKind::Path(path) => path_text(path),
         ExprKind::Derivative { of, along } => derivative(&of.text, &along.text),
-        ExprKind::Call { function, args } => {
+        ExprKind::Call { function, args, .. } => {
             let shown: Vec<String> = args.iter().map(expression).collect();
             match (function.text.as_str(), shown.as_slice()) {
                 ("abs", [x]) => format!("|{x}|"),

@@ -2,13 +2,13 @@
 
 use crate::compile::Stages;
 use crate::terminal::{Style, Terminal};
-use crate::value::{count, duration, show, significant};
+use crate::value::{count, duration, show, significant, uncertain};
 use abi::plan::{Experiment, Method, Solver};
 use abi::unit::Unit;
 use abi::{Description, Instance};
-use runtime::engine::{Failure, Outcome};
-use runtime::measure::{Margin, Reading, Verdict};
+use runtime::engine::{Estimate, Failure, Outcome};
 use runtime::record::Recording;
+use runtime::verdict::{Margin, Reading, Verdict};
 use serde_json::{Value, json};
 
 /// One run and all that is told of it.
@@ -62,9 +62,13 @@ impl Ran<'_> {
             Ok(outcome) => {
                 object["steps"] = json!(outcome.work.steps);
                 object["time"] = number(outcome.time);
-                object["expects"] = outcome.verdicts.iter().map(verdict_json).collect();
+                let (shown, expects): (Vec<&Verdict>, Vec<&Verdict>) =
+                    outcome.verdicts.iter().partition(|verdict| verdict.shown.is_some());
+                object["expects"] = expects.into_iter().map(verdict_json).collect();
+                object["shows"] = shown.into_iter().filter_map(|v| Some(reading_json(v.shown.as_ref()?))).collect();
                 object["finals"] = finals(outcome);
                 object["notes"] = self.notes.iter().chain(&outcome.notes).map(String::as_str).collect();
+                object["errors"] = outcome.estimate.as_ref().map_or(Value::Null, estimate_json);
             }
             Err(failure) => {
                 object["error"] = json!(failure.to_string());
@@ -126,63 +130,128 @@ fn plotted(recording: &Recording) -> Vec<(&str, f64, &Unit, bool)> {
     columns.map(|(column, value)| (column.label.as_str(), *value, &column.unit, column.boolean)).collect()
 }
 
+/// How errors were found: what kind of error, companions, and what would decide.
+fn estimate_json(estimate: &Estimate) -> Value {
+    json!({
+        "companions": estimate.companions.iter().map(solver).collect::<Vec<_>>(),
+        "failed": estimate.failed.as_ref().map(|(finer, why)| json!({ "solver": solver(finer), "why": why })),
+        "decides": estimate.decides.as_ref().map(solver),
+    })
+}
+
+/// A difference of two values in a unit.
+fn width(unit: &Unit, si: f64) -> Value {
+    number(unit.from_si(si) - unit.from_si(0.0))
+}
+
+fn reading_json(reading: &Reading) -> Value {
+    json!({
+        "text": reading.text,
+        "value": number(reading.unit.from_si(reading.value)),
+        "error": reading.error.map(|error| width(&reading.unit, error)),
+        "unit": reading.unit.text,
+        "time": reading.time.map(number),
+    })
+}
+
 fn verdict_json(verdict: &Verdict) -> Value {
-    let reading = |reading: &Reading| {
-        json!({
-            "text": reading.text,
-            "value": number(reading.unit.from_si(reading.value)),
-            "unit": reading.unit.text,
-            "time": reading.time.map(number),
-        })
-    };
     let margin = verdict.margin.as_ref();
     let part = |of: fn(&Margin) -> f64| margin.map(|margin| number(margin.unit.from_si(of(margin))));
     json!({
         "text": verdict.text,
         "holds": verdict.holds,
+        "decided": verdict.decided,
         "value": part(|margin| margin.value),
+        "error": margin.and_then(|margin| Some(width(&margin.unit, margin.error?))),
         "limit": part(|margin| margin.limit),
         "margin": part(|margin| margin.amount),
         "unit": margin.map(|margin| margin.unit.text.as_str()),
         "time": margin.and_then(|margin| margin.time).map(number),
-        "readings": verdict.readings.iter().map(reading).collect::<Vec<_>>(),
+        "readings": verdict.readings.iter().map(reading_json).collect::<Vec<_>>(),
         "problem": verdict.problem,
     })
 }
 
-/// One line each: mark, text, value, margin.
-pub fn verdicts(terminal: &Terminal, verdicts: &[Verdict], indent: &str) -> String {
+/// One line each: mark, text, value with its error, margin. `estimate`: how the errors were found; `digits`: how many are shown
+/// at most.
+pub fn verdicts(
+    terminal: &Terminal,
+    verdicts: &[Verdict],
+    estimate: Option<&Estimate>,
+    digits: Option<u8>,
+    indent: &str,
+) -> String {
     let width = verdicts.iter().map(|verdict| verdict.text.chars().count()).max().unwrap_or(0).min(60);
     let mut out = String::new();
     for verdict in verdicts {
-        let mark = if verdict.holds { terminal.styled(Style::Good, "✓") } else { terminal.styled(Style::Bad, "✗") };
-        out += &format!("{indent}{mark} {:width$}  {}\n", verdict.text, words(verdict));
+        let mark = match (verdict.holds, verdict.decided) {
+            (true, true) => terminal.styled(Style::Good, "✓"),
+            (false, true) => terminal.styled(Style::Bad, "✗"),
+            (_, false) => terminal.styled(Style::Bad, "?"),
+        };
+        let mark = match verdict.shown {
+            Some(_) => "·".into(),
+            None => mark,
+        };
+        out += &format!("{indent}{mark} {:width$}  {}\n", verdict.text, words(verdict, estimate, digits));
     }
     out
 }
 
-/// The value, how far from the limit, and when.
-fn words(verdict: &Verdict) -> String {
+/// The value with its error, how far from the limit, and when.
+fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> String {
     if let Some(problem) = &verdict.problem {
         return problem.clone();
     }
-    let readings = || {
-        let one = |reading: &Reading| format!("{} = {}", reading.text, show(reading.value, &reading.unit, 6));
-        verdict.readings.iter().map(one).collect::<Vec<_>>().join(", ")
+    let shown = |value: f64, error: Option<f64>, unit: &Unit| match error {
+        Some(error) => uncertain(value, error, unit, digits.unwrap_or(9).into()),
+        None => show(value, unit, digits.unwrap_or(6).into()),
     };
-    let Some(margin) = &verdict.margin else { return readings() };
+    if let Some(reading) = &verdict.shown {
+        let value = shown(reading.value, reading.error, &reading.unit);
+        return match verdict.readings.as_slice() {
+            [only] if only.value == reading.value => value,
+            _ => format!("{value} ({})", readings_in(verdict, &shown)),
+        };
+    }
+    let readings = || readings_in(verdict, &shown);
+    let open = |error: String| {
+        let why = match estimate.and_then(|estimate| estimate.failed.as_ref()) {
+            Some((finer, why)) => format!("the error is not known, for with {} {why}", solver(finer)),
+            None => error,
+        };
+        let decides = estimate.and_then(|estimate| estimate.decides.as_ref());
+        let remedy = decides.map_or(String::new(), |finer| format!("; {} decides", solver(finer)));
+        format!("undecided: {why}{remedy}")
+    };
+    let Some(margin) = &verdict.margin else {
+        return match verdict.decided {
+            true => readings(),
+            false => format!("{}, {}", readings(), open("finer runs disagree".into())),
+        };
+    };
     // One measure against a limit speaks for itself; arithmetic over several shows what went in.
     let value = match verdict.readings.as_slice() {
-        [reading] if reading.value == margin.value => show(margin.value, &reading.unit, 6),
-        _ => format!("{} ({})", show(margin.value, &margin.unit, 6), readings()),
+        [reading] if reading.value == margin.value => shown(margin.value, margin.error, &margin.unit),
+        _ => format!("{} ({})", shown(margin.value, margin.error, &margin.unit), readings()),
     };
     let amount = show(margin.amount.abs(), &margin.unit, 3);
+    if !verdict.decided {
+        let error = show(margin.error.unwrap_or(f64::NAN), &margin.unit, 2);
+        return format!("{value}, {}", open(format!("the error {error} exceeds the margin {amount}")));
+    }
     let distance = if verdict.holds { format!("margin {amount}") } else { format!("misses by {amount}") };
     let time = match margin.time {
         Some(time) if !verdict.holds => format!(", at {}", runtime::show::time(time)),
         Some(_) | None => String::new(),
     };
     format!("{value}, {distance}{time}")
+}
+
+/// `max(x) = 1.5(1) m, min(x) = 0 m`
+fn readings_in(verdict: &Verdict, shown: &dyn Fn(f64, Option<f64>, &Unit) -> String) -> String {
+    let one = |reading: &Reading| format!("{} = {}", reading.text, shown(reading.value, reading.error, &reading.unit));
+    verdict.readings.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
 /// `rk4 step 10 µs`, `adaptive tol 1e-6`.
@@ -216,15 +285,27 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     )
 }
 
-/// How much work the runs were.
-pub fn work(outcomes: &[&Outcome], wall: f64) -> String {
+/// How much work the runs were, and what their errors were found with in how many s besides.
+pub fn work(outcomes: &[&Outcome], wall: f64, judging: f64) -> String {
     let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
     let simulated: f64 = outcomes.iter().map(|outcome| outcome.time).sum();
     let speed = match simulated / wall {
         speed if speed.is_finite() && speed >= 2.0 => format!(", {} times real time", count(speed as u64)),
         _ => String::new(),
     };
-    format!("  ran {} steps in {}{speed}\n", count(steps), duration(wall))
+    let estimate = outcomes.iter().find_map(|outcome| outcome.estimate.as_ref());
+    let errors = match estimate.map(|estimate| estimate.companions.as_slice()) {
+        None | Some([]) => String::new(),
+        Some(all) => {
+            let (kind, one): (_, fn(&Solver) -> String) = match all[0].method {
+                Method::Adaptive => ("errors by tol", |finer| significant(finer.tol, 3)),
+                _ => ("discretisation by steps of", |finer| duration(finer.step)),
+            };
+            let all: Vec<String> = all.iter().map(one).collect();
+            format!("; {kind} {} in {}", all.join(" and "), duration(judging))
+        }
+    };
+    format!("  ran {} steps in {}{speed}{errors}\n", count(steps), duration(wall))
 }
 
 #[cfg(test)]
@@ -243,17 +324,27 @@ mod tests {
         let mut verdict = Verdict {
             text: "max(F) < 1.6 N".into(),
             holds: true,
-            readings: vec![Reading { text: "max(F)".into(), value: 1.5035, unit: unit.clone(), time: Some(3.0) }],
-            margin: Some(Margin { amount: 0.0965, value: 1.5035, limit: 1.6, unit, time: Some(3.0) }),
+            decided: true,
+            readings: vec![Reading {
+                text: "max(F)".into(),
+                value: 1.5035,
+                unit: unit.clone(),
+                time: Some(3.0),
+                resolution: 0.0,
+                scale: 1.5,
+                error: None,
+            }],
+            margin: Some(Margin { amount: 0.0965, value: 1.5035, limit: 1.6, unit, time: Some(3.0), error: None }),
             problem: None,
+            shown: None,
         };
-        assert_eq!(words(&verdict), "1.5035 N, margin 0.0965 N");
+        assert_eq!(words(&verdict, None, None), "1.5035 N, margin 0.0965 N");
         verdict.holds = false;
-        assert_eq!(words(&verdict), "1.5035 N, misses by 0.0965 N, at 3 s");
+        assert_eq!(words(&verdict, None, None), "1.5035 N, misses by 0.0965 N, at 3 s");
         verdict.readings[0].value = 0.75;
         verdict.margin.as_mut().expect("it has one").time = None;
-        assert_eq!(words(&verdict), "1.5035 N (max(F) = 0.75 N), misses by 0.0965 N");
+        assert_eq!(words(&verdict, None, None), "1.5035 N (max(F) = 0.75 N), misses by 0.0965 N");
         verdict.problem = Some("max(F): the window is empty".into());
-        assert_eq!(words(&verdict), "max(F): the window is empty");
+        assert_eq!(words(&verdict, None, None), "max(F): the window is empty");
     }
 }

@@ -23,6 +23,61 @@ pub fn show(si: f64, unit: &Unit, digits: usize) -> String {
     if unit.text.is_empty() { number } else { format!("{number} {unit}") }
 }
 
+/// A value in SI with its error, in a unit: `6.36281(2) s`, the number in parentheses being the error of the last digits, rounded
+/// up; `0.3 ± 0.5 mm` where the error leaves less than two digits. At most so many significant digits, of which the last may
+/// be off by one then.
+pub fn uncertain(si: f64, error: f64, unit: &Unit, digits: usize) -> String {
+    let (value, error) = (unit.from_si(si), (error * (unit.from_si(1.0) - unit.from_si(0.0))).abs());
+    let unit = if unit.text.is_empty() { String::new() } else { format!(" {unit}") };
+    if error == 0.0 || !value.is_finite() {
+        return format!("{}{unit}", significant(value, digits));
+    }
+    if !error.is_finite() {
+        return format!("{}{unit} ± unknown", significant(value, 6));
+    }
+    let exponent = |x: f64, digits: usize| {
+        let text = format!("{x:.*e}", digits);
+        text.split_once('e').and_then(|(_, exponent)| exponent.parse::<i32>().ok()).unwrap_or(0)
+    };
+    // The error as a digit of 10^last, rounded up.
+    let mut last = exponent(error, 17);
+    let mut digit = scaled(error, -last).ceil();
+    if digit > 9.0 {
+        (digit, last) = (1.0, last + 1);
+    }
+    let first = if value == 0.0 { last } else { exponent(value, 17) };
+    let kept = first - digits.max(1) as i32 + 1;
+    if last < kept {
+        (digit, last) = (1.0, kept);
+    }
+    let plain = |x: f64, last: i32| format!("{x:.*}", (-last).max(0) as usize);
+    if value == 0.0 || first < last + 1 {
+        let rounded = scaled(scaled(value, -last).round(), last);
+        return match last {
+            -4..=8 => format!("{} ± {}{unit}", plain(rounded + 0.0, last), plain(scaled(digit, last), last)),
+            _ => format!("{} ± {}{unit}", significant(rounded + 0.0, 2), significant(scaled(digit, last), 1)),
+        };
+    }
+    match first {
+        -3..=8 => {
+            let rounded = if last > 0 { scaled(scaled(value, -last).round(), last) } else { value };
+            let doubt = if last > 0 { scaled(digit, last) } else { digit };
+            format!("{}({doubt}){unit}", plain(rounded, last))
+        }
+        _ => {
+            let text = format!("{value:.*e}", (first - last) as usize);
+            let (mantissa, exponent) = text.split_once('e').unwrap_or((&text, "0"));
+            format!("{mantissa}({digit})e{exponent}{unit}")
+        }
+    }
+}
+
+/// x · 10^exponent, by the double nearest to that power or its inverse.
+fn scaled(x: f64, exponent: i32) -> f64 {
+    let power: f64 = format!("1e{}", exponent.abs()).parse().unwrap_or(f64::INFINITY);
+    if exponent < 0 { x / power } else { x * power }
+}
+
 /// A number rounded to so many significant digits, without trailing zeros.
 pub fn significant(value: f64, digits: usize) -> String {
     if value == 0.0 || !value.is_finite() {
@@ -67,6 +122,28 @@ mod tests {
         assert_eq!(read("2furlong").unwrap_err(), "`furlong` is not a known unit");
         assert_eq!(read("N").unwrap_err(), "`N` does not begin with a number");
         assert!(read("").is_err() && read("inf").is_err() && read("é").is_err());
+    }
+
+    #[test]
+    fn an_error_stands_behind_the_digits_it_concerns() {
+        let shown = |value: f64, error: f64| uncertain(value, error, &Unit::none(), 9);
+        assert_eq!(shown(6.362812, 1.2e-5), "6.36281(2)");
+        assert_eq!(shown(6.362812, 1e-5), "6.36281(1)");
+        assert_eq!(shown(6.362812, 9.7e-6), "6.36281(1)");
+        assert_eq!(shown(-0.0012345, 2.1e-7), "-0.0012345(3)");
+        assert_eq!(shown(0.4, 3e-12), "0.400000000(1)");
+        assert_eq!(shown(1.5, 0.0), "1.5");
+        assert_eq!(shown(12345.0, 120.0), "12300(200)");
+        assert_eq!(shown(1.23456789e-7, 4e-12), "1.23457(4)e-7");
+        assert_eq!(shown(0.0003, 0.0005), "0.0003 ± 0.0005");
+        assert_eq!(shown(0.0, 2.5e-9), "0 ± 3e-9");
+        assert_eq!(shown(3.0, 1.0), "3 ± 1");
+        assert_eq!(shown(-1e-20, 1e-7), "0 ± 1e-7");
+        assert_eq!(shown(f64::INFINITY, f64::INFINITY), "inf");
+        assert_eq!(shown(2.0, f64::INFINITY), "2 ± unknown");
+        let millimetre = Unit::parse("mm").unwrap();
+        assert_eq!(uncertain(0.0123456, 1.1e-6, &millimetre, 9), "12.346(2) mm");
+        assert_eq!(uncertain(1.0 / 3.0, 1e-13, &Unit::none(), 12), "0.333333333333(1)");
     }
 
     #[test]

@@ -2,8 +2,10 @@
 
 use crate::description::Slot;
 use crate::rig::Bench;
-pub use crate::series::{Method, Series, Solver};
+pub use crate::series::{Method, PARTS, Series, Solver};
 use crate::unit::Unit;
+use std::fmt;
+use std::sync::Arc;
 
 /// One experiment on one instance.
 #[derive(Clone, PartialEq, Debug)]
@@ -22,6 +24,8 @@ pub struct Experiment {
     pub expects: Vec<Expect>,
     /// Instants in s, ascending, at which a signal or a recording has a corner.
     pub corners: Vec<f64>,
+    /// The system as it is stepped is what is judged: discretisation leaves no verdict open.
+    pub stepped: bool,
 }
 
 /// One plot.
@@ -59,6 +63,42 @@ pub struct Measure {
     pub slot: Slot,
     /// The unit in which the result is shown.
     pub unit: Unit,
+    /// The part of the expectation's window in which it is taken.
+    pub window: Window,
+}
+
+/// Begin and end of the part of a run in which a measure is taken.
+#[derive(Clone, Copy, PartialEq, Default, Debug)]
+pub struct Window {
+    /// Its begin.
+    pub after: Edge,
+    /// Its end.
+    pub before: Edge,
+}
+
+/// An end of a window.
+#[derive(Clone, Copy, PartialEq, Default, Debug)]
+pub enum Edge {
+    /// That of the expectation.
+    #[default]
+    Open,
+    /// This time in s.
+    At(f64),
+    /// The first instant of the run at which the condition in this slot holds.
+    First(Slot),
+}
+
+/// An instant that only the run shows.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Moment {
+    /// When the condition in this slot first holds.
+    First(Slot),
+    /// When the condition in this slot first turns true, having been false.
+    Rises(Slot),
+    /// When the quantity in this slot is least.
+    Least(Slot),
+    /// When it is greatest.
+    Greatest(Slot),
 }
 
 /// What a measure measures. Booleans count as 0 and 1.
@@ -88,6 +128,37 @@ pub enum MeasureKind {
     Settling(f64),
     /// First time the condition holds; inf if never.
     First,
+    /// First time the condition turns true, having been false; inf if never.
+    Rises,
+    /// First time the condition turns; inf if never.
+    Turns,
+    /// Value at a moment of the run.
+    AtMoment(Moment),
+    /// When the quantity is least.
+    TimeOfLeast,
+    /// When it is greatest.
+    TimeOfGreatest,
+}
+
+/// A function that the compiler hands over, so that every machine computes it alike: numbers in their order → number.
+#[derive(Clone)]
+pub struct Elementary {
+    /// Its name in the language.
+    pub name: &'static str,
+    /// Its value; a number that is missing counts as 0.
+    pub at: Arc<dyn Fn(f64, f64) -> f64 + Send + Sync>,
+}
+
+impl PartialEq for Elementary {
+    fn eq(&self, other: &Elementary) -> bool {
+        self.name == other.name
+    }
+}
+
+impl fmt::Debug for Elementary {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(self.name)
+    }
 }
 
 /// Arithmetic over measures.
@@ -121,4 +192,10 @@ pub enum Formula {
         tolerance: Box<Formula>,
         relative: bool,
     },
+    /// An elementary function of one or two numbers.
+    Function(Elementary, Vec<Formula>),
+    /// A number that is shown in this unit and not judged.
+    Shown(Unit, Box<Formula>),
+    /// A comparison whose sides are shown in this unit.
+    In(Unit, Box<Formula>),
 }

@@ -44,7 +44,12 @@ pub struct Solver {
     pub step: f64,
     /// Relative tolerance of an adaptive run.
     pub tol: f64,
+    /// In how many parts an adaptive run is made at least: no step is longer than the duration divided by it.
+    pub parts: f64,
 }
+
+/// The parts of an adaptive run, at least, unless somebody wants it finer.
+pub const PARTS: f64 = 50.0;
 
 /// A drawn quantity.
 #[derive(Clone, PartialEq, Debug)]

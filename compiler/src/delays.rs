@@ -126,6 +126,13 @@ fn slots(most: f64, step: f64) -> f64 {
 }
 
 impl crate::program::Program {
+    /// Makes room for fixed steps of so many s, and for those of companion runs that are up to four times as short, where
+    /// that is not too much.
+    pub fn size_rings_for_companions(&mut self, step: f64) {
+        let samples: f64 = self.description.delays.iter().map(|delay| slots(delay.range.1, 0.25 * step)).sum();
+        self.size_rings(if samples <= MOST_SAMPLES { 0.25 * step } else { step });
+    }
+
     /// Makes room for what is delayed in fixed steps of so many s, and takes back that for adaptive ones: before code is
     /// made for them.
     pub fn size_rings(&mut self, step: f64) {

@@ -3,7 +3,9 @@
 //! In: an experiment's tree and changes from outside. Out: for each combination of its sweeps a flat system with a plan
 //! that holds slots only.
 
+use crate::alone::Alone;
 use crate::flatten::{Instance, Override, OverrideValue, Request, flatten};
+use crate::ir::{Binary, Unary};
 use crate::linearise::{Opened, PortSlots, Ports, open};
 use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
 use crate::resolve::Loaded;
@@ -13,11 +15,12 @@ use crate::system::*;
 use crate::tables::columns;
 use crate::units::{self, Types, literal};
 use crate::{causality, checks, delays};
-use abi::plan::{self, Formula, MeasureKind, Method, Solver};
+use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
+use std::sync::Arc;
 
 /// Changes from outside to an experiment.
 #[derive(Clone, Debug, Default)]
@@ -53,6 +56,10 @@ pub enum Place {
     Before(usize),
     /// Second argument of this measure of this expectation.
     Second(usize, usize),
+    /// Start of the window of this measure of this expectation.
+    MeasureAfter(usize, usize),
+    /// End of it.
+    MeasureBefore(usize, usize),
 }
 
 /// One combination of an experiment's sweeps, lowered.
@@ -93,6 +100,8 @@ struct Parts<'a> {
     data: Option<&'a ast::Data>,
     plots: Vec<&'a ast::Plot>,
     expects: Vec<&'a ast::Expect>,
+    /// `allow discretisation`
+    stepped: bool,
 }
 
 /// Where the value of a sweep or a change comes from.
@@ -305,6 +314,7 @@ fn looks_like_instance(value: &str) -> bool {
 fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
     let mut run: Option<&ast::Run> = None;
     let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
+    let mut stepped = false;
     let mut twice = |what: &str, span: Span, first: Span| {
         let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
             .label(span, "again here")
@@ -328,7 +338,7 @@ fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut V
             },
             ExperimentStatement::Plot(one) => parts.3.push(one),
             ExperimentStatement::Expect(one) => parts.4.push(one),
-            ExperimentStatement::Allow(_) => {}
+            ExperimentStatement::Allow(allow) => stepped |= allow.lint.text == "discretisation",
         }
     }
     let Some(run) = run else {
@@ -341,7 +351,7 @@ fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut V
         return None;
     };
     let (solver, sweeps, data, plots, expects) = parts;
-    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects })
+    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped })
 }
 
 /// Columns of a recording as tables over time.
@@ -705,7 +715,22 @@ fn variant(
         .flatten()
         .map(|mut expect| {
             for measure in &mut expect.measures {
-                measure.slot = slots[measure.slot.index()];
+                let place = |slot: &mut abi::Slot| *slot = slots[slot.index()];
+                place(&mut measure.slot);
+                for edge in [&mut measure.window.after, &mut measure.window.before] {
+                    if let plan::Edge::First(slot) = edge {
+                        place(slot);
+                    }
+                }
+                if let MeasureKind::AtMoment(
+                    plan::Moment::First(slot)
+                    | plan::Moment::Rises(slot)
+                    | plan::Moment::Least(slot)
+                    | plan::Moment::Greatest(slot),
+                ) = &mut measure.kind
+                {
+                    place(slot);
+                }
             }
             expect
         })
@@ -717,14 +742,20 @@ fn variant(
             MeasureKind::At(t) => Some(t),
             _ => None,
         });
-        at.chain([expect.after, expect.before])
+        let edges = expect.measures.iter().flat_map(|measure| [measure.window.after, measure.window.before]);
+        let edges = edges.filter_map(|edge| match edge {
+            plan::Edge::At(t) => Some(t),
+            plan::Edge::Open | plan::Edge::First(_) => None,
+        });
+        at.chain(edges).chain([expect.after, expect.before])
     });
     let asked: Vec<f64> = asked.collect();
     let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
+    let stepped = parts.stepped;
     let experiment =
-        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners };
+        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners, stepped };
     let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
         let quantity = program.description.quantity(moved)?;
         Some((path.clone(), quantity.slot))
@@ -872,14 +903,14 @@ impl Reader<'_> {
             self.diagnostics.push(error.help("it lies between 0 and 1, such as `tol 1e-8`"));
         }
         match method {
-            Method::Adaptive => Solver { method, step: 0.0, tol },
-            _ => Solver { method, step: step.unwrap_or(DEFAULT_STEP), tol },
+            Method::Adaptive => Solver { method, step: 0.0, tol, parts: PARTS },
+            _ => Solver { method, step: step.unwrap_or(DEFAULT_STEP), tol, parts: PARTS },
         }
     }
 
     /// How the crossed-out part of a rig is stepped between ticks: by a fixed method whose step divides the period.
     fn between_ticks(&mut self, parts: &Parts, given: &Given, period: f64, solver: Solver) -> Solver {
-        let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), tol: solver.tol };
+        let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), ..solver };
         if given.method.is_none() && parts.solver.is_none() {
             return match given.step {
                 Some(step) => self.divides(parts, period, Solver { step, ..usual }),
@@ -935,8 +966,9 @@ impl Reader<'_> {
         }
     }
 
-    fn show(&mut self, show: &ast::Show, expr: ExprId) -> usize {
-        let unit = show.unit.as_ref().and_then(|text| match Unit::parse(&text.text) {
+    /// The unit that is written for what is shown, if it suits.
+    fn unit_for(&mut self, expr: ExprId, text: &ast::UnitText) -> Option<Unit> {
+        match Unit::parse(&text.text) {
             Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
             Ok(unit) => {
                 let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
@@ -951,7 +983,20 @@ impl Reader<'_> {
                 self.diagnostics.push(error);
                 None
             }
-        });
+        }
+    }
+
+    /// The unit of a side of a comparison: that of the measure that it is, else SI.
+    fn side_unit(&self, id: ExprId) -> Unit {
+        match self.system.node(id) {
+            Node::Measure(name, value, ..) => self.measure_unit(*name, id, *value),
+            _ if self.types.boolean[id.0 as usize] => Unit::none(),
+            _ => Unit::si(self.dimension(id)),
+        }
+    }
+
+    fn show(&mut self, show: &ast::Show, expr: ExprId) -> usize {
+        let unit = show.unit.as_ref().and_then(|text| self.unit_for(expr, text));
         if let Node::Measure(..) = self.system.node(expr) {
             let error = Diagnostic::error("E0901", "a measure belongs in `expect`, not in `plot`")
                 .label(self.system.span(expr), "one number for the whole run");
@@ -962,10 +1007,18 @@ impl Reader<'_> {
 
     fn expect(&mut self, expect: &ast::Expect, at: &ExpectAt, nodes: &[ExprId], duration: f64) -> Option<plan::Expect> {
         let text = self.loaded.files.slice(expect.span);
-        let text = one_line(text.strip_prefix("expect").unwrap_or(text));
+        let text = one_line(text.strip_prefix("expect").or(text.strip_prefix("show")).unwrap_or(text));
         let mut measures = Vec::new();
         let value = self.formula(nodes[at.value], &mut measures)?;
         let condition = match at.near {
+            None if expect.shows.is_some() => {
+                let unit = expect.shows.as_ref().and_then(Option::as_ref);
+                let unit = match unit {
+                    Some(text) => self.unit_for(nodes[at.value], text)?,
+                    None => self.side_unit(nodes[at.value]),
+                };
+                Formula::Shown(unit, Box::new(value))
+            }
             None => {
                 if !self.types.boolean[nodes[at.value].0 as usize] {
                     let error = Diagnostic::error("E0901", "an expectation is a condition")
@@ -1001,12 +1054,8 @@ impl Reader<'_> {
                 }
                 let target = self.formula(target_node, &mut measures)?;
                 let tolerance = self.formula(tolerance_node, &mut measures)?;
-                Formula::Near {
-                    value: Box::new(value),
-                    target: Box::new(target),
-                    tolerance: Box::new(tolerance),
-                    relative,
-                }
+                let (value, target, tolerance) = (Box::new(value), Box::new(target), Box::new(tolerance));
+                self.shown_in(value_node, target_node, Formula::Near { value, target, tolerance, relative })
             }
         };
         for (at, place) in [(at.after, Place::After(self.expect)), (at.before, Place::Before(self.expect))] {
@@ -1040,14 +1089,14 @@ impl Reader<'_> {
                     return Some(compare(op, a, b));
                 }
                 // A condition without a measure is its value at the end.
-                return Some(self.measure(id, id, MeasureKind::Final, measures));
+                return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
             }
             if let Some(value) = literal(self.system, id) {
                 return Some(Formula::Number(value));
             }
             if self.varies(id) {
                 // It is constant in a run, but not the same in each.
-                return Some(self.measure(id, id, MeasureKind::Final, measures));
+                return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
             }
             let value = self.constant(id);
             if !value.is_nan() {
@@ -1064,11 +1113,40 @@ impl Reader<'_> {
             Some((Box::new(reader.formula(a, measures)?), Box::new(reader.formula(b, measures)?)))
         };
         match node {
-            Node::Measure(name, value, second) => {
-                if let Some(second) = second {
+            Node::Measure(name, value, second, window) => {
+                let moment = match second {
+                    Some(second) if self.measured(second) => Some(self.moment(second)?),
+                    _ => None,
+                };
+                if let Some(second) = second.filter(|_| moment.is_none()) {
                     self.places.push((Place::Second(self.expect, measures.len()), second));
                 }
-                let second = second.map(|second| self.constant(second));
+                let second = second.map(|second| if moment.is_some() { f64::NAN } else { self.constant(second) });
+                if second.is_some_and(f64::is_nan) && moment.is_none() {
+                    return self.unknown_before(id);
+                }
+                let after = window.after.map(|edge| self.edge(edge, Place::MeasureAfter(self.expect, measures.len())));
+                let before = window.before.map(|e| self.edge(e, Place::MeasureBefore(self.expect, measures.len())));
+                let open = || Some(plan::Edge::Open);
+                let window = plan::Window { after: after.unwrap_or_else(open)?, before: before.unwrap_or_else(open)? };
+                if name == MeasureName::Time {
+                    return match *self.system.node(value) {
+                        Node::Measure(MeasureName::Max, of, None, inner) if inner == Window::default() => {
+                            Some(self.measure(id, of, MeasureKind::TimeOfGreatest, window, measures))
+                        }
+                        Node::Measure(MeasureName::Min, of, None, inner) if inner == Window::default() => {
+                            Some(self.measure(id, of, MeasureKind::TimeOfLeast, window, measures))
+                        }
+                        _ => {
+                            let error =
+                                Diagnostic::error("E0901", "`time` is of an extremum: `time(max(x))`, `time(min(x))`")
+                                    .label(self.system.span(value), "happens at no one instant");
+                            let help = "a window stands in `time` itself: `time(max(x) after 1 s)`; when a condition first holds is `first(x > 0)`";
+                            self.diagnostics.push(error.help(help));
+                            None
+                        }
+                    };
+                }
                 let kind = match name {
                     MeasureName::Min => MeasureKind::Min,
                     MeasureName::Max => MeasureKind::Max,
@@ -1080,6 +1158,10 @@ impl Reader<'_> {
                     MeasureName::Crossings => MeasureKind::Crossings,
                     MeasureName::Period => MeasureKind::Period,
                     MeasureName::First => MeasureKind::First,
+                    MeasureName::Rises => MeasureKind::Rises,
+                    MeasureName::Turns => MeasureKind::Turns,
+                    MeasureName::Time => unreachable!("it is of a measure"),
+                    MeasureName::At if moment.is_some() => MeasureKind::AtMoment(moment?),
                     MeasureName::At => MeasureKind::At(second.expect("`at` has two arguments")),
                     MeasureName::Settling => MeasureKind::Settling(second.expect("`settling` has two arguments")),
                 };
@@ -1089,12 +1171,12 @@ impl Reader<'_> {
                     self.diagnostics.push(error);
                     return None;
                 }
-                Some(self.measure(id, value, kind, measures))
+                Some(self.measure(id, value, kind, window, measures))
             }
             Node::Negate(a) => Some(Formula::Negate(Box::new(self.formula(a, measures)?))),
             Node::Not(a) => Some(Formula::Not(Box::new(self.formula(a, measures)?))),
-            Node::Binary(op, a, b) => {
-                let (a, b) = pair(self, a, b, measures)?;
+            Node::Binary(op, left, right) => {
+                let (a, b) = pair(self, left, right, measures)?;
                 Some(match op {
                     BinaryOp::Add => Formula::Add(a, b),
                     BinaryOp::Subtract => Formula::Subtract(a, b),
@@ -1103,23 +1185,27 @@ impl Reader<'_> {
                     BinaryOp::And => Formula::And(a, b),
                     BinaryOp::Or => Formula::Or(a, b),
                     BinaryOp::Power => {
-                        let span = self.system.span(id);
-                        let error =
-                            Diagnostic::error("E0901", "powers of measures are not available").label(span, "here");
-                        self.diagnostics.push(error.help("multiply: `max(x) * max(x)`"));
-                        return None;
+                        let alone = Alone::binary(Binary::Pow);
+                        let at = Arc::new(move |x: f64, y: f64| alone.of_both(x, y));
+                        Formula::Function(plan::Elementary { name: "^", at }, vec![*a, *b])
                     }
-                    op => compare(op, *a, *b),
+                    op => self.shown_in(left, right, compare(op, *a, *b)),
                 })
             }
             Node::Call(Builtin::Abs, args) => Some(Formula::Abs(Box::new(self.formula(args[0], measures)?))),
             Node::Call(Builtin::Sqrt, args) => Some(Formula::Sqrt(Box::new(self.formula(args[0], measures)?))),
+            Node::Call(builtin, args) if elementary(builtin).is_some() => {
+                let (name, function) = elementary(builtin)?;
+                let alone = Alone::unary(function);
+                let at = Arc::new(move |x: f64, _: f64| alone.at(x));
+                Some(Formula::Function(plan::Elementary { name, at }, vec![self.formula(args[0], measures)?]))
+            }
             Node::Call(Builtin::Min, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Min(a, b)),
             Node::Call(Builtin::Max, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Max(a, b)),
             _ => {
                 let error = Diagnostic::error("E0901", "this cannot be computed from measures")
                     .label(self.system.span(id), "not arithmetic")
-                    .help("use + - * / abs sqrt min max and comparisons around measures");
+                    .help("use + - * / ^ abs sqrt min max exp log sin cos tan and the like, and comparisons, around measures");
                 self.diagnostics.push(error);
                 None
             }
@@ -1131,20 +1217,110 @@ impl Reader<'_> {
         whole: ExprId,
         value: ExprId,
         kind: MeasureKind,
+        window: plan::Window,
         measures: &mut Vec<plan::Measure>,
     ) -> Formula {
         let text = one_line(self.loaded.files.slice(self.system.span(whole)));
-        let own = self.own_unit(value);
-        let seconds = Unit::parse("s").expect("the second is known");
-        let unit = match kind {
-            MeasureKind::Integral => Unit::si(self.dimension(whole)),
-            MeasureKind::Crossings => Unit::none(),
-            MeasureKind::Period | MeasureKind::Settling(_) | MeasureKind::First => seconds,
-            _ => own,
+        let unit = match self.system.node(whole) {
+            Node::Measure(name, ..) => self.measure_unit(*name, whole, value),
+            // A condition that is measured at the end.
+            _ => self.own_unit(value),
         };
         let at = self.want(value, None);
-        measures.push(plan::Measure { text, kind, slot: abi::Slot(at as u32), unit });
+        measures.push(plan::Measure { text, kind, slot: abi::Slot(at as u32), unit, window });
         Formula::Measure(measures.len() - 1)
+    }
+
+    /// An instant that only the run shows, for `at(x, …)`.
+    fn moment(&mut self, id: ExprId) -> Option<plan::Moment> {
+        let node = self.system.node(id).clone();
+        let inner = match node {
+            Node::Measure(MeasureName::Time, of, None, Window { after: None, before: None }) => {
+                self.system.node(of).clone()
+            }
+            ref other => other.clone(),
+        };
+        let is_time = matches!(node, Node::Measure(MeasureName::Time, ..));
+        match inner {
+            Node::Measure(name, of, None, Window { after: None, before: None }) if !self.measured(of) => {
+                let make = match (name, is_time) {
+                    (MeasureName::First, false) => plan::Moment::First,
+                    (MeasureName::Rises, false) => plan::Moment::Rises,
+                    (MeasureName::Max, true) => plan::Moment::Greatest,
+                    (MeasureName::Min, true) => plan::Moment::Least,
+                    _ => return self.unknown_before(id),
+                };
+                Some(make(abi::Slot(self.want(of, None) as u32)))
+            }
+            _ => self.unknown_before(id),
+        }
+    }
+
+    /// An end of a measure's window: a time, or the first instant of a condition.
+    fn edge(&mut self, id: ExprId, place: Place) -> Option<plan::Edge> {
+        match *self.system.node(id) {
+            Node::Measure(MeasureName::First, of, None, Window { after: None, before: None }) if !self.measured(of) => {
+                Some(plan::Edge::First(abi::Slot(self.want(of, None) as u32)))
+            }
+            _ if self.measured(id) => self.unknown_before(id),
+            _ => {
+                self.places.push((place, id));
+                let time = if self.constant(id) == 0.0 { 0.0 } else { self.time(id, "a window") };
+                Some(plan::Edge::At(time))
+            }
+        }
+    }
+
+    fn unknown_before<T>(&mut self, id: ExprId) -> Option<T> {
+        let error = Diagnostic::error("E0901", "this instant or window is not known before the run")
+            .label(self.system.span(id), "follows from the run");
+        let help =
+            "a time such as `1 s`, `first(v > 0)` or, in `at`, `time(max(x))` can stand here, each without a window";
+        self.diagnostics.push(error.help(help));
+        None
+    }
+
+    /// A comparison, to be shown in the unit of a quantity written on one of its sides, else in that of a measure that is a
+    /// whole side, else in SI.
+    fn shown_in(&self, left: ExprId, right: ExprId, comparison: Formula) -> Formula {
+        let dimension = self.dimension(left);
+        let written = |id: ExprId| {
+            let text = self.loaded.files.slice(self.system.span(id));
+            let unit = text.trim_start_matches(|c: char| c.is_ascii_digit() || "+-. ".contains(c));
+            // `5e-4 m`: what the exponent leaves is no unit, and the unit stands after the last blank.
+            let unit = if unit.starts_with(['e', 'E']) { unit.rsplit(' ').next().unwrap_or(unit) } else { unit };
+            let number = matches!(self.system.node(id), Node::Number { .. } | Node::Negate(_));
+            Unit::parse(unit.trim()).ok().filter(|unit| number && !unit.text.is_empty() && unit.dimension == dimension)
+        };
+        let measure = |id: ExprId| match self.system.node(id) {
+            Node::Measure(name, value, ..) => Some(self.measure_unit(*name, id, *value)),
+            _ => None,
+        };
+        let unit = written(right).or(written(left)).or(measure(left)).or(measure(right));
+        let boolean = self.types.boolean[left.0 as usize];
+        let unit = unit.unwrap_or_else(|| if boolean { Unit::none() } else { Unit::si(dimension) });
+        Formula::In(unit, Box::new(comparison))
+    }
+
+    /// The unit in which a measure is shown.
+    fn measure_unit(&self, name: MeasureName, whole: ExprId, value: ExprId) -> Unit {
+        match name {
+            MeasureName::Integral => Unit::si(self.dimension(whole)),
+            MeasureName::Crossings => Unit::none(),
+            MeasureName::Period
+            | MeasureName::Settling
+            | MeasureName::First
+            | MeasureName::Rises
+            | MeasureName::Turns
+            | MeasureName::Time => Unit::parse("s").expect("the second is known"),
+            MeasureName::Min
+            | MeasureName::Max
+            | MeasureName::Mean
+            | MeasureName::Rms
+            | MeasureName::Final
+            | MeasureName::At
+            | MeasureName::PeakToPeak => self.own_unit(value),
+        }
     }
 
     fn measured(&self, id: ExprId) -> bool {
@@ -1176,6 +1352,26 @@ pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool
         stack.extend(system.node(id).operands());
     }
     false
+}
+
+/// The elementary function of one number that a built-in one is, with its name.
+fn elementary(builtin: Builtin) -> Option<(&'static str, Unary)> {
+    Some(match builtin {
+        Builtin::Exp => ("exp", Unary::Exp),
+        Builtin::Expm1 => ("expm1", Unary::Expm1),
+        Builtin::Log => ("log", Unary::Log),
+        Builtin::Log1p => ("log1p", Unary::Log1p),
+        Builtin::Sin => ("sin", Unary::Sin),
+        Builtin::Cos => ("cos", Unary::Cos),
+        Builtin::Tan => ("tan", Unary::Tan),
+        Builtin::Asin => ("asin", Unary::Asin),
+        Builtin::Acos => ("acos", Unary::Acos),
+        Builtin::Atan => ("atan", Unary::Atan),
+        Builtin::Sinh => ("sinh", Unary::Sinh),
+        Builtin::Cosh => ("cosh", Unary::Cosh),
+        Builtin::Tanh => ("tanh", Unary::Tanh),
+        _ => return None,
+    })
 }
 
 fn compare(op: BinaryOp, a: Formula, b: Formula) -> Formula {

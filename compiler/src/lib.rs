@@ -17,6 +17,7 @@ pub mod discretize;
 pub mod rosenbrock;
 pub mod backend;
 pub mod code;
+pub mod alone;
 
 pub mod names;
 pub mod source;
@@ -332,7 +333,11 @@ impl Made {
 
 /// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
-    let experiment::Variant { label, program, mut experiment, rig, .. } = variant;
+    let experiment::Variant { label, mut program, mut experiment, mut rig, .. } = variant;
+    let stepped = rig.as_mut().map_or(&mut program, |(_, plant)| plant);
+    if experiment.solver.method != Method::Adaptive && !stepped.description.delays.is_empty() {
+        stepped.size_rings_for_companions(experiment.solver.step);
+    }
     let method = rig.as_ref().map_or(experiment.solver.method, |(rig, _)| rig.method);
     let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
     let (code, notes) = match made {

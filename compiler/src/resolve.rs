@@ -135,7 +135,10 @@ impl Loaded {
             Item::Experiment(e) => Some(ExperimentInfo {
                 name: e.name.text.clone(),
                 span: e.name.span,
-                has_expect: e.body.iter().any(|s| matches!(s, ast::ExperimentStatement::Expect(_))),
+                has_expect: e
+                    .body
+                    .iter()
+                    .any(|s| matches!(s, ast::ExperimentStatement::Expect(e) if e.shows.is_none())),
             }),
             _ => None,
         };

@@ -250,11 +250,20 @@ pub enum Node {
         role: Role,
     },
     /// A measure over the course of a value; only in expectations.
-    Measure(MeasureName, ExprId, Option<ExprId>),
+    Measure(MeasureName, ExprId, Option<ExprId>, Window),
     /// `?`
     Hole,
     /// Reported already.
     Error,
+}
+
+/// Over which part of a run a measure is taken: from a time or from the first instant of a condition, and so on.
+#[derive(Clone, Copy, PartialEq, Default, Debug)]
+pub struct Window {
+    /// Its begin.
+    pub after: Option<ExprId>,
+    /// Its end.
+    pub before: Option<ExprId>,
 }
 
 /// Why a value must have a dimension.
@@ -379,6 +388,12 @@ pub enum MeasureName {
     Period,
     Settling,
     First,
+    /// `first(a rises b)`
+    Rises,
+    /// `first(a crosses b)`
+    Turns,
+    /// `time(max(x))`
+    Time,
 }
 
 /// Name, measure, number of arguments.
@@ -395,6 +410,7 @@ const MEASURES: &[(&str, MeasureName, usize)] = &[
     ("period", MeasureName::Period, 1),
     ("settling", MeasureName::Settling, 2),
     ("first", MeasureName::First, 1),
+    ("time", MeasureName::Time, 1),
 ];
 
 impl MeasureName {
@@ -573,18 +589,18 @@ impl System {
 impl Node {
     /// The operands, in order.
     pub fn operands(&self) -> impl Iterator<Item = ExprId> + '_ {
-        let (fixed, list): ([Option<ExprId>; 3], &[ExprId]) = match self {
+        let (fixed, list): ([Option<ExprId>; 4], &[ExprId]) = match self {
             Node::Number { .. } | Node::Bool(_) | Node::Time | Node::Var(_) | Node::Rate(_) | Node::PathRate(_) => {
-                ([None; 3], &[])
+                ([None; 4], &[])
             }
-            Node::InRegime(..) | Node::Crossing(_) | Node::Hole | Node::Error => ([None; 3], &[]),
+            Node::InRegime(..) | Node::Crossing(_) | Node::Hole | Node::Error => ([None; 4], &[]),
             Node::Negate(a) | Node::Not(a) | Node::Table(_, a) | Node::Fits { value: a, .. } => {
-                ([Some(*a), None, None], &[])
+                ([Some(*a), None, None, None], &[])
             }
-            Node::Binary(_, a, b) => ([Some(*a), Some(*b), None], &[]),
-            Node::If(a, b, c) => ([Some(*a), Some(*b), Some(*c)], &[]),
-            Node::Measure(_, a, b) => ([Some(*a), *b, None], &[]),
-            Node::Call(_, args) => ([None; 3], args),
+            Node::Binary(_, a, b) => ([Some(*a), Some(*b), None, None], &[]),
+            Node::If(a, b, c) => ([Some(*a), Some(*b), Some(*c), None], &[]),
+            Node::Measure(_, a, b, window) => ([Some(*a), *b, window.after, window.before], &[]),
+            Node::Call(_, args) => ([None; 4], args),
         };
         fixed.into_iter().flatten().chain(list.iter().copied())
     }

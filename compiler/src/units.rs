@@ -311,10 +311,18 @@ impl Checker<'_> {
             // Its difference is a node before this one and has been checked as a subtraction.
             Node::Crossing(_) => Kind::Boolean,
             Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
-            Node::Measure(measure, value, second) => {
+            Node::Measure(measure, value, second, window) => {
+                for edge in [window.after, window.before].into_iter().flatten() {
+                    if let Some(given) = self.real(edge)
+                        && !self.unify(&given, &Term::known(TIME))
+                    {
+                        self.mismatch(edge, &given, &Term::known(TIME));
+                    }
+                }
+                let event = matches!(measure, MeasureName::First | MeasureName::Rises | MeasureName::Turns);
                 let Some(term) = (match (measure, self.kind(value).clone()) {
-                    (MeasureName::First, _) | (_, Kind::Boolean) => {
-                        if measure == MeasureName::First {
+                    (_, Kind::Boolean) | (MeasureName::First, _) => {
+                        if event {
                             self.condition(value, "`first`");
                         }
                         Some(Term::known(Dimension::NONE))
@@ -334,7 +342,12 @@ impl Checker<'_> {
                 match measure {
                     MeasureName::Integral => Kind::Real(term.times(&Term::known(TIME), Ratio::ONE)),
                     MeasureName::Crossings => number,
-                    MeasureName::Period | MeasureName::Settling | MeasureName::First => Kind::Real(Term::known(TIME)),
+                    MeasureName::Period
+                    | MeasureName::Settling
+                    | MeasureName::First
+                    | MeasureName::Rises
+                    | MeasureName::Turns
+                    | MeasureName::Time => Kind::Real(Term::known(TIME)),
                     _ => Kind::Real(term),
                 }
             }

@@ -6,14 +6,13 @@
 
 use crate::backend::interp::run_once;
 use crate::experiment::{Place, Variant, depends};
-use crate::ir::build::Build;
-use crate::ir::{Func, Unary};
+use crate::ir::Func;
 use crate::lower::formulas;
 use crate::source::Files;
 use crate::system::*;
 use abi::description::{Guard, Kind, Quantity};
 use abi::lanes::Lanes;
-use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot};
+use abi::plan::{Edge, Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Window};
 use abi::table::Code;
 use abi::unit::Unit;
 use abi::{Description, Instance, Slot};
@@ -270,36 +269,6 @@ impl Varying {
     }
 }
 
-/// One elementary function by itself: for whoever needs, outside a model, what every machine computes alike.
-pub struct Alone(Func);
-
-impl Alone {
-    /// e^x
-    pub fn exp() -> Alone {
-        Alone::of(Unary::Exp)
-    }
-
-    /// The natural logarithm.
-    pub fn log() -> Alone {
-        Alone::of(Unary::Log)
-    }
-
-    fn of(function: Unary) -> Alone {
-        let mut build = Build::new("alone");
-        let x = build.load(Slot(0));
-        let y = build.unary(function, x);
-        build.store(Slot(0), y);
-        Alone(crate::math::expand(&build.finish()))
-    }
-
-    /// Its value.
-    pub fn at(&self, x: f64) -> f64 {
-        let mut block = [x];
-        run_once(&self.0, &mut block, crate::math::pool());
-        block[0]
-    }
-}
-
 /// The guards as the code of a fixed step may know them: those whose range changes watch only that numbers are finite.
 pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
     let system = &variant.system;
@@ -317,8 +286,13 @@ pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
 
 /// An expectation that only reads the least and the greatest value.
 fn extremes(quantity: &Quantity, duration: f64) -> Expect {
-    let measure =
-        |kind| Measure { text: quantity.path.clone(), kind, slot: quantity.slot, unit: quantity.unit.clone() };
+    let measure = |kind| Measure {
+        text: quantity.path.clone(),
+        kind,
+        slot: quantity.slot,
+        unit: quantity.unit.clone(),
+        window: Window::default(),
+    };
     Expect {
         text: quantity.path.clone(),
         measures: vec![measure(MeasureKind::Min), measure(MeasureKind::Max)],
@@ -338,6 +312,8 @@ fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), Str
         Place::Step => experiment.solver.step = positive("the step")?,
         Place::After(k) => experiment.expects[k].after = number,
         Place::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
+        Place::MeasureAfter(k, j) => experiment.expects[k].measures[j].window.after = Edge::At(number),
+        Place::MeasureBefore(k, j) => experiment.expects[k].measures[j].window.before = Edge::At(number),
         Place::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
             MeasureKind::At(second) | MeasureKind::Settling(second) => *second = number,
             kind => unreachable!("{kind:?} has no second argument"),

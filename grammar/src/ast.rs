@@ -520,6 +520,8 @@ pub struct Expect {
     pub value: Expr,
     /// `~= target +- tolerance`
     pub near: Option<(Expr, Expr)>,
+    /// Of `show`: nothing is expected, and the value is shown in this unit if one is given.
+    pub shows: Option<Option<UnitText>>,
     pub after: Option<Expr>,
     pub before: Option<Expr>,
     pub span: Span,
@@ -737,6 +739,8 @@ pub enum ExprKind {
         function: Name,
         /// At least one.
         args: Vec<Expr>,
+        /// Of a measure: over which part of the run it is taken.
+        window: Option<Box<Window>>,
     },
     /// `-a`, `not a`
     Unary(UnaryOp, Box<Expr>),
@@ -748,6 +752,14 @@ pub enum ExprKind {
     Hole,
     /// Something that could not be read and has been reported.
     Error,
+}
+
+/// `after 1 s before first(v > 0)`
+#[derive(Clone, PartialEq, Debug)]
+#[allow(missing_docs)]
+pub struct Window {
+    pub after: Option<Expr>,
+    pub before: Option<Expr>,
 }
 
 /// Operators before one operand.

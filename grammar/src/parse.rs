@@ -770,6 +770,16 @@ impl<'t> Reader<'t> {
                     ExperimentStatement::Plot(Plot { shows, against, span })
                 }
                 Rule::expect => ExperimentStatement::Expect(self.expect(pair)),
+                Rule::shown => {
+                    let show = self.shows(&mut children).remove(0);
+                    let [after, before] = [Rule::kw_after, Rule::kw_before].map(|word| says(&pair, word));
+                    let mut edges: Vec<Expr> =
+                        children.all(Rule::expr).into_iter().map(|value| self.expr(value)).collect();
+                    let before = if before { edges.pop() } else { None };
+                    let after = if after { edges.pop() } else { None };
+                    let (value, shows) = (show.value, Some(show.unit));
+                    ExperimentStatement::Expect(Expect { value, near: None, shows, after, before, span })
+                }
                 Rule::allow => ExperimentStatement::Allow(self.allow(pair)),
                 Rule::vary => {
                     let items = children.all(Rule::vary_item).into_iter().map(|item| {
@@ -1074,7 +1084,7 @@ impl<'t> Reader<'t> {
         let tolerance = if values.len() == 3 { values.pop() } else { None };
         let near = tolerance.and_then(|tolerance| values.pop().map(|target| (target, tolerance)));
         let value = values.pop().expect("the grammar asks for a condition");
-        Expect { value, near, after, before, span }
+        Expect { value, near, shows: None, after, before, span }
     }
 
     fn drive_argument(&mut self, pair: Pair<'t, Rule>) -> (Name, DriveArg) {
@@ -1206,7 +1216,22 @@ impl<'t> Reader<'t> {
         let mut children = Children::of(pair);
         let function = self.name(children.one());
         let args: Vec<Built> = children.all(Rule::expr).into_iter().map(|arg| self.build(arg)).collect();
-        let height = 1 + args.iter().map(|arg| arg.height).max().unwrap_or(0);
+        let mut height = 1 + args.iter().map(|arg| arg.height).max().unwrap_or(0);
+        let mut window = Window { after: None, before: None };
+        let mut word = Rule::kw_after;
+        let edges = children.all(Rule::window).into_iter().flat_map(Pair::into_inner).collect::<Vec<_>>();
+        for edge in edges {
+            match edge.as_rule() {
+                Rule::expr => {
+                    let built = self.build(edge);
+                    height = height.max(1 + built.height);
+                    let place = if word == Rule::kw_after { &mut window.after } else { &mut window.before };
+                    *place = Some(built.expr);
+                }
+                other => word = other,
+            }
+        }
+        let window = (window.after.is_some() || window.before.is_some()).then(|| Box::new(window));
         if let ("der", [Built { expr: Expr { kind: ExprKind::Path(path), .. }, .. }]) =
             (function.text.as_str(), args.as_slice())
             && let Some(of) = path.single().filter(|_| !self.names.file.contains("der"))
@@ -1218,7 +1243,7 @@ impl<'t> Reader<'t> {
             );
             return Built { expr: Expr { kind: ExprKind::Error, span }, outer: span, height: 1 };
         }
-        let kind = ExprKind::Call { function, args: args.into_iter().map(|arg| arg.expr).collect() };
+        let kind = ExprKind::Call { function, args: args.into_iter().map(|arg| arg.expr).collect(), window };
         self.limited(Built { expr: Expr { kind, span }, outer: span, height })
     }
 
@@ -1521,6 +1546,7 @@ fn words(rule: Rule) -> Option<String> {
         | Rule::atom
         | Rule::call
         | Rule::called
+        | Rule::window
         | Rule::quantity
         | Rule::path
         | Rule::hole

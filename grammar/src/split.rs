@@ -84,8 +84,8 @@ impl Place {
     /// Words that begin a statement here and are free as names elsewhere.
     fn starters(self) -> &'static [&'static str] {
         match self {
-            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "expect"],
-            Place::Fit => &["run", "solver", "sweep", "data", "plot", "expect", "vary", "minimise"],
+            Place::Experiment => &["run", "solver", "sweep", "data", "plot", "expect", "show"],
+            Place::Fit => &["run", "solver", "sweep", "data", "plot", "expect", "show", "vary", "minimise"],
             Place::Device => &["send", "read"],
             Place::Rig => &[
                 "run", "rate", "solver", "bus", "drive", "hardware", "watchdog", "overrun", "predict", "safe", "stop",
@@ -443,7 +443,7 @@ impl<'t> Source<'t> {
             (_, Some(TokenKind::Number)) => true,
             (word, Some(TokenKind::Symbol)) => {
                 matches!(next, "-" | "(" | "?")
-                    && matches!(word, "plot" | "expect" | "minimise" | "record" | "rate" | "watchdog")
+                    && matches!(word, "plot" | "expect" | "show" | "minimise" | "record" | "rate" | "watchdog")
                     && self.marks[at].first_on_line
             }
             (_, Some(_)) => false,

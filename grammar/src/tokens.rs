@@ -45,11 +45,11 @@ pub const KEYWORDS: [&str; 36] = [
 ];
 
 /// Words that mean something only in experiments, fits, tables, devices and rigs. Free as names, never a unit.
-pub const CONTEXT_WORDS: [&str; 39] = [
+pub const CONTEXT_WORDS: [&str; 40] = [
     "after", "against", "as", "at", "before", "bus", "by", "byte", "data", "drive", "expect", "for", "from",
     "hardware", "hold", "limit", "linear", "message", "minimise", "overrun", "plot", "predict", "rate", "read",
-    "record", "rotary", "run", "safe", "scale", "send", "slew", "smooth", "solver", "step", "stop", "sweep", "tol",
-    "vary", "watchdog",
+    "record", "rotary", "run", "safe", "scale", "send", "show", "slew", "smooth", "solver", "step", "stop", "sweep",
+    "tol", "vary", "watchdog",
 ];
 
 /// Whether `word` is reserved everywhere.

@@ -65,8 +65,13 @@ fn prefix(expr: &Expr) -> String {
             segments.collect::<Vec<_>>().join(".")
         }
         ExprKind::Derivative { of, along } => format!("D({},{})", of.text, along.text),
-        ExprKind::Call { function, args } => {
-            format!("{}({})", function.text, args.iter().map(prefix).collect::<Vec<_>>().join(" "))
+        ExprKind::Call { function, args, window } => {
+            let edge = |word: &str, edge: &Option<Expr>| {
+                edge.as_ref().map(|edge| format!(" {word} {}", prefix(edge))).unwrap_or_default()
+            };
+            let window = window.as_ref().map(|w| edge("after", &w.after) + &edge("before", &w.before));
+            let args = args.iter().map(prefix).collect::<Vec<_>>().join(" ");
+            format!("{}({args}{})", function.text, window.unwrap_or_default())
         }
         ExprKind::Unary(UnaryOp::Negate, a) => format!("(neg {})", prefix(a)),
         ExprKind::Unary(UnaryOp::Not, a) => format!("(not {})", prefix(a)),

@@ -9,7 +9,7 @@ use crate::dry;
 use crate::fixed::Fixed;
 use crate::observe::{Observer, Probe};
 use crate::outcome::Stop;
-pub use crate::outcome::{Cause, Continue, Failure, Final, Outcome, Work};
+pub use crate::outcome::{Cause, Continue, Estimate, Failure, Final, Outcome, Work};
 use crate::record::Recording;
 use crate::solver::adaptive::Adaptive;
 use abi::description::Kind;
@@ -138,6 +138,7 @@ pub(crate) fn ended(rest: Rest, result: Result<(), Stop>) -> Result<Outcome, Fai
         time: instance.get(Slot::TIME),
         work,
         notes,
+        estimate: None,
     })
 }
 

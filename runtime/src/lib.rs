@@ -10,6 +10,7 @@ pub mod chance;
 pub mod show;
 pub mod queue;
 
+pub mod verdict;
 pub mod measure;
 pub mod record;
 
@@ -27,6 +28,7 @@ pub mod lookahead;
 mod dry;
 
 pub mod engine;
+pub mod estimate;
 pub mod steady;
 pub mod lanes;
 pub mod sweep;

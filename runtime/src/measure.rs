@@ -1,59 +1,16 @@
-//! Numbers taken from the course of a run, and the expectations that are made of them.
+//! Numbers taken from the course of a run.
 //!
 //! In: the points of a run in order of time, as blocks. Out: a [`Verdict`] for each expectation. Most measures look
 //! at each point once and forget it; `period` and `settling` keep theirs, up to [`KEPT_POINTS`]. Knows neither
 //! solver nor clock: between two points a quantity is a straight line, and an event is two points at one time.
 
 use crate::show;
+use crate::verdict::{self, Reading, Verdict};
 use abi::Slot;
-use abi::plan::{Expect, Formula, Measure, MeasureKind};
-use abi::unit::Unit;
+use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
 
 /// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. Beyond, the measure fails and says so.
 pub const KEPT_POINTS: usize = 1 << 25;
-
-/// What became of one expectation.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Verdict {
-    /// As written.
-    pub text: String,
-    /// Whether it held. Never where there is a `problem`.
-    pub holds: bool,
-    /// The measures that could be taken, in the order of the text.
-    pub readings: Vec<Reading>,
-    /// The comparison that decided; none where the condition compares nothing or could not be evaluated.
-    pub margin: Option<Margin>,
-    /// Why it could not be evaluated, in words: `the window … is empty`.
-    pub problem: Option<String>,
-}
-
-/// The value of one measure.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Reading {
-    /// As written.
-    pub text: String,
-    /// In SI.
-    pub value: f64,
-    /// The unit it is shown in.
-    pub unit: Unit,
-    /// When it happened, in s, where it happened at an instant: of `max`, when the maximum was reached.
-    pub time: Option<f64>,
-}
-
-/// How far a comparison was from turning over.
-#[derive(Clone, PartialEq, Debug)]
-pub struct Margin {
-    /// Distance to the limit in SI: positive where the comparison holds.
-    pub amount: f64,
-    /// The value compared, in SI.
-    pub value: f64,
-    /// What it was compared with, in SI.
-    pub limit: f64,
-    /// The unit of all three.
-    pub unit: Unit,
-    /// The instant that matters, in s, if one of the measures compared has one.
-    pub time: Option<f64>,
-}
 
 /// All expectations of an experiment, filled point by point.
 pub struct Expectations {
@@ -72,19 +29,24 @@ impl Expectations {
 
     /// Whether only the last point of the run counts, so that the others need not be shown.
     pub fn only_last(&self) -> bool {
-        let last = |meter: &Meter| matches!(meter.tally, Tally::Final) && meter.before == f64::INFINITY;
+        let last = |meter: &Meter| {
+            matches!(meter.tally, Tally::Final) && meter.before == f64::INFINITY && meter.ends.is_none()
+        };
         self.meters.iter().flatten().all(last)
     }
 
     /// The slots that are read.
     pub fn slots(&self) -> impl Iterator<Item = Slot> {
-        self.meters.iter().flatten().map(|meter| meter.slot)
+        self.meters
+            .iter()
+            .flatten()
+            .flat_map(|meter| [Some(meter.slot), meter.begins, meter.ends, meter.moment].into_iter().flatten())
     }
 
     /// Shows the state of the model at time `t` in s. Times must not decrease.
     pub fn see(&mut self, t: f64, block: &[f64]) {
         for meter in self.meters.iter_mut().flatten() {
-            meter.see(t, block[meter.slot.index()]);
+            meter.see_block(t, block);
         }
     }
 
@@ -100,141 +62,18 @@ fn verdict(expect: &Expect, meters: &[Meter]) -> Verdict {
     for (measure, meter) in expect.measures.iter().zip(meters) {
         match meter.reading() {
             Ok((value, time)) => {
-                let unit = measure.unit.clone();
-                readings.push(Reading { text: measure.text.clone(), value, unit, time });
+                let (text, unit) = (measure.text.clone(), measure.unit.clone());
+                let (resolution, scale) = (meter.resolution(), meter.scale);
+                readings.push(Reading { text, value, unit, time, resolution, scale, error: None });
             }
             Err(reason) => {
                 problem.get_or_insert(format!("{}: {reason}", measure.text));
             }
         }
     }
-    let failed = |readings, problem| Verdict {
-        text: expect.text.clone(),
-        holds: false,
-        readings,
-        margin: None,
-        problem: Some(problem),
-    };
-    if let Some(problem) = problem {
-        return failed(readings, problem);
-    }
-    match evaluate(&expect.condition, &readings) {
-        Ok(Evaluated { value, margin }) => {
-            Verdict { text: expect.text.clone(), holds: value != 0.0, readings, margin, problem: None }
-        }
-        Err(problem) => failed(readings, problem),
-    }
-}
-
-struct Evaluated {
-    value: f64,
-    margin: Option<Margin>,
-}
-
-/// A formula over readings; a result that is not a number (0/0) is an error, since no comparison with it means anything.
-fn evaluate(formula: &Formula, readings: &[Reading]) -> Result<Evaluated, String> {
-    let plain = |value: f64| {
-        if value.is_nan() {
-            return Err("the condition is not a number: a division of zero by zero, or a root of a negative".into());
-        }
-        Ok(Evaluated { value, margin: None })
-    };
-    let value = |formula: &Formula| evaluate(formula, readings).map(|e| e.value);
-    let compare = |left: &Formula, right: &Formula, sign: f64, strict: bool| {
-        let (value, limit) = (value(left)?, value(right)?);
-        // Equal infinities leave no room.
-        let amount = if value == limit { 0.0 } else { sign * (limit - value) };
-        let holds = if strict { amount > 0.0 } else { amount >= 0.0 };
-        Ok(compared(holds, amount, value, limit, formula, readings))
-    };
-    match formula {
-        Formula::Number(number) => plain(*number),
-        Formula::Measure(index) => plain(readings[*index].value),
-        Formula::Negate(a) => plain(-value(a)?),
-        Formula::Abs(a) => plain(value(a)?.abs()),
-        Formula::Sqrt(a) => plain(value(a)?.sqrt()),
-        Formula::Add(a, b) => plain(value(a)? + value(b)?),
-        Formula::Subtract(a, b) => plain(value(a)? - value(b)?),
-        Formula::Multiply(a, b) => plain(value(a)? * value(b)?),
-        Formula::Divide(a, b) => plain(value(a)? / value(b)?),
-        Formula::Min(a, b) => plain(value(a)?.min(value(b)?)),
-        Formula::Max(a, b) => plain(value(a)?.max(value(b)?)),
-        Formula::Less(a, b) => compare(a, b, 1.0, true),
-        Formula::LessEqual(a, b) => compare(a, b, 1.0, false),
-        Formula::Greater(a, b) => compare(a, b, -1.0, true),
-        Formula::GreaterEqual(a, b) => compare(a, b, -1.0, false),
-        Formula::Near { value: measured, target, tolerance, relative } => {
-            let (measured, target, tolerance) = (value(measured)?, value(target)?, value(tolerance)?);
-            let width = if *relative { tolerance * target.abs() } else { tolerance };
-            let distance = if measured == target { 0.0 } else { (measured - target).abs() };
-            let amount = width - distance;
-            Ok(compared(amount >= 0.0, amount, measured, target, formula, readings))
-        }
-        Formula::And(a, b) => {
-            let (a, b) = (evaluate(a, readings)?, evaluate(b, readings)?);
-            let value = f64::from(a.value != 0.0 && b.value != 0.0);
-            Ok(Evaluated { value, margin: deciding(a, b, f64::lt) })
-        }
-        Formula::Or(a, b) => {
-            let (a, b) = (evaluate(a, readings)?, evaluate(b, readings)?);
-            let value = f64::from(a.value != 0.0 || b.value != 0.0);
-            Ok(Evaluated { value, margin: deciding(a, b, f64::gt) })
-        }
-        Formula::Not(a) => {
-            let a = evaluate(a, readings)?;
-            let turned = a.margin.map(|margin| Margin { amount: -margin.amount, ..margin });
-            Ok(Evaluated { value: f64::from(a.value == 0.0), margin: turned })
-        }
-    }
-}
-
-/// Of two comparisons, the one whose margin as a fraction of its limit is the smaller (or larger): units differ.
-fn deciding(a: Evaluated, b: Evaluated, better: fn(&f64, &f64) -> bool) -> Option<Margin> {
-    let fraction = |margin: &Margin| match margin.limit.abs().max(margin.value.abs()) {
-        scale if scale > 0.0 && scale.is_finite() => margin.amount / scale,
-        _ => margin.amount,
-    };
-    match (a.margin, b.margin) {
-        (Some(a), Some(b)) => Some(if better(&fraction(&b), &fraction(&a)) { b } else { a }),
-        (a, b) => a.or(b),
-    }
-}
-
-fn compared(holds: bool, amount: f64, value: f64, limit: f64, formula: &Formula, readings: &[Reading]) -> Evaluated {
-    let mut indices = Vec::new();
-    measures(formula, &mut indices);
-    let used = || indices.iter().map(|&i| &readings[i]);
-    let unit = used().next().map_or_else(Unit::none, |reading| reading.unit.clone());
-    let time = used().find_map(|reading| reading.time);
-    Evaluated { value: f64::from(holds), margin: Some(Margin { amount, value, limit, unit, time }) }
-}
-
-/// The measures of a formula, in the order of the text.
-fn measures(formula: &Formula, into: &mut Vec<usize>) {
-    match formula {
-        Formula::Number(_) => {}
-        Formula::Measure(index) => into.push(*index),
-        Formula::Negate(a) | Formula::Abs(a) | Formula::Sqrt(a) | Formula::Not(a) => measures(a, into),
-        Formula::Add(a, b)
-        | Formula::Subtract(a, b)
-        | Formula::Multiply(a, b)
-        | Formula::Divide(a, b)
-        | Formula::Min(a, b)
-        | Formula::Max(a, b)
-        | Formula::Less(a, b)
-        | Formula::LessEqual(a, b)
-        | Formula::Greater(a, b)
-        | Formula::GreaterEqual(a, b)
-        | Formula::And(a, b)
-        | Formula::Or(a, b) => {
-            measures(a, into);
-            measures(b, into);
-        }
-        Formula::Near { value, target, tolerance, relative: _ } => {
-            measures(value, into);
-            measures(target, into);
-            measures(tolerance, into);
-        }
+    match problem {
+        Some(problem) => verdict::unable(expect, readings, problem),
+        None => verdict::verdict(expect, readings),
     }
 }
 
@@ -244,6 +83,12 @@ type Point = (f64, f64);
 /// One measure at work: cuts its window exactly and tallies what lies inside.
 struct Meter {
     slot: Slot,
+    /// Conditions that open and close the window, until they first hold.
+    begins: Option<Slot>,
+    ends: Option<Slot>,
+    /// What tells the moment at which the value is wanted, and its present value.
+    moment: Option<Slot>,
+    telling: f64,
     after: f64,
     before: f64,
     /// The last point seen, inside the window or not; in the beginning none, at an infinite time.
@@ -252,6 +97,8 @@ struct Meter {
     first: Point,
     end: Point,
     counted: bool,
+    /// The greatest magnitude counted.
+    scale: f64,
     tally: Tally,
 }
 
@@ -261,9 +108,20 @@ enum Tally {
     Final,
     At { instant: f64, value: Option<f64> },
     Crossings { sign: f64, count: u64, time: Option<f64> },
-    First { time: f64 },
+    First { after: Before, time: f64, gap: f64 },
+    AtMoment { moment: Moment, best: f64, found: Option<Point>, gap: f64 },
+    TimeOf { sign: f64, best: f64, time: f64 },
     Period { kept: Kept },
     Settling { band: f64, kept: Kept },
+}
+
+/// What a condition must have been before it counts as first.
+#[derive(Clone, Copy)]
+enum Before {
+    Anything,
+    False,
+    /// The other of what it is then.
+    Other,
 }
 
 enum Extreme {
@@ -292,12 +150,65 @@ impl Meter {
             MeasureKind::Final => Tally::Final,
             MeasureKind::At(instant) => Tally::At { instant, value: None },
             MeasureKind::Crossings => Tally::Crossings { sign: 0.0, count: 0, time: None },
-            MeasureKind::First => Tally::First { time: f64::INFINITY },
+            MeasureKind::First => Tally::First { after: Before::Anything, time: f64::INFINITY, gap: 0.0 },
+            MeasureKind::Rises => Tally::First { after: Before::False, time: f64::INFINITY, gap: 0.0 },
+            MeasureKind::Turns => Tally::First { after: Before::Other, time: f64::INFINITY, gap: 0.0 },
+            MeasureKind::AtMoment(moment) => Tally::AtMoment { moment, best: f64::INFINITY, found: None, gap: 0.0 },
+            MeasureKind::TimeOfLeast => Tally::TimeOf { sign: 1.0, best: f64::INFINITY, time: 0.0 },
+            MeasureKind::TimeOfGreatest => Tally::TimeOf { sign: -1.0, best: f64::INFINITY, time: 0.0 },
             MeasureKind::Period => Tally::Period { kept: Kept::default() },
             MeasureKind::Settling(band) => Tally::Settling { band, kept: Kept::default() },
         };
         let none = (f64::INFINITY, 0.0);
-        Meter { slot: measure.slot, after, before, last: none, first: none, end: none, counted: false, tally }
+        // An edge that an event sets is out of reach until then.
+        let (mut after, mut before, mut begins, mut ends) = (after, before, None, None);
+        match measure.window.after {
+            Edge::Open => {}
+            Edge::At(time) => after = after.max(time),
+            Edge::First(slot) => (after, begins) = (f64::INFINITY, Some(slot)),
+        }
+        match measure.window.before {
+            Edge::Open => {}
+            Edge::At(time) => before = before.min(time),
+            Edge::First(slot) => ends = Some(slot),
+        }
+        let moment = match measure.kind {
+            MeasureKind::AtMoment(
+                Moment::First(slot) | Moment::Rises(slot) | Moment::Least(slot) | Moment::Greatest(slot),
+            ) => Some(slot),
+            _ => None,
+        };
+        let (slot, telling, scale, counted) = (measure.slot, 0.0, 0.0, false);
+        Meter {
+            slot,
+            begins,
+            ends,
+            moment,
+            telling,
+            after,
+            before,
+            last: none,
+            first: none,
+            end: none,
+            counted,
+            scale,
+            tally,
+        }
+    }
+
+    /// One more point, as a block: events may open or close the window there.
+    fn see_block(&mut self, t: f64, block: &[f64]) {
+        let holds = |slot: Option<Slot>| slot.is_some_and(|slot| block[slot.index()] != 0.0);
+        if holds(self.begins) {
+            (self.begins, self.after) = (None, t);
+        }
+        if holds(self.ends) {
+            (self.ends, self.before) = (None, self.before.min(t));
+        }
+        if let Some(moment) = self.moment {
+            self.telling = block[moment.index()];
+        }
+        self.see(t, block[self.slot.index()]);
     }
 
     /// One more point; at the edges of the window, the point on the line to the one before.
@@ -358,15 +269,67 @@ impl Meter {
                     *sign = v.signum();
                 }
             }
-            Tally::First { time } => {
-                if v != 0.0 && *time == f64::INFINITY {
+            Tally::AtMoment { moment, best, found, gap } => {
+                let telling = self.telling;
+                let now = match moment {
+                    Moment::First(_) => found.is_none() && telling != 0.0,
+                    Moment::Rises(_) => found.is_none() && telling != 0.0 && *best == 0.0,
+                    Moment::Least(_) => telling < *best,
+                    Moment::Greatest(_) => -telling < *best,
+                };
+                match moment {
+                    Moment::First(_) | Moment::Rises(_) => {
+                        if now && self.counted && t > previous.0 {
+                            // It lies somewhere since the point before.
+                            *gap = (v - previous.1).abs();
+                        }
+                        *best = telling;
+                    }
+                    Moment::Least(_) => *best = best.min(telling),
+                    Moment::Greatest(_) => *best = best.min(-telling),
+                }
+                if now {
+                    *found = Some((t, v));
+                }
+            }
+            Tally::TimeOf { sign, best, time } => {
+                if *sign * v < *best {
+                    (*best, *time) = (*sign * v, t);
+                }
+            }
+            Tally::First { after, time, gap } => {
+                let was = if self.counted { Some(previous.1 != 0.0) } else { None };
+                let now = match after {
+                    Before::Anything => v != 0.0,
+                    Before::False => v != 0.0 && was == Some(false),
+                    Before::Other => was.is_some_and(|was| was != (v != 0.0)),
+                };
+                if now && *time == f64::INFINITY {
                     *time = t;
+                    // It became true somewhere since the point before.
+                    *gap = if self.counted { t - previous.0 } else { 0.0 };
                 }
             }
             Tally::Period { kept } | Tally::Settling { kept, .. } => kept.push((t, v)),
         }
         self.end = (t, v);
+        self.scale = self.scale.max(v.abs());
         self.counted = true;
+    }
+
+    /// How far the reading may be off because only points were looked at, SI.
+    fn resolution(&self) -> f64 {
+        match &self.tally {
+            Tally::First { gap, .. } | Tally::AtMoment { gap, .. } => *gap,
+            Tally::Extremes { .. }
+            | Tally::Sum { .. }
+            | Tally::Final
+            | Tally::At { .. }
+            | Tally::Crossings { .. }
+            | Tally::TimeOf { .. }
+            | Tally::Period { .. }
+            | Tally::Settling { .. } => 0.0,
+        }
     }
 
     /// Value in SI, and the time in s where it happened; or the reason why there is none.
@@ -376,6 +339,9 @@ impl Meter {
                 f64::INFINITY => "the run has no point".into(),
                 end => format!("the run ends at {}", show::time(end)),
             };
+            if self.begins.is_some() {
+                return Err("the window never begins: its event does not happen".into());
+            }
             let (after, before) = (show::time(self.after), show::time(self.before));
             return Err(format!("the window from {after} to {before} is empty; {end}"));
         }
@@ -414,7 +380,12 @@ impl Meter {
                 Ok((value, Some(*instant)))
             }
             Tally::Crossings { count, time, .. } => Ok((*count as f64, *time)),
-            Tally::First { time } => Ok((*time, time.is_finite().then_some(*time))),
+            Tally::AtMoment { found, .. } => {
+                let (time, value) = found.ok_or("its event does not happen in the window")?;
+                Ok((value, Some(time)))
+            }
+            Tally::TimeOf { time, .. } => Ok((*time, Some(*time))),
+            Tally::First { time, .. } => Ok((*time, time.is_finite().then_some(*time))),
             Tally::Period { kept } => Ok((period(kept.whole()?)?, None)),
             Tally::Settling { band, kept } => {
                 let time = settling(kept.whole()?, last.1, *band).unwrap_or(first.0);
@@ -554,11 +525,13 @@ impl Sum {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use abi::plan::Window;
+    use abi::unit::Unit;
 
     const WHOLE: (f64, f64) = (0.0, f64::INFINITY);
 
     fn measure(kind: MeasureKind) -> Measure {
-        Measure { text: "m".into(), kind, slot: Slot(3), unit: Unit::parse("m").unwrap() }
+        Measure { text: "m".into(), kind, slot: Slot(3), unit: Unit::parse("m").unwrap(), window: Window::default() }
     }
 
     /// One measure over these points, and its time.
@@ -634,6 +607,37 @@ mod tests {
         assert_eq!(taken(MeasureKind::First, (0.0, 1.0), &points), Ok((f64::INFINITY, None)));
     }
 
+    /// One measure over points of a quantity and of what tells when.
+    fn told(kind: MeasureKind, window: Window, points: &[(f64, f64, f64)]) -> Result<(f64, Option<f64>), String> {
+        let mut meter = Meter::new(&Measure { window, ..measure(kind) }, 0.0, f64::INFINITY);
+        points.iter().for_each(|(t, v, w)| meter.see_block(*t, &[*t, 0.0, *w, *v]));
+        meter.reading()
+    }
+
+    #[test]
+    fn events_set_moments_and_windows() {
+        let (slot, open) = (Slot(2), Window::default());
+        let points = [(0.0, 0.0, 1.0), (1.0, 5.0, 0.0), (2.0, 3.0, 0.0), (2.0, 3.0, 1.0), (3.0, 4.0, 1.0)];
+        let at = |moment| told(MeasureKind::AtMoment(moment), open, &points);
+        assert_eq!(at(Moment::First(slot)), Ok((0.0, Some(0.0))));
+        assert_eq!(at(Moment::Rises(slot)), Ok((3.0, Some(2.0))));
+        assert_eq!(at(Moment::Least(slot)), Ok((5.0, Some(1.0))));
+        assert_eq!(at(Moment::Greatest(slot)), Ok((0.0, Some(0.0))));
+        assert_eq!(told(MeasureKind::TimeOfGreatest, open, &points), Ok((1.0, Some(1.0))));
+        assert_eq!(told(MeasureKind::TimeOfLeast, open, &points), Ok((0.0, Some(0.0))));
+        let late = [(0.0, 9.0, 0.0), (1.0, 5.0, 0.0), (2.0, 3.0, 1.0), (3.0, 4.0, 0.0)];
+        let after = Window { after: Edge::First(slot), before: Edge::Open };
+        let before = Window { after: Edge::At(0.5), before: Edge::First(slot) };
+        assert_eq!(told(MeasureKind::Max, after, &late), Ok((4.0, Some(3.0))));
+        assert_eq!(told(MeasureKind::Max, before, &late), Ok((7.0, Some(0.5))));
+        assert_eq!(told(MeasureKind::Final, before, &late), Ok((3.0, Some(2.0))));
+        let never = told(MeasureKind::Max, after, &late[..2]).unwrap_err();
+        assert_eq!(never, "the window never begins: its event does not happen");
+        let turns = [(0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (2.0, 0.0, 0.0), (3.0, 1.0, 0.0)];
+        assert_eq!(told(MeasureKind::Turns, open, &turns), Ok((2.0, Some(2.0))));
+        assert_eq!(told(MeasureKind::Rises, open, &turns), Ok((3.0, Some(3.0))));
+    }
+
     #[test]
     fn averages_of_a_sine() {
         let points = sine(1.0, 3.0, 1e-4);
@@ -680,71 +684,5 @@ mod tests {
         let mut sum = Sum::default();
         (0..10_000_000).for_each(|_| sum.add(0.1));
         assert_eq!(sum.total(), 1_000_000.0);
-    }
-
-    /// The verdict on `condition` when max(x) is 2 m at 1 s and min(x) is −2 m at 3 s.
-    fn judged(condition: Formula) -> Verdict {
-        let measures = vec![measure(MeasureKind::Max), measure(MeasureKind::Min)];
-        let expect = Expect { text: "e".into(), measures, condition, after: 0.0, before: f64::INFINITY };
-        let mut expectations = Expectations::new(&[expect]);
-        for (t, v) in [(0.0, 0.0), (1.0, 2.0), (3.0, -2.0)] {
-            expectations.see(t, &[t, 0.0, 0.0, v]);
-        }
-        expectations.verdicts().remove(0)
-    }
-
-    fn max() -> Box<Formula> {
-        Box::new(Formula::Measure(0))
-    }
-    fn min() -> Box<Formula> {
-        Box::new(Formula::Measure(1))
-    }
-    fn number(value: f64) -> Box<Formula> {
-        Box::new(Formula::Number(value))
-    }
-
-    #[test]
-    fn a_margin_names_distance_and_instant() {
-        let verdict = judged(Formula::Less(max(), number(1.5)));
-        let margin = verdict.margin.unwrap();
-        assert!(!verdict.holds);
-        assert_eq!((margin.amount, margin.value, margin.limit, margin.time), (-0.5, 2.0, 1.5, Some(1.0)));
-        assert_eq!(margin.unit.text, "m");
-        assert_eq!(verdict.readings.len(), 2);
-        assert!(judged(Formula::LessEqual(max(), number(2.0))).holds);
-        assert!(!judged(Formula::Less(max(), number(2.0))).holds);
-        assert!(judged(Formula::Greater(number(3.0), max())).holds);
-    }
-
-    #[test]
-    fn near_takes_an_absolute_or_a_relative_tolerance() {
-        let near = |target, tolerance, relative| {
-            let (value, target, tolerance) = (min(), number(target), number(tolerance));
-            judged(Formula::Near { value, target, tolerance, relative })
-        };
-        assert!(near(-2.5, 0.5, false).holds);
-        assert!(!near(-2.5, 0.4, false).holds);
-        assert!(near(-2.5, 0.2, true).holds);
-        assert!(!near(-2.5, 0.19, true).holds);
-        assert_eq!(near(-2.5, 0.5, false).margin.unwrap().time, Some(3.0));
-    }
-
-    #[test]
-    fn the_comparison_that_decides_gives_the_margin() {
-        let loose = || Box::new(Formula::Less(max(), number(10.0)));
-        let tight = || Box::new(Formula::Greater(min(), number(-2.1)));
-        let both = judged(Formula::And(loose(), tight()));
-        assert!(both.holds && (both.margin.unwrap().amount - 0.1).abs() < 1e-15);
-        let either = judged(Formula::Or(loose(), tight()));
-        assert!(either.holds && either.margin.unwrap().amount == 8.0);
-        let neither = judged(Formula::Not(loose()));
-        assert!(!neither.holds && neither.margin.unwrap().amount == -8.0);
-    }
-
-    #[test]
-    fn what_is_not_a_number_holds_nothing() {
-        let zero = || Box::new(Formula::Add(max(), min()));
-        let verdict = judged(Formula::Not(Box::new(Formula::Less(Box::new(Formula::Divide(zero(), zero())), max()))));
-        assert!(!verdict.holds && verdict.problem.unwrap().contains("not a number"));
     }
 }

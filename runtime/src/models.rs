@@ -1,7 +1,7 @@
 //! Models written by hand, for tests: what a compiler would make, as closures over a [`View`].
 
 use abi::description::{Automaton, Guard, Kind, Quantity, Root, Tick};
-use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Series, Solver};
+use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, PARTS, Plot, Series, Solver, Window};
 use abi::table::{Interpret, keep_time};
 use abi::unit::Unit;
 use abi::{Code, Description, Function, Instance, Layout, Slot};
@@ -331,7 +331,7 @@ pub fn slot(instance: &Instance, path: &str) -> Slot {
 
 /// An experiment that neither draws nor expects.
 pub fn fixed(duration: f64, step: f64) -> Experiment {
-    let solver = Solver { method: Method::Rk4, step, tol: 0.0 };
+    let solver = Solver { method: Method::Rk4, step, tol: 0.0, parts: PARTS };
     Experiment {
         name: "test".into(),
         duration,
@@ -340,18 +340,25 @@ pub fn fixed(duration: f64, step: f64) -> Experiment {
         plots: Vec::new(),
         expects: Vec::new(),
         corners: Vec::new(),
+        stepped: false,
     }
 }
 
 /// An adaptive experiment that neither draws nor expects.
 pub fn adaptive(duration: f64, tol: f64) -> Experiment {
-    Experiment { solver: Solver { method: Method::Adaptive, step: 0.0, tol }, ..fixed(duration, 1.0) }
+    Experiment { solver: Solver { method: Method::Adaptive, step: 0.0, tol, parts: PARTS }, ..fixed(duration, 1.0) }
 }
 
 /// `text` over the whole run, for reading one measure: the condition is the measure itself.
 pub fn reading(instance: &Instance, kind: MeasureKind, path: &str) -> Expect {
     let quantity = instance.description().quantity(path).unwrap_or_else(|| panic!("no quantity `{path}`"));
-    let measure = Measure { text: format!("{kind:?}({path})"), kind, slot: quantity.slot, unit: quantity.unit.clone() };
+    let measure = Measure {
+        text: format!("{kind:?}({path})"),
+        kind,
+        slot: quantity.slot,
+        unit: quantity.unit.clone(),
+        window: Window::default(),
+    };
     Expect {
         text: measure.text.clone(),
         measures: vec![measure],

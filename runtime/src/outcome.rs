@@ -1,9 +1,10 @@
 //! How a run ends: what it gives, or why it stopped.
 
-use crate::measure::Verdict;
 use crate::record::Recording;
 use crate::show;
+use crate::verdict::Verdict;
 use abi::description::Guard;
+use abi::plan::Solver;
 use abi::unit::Unit;
 use std::fmt;
 use std::ops::ControlFlow;
@@ -26,12 +27,25 @@ pub struct Outcome {
     pub work: Work,
     /// What the reader should know besides: in words, a sentence each.
     pub notes: Vec<String>,
+    /// How the errors of the readings were found; none where nobody asked.
+    pub estimate: Option<Estimate>,
+}
+
+/// How the errors of an outcome were found.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Estimate {
+    /// Runs of the same by a finer solver that came to their end.
+    pub companions: Vec<Solver>,
+    /// One that did not, and why, in words: then no error is known.
+    pub failed: Option<(Solver, String)>,
+    /// Where verdicts are open: a solver that decides all of them, tried.
+    pub decides: Option<Solver>,
 }
 
 impl Outcome {
-    /// Whether every expectation held.
+    /// Whether every expectation held, without a doubt where errors were estimated.
     pub fn passed(&self) -> bool {
-        self.verdicts.iter().all(|verdict| verdict.holds)
+        self.verdicts.iter().all(Verdict::passed)
     }
 }
 

@@ -7,7 +7,7 @@
 use crate::engine::{self, Cause, Continue, Failure};
 use crate::record::Recording;
 use abi::description::Kind;
-use abi::plan::{Experiment, Method, Solver};
+use abi::plan::{Experiment, Method, PARTS, Solver};
 use abi::{Function, Instance, Slot};
 use std::fmt;
 
@@ -63,10 +63,18 @@ pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Contin
             let stopped = Failure { cause: Cause::Stopped, time: 0.0, recording: Recording::default() };
             return Err(Restless::Failed(stopped));
         }
-        let solver = Solver { method: Method::Adaptive, step: 0.0, tol };
+        let solver = Solver { method: Method::Adaptive, step: 0.0, tol, parts: PARTS };
         let (plots, expects, corners) = (Vec::new(), Vec::new(), Vec::new());
-        let experiment =
-            Experiment { name: String::new(), duration: *wait, solver, bench: None, plots, expects, corners };
+        let experiment = Experiment {
+            name: String::new(),
+            duration: *wait,
+            solver,
+            bench: None,
+            plots,
+            expects,
+            corners,
+            stepped: false,
+        };
         let before = now.clone();
         let mut begin = |instance: &mut Instance| {
             instance.carry(&before);

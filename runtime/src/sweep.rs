@@ -4,6 +4,7 @@
 //! results have the same bits for any number of threads.
 
 use crate::engine::{self, Continue, Failure, Outcome};
+use crate::estimate;
 use abi::Instance;
 use abi::plan::Experiment;
 use rayon::prelude::*;
@@ -47,6 +48,16 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
         engine::run(case.instance.clone(), &case.experiment, &mut report)
     };
     cases.par_iter().with_max_len(1).map(run).collect()
+}
+
+/// Estimates the errors of what became of all cases, as [`estimate::judge`] does.
+pub fn judge(cases: &[Case], results: &mut [Result<Outcome, Failure>], watch: &(dyn Fn(f64) -> Continue + Sync)) {
+    let judge = |(case, result): (&Case, &mut Result<Outcome, Failure>)| {
+        if let Ok(outcome) = result {
+            estimate::judge(&case.instance, &case.experiment, outcome, &mut |done| watch(done));
+        }
+    };
+    cases.par_iter().zip(results).with_max_len(1).for_each(judge);
 }
 
 /// Results that wait for an earlier one, at most, for each thread: more than there are lanes.

@@ -14,7 +14,7 @@ use abi::plan::{Experiment, Method, Solver};
 use abi::unit::Unit;
 use abi::{Instance, Slot};
 use runtime::engine::{self, Continue, Failure, Outcome};
-use runtime::measure::Verdict;
+use runtime::verdict::Verdict;
 use serde_json::{Value, json};
 
 /// Intervals between the instants that are compared.
@@ -97,7 +97,7 @@ impl Crossed {
             out += &format!("{indent}  {}\n", cells.join("  ").trim_end());
         }
         let broken: Vec<Verdict> = verdicts.iter().filter(|verdict| !verdict.holds).cloned().collect();
-        out += &results::verdicts(terminal, &broken, &format!("{indent}  "));
+        out += &results::verdicts(terminal, &broken, None, None, &format!("{indent}  "));
         if let Some(advice) = &self.advice {
             out += &format!("{indent}  {advice}\n");
         }
@@ -326,6 +326,7 @@ fn round_down(value: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use abi::plan::PARTS;
 
     #[test]
     fn steps_are_rounded_to_what_people_write() {
@@ -334,7 +335,7 @@ mod tests {
 
     #[test]
     fn instants_are_ends_of_steps() {
-        let solver = |step| Solver { method: Method::Expo, step, tol: 1e-6 };
+        let solver = |step| Solver { method: Method::Expo, step, tol: 1e-6, parts: PARTS };
         let times = instants(1.0, [solver(0.0), solver(3e-3)]);
         assert!(times.is_sorted_by(|a, b| a < b) && times.len() == 334, "{}", times.len());
         assert!(times.iter().all(|t| (t / 3e-3 - (t / 3e-3).round()).abs() < 1e-9));

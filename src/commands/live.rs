@@ -80,8 +80,8 @@ pub(super) fn show_run(ran: &Ran, draw: bool, terminal: &mut Terminal) -> bool {
         if !case.label.is_empty() && !outcome.verdicts.is_empty() {
             terminal.line(&format!("  {}", case.label));
         }
-        held &= outcome.verdicts.iter().all(|verdict| verdict.holds);
-        let words = results::verdicts(terminal, &outcome.verdicts, "  ");
+        held &= outcome.passed();
+        let words = results::verdicts(terminal, &outcome.verdicts, outcome.estimate.as_ref(), None, "  ");
         terminal.print(&words);
     }
     held

@@ -196,8 +196,9 @@ fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatc
 struct Done {
     cases: Vec<Case>,
     results: Vec<Result<Outcome, Failure>>,
-    /// Seconds that all cases took.
+    /// Seconds that all cases took, and that the estimate of their errors took besides.
     wall: f64,
+    judging: f64,
     stages: Stages,
 }
 
@@ -232,7 +233,8 @@ fn reported(loaded: &Loaded, diagnostics: &[Diagnostic], terminal: &Terminal) {
 }
 
 /// Runs the cases of an experiment, with a bar on a terminal if it takes a while.
-fn done(cases: Vec<Case>, stages: Stages, quiet: bool) -> Done {
+/// Estimates their numerical errors besides, if `errors` are wanted.
+fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
     let bar = ProgressBar::with_draw_target(
         Some(1000),
         if quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() },
@@ -256,8 +258,13 @@ fn done(cases: Vec<Case>, stages: Stages, quiet: bool) -> Done {
             experiment: case.experiment.clone(),
         })
         .collect();
-    let results = runs::run(&all, &watch);
+    let mut results = runs::run(&all, &watch);
     let wall = begin.elapsed().as_secs_f64();
+    if errors {
+        bar.set_position(0);
+        runs::judge(&all, &mut results, &watch);
+    }
+    let judging = begin.elapsed().as_secs_f64() - wall;
     bar.finish_and_clear();
-    Done { cases, results, wall, stages }
+    Done { cases, results, wall, judging, stages }
 }

@@ -10,6 +10,7 @@ use crate::terminal::{Style, Terminal};
 use crate::{diagram, equations, project, report, results};
 use abi::unit::Unit;
 use runtime::engine::Cause;
+use runtime::verdict::Verdict;
 use std::cell::RefCell;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -319,8 +320,8 @@ impl Prompt<'_> {
             if !case.label.is_empty() {
                 self.terminal.line(&format!("  {}", case.label));
             }
-            held &= last.iter().all(|verdict| verdict.holds);
-            let words = results::verdicts(self.terminal, last, "");
+            held &= last.iter().all(Verdict::passed);
+            let words = results::verdicts(self.terminal, last, outcome.estimate.as_ref(), None, "");
             self.terminal.print(&words);
         }
         Ok(if held { Next::Line } else { Next::Missed })

@@ -104,7 +104,7 @@ fn experiment(
             terminal.line("  nothing to write: the experiment has no `plot`");
         }
     }
-    let done = done(cases, stages, !talking);
+    let done = done(cases, stages, !talking, !args.trust.no_error);
     let crossed: Option<Vec<Crossed>> = match args.cross {
         true => cross(loaded, name, options, &done.cases, terminal),
         false => Some(Vec::new()),
@@ -135,10 +135,10 @@ fn experiment(
         }
     }
     if talking {
-        tell(&done, drawn.as_ref(), terminal);
+        tell(&done, drawn.as_ref(), args.trust.digits, terminal);
         crossed.iter().for_each(|crossed| terminal.print(&crossed.words(terminal, "  ")));
     } else if args.quiet {
-        complain(name, &done, terminal);
+        complain(name, &done, args.trust.digits, terminal);
         for crossed in crossed.iter().filter(|crossed| !crossed.passed()) {
             terminal.report(&crossed.words(terminal, "  "));
         }
@@ -226,10 +226,10 @@ fn for_case(path: &Path, label: &str) -> PathBuf {
 }
 
 /// Work, plot and verdicts in full.
-fn tell(done: &Done, drawn: Option<&Figure>, terminal: &mut Terminal) {
+fn tell(done: &Done, drawn: Option<&Figure>, digits: Option<u8>, terminal: &mut Terminal) {
     let outcomes: Vec<_> = done.results.iter().filter_map(|result| result.as_ref().ok()).collect();
     if !outcomes.is_empty() {
-        terminal.print(&results::work(&outcomes, done.wall));
+        terminal.print(&results::work(&outcomes, done.wall, done.judging));
     }
     let mut notes: Vec<&String> = outcomes.iter().flat_map(|outcome| &outcome.notes).collect();
     notes.dedup();
@@ -245,18 +245,19 @@ fn tell(done: &Done, drawn: Option<&Figure>, terminal: &mut Terminal) {
         if !case.label.is_empty() && !outcome.verdicts.is_empty() {
             terminal.line(&format!("  {}", case.label));
         }
-        terminal.print(&results::verdicts(terminal, &outcome.verdicts, "  "));
+        terminal.print(&results::verdicts(terminal, &outcome.verdicts, outcome.estimate.as_ref(), digits, "  "));
     }
 }
 
 /// What did not hold, on the standard error.
-fn complain(name: &str, done: &Done, terminal: &Terminal) {
+fn complain(name: &str, done: &Done, digits: Option<u8>, terminal: &Terminal) {
     for (case, result) in done.cases.iter().zip(&done.results) {
         let Ok(outcome) = result else { continue };
-        let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.holds).cloned().collect();
+        let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.passed()).cloned().collect();
         if !failed.is_empty() {
             let label = if case.label.is_empty() { String::new() } else { format!(", {}", case.label) };
-            terminal.report(&format!("{name}{label}\n{}", results::verdicts(terminal, &failed, "  ")));
+            let words = results::verdicts(terminal, &failed, outcome.estimate.as_ref(), digits, "  ");
+            terminal.report(&format!("{name}{label}\n{words}"));
         }
     }
 }

@@ -14,7 +14,7 @@ use crate::unfinished::{Hash, Mark, Unfinished};
 use crate::value::{self, count, significant};
 use crate::vary::{Dice, Vary};
 use crate::{project, results};
-use abi::plan::Measure;
+use abi::plan::{Formula, Measure};
 use abi::{Description, Slot};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
@@ -298,7 +298,7 @@ impl Table {
                     })
                     .collect();
                 for verdict in own {
-                    let read = |r: &runtime::measure::Reading| (r.text.clone(), r.unit.from_si(r.value));
+                    let read = |r: &runtime::verdict::Reading| (r.text.clone(), r.unit.from_si(r.value));
                     readings.push(verdict.readings.iter().map(read).collect());
                     verdicts.push(verdict.holds);
                 }
@@ -646,7 +646,9 @@ fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
             let axis = Axis { name: text.clone(), unit: unit.text.clone(), logarithmic: false };
             columns.push(Column { title: axis.title(), axis, kind: ColumnKind::Measure(k, j) });
         }
-        columns.push(plain(&expect.text, ColumnKind::Verdict(k)));
+        if !matches!(expect.condition, Formula::Shown(..)) {
+            columns.push(plain(&expect.text, ColumnKind::Verdict(k)));
+        }
     }
     columns.push(plain("status", ColumnKind::Status));
     columns

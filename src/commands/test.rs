@@ -72,7 +72,7 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, ter
         terminal.line(&line(terminal, false, name, ""));
         return false;
     };
-    let done = done(cases, stages, args.quiet);
+    let done = done(cases, stages, args.quiet, !args.trust.no_error);
     let held = done.results.iter().all(|result| result.as_ref().is_ok_and(runtime::engine::Outcome::passed));
     let crossed = match args.cross && held {
         true => cross(loaded, name, &options, &done.cases, terminal),
@@ -87,8 +87,9 @@ fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, ter
         match result {
             Ok(outcome) if outcome.passed() => {}
             Ok(outcome) => {
-                let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.holds).cloned().collect();
-                terminal.print(&results::verdicts(terminal, &failed, &format!("          {label}")));
+                let failed: Vec<_> = outcome.verdicts.iter().filter(|verdict| !verdict.passed()).cloned().collect();
+                let (estimate, indent) = (outcome.estimate.as_ref(), format!("          {label}"));
+                terminal.print(&results::verdicts(terminal, &failed, estimate, args.trust.digits, &indent));
             }
             Err(failure) => terminal.line(&format!("          {label}{failure}")),
         }

@@ -434,7 +434,7 @@ impl Found {
                 Some(_) => What::Name,
                 None => What::Other,
             },
-            ExprKind::Call { function, args } => {
+            ExprKind::Call { function, args, .. } => {
                 args.iter().for_each(|arg| self.expr(arg));
                 What::Call(function.text.clone(), function.span)
             }

@@ -179,7 +179,9 @@ impl<'a> Flattener<'a> {
             ExprKind::Number { value, unit } => return self.number(*value, unit.as_ref(), span, env),
             ExprKind::Path(path) => return self.path(path, env),
             ExprKind::Derivative { of, along } => return self.derivative(of, along, span, env),
-            ExprKind::Call { function, args } => return self.call(function, args, span, env),
+            ExprKind::Call { function, args, window } => {
+                return self.call(function, args, window.as_deref(), span, env);
+            }
             ExprKind::Unary(UnaryOp::Negate, a) => Node::Negate(self.expr(a, env)),
             ExprKind::Unary(UnaryOp::Not, a) => Node::Not(self.expr(a, env)),
             ExprKind::If(c, a, b) => Node::If(self.expr(c, env), self.expr(a, env), self.expr(b, env)),
@@ -429,7 +431,44 @@ impl<'a> Flattener<'a> {
         self.system.push(node, span)
     }
 
-    pub(super) fn call(&mut self, function: &'a Name, args: &'a [Expr], span: Span, env: &Env) -> ExprId {
+    /// A measure. `first(a rises b)` is when `a >= b` turns true, having been false.
+    fn measure(
+        &mut self,
+        mut measure: MeasureName,
+        args: &'a [Expr],
+        window: Option<&'a ast::Window>,
+        span: Span,
+        env: &Env,
+    ) -> ExprId {
+        let value = match (&args[0].kind, measure) {
+            (
+                ExprKind::Binary(op @ (BinaryOp::Rises | BinaryOp::Falls | BinaryOp::Crosses), at, a, b),
+                MeasureName::First,
+            ) => {
+                let (a, b) = (self.expr(a, env), self.expr(b, env));
+                measure = if *op == BinaryOp::Crosses { MeasureName::Turns } else { MeasureName::Rises };
+                let op = if *op == BinaryOp::Falls { BinaryOp::LessEqual } else { BinaryOp::GreaterEqual };
+                self.system.push(Node::Binary(op, a, b), *at)
+            }
+            _ => self.expr(&args[0], env),
+        };
+        let second = args.get(1).map(|arg| self.expr(arg, env));
+        let mut edge = |edge: Option<&'a Expr>| edge.map(|edge| self.expr(edge, env));
+        let window = window.map_or_else(Window::default, |window| Window {
+            after: edge(window.after.as_ref()),
+            before: edge(window.before.as_ref()),
+        });
+        self.system.push(Node::Measure(measure, value, second, window), span)
+    }
+
+    pub(super) fn call(
+        &mut self,
+        function: &'a Name,
+        args: &'a [Expr],
+        window: Option<&'a ast::Window>,
+        span: Span,
+        env: &Env,
+    ) -> ExprId {
         if let ("sum" | "min" | "max", [Expr { kind: ExprKind::Path(path), .. }]) = (function.text.as_str(), args)
             && let Some(folded) = self.fold(function, path, span, env)
         {
@@ -439,9 +478,14 @@ impl<'a> Flattener<'a> {
             && let Some((measure, wanted)) = MeasureName::named(&function.text)
             && args.len() == wanted
         {
-            let value = self.expr(&args[0], env);
-            let second = args.get(1).map(|arg| self.expr(arg, env));
-            return self.system.push(Node::Measure(measure, value, second), span);
+            return self.measure(measure, args, window, span, env);
+        }
+        if let Some(window) = window {
+            let edge = window.after.as_ref().or(window.before.as_ref()).map_or(span, |edge| edge.span);
+            let error = Diagnostic::error("E0901", format!("`{}` has no window: it is no measure here", function.text))
+                .label(edge, "a part of a run");
+            self.report(error.help("measures in `expect` have one: `expect max(x after 1 s) < 2 mm`"));
+            return self.error(span);
         }
         match self.loaded.find(env.file, Space::Function, &function.text) {
             Lookup::Found(item, Item::Function(f)) => return self.expand(item, f, function, args, span, env),

@@ -193,7 +193,7 @@ impl Adaptive {
             t: 0.0,
             x: system.instance.block()[system.states.clone()].to_vec(),
             h: 0.0,
-            longest: (experiment.duration / 50.0).min(system.history.longest()),
+            longest: (experiment.duration / experiment.solver.parts).min(system.history.longest()),
             kept: 0.0,
             step: Step::new(n),
             slope_known: false,

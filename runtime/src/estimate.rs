@@ -1,0 +1,322 @@
+//! How far the measures of a run are from the exact solution of its model.
+//!
+//! In: an instance as it was before its run, the plan, and the outcome. Out: the same outcome whose readings and margins carry
+//! their numerical error, whose verdicts are open where that error may turn them over, and an [`Estimate`] of how it was
+//! found: companion runs of the same code at a tenth and a hundredth of the tolerance, or with a half and a quarter of the
+//! step. The run itself is over by then: nothing here can change its bits.
+//!
+//! The error of a number is the width that all results span, at least; of fixed steps it is extrapolated to the step 0
+//! besides (Richardson) with the order that three runs show, at least 1 and at most that of the method. Two companions
+//! rather than one since two results may agree by accident.
+
+use crate::engine::{self, Cause, Continue, Estimate, Outcome};
+use crate::verdict::{Reading, Runs, Verdict, judged};
+use abi::plan::{Experiment, Method, Solver};
+use abi::{Description, Instance};
+
+/// Tolerances of companions, as parts of that of the run.
+const TOLERANCES: [f64; 2] = [0.1, 0.01];
+
+/// No companion has a smaller tolerance: below, rounding is all there is.
+const LEAST_TOL: f64 = 1e-13;
+
+/// Steps of companions, as parts of that of the run. Powers of two: whatever divides into steps still does.
+const STEPS: [f64; 2] = [0.5, 0.25];
+
+/// A run that is tried to see whether it decides takes so many times the steps of the run itself at most.
+const MOST_WORK: f64 = 64.0;
+
+/// Estimates the errors of an outcome; `instance` and `experiment` as they were given to [`engine::run`]. An experiment that
+/// expects nothing needs no companion. `watch` may end it: then the outcome stays as it was.
+pub fn judge(
+    instance: &Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) {
+    if experiment.expects.is_empty() {
+        return;
+    }
+    let bare = Experiment { plots: Vec::new(), ..experiment.clone() };
+    let mut ladder = Ladder { instance, bare, runs: Vec::new() };
+    ladder.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
+    for solver in companions(&experiment.solver) {
+        if !ladder.run(solver, watch) {
+            return;
+        }
+    }
+    let mut estimate = Estimate::default();
+    let finer = &ladder.runs[1..];
+    estimate.failed = finer.iter().find_map(|(solver, run)| Some((*solver, run.as_ref().err()?.clone())));
+    estimate.companions = finer.iter().filter(|(_, run)| run.is_ok()).map(|(solver, _)| *solver).collect();
+    outcome.verdicts = ladder.verdicts(0);
+    if experiment.stepped && experiment.solver.method != Method::Adaptive {
+        outcome.verdicts.iter_mut().for_each(|verdict| verdict.decided = true);
+    }
+    if estimate.failed.is_none() && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
+        estimate.decides = ladder.decides(&outcome.verdicts, outcome.work.steps, watch);
+    }
+    outcome.estimate = Some(estimate);
+}
+
+/// The solvers of the companions of a run, finer and finer; coarser ones where none can be finer.
+fn companions(solver: &Solver) -> Vec<Solver> {
+    match solver.method {
+        Method::Adaptive => {
+            let finer = |part: f64| Solver { tol: part * solver.tol, parts: 2.0 * solver.parts, ..*solver };
+            let all: Vec<Solver> =
+                TOLERANCES.map(finer).into_iter().filter(|finer| finer.tol >= 0.999 * LEAST_TOL).collect();
+            if all.is_empty() { vec![Solver { tol: 10.0 * solver.tol, ..*solver }] } else { all }
+        }
+        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+            STEPS.map(|part| Solver { step: part * solver.step, ..*solver }).to_vec()
+        }
+    }
+}
+
+/// Runs of one experiment by one method, finer and finer.
+struct Ladder<'a> {
+    instance: &'a Instance,
+    /// Without plots.
+    bare: Experiment,
+    /// The verdicts of each, or why it did not come to its end.
+    runs: Vec<(Solver, Result<Vec<Verdict>, String>)>,
+}
+
+impl Ladder<'_> {
+    /// Makes one more run, which must be finer than the last; false if the caller ended it.
+    fn run(&mut self, solver: Solver, watch: &mut dyn FnMut(f64) -> Continue) -> bool {
+        let plant = self.bare.bench.as_ref().map(|bench| &bench.plant);
+        let stepped = plant.unwrap_or(self.instance).description();
+        let (mut going, mut result) = (true, Err("its delays reach back over more steps than are kept".into()));
+        if solver.method == Method::Adaptive || has_room(stepped, solver.step) {
+            let experiment = Experiment { solver, ..self.bare.clone() };
+            let ended = engine::run(self.instance.clone(), &experiment, watch);
+            going = !ended.as_ref().is_err_and(|failure| failure.cause == Cause::Stopped);
+            result = ended.map(|outcome| outcome.verdicts).map_err(|failure| failure.to_string());
+        }
+        self.runs.push((solver, result));
+        going
+    }
+
+    /// The verdicts of a run, judged by those after it.
+    fn verdicts(&self, of: usize) -> Vec<Verdict> {
+        let (solver, Ok(own)) = &self.runs[of] else { return Vec::new() };
+        let finer = &self.runs[of + 1..];
+        let failed = finer.iter().any(|(_, run)| run.is_err());
+        let error = |values: &[f64]| Some(if failed { f64::INFINITY } else { error(solver.method, values) });
+        let judge = |(k, expect): (usize, &abi::plan::Expect)| {
+            let own = &own[k];
+            if own.problem.is_some() {
+                return own.clone();
+            }
+            let mut readings: Vec<&[Reading]> = vec![&own.readings];
+            let mut doubt = false;
+            for (_, run) in finer {
+                match run.as_ref().map(|verdicts| &verdicts[k]) {
+                    Ok(verdict) if verdict.problem.is_none() => readings.push(&verdict.readings),
+                    // What cannot be measured in a finer run is not known of this one.
+                    Ok(_) | Err(_) => doubt = true,
+                }
+            }
+            let unknown = |_: &[f64]| Some(f64::INFINITY);
+            let error: &dyn Fn(&[f64]) -> Option<f64> = if doubt { &unknown } else { &error };
+            judged(expect, &Runs { readings: &readings, error })
+        };
+        self.bare.expects.iter().enumerate().map(judge).collect()
+    }
+
+    /// The coarsest solver found under which all is decided; `open` are the verdicts of the first run, which took so many
+    /// steps.
+    fn decides(&mut self, open: &[Verdict], steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<Solver> {
+        let decided = |verdicts: &[Verdict]| !verdicts.is_empty() && verdicts.iter().all(|verdict| verdict.decided);
+        // The companions are judged by those after them.
+        for of in 1..self.runs.len() - 1 {
+            if decided(&self.verdicts(of)) {
+                return Some(self.runs[of].0);
+            }
+        }
+        // Then as the order of the method foretells; less than a factor of 4 is no news.
+        let excess = open.iter().filter(|verdict| !verdict.decided).filter_map(|verdict| {
+            let margin = verdict.margin.as_ref()?;
+            Some(margin.error? / margin.amount.abs())
+        });
+        let excess = excess.fold(4.0, f64::max);
+        let own = self.runs[0].0;
+        for safety in [4.0, 64.0] {
+            let solver = match own.method {
+                Method::Adaptive => {
+                    let tol = power_of_ten_below(own.tol / (safety * excess));
+                    Solver { tol, parts: 2.0 * own.parts, ..own }
+                }
+                Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+                    let mut part = 0.5;
+                    while power(1.0 / part, order(own.method).min(2)) < safety * excess {
+                        part *= 0.5;
+                        if part < 1e-6 {
+                            return None;
+                        }
+                    }
+                    Solver { step: part * own.step, ..own }
+                }
+            };
+            let work = match own.method {
+                Method::Adaptive => power_of_fifth(own.tol / solver.tol),
+                Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => own.step / solver.step,
+            };
+            if work > MOST_WORK || work * steps as f64 > 2e7 || solver.method == Method::Adaptive && solver.tol < 1e-12
+            {
+                return None;
+            }
+            let finer = Solver { step: 0.5 * solver.step, tol: 0.1 * solver.tol, ..solver };
+            let at = self.runs.len();
+            if !(self.run(solver, watch) && self.run(finer, watch)) {
+                return None;
+            }
+            if decided(&self.verdicts(at)) {
+                return Some(solver);
+            }
+        }
+        None
+    }
+}
+
+/// Whether what is delayed has room in steps of so many s.
+fn has_room(description: &Description, step: f64) -> bool {
+    description.delays.iter().all(|delay| (delay.range.1 / step).ceil() + 2.0 <= f64::from(delay.ring.len))
+}
+
+/// The error of the first of the results of finer and finer runs.
+fn error(method: Method, values: &[f64]) -> f64 {
+    if values.iter().all(|value| *value == values[0]) {
+        return 0.0;
+    }
+    if values.iter().any(|value| !value.is_finite()) {
+        return f64::INFINITY;
+    }
+    let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let span = most - values.iter().copied().fold(f64::INFINITY, f64::min);
+    match (method, values) {
+        (Method::Adaptive, _) => span,
+        // Of two steps alone the order is not known: 1 is the least.
+        (_, [coarse, fine]) => 2.0 * (coarse - fine).abs(),
+        (_, [coarse, fine, finest, ..]) => {
+            let (first, second) = (coarse - fine, fine - finest);
+            // 2^p, where the steps are short enough for the order p to show.
+            let ratio = (first / second).clamp(2.0, power(2.0, order(method)));
+            let ratio = if ratio.is_nan() { 2.0 } else { ratio };
+            let limit = finest - second / (ratio - 1.0);
+            span.max((coarse - limit).abs())
+        }
+        (_, _) => 0.0,
+    }
+}
+
+/// The order of a fixed method.
+fn order(method: Method) -> u32 {
+    match method {
+        Method::Euler => 1,
+        Method::Rk4 => 4,
+        Method::Expo | Method::Implicit | Method::Adaptive => 2,
+    }
+}
+
+fn power(base: f64, exponent: u32) -> f64 {
+    (0..exponent).fold(1.0, |product, _| product * base)
+}
+
+/// The fifth root of what is at least 1, to a factor of 10 ^ 0.2: how many times the steps a smaller tolerance takes.
+fn power_of_fifth(ratio: f64) -> f64 {
+    let (mut rest, mut root) = (ratio, 1.0);
+    while rest > 1.0 {
+        rest *= 0.1;
+        root *= 1.5848931924611136;
+    }
+    root
+}
+
+/// The greatest power of ten that is not above.
+fn power_of_ten_below(value: f64) -> f64 {
+    let text = format!("{value:e}");
+    let exponent = text.split_once('e').map_or("0", |(_, exponent)| exponent);
+    format!("1e{exponent}").parse().unwrap_or(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::models::{self, adaptive, fixed, reading};
+    use abi::plan::{Formula, MeasureKind};
+
+    fn judged(instance: &Instance, experiment: &Experiment) -> Outcome {
+        let mut go_on = |_| Continue::Continue(());
+        let mut outcome = engine::run(instance.clone(), experiment, &mut go_on).unwrap();
+        let before = outcome.clone();
+        judge(instance, experiment, &mut outcome, &mut go_on);
+        assert_eq!((&before.finals, before.work), (&outcome.finals, outcome.work));
+        for (a, b) in before.verdicts.iter().zip(&outcome.verdicts) {
+            assert!(a.readings.iter().zip(&b.readings).all(|(a, b)| a.value.to_bits() == b.value.to_bits()));
+        }
+        outcome
+    }
+
+    /// The error of x = e^-t at 1 s, and its estimate.
+    fn decay(mut experiment: Experiment) -> (f64, f64) {
+        let instance = models::decay();
+        experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+        let reading = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+        ((reading.value - (-1f64).exp()).abs(), reading.error.unwrap())
+    }
+
+    #[test]
+    fn a_decay_is_as_far_off_as_is_said() {
+        for experiment in [adaptive(1.0, 1e-3), adaptive(1.0, 1e-5), fixed(1.0, 0.1), fixed(1.0, 0.01)] {
+            let (error, estimate) = decay(experiment.clone());
+            let fits = error > 0.0 && error <= 3.0 * estimate && estimate <= 10.0 * error + 1e-15;
+            assert!(fits, "{:?}: {error:e}, {estimate:e}", experiment.solver);
+        }
+    }
+
+    #[test]
+    fn the_tightest_tolerance_is_judged_by_a_looser_one() {
+        let (error, estimate) = decay(adaptive(1.0, 1e-13));
+        assert!(error <= 3.0 * estimate + 1e-15, "{error:e}, {estimate:e}");
+    }
+
+    #[test]
+    fn an_open_verdict_names_what_decides() {
+        let instance = models::decay();
+        for mut experiment in [fixed(1.0, 0.1), adaptive(1.0, 1e-3)] {
+            let solver = experiment.solver;
+            let mut expect = reading(&instance, MeasureKind::Final, "x");
+            // Beside the truth by a part of the error of the run.
+            let (error, _) = decay(experiment.clone());
+            let limit = (-1f64).exp() + 0.2 * error;
+            expect.condition = Formula::Less(Box::new(Formula::Measure(0)), Box::new(Formula::Number(limit)));
+            experiment.expects.push(expect);
+            let outcome = judged(&instance, &experiment);
+            assert!(!outcome.verdicts[0].decided && !outcome.passed(), "{solver:?}");
+            let decides = outcome.estimate.unwrap().decides.unwrap_or_else(|| panic!("{solver:?} has no remedy"));
+            let better = judged(&instance, &Experiment { solver: decides, ..experiment.clone() });
+            assert!(better.passed(), "{decides:?}");
+            experiment.stepped = true;
+            let on_purpose = judged(&instance, &experiment);
+            assert_eq!(on_purpose.verdicts[0].decided, solver.method != Method::Adaptive);
+        }
+    }
+
+    #[test]
+    fn three_results_show_their_order_and_two_do_not() {
+        let at = |order: u32| [1.0, 0.5, 0.25].map(|h| 7.0 + power(h, order));
+        assert!((error(Method::Euler, &at(1)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Expo, &at(2)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Rk4, &at(4)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Rk4, &at(4)[..2]) - 1.875).abs() < 1e-12);
+        // Two that agree by accident do not make a small error.
+        assert!(error(Method::Expo, &[1.0, 1.0, 1.5]) >= 0.5);
+        assert!(error(Method::Adaptive, &[1.0, 1.0, 1.5]) >= 0.5);
+        assert_eq!(error(Method::Adaptive, &[f64::INFINITY; 3]), 0.0);
+        assert_eq!(error(Method::Adaptive, &[f64::INFINITY, 1.0, 1.0]), f64::INFINITY);
+        assert_eq!(error(Method::Rk4, &[2.0; 3]), 0.0);
+    }
+}

@@ -1,0 +1,516 @@
+//! The verdict on an expectation, from the readings of its measures.
+//!
+//! In: an [`Expect`] and the readings of one run, or of one run and of the same computed more finely. Out: a [`Verdict`] with
+//! the comparison that decided, and with more than one run the numerical error of each number and whether the verdict
+//! stands in spite of it. Knows neither points nor solvers.
+
+use abi::plan::{Expect, Formula};
+use abi::unit::Unit;
+
+/// Differences below this part of the greatest magnitude that a measured quantity reaches are rounding and doubt nothing: that a
+/// power is nowhere negative is not in doubt because it is -1e-25 W at rest.
+const ROUNDING: f64 = 1e-11;
+
+/// What became of one expectation.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Verdict {
+    /// As written.
+    pub text: String,
+    /// Whether it held. Never where there is a `problem`.
+    pub holds: bool,
+    /// Whether the numerical error is too small to turn it over; true where no error was estimated.
+    pub decided: bool,
+    /// The measures that could be taken, in the order of the text.
+    pub readings: Vec<Reading>,
+    /// The comparison that decided; none where the condition compares nothing or could not be evaluated.
+    pub margin: Option<Margin>,
+    /// Why it could not be evaluated, in words: `the window … is empty`.
+    pub problem: Option<String>,
+    /// Of what is only shown: the value, with its error. Nothing is judged then: it holds and is decided.
+    pub shown: Option<Reading>,
+}
+
+impl Verdict {
+    /// Whether it holds and the numerical error leaves no doubt of it.
+    pub fn passed(&self) -> bool {
+        self.holds && self.decided
+    }
+}
+
+/// The value of one measure.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Reading {
+    /// As written.
+    pub text: String,
+    /// In SI.
+    pub value: f64,
+    /// The unit it is shown in.
+    pub unit: Unit,
+    /// When it happened, in s, where it happened at an instant: of `max`, when the maximum was reached.
+    pub time: Option<f64>,
+    /// How far it may be off because only the points of the run were looked at, SI: half of what a denser set could change.
+    pub resolution: f64,
+    /// The greatest magnitude that the measured quantity reached, SI.
+    pub scale: f64,
+    /// Estimated distance to the exact solution of the model, SI; infinite where it could not be estimated, none where nobody
+    /// asked.
+    pub error: Option<f64>,
+}
+
+/// How far a comparison was from turning over.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Margin {
+    /// Distance to the limit in SI: positive where the comparison holds.
+    pub amount: f64,
+    /// The value compared, in SI.
+    pub value: f64,
+    /// What it was compared with, in SI.
+    pub limit: f64,
+    /// The unit of all three.
+    pub unit: Unit,
+    /// The instant that matters, in s, if one of the measures compared has one.
+    pub time: Option<f64>,
+    /// Estimated numerical error of value less limit, SI, as of [`Reading::error`].
+    pub error: Option<f64>,
+}
+
+/// One run of an experiment and finer ones of the same, and how much their results say about the error of the first.
+pub struct Runs<'a> {
+    /// The readings of one expectation: those of the run itself, then those of finer ones.
+    pub readings: &'a [&'a [Reading]],
+    /// The error of the first of these values, all of the same number; none where it is not asked for.
+    pub error: &'a dyn Fn(&[f64]) -> Option<f64>,
+}
+
+/// The verdict from the readings of a run alone.
+pub fn verdict(expect: &Expect, readings: Vec<Reading>) -> Verdict {
+    judged(expect, &Runs { readings: &[&readings], error: &|_| None })
+}
+
+/// The verdict on the first of several runs, with its error.
+pub fn judged(expect: &Expect, runs: &Runs) -> Verdict {
+    let mut readings = runs.readings[0].to_vec();
+    for (k, reading) in readings.iter_mut().enumerate() {
+        let values: Vec<f64> = runs.readings.iter().map(|readings| readings[k].value).collect();
+        reading.error = (runs.error)(&values).map(|error| error.max(reading.resolution));
+    }
+    if let Formula::Shown(unit, value) = &expect.condition {
+        return shown(expect, runs, readings, unit, value);
+    }
+    match (Evaluation { runs }).of(&expect.condition) {
+        Ok(Evaluated { value, margin, known, .. }) => {
+            let decided = known || (runs.error)(&[0.0]).is_none();
+            Verdict {
+                text: expect.text.clone(),
+                holds: value != 0.0,
+                decided,
+                readings,
+                margin,
+                problem: None,
+                shown: None,
+            }
+        }
+        Err(problem) => unable(expect, readings, problem),
+    }
+}
+
+/// The verdict where the condition cannot be evaluated, and why.
+pub fn unable(expect: &Expect, readings: Vec<Reading>, problem: String) -> Verdict {
+    let text = expect.text.clone();
+    Verdict { text, holds: false, decided: true, readings, margin: None, problem: Some(problem), shown: None }
+}
+
+/// What is shown and not judged.
+fn shown(expect: &Expect, runs: &Runs, readings: Vec<Reading>, unit: &Unit, formula: &Formula) -> Verdict {
+    let value = match number(formula, runs.readings[0]) {
+        Ok(value) => value,
+        Err(problem) => return unable(expect, readings, problem),
+    };
+    let error = Evaluation { runs }.error(formula);
+    let time = match formula {
+        Formula::Measure(index) => readings[*index].time,
+        _ => None,
+    };
+    let text = expect.text.clone();
+    let shown =
+        Reading { text: text.clone(), value, unit: unit.clone(), time, resolution: 0.0, scale: value.abs(), error };
+    Verdict { text, holds: true, decided: true, readings, margin: None, problem: None, shown: Some(shown) }
+}
+
+struct Evaluated {
+    value: f64,
+    margin: Option<Margin>,
+    /// Of a condition: whether no error within the estimate turns it over (Kleene's logic of three values).
+    known: bool,
+}
+
+struct Evaluation<'a> {
+    runs: &'a Runs<'a>,
+}
+
+impl Evaluation<'_> {
+    /// A formula over the readings of the first run; a result that is not a number (0/0) is an error, since no comparison
+    /// with it means anything.
+    fn of(&self, formula: &Formula) -> Result<Evaluated, String> {
+        match formula {
+            Formula::Less(a, b) => self.compared(formula, a, b, 1.0, true),
+            Formula::LessEqual(a, b) => self.compared(formula, a, b, 1.0, false),
+            Formula::Greater(a, b) => self.compared(formula, a, b, -1.0, true),
+            Formula::GreaterEqual(a, b) => self.compared(formula, a, b, -1.0, false),
+            Formula::Near { value, target, tolerance, relative } => {
+                let readings = self.runs.readings[0];
+                let (measured, target) = (number(value, readings)?, number(target, readings)?);
+                let tolerance = number(tolerance, readings)?;
+                let amount = width(tolerance, target, *relative) - distance(measured, target);
+                Ok(self.margin(amount >= 0.0, amount, (measured, target), formula))
+            }
+            Formula::And(a, b) => {
+                let (a, b) = (self.of(a)?, self.of(b)?);
+                let value = f64::from(a.value != 0.0 && b.value != 0.0);
+                let settles = |one: &Evaluated| one.known && one.value == 0.0;
+                let known = a.known && b.known || settles(&a) || settles(&b);
+                Ok(Evaluated { value, margin: deciding(a, b, known, f64::lt), known })
+            }
+            Formula::Or(a, b) => {
+                let (a, b) = (self.of(a)?, self.of(b)?);
+                let value = f64::from(a.value != 0.0 || b.value != 0.0);
+                let settles = |one: &Evaluated| one.known && one.value != 0.0;
+                let known = a.known && b.known || settles(&a) || settles(&b);
+                Ok(Evaluated { value, margin: deciding(a, b, known, f64::gt), known })
+            }
+            Formula::Not(a) => {
+                let a = self.of(a)?;
+                let turned = a.margin.map(|margin| Margin { amount: -margin.amount, ..margin });
+                Ok(Evaluated { value: f64::from(a.value == 0.0), margin: turned, known: a.known })
+            }
+            Formula::Shown(_, a) => self.of(a),
+            Formula::In(unit, a) => {
+                let a = self.of(a)?;
+                Ok(Evaluated { margin: a.margin.map(|margin| Margin { unit: unit.clone(), ..margin }), ..a })
+            }
+            Formula::Number(_)
+            | Formula::Measure(_)
+            | Formula::Function(..)
+            | Formula::Negate(_)
+            | Formula::Abs(_)
+            | Formula::Sqrt(_)
+            | Formula::Add(..)
+            | Formula::Subtract(..)
+            | Formula::Multiply(..)
+            | Formula::Divide(..)
+            | Formula::Min(..)
+            | Formula::Max(..) => {
+                let value = number(formula, self.runs.readings[0])?;
+                // A truth value that was measured: the finer runs must agree.
+                let same =
+                    |readings: &&[Reading]| number(formula, readings).is_ok_and(|v| (v != 0.0) == (value != 0.0));
+                let known = self.runs.readings.iter().all(same) && self.error(formula).is_none_or(f64::is_finite);
+                Ok(Evaluated { value, margin: None, known })
+            }
+        }
+    }
+
+    fn compared(
+        &self,
+        formula: &Formula,
+        left: &Formula,
+        right: &Formula,
+        sign: f64,
+        strict: bool,
+    ) -> Result<Evaluated, String> {
+        let readings = self.runs.readings[0];
+        let (value, limit) = (number(left, readings)?, number(right, readings)?);
+        // Equal infinities leave no room.
+        let amount = if value == limit { 0.0 } else { sign * (limit - value) };
+        let holds = if strict { amount > 0.0 } else { amount >= 0.0 };
+        Ok(self.margin(holds, amount, (value, limit), formula))
+    }
+
+    fn margin(&self, holds: bool, amount: f64, (value, limit): (f64, f64), formula: &Formula) -> Evaluated {
+        let mut indices = Vec::new();
+        measures(formula, &mut indices);
+        let used = || indices.iter().map(|&i| &self.runs.readings[0][i]);
+        let unit = used().next().map_or_else(Unit::none, |reading| reading.unit.clone());
+        let time = used().find_map(|reading| reading.time);
+        let error = self.error(formula);
+        // A measure that is a whole side is as large as what it is of; arithmetic is as large as its value.
+        let scale = match formula {
+            Formula::Less(a, b)
+            | Formula::LessEqual(a, b)
+            | Formula::Greater(a, b)
+            | Formula::GreaterEqual(a, b)
+            | Formula::Near { value: a, target: b, .. } => [a, b]
+                .iter()
+                .map(|side| if let Formula::Measure(k) = &***side { self.runs.readings[0][*k].scale } else { 0.0 })
+                .fold(value.abs().max(limit.abs()), f64::max),
+            _ => 0.0,
+        };
+        let rounding = if scale.is_finite() { ROUNDING * scale } else { 0.0 };
+        let known = error.is_none_or(|error| error <= amount.abs().max(rounding));
+        let margin = Margin { amount, value, limit, unit, time, error };
+        Evaluated { value: f64::from(holds), margin: Some(margin), known }
+    }
+
+    /// The error of what a comparison compares: of the distance between its two sides, or of a number.
+    fn error(&self, formula: &Formula) -> Option<f64> {
+        let all: Vec<(f64, f64)> = self.runs.readings.iter().map(|readings| sides(formula, readings)).collect();
+        let of = |part: fn(&(f64, f64)) -> f64| (self.runs.error)(&all.iter().map(part).collect::<Vec<f64>>());
+        let error = of(|side| side.0)?.max(of(|side| side.1)?);
+        // What a denser look could change in each measure, through the formula.
+        let own = self.runs.readings[0];
+        let (mut moved, mut coarse) = (own.to_vec(), 0.0);
+        for k in 0..own.len() {
+            if own[k].resolution > 0.0 {
+                moved[k].value = own[k].value + own[k].resolution;
+                let (there, here) = (sides(formula, &moved), sides(formula, own));
+                coarse += (there.0 - here.0).abs().max((there.1 - here.1).abs());
+                moved[k].value = own[k].value;
+            }
+        }
+        Some(error.max(coarse))
+    }
+}
+
+/// Of a comparison, how far its sides are apart, and the width that this may have; of a number it itself.
+fn sides(formula: &Formula, readings: &[Reading]) -> (f64, f64) {
+    let value = |formula: &Formula| number(formula, readings).unwrap_or(f64::NAN);
+    let apart = |a: &Formula, b: &Formula| {
+        let (a, b) = (value(a), value(b));
+        (if a == b { 0.0 } else { a - b }, 0.0)
+    };
+    match formula {
+        Formula::Less(a, b) | Formula::LessEqual(a, b) | Formula::Greater(a, b) | Formula::GreaterEqual(a, b) => {
+            apart(a, b)
+        }
+        Formula::Near { value: measured, target, tolerance, relative } => {
+            (apart(measured, target).0, width(value(tolerance), value(target), *relative))
+        }
+        _ => (value(formula), 0.0),
+    }
+}
+
+fn width(tolerance: f64, target: f64, relative: bool) -> f64 {
+    if relative { tolerance * target.abs() } else { tolerance }
+}
+
+fn distance(measured: f64, target: f64) -> f64 {
+    if measured == target { 0.0 } else { (measured - target).abs() }
+}
+
+/// The value of a formula over these readings.
+fn number(formula: &Formula, readings: &[Reading]) -> Result<f64, String> {
+    let of = |formula: &Formula| number(formula, readings);
+    let truth = |holds: bool| f64::from(holds);
+    let value = match formula {
+        Formula::Number(number) => *number,
+        Formula::Measure(index) => readings[*index].value,
+        Formula::Negate(a) => -of(a)?,
+        Formula::Abs(a) => of(a)?.abs(),
+        Formula::Sqrt(a) => of(a)?.sqrt(),
+        Formula::Add(a, b) => of(a)? + of(b)?,
+        Formula::Subtract(a, b) => of(a)? - of(b)?,
+        Formula::Multiply(a, b) => of(a)? * of(b)?,
+        Formula::Divide(a, b) => of(a)? / of(b)?,
+        Formula::Min(a, b) => of(a)?.min(of(b)?),
+        Formula::Max(a, b) => of(a)?.max(of(b)?),
+        Formula::Less(a, b) => truth(of(a)? < of(b)?),
+        Formula::LessEqual(a, b) => truth(of(a)? <= of(b)?),
+        Formula::Greater(a, b) => truth(of(a)? > of(b)?),
+        Formula::GreaterEqual(a, b) => truth(of(a)? >= of(b)?),
+        Formula::And(a, b) => truth(of(a)? != 0.0 && of(b)? != 0.0),
+        Formula::Or(a, b) => truth(of(a)? != 0.0 || of(b)? != 0.0),
+        Formula::Not(a) => truth(of(a)? == 0.0),
+        Formula::In(_, a) | Formula::Shown(_, a) => of(a)?,
+        Formula::Function(function, args) => {
+            let arg = |k: usize| args.get(k).map_or(Ok(0.0), of);
+            (function.at)(arg(0)?, arg(1)?)
+        }
+        Formula::Near { value, target, tolerance, relative } => {
+            let target = of(target)?;
+            truth(distance(of(value)?, target) <= width(of(tolerance)?, target, *relative))
+        }
+    };
+    match value.is_nan() {
+        true => Err("the condition is not a number: a division of zero by zero, or a root of a negative".into()),
+        false => Ok(value),
+    }
+}
+
+/// Of two comparisons the one that decides: one that is in doubt where the whole is, else the one whose margin as a fraction of
+/// its limit is the smaller (or larger), since units differ.
+fn deciding(a: Evaluated, b: Evaluated, known: bool, better: fn(&f64, &f64) -> bool) -> Option<Margin> {
+    let fraction = |margin: &Margin| match margin.limit.abs().max(margin.value.abs()) {
+        scale if scale > 0.0 && scale.is_finite() => margin.amount / scale,
+        _ => margin.amount,
+    };
+    match (a.margin, b.margin) {
+        (Some(first), Some(_)) if !known && !a.known && b.known => Some(first),
+        (Some(_), Some(second)) if !known && a.known && !b.known => Some(second),
+        (Some(a), Some(b)) => Some(if better(&fraction(&b), &fraction(&a)) { b } else { a }),
+        (a, b) => a.or(b),
+    }
+}
+
+/// The measures of a formula, in the order of the text.
+fn measures(formula: &Formula, into: &mut Vec<usize>) {
+    match formula {
+        Formula::Number(_) => {}
+        Formula::Measure(index) => into.push(*index),
+        Formula::Function(_, args) => args.iter().for_each(|arg| measures(arg, into)),
+        Formula::Negate(a)
+        | Formula::Abs(a)
+        | Formula::Sqrt(a)
+        | Formula::Not(a)
+        | Formula::In(_, a)
+        | Formula::Shown(_, a) => measures(a, into),
+        Formula::Add(a, b)
+        | Formula::Subtract(a, b)
+        | Formula::Multiply(a, b)
+        | Formula::Divide(a, b)
+        | Formula::Min(a, b)
+        | Formula::Max(a, b)
+        | Formula::Less(a, b)
+        | Formula::LessEqual(a, b)
+        | Formula::Greater(a, b)
+        | Formula::GreaterEqual(a, b)
+        | Formula::And(a, b)
+        | Formula::Or(a, b) => {
+            measures(a, into);
+            measures(b, into);
+        }
+        Formula::Near { value, target, tolerance, relative: _ } => {
+            measures(value, into);
+            measures(target, into);
+            measures(tolerance, into);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn expect(condition: Formula) -> Expect {
+        Expect { text: "e".into(), measures: Vec::new(), condition, after: 0.0, before: f64::INFINITY }
+    }
+
+    fn readings(max: f64, min: f64) -> Vec<Reading> {
+        let reading = |text: &str, value, time| {
+            let (text, unit) = (text.into(), Unit::parse("m").unwrap());
+            Reading { text, value, unit, time: Some(time), resolution: 0.0, scale: 2.0, error: None }
+        };
+        vec![reading("max(x)", max, 1.0), reading("min(x)", min, 3.0)]
+    }
+
+    /// The verdict on `condition` when max(x) is 2 m at 1 s and min(x) is −2 m at 3 s.
+    fn alone(condition: Formula) -> Verdict {
+        verdict(&expect(condition), readings(2.0, -2.0))
+    }
+
+    fn max() -> Box<Formula> {
+        Box::new(Formula::Measure(0))
+    }
+    fn min() -> Box<Formula> {
+        Box::new(Formula::Measure(1))
+    }
+    fn number(value: f64) -> Box<Formula> {
+        Box::new(Formula::Number(value))
+    }
+
+    #[test]
+    fn a_margin_names_distance_and_instant() {
+        let verdict = alone(Formula::Less(max(), number(1.5)));
+        let margin = verdict.margin.unwrap();
+        assert!(!verdict.holds);
+        assert_eq!((margin.amount, margin.value, margin.limit, margin.time), (-0.5, 2.0, 1.5, Some(1.0)));
+        assert_eq!(margin.unit.text, "m");
+        assert_eq!(verdict.readings.len(), 2);
+        assert!(alone(Formula::LessEqual(max(), number(2.0))).holds);
+        assert!(!alone(Formula::Less(max(), number(2.0))).holds);
+        assert!(alone(Formula::Greater(number(3.0), max())).holds);
+    }
+
+    #[test]
+    fn near_takes_an_absolute_or_a_relative_tolerance() {
+        let near = |target, tolerance, relative| {
+            let (value, target, tolerance) = (min(), number(target), number(tolerance));
+            alone(Formula::Near { value, target, tolerance, relative })
+        };
+        assert!(near(-2.5, 0.5, false).holds);
+        assert!(!near(-2.5, 0.4, false).holds);
+        assert!(near(-2.5, 0.2, true).holds);
+        assert!(!near(-2.5, 0.19, true).holds);
+        assert_eq!(near(-2.5, 0.5, false).margin.unwrap().time, Some(3.0));
+    }
+
+    #[test]
+    fn the_comparison_that_decides_gives_the_margin() {
+        let loose = || Box::new(Formula::Less(max(), number(10.0)));
+        let tight = || Box::new(Formula::Greater(min(), number(-2.1)));
+        let both = alone(Formula::And(loose(), tight()));
+        assert!(both.holds && (both.margin.unwrap().amount - 0.1).abs() < 1e-15);
+        let either = alone(Formula::Or(loose(), tight()));
+        assert!(either.holds && either.margin.unwrap().amount == 8.0);
+        let neither = alone(Formula::Not(loose()));
+        assert!(!neither.holds && neither.margin.unwrap().amount == -8.0);
+    }
+
+    #[test]
+    fn what_is_not_a_number_holds_nothing() {
+        let zero = || Box::new(Formula::Add(max(), min()));
+        let verdict = alone(Formula::Not(Box::new(Formula::Less(Box::new(Formula::Divide(zero(), zero())), max()))));
+        assert!(!verdict.holds && verdict.problem.unwrap().contains("not a number"));
+    }
+
+    /// The same judged with two finer runs; the error is the width that the three span.
+    fn with_error(condition: Formula, finer: [(f64, f64); 2]) -> Verdict {
+        let all = [readings(2.0, -2.0), readings(finer[0].0, finer[0].1), readings(finer[1].0, finer[1].1)];
+        let slices: Vec<&[Reading]> = all.iter().map(Vec::as_slice).collect();
+        let span = |values: &[f64]| {
+            let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            Some(most - values.iter().copied().fold(f64::INFINITY, f64::min))
+        };
+        judged(&expect(condition), &Runs { readings: &slices, error: &span })
+    }
+
+    #[test]
+    fn an_error_larger_than_the_margin_leaves_the_verdict_open() {
+        let below = |limit: f64| Formula::Less(max(), number(limit));
+        let finer = [(2.01, -2.0), (2.012, -2.0)];
+        let clear = with_error(below(2.5), finer);
+        assert!(clear.passed() && (clear.readings[0].error.unwrap() - 0.012).abs() < 1e-12);
+        assert!((clear.margin.unwrap().error.unwrap() - 0.012).abs() < 1e-12);
+        let open = with_error(below(2.005), finer);
+        assert!(open.holds && !open.decided && !open.passed());
+        // One side that is clear decides what the other leaves open.
+        let both = |a: f64, b: f64| Formula::And(Box::new(below(a)), Box::new(below(b)));
+        assert!(with_error(both(2.005, 1.0), finer).decided);
+        let doubtful = with_error(both(2.005, 2.1), finer);
+        assert!(!doubtful.decided && doubtful.margin.unwrap().limit == 2.005);
+        let either = |a: f64, b: f64| Formula::Or(Box::new(below(a)), Box::new(below(b)));
+        assert!(with_error(either(2.005, 2.1), finer).decided && !with_error(either(2.005, 1.0), finer).decided);
+        // Errors that two measures have in common cancel in their difference.
+        let shifted = [(2.01, -1.99), (2.011, -1.989)];
+        let width = Formula::Subtract(max(), min());
+        let near =
+            Formula::Near { value: Box::new(width), target: number(4.0), tolerance: number(1e-9), relative: false };
+        assert!(with_error(near, shifted).passed());
+    }
+
+    #[test]
+    fn a_truth_value_on_which_finer_runs_disagree_is_open() {
+        let same = [(1.0, -2.0), (1.0, -2.0)];
+        assert!(with_error(*max(), same).decided && !with_error(*max(), [(1.0, 0.0), (0.0, 0.0)]).decided);
+    }
+
+    #[test]
+    fn what_is_seen_at_points_alone_is_as_coarse_as_they_are() {
+        let mut coarse = readings(2.0, -2.0);
+        coarse[0].resolution = 0.1;
+        let condition = Formula::Less(Box::new(Formula::Multiply(number(3.0), max())), number(6.2));
+        let judged = judged(&expect(condition), &Runs { readings: &[&coarse, &coarse], error: &|_| Some(0.0) });
+        assert!(judged.holds && !judged.decided);
+        assert!((judged.margin.unwrap().error.unwrap() - 0.3).abs() < 1e-12);
+        assert_eq!(judged.readings[0].error, Some(0.1));
+    }
+}
