@@ -503,3 +503,52 @@ fn a_text_that_names_a_pipe_is_refused_at_once() {
         assert!(output.status.code() == Some(1) && told.contains("it is a pipe or a device, not a file"), "{told}");
     }
 }
+
+#[test]
+fn an_error_that_exceeds_the_margin_leaves_the_verdict_open() {
+    let text = r#"
+model Decay {
+  state x [m] = 1 m
+  dx/dt = -x / 1 s
+}
+experiment coarse {
+  run    Decay() for 1 s
+  solver euler step 0.1 s
+  expect final(x) ~= 348.7 mm +- 1 mm
+}
+experiment fine {
+  run    Decay() for 1 s
+  show   final(x) * 2 [mm]
+  expect integral(x * 1 N / 1 s) ~= 0.6321 J +- 1 mJ
+  expect final(x) / integral(x) ~= 0.58198 1/s +- 0.1 %
+}
+"#;
+    let folder = Folder::new("undecided").with("decay.fric", text);
+    // By ten steps x is 0.349 m, in truth 0.368 m.
+    let (out, _) = folder.check(&["run", "decay.fric", "coarse"], 1, "undecided: the error");
+    assert!(out.contains("discretisation by steps of 50 ms and 25 ms"), "{out}");
+    folder.check(&["run", "decay.fric", "coarse", "--no-error"], 0, "348.678 mm, margin");
+    folder.check(&["test", "decay.fric"], 1, "1 passed, 1 failed");
+    folder.check(&["test", "decay.fric", "--no-error"], 0, "2 passed, 0 failed");
+    let (out, _) = folder.check(&["run", "decay.fric", "--json"], 1, "");
+    let objects: Vec<Value> = out.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let expect = &objects[0]["expects"][0];
+    assert_eq!((&expect["holds"], &expect["decided"], &expect["unit"]), (&true.into(), &false.into(), &"mm".into()));
+    let (value, error) = (expect["value"].as_f64().unwrap(), expect["error"].as_f64().unwrap());
+    let truth = 1e3 * (-1f64).exp();
+    assert!((value - truth).abs() < 1.5 * error && error < 3.0 * (value - truth).abs(), "{value} {error}");
+    assert_eq!(objects[0]["errors"]["companions"], serde_json::json!(["euler step 50 ms", "euler step 25 ms"]));
+    // What decides does.
+    let decides = objects[0]["errors"]["decides"].as_str().map(|s| s.replace("euler step ", "").replace(' ', ""));
+    if let Some(step) = decides {
+        let (out, _) = folder.check(&["run", "decay.fric", "coarse", "--step", &step], 1, "");
+        assert!(!out.contains("undecided"), "{step}: {out}");
+    }
+    let shown = &objects[1]["shows"][0];
+    assert!((shown["value"].as_f64().unwrap() - 2.0 * truth).abs() < 1e-2 && shown["unit"] == "mm", "{shown}");
+    assert_eq!(objects[1]["expects"][0]["unit"], "J");
+    assert_eq!(objects[1]["expects"][1]["unit"], "1/s");
+    // More digits.
+    let (out, _) = folder.check(&["run", "decay.fric", "fine", "--no-error", "--digits", "12"], 0, "");
+    assert!(out.contains("735.758882"), "{out}");
+}

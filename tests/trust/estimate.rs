@@ -146,6 +146,8 @@ fn judge(
         }
         let error = if reading.value == *true_value { 0.0 } else { (reading.value - true_value).abs() };
         count.measures += 1;
+        // Rounding, of the quantity and of what is as good as nothing in any unit of the library.
+        let unsure = &(unsure + 1e-11 * reading.scale + 1e-18);
         let covered = error <= TIMES * estimate + unsure;
         count.covered += u64::from(covered);
         if error > *unsure {

@@ -442,13 +442,13 @@ impl<'a> Flattener<'a> {
     ) -> ExprId {
         let value = match (&args[0].kind, measure) {
             (
-                ExprKind::Binary(op @ (BinaryOp::Rises | BinaryOp::Falls | BinaryOp::Crosses), at, a, b),
+                ExprKind::Binary(op @ (BinaryOp::Rises | BinaryOp::Falls | BinaryOp::Crosses), _, a, b),
                 MeasureName::First,
             ) => {
                 let (a, b) = (self.expr(a, env), self.expr(b, env));
                 measure = if *op == BinaryOp::Crosses { MeasureName::Turns } else { MeasureName::Rises };
                 let op = if *op == BinaryOp::Falls { BinaryOp::LessEqual } else { BinaryOp::GreaterEqual };
-                self.system.push(Node::Binary(op, a, b), *at)
+                self.system.push(Node::Binary(op, a, b), args[0].span)
             }
             _ => self.expr(&args[0], env),
         };
