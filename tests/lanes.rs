@@ -40,6 +40,7 @@ model Sampled {
 experiment last    { run Pull() for 10 s  expect final(x) > 0 m }
 experiment measured { run Pull() for 10 s  expect max(v) > 0 m/s  expect mean(power) > 0 W after 2 s }
 experiment regimes { run Pull(fr = Karnopp()) for 10 s  expect max(x) > 0 m }
+experiment narrow  { run Pull(fr = Karnopp(Dv = 1 um/s, Fv = 0 N·s/m)) for 20 s  expect final(x) > 0 m }
 experiment sampled { run Sampled() for 2 s  expect final(x) > -10 m }
 "#;
 
@@ -90,7 +91,9 @@ fn compare(varying: &Varying, path: &str, runs: usize, low: f64, by: f64) -> usi
 
 #[test]
 fn adaptive_runs_share_their_lanes() {
-    for (experiment, path) in [("last", "fr.Fs"), ("measured", "fr.Fs"), ("regimes", "fr.Fs"), ("sampled", "Kp")] {
+    for (experiment, path) in
+        [("last", "fr.Fs"), ("measured", "fr.Fs"), ("regimes", "fr.Fs"), ("narrow", "fr.Fs"), ("sampled", "Kp")]
+    {
         if !has_lanes() {
             return;
         }

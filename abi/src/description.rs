@@ -234,6 +234,8 @@ pub struct Root {
     pub decides: bool,
     /// Whether derivatives at most bend there, as at x = 0 with |x|; else they may jump.
     pub bends: bool,
+    /// Whether only observed quantities change their branch there: neither states nor regimes depend on it.
+    pub observed: bool,
 }
 
 /// All that is known of a compiled model besides its code.

@@ -319,7 +319,7 @@ encode_structs! {
     Segment { start, len }
     Delay { time, range, back, source, past, weight, slope, ring }
     Guard { path, slot, range, unit }
-    Root { text, decides, bends }
+    Root { text, decides, bends, observed }
 }
 
 /// Without the coupling of its Jacobian: what lies in a file makes fixed steps.

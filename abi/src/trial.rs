@@ -167,7 +167,8 @@ impl Trial {
         Slot(self.start + 17)
     }
 
-    /// For each state, what its size is measured with: tol · (|x| + s) is allowed. SI, read.
+    /// For each state, what its size is measured with: tol · (|x| + s) is allowed, where s is half the width of its declared
+    /// range or the largest |x| so far. SI, read and written.
     pub fn scales(self) -> Segment {
         Segment { start: self.start + SINGLE, len: self.states }
     }

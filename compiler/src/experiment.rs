@@ -735,22 +735,7 @@ fn variant(
             expect
         })
         .collect();
-    let expects: Vec<plan::Expect> = expects;
-    // Instants that a measure asks for are met exactly.
-    let asked = expects.iter().flat_map(|expect| {
-        let at = expect.measures.iter().filter_map(|measure| match measure.kind {
-            MeasureKind::At(t) => Some(t),
-            _ => None,
-        });
-        let edges = expect.measures.iter().flat_map(|measure| [measure.window.after, measure.window.before]);
-        let edges = edges.filter_map(|edge| match edge {
-            plan::Edge::At(t) => Some(t),
-            plan::Edge::Open | plan::Edge::First(_) => None,
-        });
-        at.chain(edges).chain([expect.after, expect.before])
-    });
-    let asked: Vec<f64> = asked.collect();
-    let mut corners: Vec<f64> = corners.into_iter().chain(asked).filter(|t| *t > 0.0 && *t < duration).collect();
+    let mut corners: Vec<f64> = corners.into_iter().filter(|t| *t > 0.0 && *t < duration).collect();
     corners.sort_by(f64::total_cmp);
     corners.dedup();
     let stepped = parts.stepped;

@@ -686,8 +686,6 @@ impl<'a> Plan<'a> {
                 from.push(rate);
             }
         }
-        // What an output alone does is seen only where somebody looks.
-        from.extend(&self.wanted);
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
@@ -695,7 +693,17 @@ impl<'a> Plan<'a> {
         let mut surfaces: Vec<(Value, ExprId, bool)> = Vec::new();
         let mut known: HashMap<Value, usize> = HashMap::new();
         let mut moving: HashMap<Value, bool> = HashMap::new();
-        while let Some(id) = stack.pop() {
+        // Observed quantities come last: a surface of theirs must not change the course of a run.
+        let mut own = None;
+        loop {
+            let Some(id) = stack.pop() else {
+                if own.is_some() {
+                    break;
+                }
+                own = Some(surfaces.len());
+                stack.extend(self.wanted.iter().rev());
+                continue;
+            };
             if std::mem::replace(&mut seen[id.0 as usize], true) {
                 continue;
             }
@@ -715,7 +723,8 @@ impl<'a> Plan<'a> {
                 }
                 let place = *known.entry(value).or_insert(surfaces.len());
                 match surfaces.get_mut(place) {
-                    Some(surface) => surface.2 &= bends,
+                    // How an observed quantity changes says nothing of derivatives.
+                    Some(surface) => surface.2 &= bends || own.is_some_and(|own| place < own),
                     None => surfaces.push((value, id, bends)),
                 }
             };
@@ -775,7 +784,9 @@ impl<'a> Plan<'a> {
         let mut roots = Vec::new();
         for (k, (value, id, bends)) in surfaces.iter().enumerate() {
             emit.build.store(segment.slot(k), *value);
-            roots.push(Root { text: self.root_text(*id), decides: deciding.contains(id), bends: *bends });
+            let observed = own.is_some_and(|own| k >= own);
+            let (text, decides) = (self.root_text(*id), deciding.contains(id));
+            roots.push(Root { text, decides, bends: *bends, observed });
         }
         (emit.build.finish(), roots)
     }

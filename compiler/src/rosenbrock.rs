@@ -124,6 +124,7 @@ struct Found<'f, 'a> {
     f: &'f [Real<'a>],
     jacobian: &'f [Real<'a>],
     surfaces: &'f [Real<'a>],
+    scales: &'f [Real<'a>],
 }
 
 struct Step<'a> {
@@ -150,12 +151,14 @@ impl<'a> Step<'a> {
         let mut u: Vec<Vec<Real>> = Vec::new();
         let mut x = x0.clone();
         let mut f = f0;
+        let mut turned = Truth::from((false, self.build));
         for stage in 0..STAGES {
             if stage > 0 {
                 x = (0..n).map(|i| self.argument(stage, i, &x0, &x, &u)).collect();
                 let time = if stage < 5 { t + C[stage] * h } else { end };
                 let mut env = self.env(time, &x);
                 f = self.rates(&mut env);
+                turned = turned | self.turned(&mut env);
             }
             let right: Vec<Real> = (0..n)
                 .map(|i| {
@@ -189,20 +192,31 @@ impl<'a> Step<'a> {
         let mut on_the_way: Vec<Vec<Real>> = Vec::new();
         if let Some(roots) = &self.program.roots {
             let surfaces = self.program.description.layout.roots;
-            let half = |i: usize| {
-                let bend = course[0][i] + 0.5 * (course[1][i] + 0.5 * course[2][i]);
-                x0[i] + 0.5 * (x1[i] - x0[i] + 0.5 * bend)
+            let between = |theta: f64| -> Vec<Real> {
+                let at = |i: usize| {
+                    let bend = course[0][i] + theta * (course[1][i] + theta * course[2][i]);
+                    x0[i] + theta * (x1[i] - x0[i] + (1.0 - theta) * bend)
+                };
+                (0..n).map(at).collect()
             };
-            let middle: Vec<Real> = (0..n).map(half).collect();
-            let at = [(t + 0.5 * h, middle, self.trial.middle()), (end, x1.clone(), self.trial.last())];
+            let at = [(t + 0.5 * h, between(0.5), self.trial.middle()), (end, x1.clone(), self.trial.last())];
+            let mut moving = Vec::new();
             for (time, x, segment) in at {
                 let mut env = self.env(time, &x);
                 self.build.borrow_mut().inline(roots, &mut env);
                 let values: Vec<Real> = slots(surfaces).map(|slot| self.read(slot, &env)).collect();
+                if moving.is_empty() {
+                    let varies = self.varies(time, &[]);
+                    let own = values.iter().zip(&self.program.description.roots);
+                    moving = own.map(|(value, root)| varies[value.value.index()] && !root.observed).collect();
+                }
                 self.store(segment, &values);
                 on_the_way.push(values);
             }
-            met = self.meets(&on_the_way[0], &on_the_way[1]);
+            let ends = [&on_the_way[0][..], &on_the_way[1][..]];
+            met = turned
+                | self.meets(ends[0], ends[1])
+                | self.comes_and_goes((t, h), [0.25, 0.75].map(between), &moving, ends);
         }
         self.keep(self.trial.met(), met.choose(1.0, t.constant(0.0)));
 
@@ -230,7 +244,15 @@ impl<'a> Step<'a> {
         self.keep(self.trial.defect(), defect);
         let singular = factors.singular.unwrap_or_else(|| Truth::from((false, self.build)));
         let surfaces = on_the_way.last().map_or(&[][..], |last| last);
-        let point = Found { t, h, end, wanted, x: &x1, f: &f1, jacobian: &jacobian, surfaces };
+        let reached: Vec<Real> = scales
+            .iter()
+            .zip(&x1)
+            .map(|(scale, x)| {
+                let size = x.abs();
+                scale.below(size).choose(size, *scale)
+            })
+            .collect();
+        let point = Found { t, h, end, wanted, x: &x1, f: &f1, jacobian: &jacobian, surfaces, scales: &reached };
         let look = self.settle(point, worst, defect, met | hits, singular);
         (singular.value, look.value)
     }
@@ -248,24 +270,70 @@ impl<'a> Step<'a> {
         Length { wanted, h, end, hits }
     }
 
+    /// Whether a stage evaluates the rates on the other side of a surface: a stiff step may end on the old side though what
+    /// holds it there holds no longer.
+    fn turned(&self, env: &mut Env) -> Truth<'a> {
+        let mut turned = Truth::from((false, self.build));
+        let Some(roots) = &self.program.roots else { return turned };
+        self.build.borrow_mut().inline(roots, env);
+        let layout = &self.program.description.layout;
+        let sides = self.loads(self.trial.sides());
+        let surfaces = slots(layout.roots).zip(sides).zip(&self.program.description.roots);
+        for ((slot, side), _) in surfaces.filter(|(_, root)| !root.observed) {
+            turned = turned | (side * self.read(slot, env)).below(0.0);
+        }
+        turned
+    }
+
     /// Whether a surface is crossed in the middle or at the end, or may be between: there a parabola through the three
     /// values tells how near it comes.
     fn meets(&self, middle: &[Real<'a>], last: &[Real<'a>]) -> Truth<'a> {
         let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
         let mut met = Truth::from((false, self.build));
-        for (((side, a), b), c) in sides.into_iter().zip(here).zip(middle).zip(last) {
-            let (b, c) = (*b, *c);
-            let stays = (side * b).above(0.0) & (side * c).above(0.0);
-            // Least at θ = rise / bend, where it is a − rise² / bend; nothing is divided.
-            let (rise, bend) = (1.5 * a - 2.0 * b + 0.5 * c, 2.0 * (a - 2.0 * b + c));
-            let steep = bend.abs();
-            let inside = (rise * bend).above(0.0) & rise.abs().below(steep);
-            let least = side * (a * steep - rise * rise.abs());
-            let (size_a, size_b, size_c) = (a.abs(), b.abs(), c.abs());
-            let smaller = size_a.below(size_b).choose(size_a, size_b);
-            let near = 0.2 * smaller.below(size_c).choose(smaller, size_c);
-            let turns = inside & least.below(near * steep);
-            met = met | !stays | turns;
+        // What is only observed decides on no step; whoever observes looks at each.
+        let surfaces = sides.into_iter().zip(here).zip(middle).zip(last).zip(&self.program.description.roots);
+        for ((((side, a), b), c), _) in surfaces.filter(|(_, root)| !root.observed) {
+            met = met | self.passes(side, [a, *b, *c]);
+        }
+        met
+    }
+
+    /// Whether a surface with these values at even distances is crossed, or may be between, where a parabola comes near zero.
+    fn passes(&self, side: Real<'a>, [a, b, c]: [Real<'a>; 3]) -> Truth<'a> {
+        let stays = (side * b).above(0.0) & (side * c).above(0.0);
+        // Least at θ = rise / bend, where it is a − rise² / bend; nothing is divided.
+        let (rise, bend) = (1.5 * a - 2.0 * b + 0.5 * c, 2.0 * (a - 2.0 * b + c));
+        let steep = bend.abs();
+        let inside = (rise * bend).above(0.0) & rise.abs().below(steep);
+        let least = side * (a * steep - rise * rise.abs());
+        let (size_a, size_b, size_c) = (a.abs(), b.abs(), c.abs());
+        let smaller = size_a.below(size_b).choose(size_a, size_b);
+        let near = 0.2 * smaller.below(size_c).choose(smaller, size_c);
+        let turns = inside & least.below(near * steep);
+        !stays | turns
+    }
+
+    /// The same over both halves of the step, with the states at a quarter and three quarters, of surfaces that move with
+    /// time: a model at rest makes long steps, on which a push comes and goes. `moving`: which.
+    fn comes_and_goes(
+        &self,
+        (t, h): (Real<'a>, Real<'a>),
+        quarters: [Vec<Real<'a>>; 2],
+        moving: &[bool],
+        [middle, last]: [&[Real<'a>]; 2],
+    ) -> Truth<'a> {
+        let mut met = Truth::from((false, self.build));
+        let Some(roots) = self.program.roots.as_ref().filter(|_| moving.contains(&true)) else { return met };
+        let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
+        let surfaces = self.program.description.layout.roots;
+        let [early, late] = [0, 1].map(|k| {
+            let mut env = self.env(t + [0.25, 0.75][k] * h, &quarters[k]);
+            self.build.borrow_mut().inline(roots, &mut env);
+            slots(surfaces).map(|slot| self.read(slot, &env)).collect::<Vec<Real>>()
+        });
+        for k in (0..moving.len()).filter(|k| moving[*k]) {
+            let halves = [[here[k], early[k], middle[k]], [middle[k], late[k], last[k]]];
+            met = halves.into_iter().fold(met, |met, half| met | self.passes(sides[k], half));
         }
         met
     }
@@ -341,7 +409,8 @@ impl<'a> Step<'a> {
         let overruns = self.load(trial.overruns());
         self.keep(trial.overruns(), (fine | seen | !behind).choose(overruns, overruns + 1.0));
         let point = [(from.states, found.x), (from.derivatives, found.f), (from.jacobian, found.jacobian)];
-        for (segment, new) in point.into_iter().chain([(trial.here(), found.surfaces)]) {
+        let others = [(trial.here(), found.surfaces), (trial.scales(), found.scales)];
+        for (segment, new) in point.into_iter().chain(others) {
             slots(segment).zip(new).for_each(|(slot, new)| settled(slot, *new));
         }
         seen
@@ -352,7 +421,8 @@ impl<'a> Step<'a> {
     fn overrun(&self, h: Real<'a>, last: &[Real<'a>]) -> (Truth<'a>, Real<'a>) {
         let mut first = (Truth::from((false, self.build)), h.constant(MOST_BEFORE_SURFACE));
         let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
-        for ((side, a), b) in sides.into_iter().zip(here).zip(last) {
+        let surfaces = sides.into_iter().zip(here).zip(last).zip(&self.program.description.roots);
+        for (((side, a), b), _) in surfaces.filter(|(_, root)| !root.observed) {
             let behind = (side * *b).below(0.0);
             let part = a / (a - *b);
             first = (first.0 | behind, (behind & part.below(first.1)).choose(part, first.1));

@@ -2,7 +2,9 @@
 //!
 //! In: the points of a run in order of time, as blocks. Out: a [`Verdict`] for each expectation. Most measures look
 //! at each point once and forget it; `period` and `settling` keep theirs, up to [`KEPT_POINTS`]. Knows neither
-//! solver nor clock: between two points a quantity is a straight line, and an event is two points at one time.
+//! solver nor clock: an event is two points at one time, and at the edge of a window a quantity lies on the straight line
+//! between two points. An adaptive run shows a point at each edge and gives the areas under its own course; of other runs
+//! the areas are those of the trapezoidal rule with the end corrections of Gregory, of order four where steps are even.
 
 use crate::show;
 use crate::verdict::{self, Reading, Verdict};
@@ -12,10 +14,35 @@ use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
 /// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. Beyond, the measure fails and says so.
 pub const KEPT_POINTS: usize = 1 << 25;
 
+/// Values below this, in SI, are rounding errors.
+const NOTHING: f64 = 1e-15;
+
 /// All expectations of an experiment, filled point by point.
 pub struct Expectations {
     expects: Vec<Expect>,
     meters: Vec<Vec<Meter>>,
+}
+
+/// What an adaptive run must know of one measure to show it the right points.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub(crate) struct Demand {
+    pub(crate) slot: Slot,
+    pub(crate) what: Wants,
+}
+
+/// What it takes from the course between two points.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(crate) enum Wants {
+    /// The area under the quantity.
+    Area,
+    /// The area under its square.
+    Square,
+    /// Where it turns.
+    Turns,
+    /// Points close enough for the straight line or the cubic between them.
+    Points,
+    /// No more than the points at the edges of the window.
+    Edges,
 }
 
 impl Expectations {
@@ -41,6 +68,50 @@ impl Expectations {
             .iter()
             .flatten()
             .flat_map(|meter| [Some(meter.slot), meter.begins, meter.ends, meter.moment].into_iter().flatten())
+    }
+
+    /// What each measure takes, in the order of [`Expectations::give_area`].
+    pub(crate) fn demands(&self) -> Vec<Demand> {
+        self.meters.iter().flatten().map(Meter::demand).collect()
+    }
+
+    /// The window of measure number `k` in s, as far as it is known: an event that has not happened yet is infinitely far.
+    pub(crate) fn window(&self, k: usize) -> (f64, f64) {
+        let meter = self.meters.iter().flatten().nth(k).expect("it was one of the demands");
+        (meter.after, meter.before)
+    }
+
+    /// Instants in s at which a window begins or ends or a value is wanted, ascending.
+    pub(crate) fn instants(&self) -> Vec<f64> {
+        let of = |meter: &Meter| {
+            let at = if let Tally::At { instant, .. } = meter.tally { instant } else { meter.after };
+            [meter.after, meter.before, at]
+        };
+        let mut instants: Vec<f64> = self.meters.iter().flatten().flat_map(of).filter(|t| t.is_finite()).collect();
+        instants.sort_by(f64::total_cmp);
+        instants.dedup();
+        instants
+    }
+
+    /// Whoever shows the points also gives the areas between them, by [`Expectations::give_area`]; and sides that
+    /// are told apart differ by more than this part of the largest value.
+    pub(crate) fn expect_areas(&mut self, tol: f64) {
+        for meter in self.meters.iter_mut().flatten() {
+            match &mut meter.tally {
+                Tally::Sum { given, .. } => *given = true,
+                Tally::Crossings { lobes } => lobes.band = tol,
+                _ => {}
+            }
+        }
+    }
+
+    /// The area under the quantity of measure number `k`, or under its square, over one more part of its window.
+    pub(crate) fn give_area(&mut self, k: usize, area: f64) {
+        let meter = self.meters.iter_mut().flatten().nth(k).expect("it was one of the demands");
+        match &mut meter.tally {
+            Tally::Sum { sum, .. } => sum.add(area),
+            _ => unreachable!("no area was asked for"),
+        }
     }
 
     /// Shows the state of the model at time `t` in s. Times must not decrease.
@@ -104,10 +175,10 @@ struct Meter {
 
 enum Tally {
     Extremes { min: Point, max: Point, kind: Extreme },
-    Sum { square: bool, kind: Average, sum: Sum },
+    Sum { square: bool, kind: Average, sum: Sum, given: bool, even: Even },
     Final,
     At { instant: f64, value: Option<f64> },
-    Crossings { sign: f64, count: u64, time: Option<f64> },
+    Crossings { lobes: Lobes },
     First { after: Before, time: f64, gap: f64 },
     AtMoment { moment: Moment, best: f64, found: Option<Point>, gap: f64 },
     TimeOf { sign: f64, best: f64, time: f64 },
@@ -139,7 +210,10 @@ enum Average {
 impl Meter {
     fn new(measure: &Measure, after: f64, before: f64) -> Meter {
         let extremes = |kind| Tally::Extremes { min: (0.0, f64::INFINITY), max: (0.0, f64::NEG_INFINITY), kind };
-        let sum = |kind, square| Tally::Sum { square, kind, sum: Sum::default() };
+        let sum = |kind, square| {
+            let (sum, even) = (Sum::default(), Even::default());
+            Tally::Sum { square, kind, sum, given: false, even }
+        };
         let tally = match measure.kind {
             MeasureKind::Min => extremes(Extreme::Min),
             MeasureKind::Max => extremes(Extreme::Max),
@@ -149,7 +223,7 @@ impl Meter {
             MeasureKind::Integral => sum(Average::Integral, false),
             MeasureKind::Final => Tally::Final,
             MeasureKind::At(instant) => Tally::At { instant, value: None },
-            MeasureKind::Crossings => Tally::Crossings { sign: 0.0, count: 0, time: None },
+            MeasureKind::Crossings => Tally::Crossings { lobes: Lobes::default() },
             MeasureKind::First => Tally::First { after: Before::Anything, time: f64::INFINITY, gap: 0.0 },
             MeasureKind::Rises => Tally::First { after: Before::False, time: f64::INFINITY, gap: 0.0 },
             MeasureKind::Turns => Tally::First { after: Before::Other, time: f64::INFINITY, gap: 0.0 },
@@ -211,9 +285,26 @@ impl Meter {
         self.see(t, block[self.slot.index()]);
     }
 
+    fn demand(&self) -> Demand {
+        let what = match &self.tally {
+            Tally::Extremes { .. } | Tally::TimeOf { .. } => Wants::Turns,
+            Tally::AtMoment { moment: Moment::Least(slot) | Moment::Greatest(slot), .. } => {
+                return Demand { slot: *slot, what: Wants::Turns };
+            }
+            Tally::Sum { square: false, .. } => Wants::Area,
+            Tally::Sum { square: true, .. } => Wants::Square,
+            Tally::Crossings { .. } | Tally::Period { .. } | Tally::Settling { .. } => Wants::Points,
+            Tally::Final | Tally::At { .. } | Tally::First { .. } | Tally::AtMoment { .. } => Wants::Edges,
+        };
+        Demand { slot: self.slot, what }
+    }
+
     /// One more point; at the edges of the window, the point on the line to the one before.
     fn see(&mut self, t: f64, v: f64) {
         let last = self.last;
+        if let Tally::Crossings { lobes } = &mut self.tally {
+            lobes.largest = lobes.largest.max(v.abs());
+        }
         if last.0 < self.after && t > self.after && self.after <= self.before {
             self.count(self.after, self.between(last, (t, v), self.after));
         }
@@ -245,11 +336,16 @@ impl Meter {
                     *max = (t, v);
                 }
             }
-            Tally::Sum { square, sum, .. } => {
+            Tally::Sum { given: true, .. } => {}
+            Tally::Sum { square, sum, even, given: false, .. } => {
+                let value = if *square { v * v } else { v };
                 if self.counted {
                     let (t0, v0) = previous;
-                    let (a, b) = if *square { (v0 * v0, v * v) } else { (v0, v) };
-                    sum.add(0.5 * (a + b) * (t - t0));
+                    let before = if *square { v0 * v0 } else { v0 };
+                    sum.add(0.5 * (before + value) * (t - t0));
+                }
+                if let Some(correction) = even.push(t, value) {
+                    sum.add(correction);
                 }
             }
             Tally::Final => {}
@@ -260,15 +356,7 @@ impl Meter {
                     *value = Some(line(previous, (t, v), *instant));
                 }
             }
-            Tally::Crossings { sign, count, time } => {
-                if v != 0.0 && v.signum() != *sign {
-                    if *sign != 0.0 {
-                        *count += 1;
-                        *time = Some(t);
-                    }
-                    *sign = v.signum();
-                }
-            }
+            Tally::Crossings { lobes } => lobes.push(t, v),
             Tally::AtMoment { moment, best, found, gap } => {
                 let telling = self.telling;
                 let now = match moment {
@@ -353,8 +441,8 @@ impl Meter {
                 Extreme::Max => (max.1, Some(max.0)),
                 Extreme::Between => (max.1 - min.1, Some(min.0.max(max.0))),
             }),
-            Tally::Sum { kind, sum, .. } => {
-                let total = sum.total();
+            Tally::Sum { kind, sum, even, .. } => {
+                let total = sum.total() + even.correction();
                 let value = match kind {
                     Average::Integral => total,
                     // A window of one instant: the limit of ever narrower ones.
@@ -379,7 +467,10 @@ impl Meter {
                 })?;
                 Ok((value, Some(*instant)))
             }
-            Tally::Crossings { count, time, .. } => Ok((*count as f64, *time)),
+            Tally::Crossings { lobes } => {
+                let (count, time) = lobes.crossings();
+                Ok((count as f64, time))
+            }
             Tally::AtMoment { found, .. } => {
                 let (time, value) = found.ok_or("its event does not happen in the window")?;
                 Ok((value, Some(time)))
@@ -392,6 +483,110 @@ impl Meter {
                 Ok((time, Some(time)))
             }
         }
+    }
+}
+
+/// Parts of a course between two changes of sign, of which those that rise above rounding errors and errors of the run count.
+#[derive(Default)]
+struct Lobes {
+    /// A value smaller than this part of the largest one is as good as zero.
+    band: f64,
+    /// Largest value of the run so far, inside the window or not.
+    largest: f64,
+    /// For each lobe its first instant in s and the value farthest from zero. Those that cannot count are dropped.
+    kept: Vec<Point>,
+}
+
+impl Lobes {
+    fn push(&mut self, t: f64, v: f64) {
+        if v == 0.0 {
+            return;
+        }
+        match self.kept.last_mut().filter(|(_, peak)| (*peak > 0.0) == (v > 0.0)) {
+            Some((_, peak)) => *peak = if v.abs() > peak.abs() { v } else { *peak },
+            None => {
+                let least = self.least();
+                self.kept.pop_if(|(_, peak)| peak.abs() <= least);
+                // Of the same sign as the one before that: both are one.
+                match self.kept.last_mut().filter(|(_, peak)| (*peak > 0.0) == (v > 0.0)) {
+                    Some((_, peak)) => *peak = if v.abs() > peak.abs() { v } else { *peak },
+                    None => self.kept.push((t, v)),
+                }
+            }
+        }
+    }
+
+    /// What is no more than this counts for zero.
+    fn least(&self) -> f64 {
+        (self.band.max(1e-12) * self.largest).max(NOTHING)
+    }
+
+    /// How often the sign changes, and when it last did.
+    fn crossings(&self) -> (u64, Option<f64>) {
+        let least = self.least();
+        let (mut sign, mut count, mut time) = (0.0, 0, None);
+        for (t, peak) in self.kept.iter().filter(|(_, peak)| peak.abs() > least) {
+            if peak.signum() != sign {
+                if sign != 0.0 {
+                    (count, time) = (count + 1, Some(*t));
+                }
+                sign = peak.signum();
+            }
+        }
+        (count, time)
+    }
+}
+
+/// A run of points at even distances: its first and last values, for the end corrections of Gregory that raise the
+/// trapezoidal rule to order four,
+///
+///   h/12 (Δf_0 − ∇f_n) − h/24 (Δ²f_0 + ∇²f_n).
+#[derive(Default)]
+struct Even {
+    step: f64,
+    last: f64,
+    points: u64,
+    head: [f64; 3],
+    tail: [f64; 3],
+}
+
+impl Even {
+    /// One more point; gives the correction of a run that ends with the one before.
+    fn push(&mut self, t: f64, v: f64) -> Option<f64> {
+        let step = t - self.last;
+        let goes_on = match self.points {
+            0 => true,
+            1 => step > 0.0,
+            // Times are multiples of the step, each rounded.
+            _ => (step - self.step).abs() <= 1e-9 * self.step + 8.0 * f64::EPSILON * t.abs(),
+        };
+        let correction = if goes_on { None } else { Some(self.correction()) };
+        if !goes_on {
+            // The last point begins the next run, unless something jumps there.
+            let from = self.tail[2];
+            self.points = u64::from(step > 0.0);
+            self.head[0] = from;
+            self.tail = [from; 3];
+        }
+        if self.points == 1 {
+            self.step = step;
+        }
+        if self.points < 3 {
+            self.head[self.points as usize] = v;
+        }
+        self.tail = [self.tail[1], self.tail[2], v];
+        self.points += 1;
+        self.last = t;
+        correction
+    }
+
+    /// What the trapezoidal rule lacks over the run so far; nothing of fewer than five points.
+    fn correction(&self) -> f64 {
+        if self.points < 5 {
+            return 0.0;
+        }
+        let ([a, b, c], [x, y, z]) = (self.head, self.tail);
+        self.step / 12.0 * ((b - a) - (z - y)) - self.step / 24.0 * ((a - 2.0 * b + c) + (x - 2.0 * y + z))
     }
 }
 

@@ -188,7 +188,11 @@ impl Model {
             automata: automata.collect(),
             delays: Vec::new(),
             guards,
-            roots: self.roots.iter().map(|text| Root { text: (*text).into(), decides: true, bends: false }).collect(),
+            roots: self
+                .roots
+                .iter()
+                .map(|text| Root { text: (*text).into(), decides: true, bends: false, observed: false })
+                .collect(),
             coupling: Arc::new([]),
             pool: Arc::new([]),
             layout,

@@ -80,11 +80,6 @@ impl Observer {
         &self.slots
     }
 
-    /// Whether anything is measured rather than only drawn.
-    pub(crate) fn measures(&self) -> bool {
-        self.expectations.slots().next().is_some()
-    }
-
     /// One point of the run: the block after a step, or on one side of an event.
     pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
         let block = instance.block();

@@ -6,6 +6,8 @@
 //! of the run; a surface at which neither states nor regimes change and the derivatives do not jump is no event.
 //! Nothing here depends on the platform's elementary functions, so a run has the same bits everywhere.
 
+mod kinks;
+
 use super::explicit::Explicit;
 use super::fused::{Fused, Judged, Pace};
 use super::jacobian::Entries;
@@ -40,6 +42,10 @@ const MOST_CROSSINGS: usize = 2000;
 /// More tries of a step than this within a millionth of the run lead nowhere.
 const MOST_IN_PLACE: u64 = 20_000;
 
+/// A state without a declared range is never measured with less than this, SI; and no error smaller than that is asked for.
+const LEAST_SCALE: f64 = 1e-9;
+const ROUNDING: f64 = 1e-15;
+
 /// So often a step is made again to end before a surface without anything coming of it.
 const MOST_AIMS: u8 = 4;
 
@@ -59,8 +65,10 @@ pub(crate) struct Adaptive {
     /// Instants that are met exactly, ascending.
     corners: Vec<f64>,
     tol: f64,
-    /// Scale of each state, SI.
+    /// Scale of each state, SI: half the width of its declared range, or its largest value so far.
     scales: Vec<f64>,
+    /// What a small change of each state is a part of, SI.
+    units: Vec<f64>,
     t: f64,
     x: Vec<f64>,
     /// Length of the next step in s, and of the longest that is allowed.
@@ -106,6 +114,13 @@ pub(crate) struct Adaptive {
     beside: Vec<f64>,
     slopes: Vec<f64>,
     surfaces: Surfaces,
+    /// Those at which only observed quantities change, and how far of the step they have been followed, in θ.
+    observed: Surfaces,
+    followed: Option<f64>,
+    /// Before this instant, in s, something lets go that a stiff step does not see; infinite if nothing does.
+    suspect: f64,
+    /// Whether the model's own function says that the step meets a surface.
+    met: bool,
     /// Whether anything in the block beside the trial may have changed since the last call.
     moved: bool,
     /// Whether no step has been made since the last restart.
@@ -154,22 +169,26 @@ impl Adaptive {
     fn new(mut instance: Instance, experiment: &Experiment, observer: Observer) -> Adaptive {
         let description = instance.description().clone();
         let states = &description.layout.states;
-        let scale = |i: usize| {
-            let slot = states.slot(i);
-            let quantity = description.quantities.iter().find(|q| q.kind == Kind::State && q.slot == slot);
-            let Some(quantity) = quantity else { return 1.0 };
+        let tol = experiment.solver.tol;
+        assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
+        let declared = |i: usize| {
+            let quantity = description.quantities.iter().find(|q| q.kind == Kind::State && q.slot == states.slot(i))?;
             let half = 0.5 * (quantity.range.1 - quantity.range.0);
-            if half > 0.0 && half.is_finite() { half } else { quantity.unit.scale }
+            (half > 0.0 && half.is_finite()).then_some(half)
         };
-        let scales: Vec<f64> = (0..states.len as usize).map(scale).collect();
+        let declared: Vec<Option<f64>> = (0..states.len as usize).map(declared).collect();
+        let units: Vec<f64> = declared.iter().map(|half| half.unwrap_or(1.0)).collect();
+        // What a state without a range reaches shows in time; until then rounding errors must not count.
+        let least = LEAST_SCALE.max(ROUNDING / tol);
+        let start = &instance.block()[states.range()];
+        let scale = |(half, x): (&Option<f64>, &f64)| half.unwrap_or(least).max(x.abs());
+        let scales: Vec<f64> = declared.iter().zip(start).map(scale).collect();
         let period = |slot| {
             let period = instance.get(slot);
             assert!(period > 0.0, "a sampled block with a period of {period} s");
             period
         };
         let ticks = description.ticks.iter().map(|tick| (period(tick.period), 1)).collect();
-        let tol = experiment.solver.tol;
-        assert!(tol > 0.0 && tol < 1.0, "a tolerance of {tol}");
         let points = Points::new(&instance, observer, experiment);
         // Ranges that are watched, with the slack of a millionth that fixed steps have; what error control may be off by
         // is no way out of a range.
@@ -181,7 +200,7 @@ impl Adaptive {
             (least, if high == f64::INFINITY { high } else { high + slack(high) })
         };
         let fine: Vec<(f64, f64)> = description.guards.iter().map(fine).collect();
-        let fused = Fused::new(&mut instance, tol, &scales, &fine);
+        let fused = Fused::new(&mut instance, tol, &fine);
         let system = System::new(instance);
         let n = system.n;
         let entries = Entries::new(n, &description.coupling);
@@ -220,7 +239,11 @@ impl Adaptive {
             usual: None,
             beside: vec![0.0; n],
             slopes: vec![0.0; 4 * n],
-            surfaces: Surfaces::new(&system, 1e-12 * experiment.duration),
+            surfaces: Surfaces::new(&system, 1e-12 * experiment.duration, false),
+            observed: Surfaces::new(&system, 1e-12 * experiment.duration, true),
+            followed: None,
+            suspect: f64::INFINITY,
+            met: false,
             moved: true,
             fresh: true,
             events: VecDeque::new(),
@@ -233,6 +256,7 @@ impl Adaptive {
             points,
             work: Work::default(),
             scales,
+            units,
             system,
         }
     }
@@ -295,6 +319,7 @@ impl Adaptive {
         let attend = self.fresh
             || self.creep.is_finite()
             || self.usual.is_some()
+            || self.suspect.is_finite()
             || self.points.are_shown()
             || self.aimed.iter().any(|aimed| *aimed > 0);
         let fused = self.fused.as_mut().expect("asked before");
@@ -303,7 +328,8 @@ impl Adaptive {
         }
         let pace =
             Pace { t: self.t, next: self.h, last: self.last, rejected: self.rejected, accepted: self.work.steps };
-        fused.prepare(&mut self.system, pace, stop, self.longest, self.points.next_probe(), attend);
+        let (lengths, watched) = ((stop, self.longest), self.points.next_probe());
+        fused.prepare(&mut self.system, pace, lengths, watched, attend, &self.scales);
         fused.prepare_surfaces(&mut self.system, self.surfaces.sides(), self.surfaces.here());
         if attend { 1 } else { WATCHED - self.attempts() % WATCHED }
     }
@@ -322,7 +348,7 @@ impl Adaptive {
         self.step.end = if hits { stop.next_down() } else { self.t + self.step.h };
         copy(&self.x, &mut self.step.x0);
         self.know_slope();
-        (self.was_stiff, self.was_fused, self.inside, self.calm) = (self.stiff, false, false, false);
+        (self.was_stiff, self.was_fused, self.inside, self.calm, self.met) = (self.stiff, false, false, false, false);
         let error = if self.stiff {
             self.stiff_attempt()
         } else {
@@ -366,6 +392,12 @@ impl Adaptive {
     /// Whether the step is accurate enough; chooses the length of the next.
     fn judge(&mut self, error: f64) -> bool {
         let h = self.step.h;
+        // Where the step runs over a surface within the rounding error of time, a shorter one would be no better.
+        let blurred = h <= 256.0 * f64::EPSILON * self.t && error.is_finite();
+        let error = match error > 1.0 && blurred && self.surfaces.guess(&mut self.system, &self.step).is_some() {
+            true => 1.0,
+            false => error,
+        };
         if error.is_nan() || error > 1.0 {
             self.work.rejected += 1;
             let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(LEAST_GAIN) } else { 0.1 };
@@ -474,7 +506,7 @@ impl Adaptive {
             self.doubts = 0;
             return;
         }
-        let size = self.step.h * self.entries.spectral_radius(&self.jacobian, &self.scales);
+        let size = self.step.h * self.entries.spectral_radius(&self.jacobian, &self.units);
         let doubt = if self.stiff { size < 0.5 } else { size > 1.5 };
         self.doubts = if doubt { self.doubts + 1 } else { 0 };
         if self.doubts >= if self.stiff { self.patience } else { 2 } {
@@ -492,8 +524,8 @@ impl Adaptive {
         if let Some(fused) = self.fused.as_ref().filter(|fused| fused.ready) {
             self.jacobian.copy_from_slice(fused.jacobian(&self.system));
         } else if !self.jacobian_known {
-            let (f0, scales) = (&self.step.f0, &self.scales);
-            self.system.jacobian(self.step.t, &self.step.x0, f0, scales, &mut self.jacobian);
+            let (f0, units) = (&self.step.f0, &self.units);
+            self.system.jacobian(self.step.t, &self.step.x0, f0, units, &mut self.jacobian);
             self.jacobian_known = true;
             self.work.jacobians += 1;
         }
@@ -502,6 +534,7 @@ impl Adaptive {
     /// Follows an accepted step up to its end at time `reached`, or to its first event.
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
+        self.followed = None;
         self.kept = 0.0;
         if self.calm && !self.fresh && self.aimed.iter().all(|aimed| *aimed == 0) {
             return self.accept_calm(reached);
@@ -511,20 +544,13 @@ impl Adaptive {
         if self.ends_before_condition() {
             return Ok(());
         }
+        let (again, met) = self.is_made_again();
+        if again {
+            return Ok(());
+        }
         let mut from = 0.0;
-        while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
+        while met && let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             let jump = self.jump(crossing);
-            // What swings through a surface at which nothing jumps is no chatter.
-            if jump > 0.0 || self.surfaces.decided() {
-                self.meet(1)
-            } else {
-                self.crossings = 0
-            }
-            // A surface left at the very start needs no other step.
-            if from == 0.0 && crossing.near > 0.0 && self.shorten(crossing, jump) {
-                self.surfaces.again();
-                return Ok(());
-            }
             if self.acts(crossing, jump > 0.0)? {
                 self.creep = f64::INFINITY;
                 self.aimed.fill(0);
@@ -532,6 +558,11 @@ impl Adaptive {
             }
             self.surfaces.pass(true);
             from = crossing.far;
+        }
+        if !met {
+            // Passes to the end.
+            let crossing = self.surfaces.first(&mut self.system, &self.step, 0.0);
+            debug_assert!(crossing.is_none());
         }
         self.fresh = false;
         // Aims that came to nothing are forgotten when a whole step meets nothing: at rest the last bits of a speed pass
@@ -541,6 +572,37 @@ impl Adaptive {
         }
         self.go_to_end(reached)?;
         if self.inside { Ok(()) } else { self.guard() }
+    }
+
+    /// Shows the course of the step up to θ, whose point is said to be at `time`, with both sides of each surface at which
+    /// observed quantities change.
+    fn show(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
+        if self.observed.any() && self.points.are_shown() {
+            if self.followed.is_none() {
+                self.observed.begin(&mut self.system, &self.step, self.fresh, None);
+            }
+            let mut from = self.followed.unwrap_or(0.0);
+            while let Some(crossing) = self.observed.first(&mut self.system, &self.step, from) {
+                if crossing.far > theta {
+                    // Not reached, or looked for again from here on.
+                    break;
+                }
+                let far = self.step.time(crossing.far);
+                self.points.until(&mut self.system, &self.step, crossing.near, far)?;
+                self.points.at(&mut self.system, &self.step, crossing.far, far)?;
+                self.observed.pass(true);
+                from = crossing.far;
+            }
+            self.followed = Some(from);
+        }
+        self.points.until(&mut self.system, &self.step, theta, time)
+    }
+
+    /// The scale of a state grows with what it reaches.
+    fn reach(&mut self) {
+        for (scale, x) in self.scales.iter_mut().zip(&self.x) {
+            *scale = if *scale < x.abs() { x.abs() } else { *scale };
+        }
     }
 
     /// Follows an accepted step that meets nothing.
@@ -558,10 +620,16 @@ impl Adaptive {
         }
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
-        self.points.until(&mut self.system, &self.step, 1.0, reached)?;
+        // Whatever lets go before that instant is found by halving.
+        if self.suspect - reached <= 256.0 * f64::EPSILON * reached {
+            self.suspect = f64::INFINITY;
+        }
+        self.h = self.h.min(0.5 * (self.suspect - reached));
+        self.show(1.0, reached)?;
         self.keep(1.0, reached)?;
         self.t = reached;
         copy(&self.step.x1, &mut self.x);
+        self.reach();
         copy(&self.end_slope, &mut self.step.f0);
         self.slope_known = true;
         self.jacobian_known = false;
@@ -574,82 +642,11 @@ impl Adaptive {
         Ok(())
     }
 
-    /// A condition is decided by the last bit of the states: where one may change, the step is made again so that it
-    /// ends just before, and the next one is as short as the bracket. So no stage that looks behind the condition moves
-    /// a state by more than a rounding error: what is at rest is at rest when it breaks away.
-    fn ends_before_condition(&mut self) -> bool {
-        if !self.surfaces.has_conditions() {
-            return false;
-        }
-        let mut from = 0.0;
-        let mut ends = false;
-        self.surfaces.only_conditions = true;
-        while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
-            let (h, width) = (self.step.h, (crossing.far - crossing.near) * self.step.h);
-            let shorter = crossing.near * h - 2.0 * width;
-            let aimed = self.surfaces.changed().map(|surface| self.aimed[surface]).min().unwrap_or(0);
-            if aimed < MOST_AIMS && shorter + 12.0 * width < h && shorter > 64.0 * f64::EPSILON * self.t {
-                (self.h, self.creep) = (shorter, 6.0 * width);
-                self.surfaces.changed().for_each(|surface| self.aimed[surface] += 1);
-                self.usual.get_or_insert(h);
-                self.retake();
-                ends = true;
-                break;
-            }
-            // One that is left at the very start, or is passed at the very end, needs no other step.
-            self.surfaces.pass(true);
-            from = crossing.far;
-        }
-        self.surfaces.only_conditions = false;
-        self.surfaces.again();
-        ends
-    }
-
-    /// Takes a step back that is made again.
-    fn retake(&mut self) {
-        self.last = None;
-        self.work.steps -= 1;
-        self.work.stiff_steps -= u64::from(self.was_stiff);
-        self.work.rejected += 1;
-    }
-
-    /// Stages behind a surface at which derivatives jump or bend spoil a step, though its error seems small. Where that
-    /// could matter, the step is made again: up to just before a jump, and the next one is so short that it cannot
-    /// matter; up to so little behind a bend that it cannot matter.
-    fn shorten(&mut self, crossing: Crossing, jump: f64) -> bool {
-        let h = self.step.h;
-        let (to, behind) = (crossing.near * h, (1.0 - crossing.near) * h);
-        let (shorter, creep) = if jump > 0.0 {
-            if jump * behind <= 0.1 {
-                return false;
-            }
-            // Not within the bracket: nothing is known there.
-            let margin = (0.05 / jump).max(4.0 * (crossing.far - crossing.near) * h);
-            if to > 2.0 * margin { (to - margin, 2.0 * margin) } else { (to + margin, f64::INFINITY) }
-        } else {
-            if self.bent.take() == Some(self.attempts()) {
-                return false;
-            }
-            let bend = self.bend(crossing);
-            if 0.5 * bend * behind * behind <= 0.1 {
-                return false;
-            }
-            (to + (0.1 / bend).sqrt(), f64::INFINITY)
-        };
-        if shorter > 0.99 * h || shorter < 64.0 * f64::EPSILON * self.t {
-            return false;
-        }
-        (self.h, self.creep) = (shorter, creep);
-        self.retake();
-        self.bent = (jump == 0.0).then_some(self.attempts() + 1);
-        true
-    }
-
     /// Does what a crossing asks for. Returns whether the step ends there: where states or regimes change, and where
     /// derivatives jump.
     fn acts(&mut self, crossing: Crossing, jumps: bool) -> Result<bool, Stop> {
         let time = self.step.time(crossing.far);
-        self.points.until(&mut self.system, &self.step, crossing.near, time)?;
+        self.show(crossing.near, time)?;
         self.keep(crossing.near, time)?;
         self.step.at(crossing.far, &mut self.x);
         self.system.place(time, &self.x);
@@ -662,6 +659,8 @@ impl Adaptive {
             check_finite(&self.system.instance)?;
         }
         self.t = time;
+        self.reach();
+        self.suspect = f64::INFINITY;
         self.work.events += 1;
         let surface = self.surfaces.changed().next();
         self.events.push_back((time, surface));
@@ -744,53 +743,6 @@ impl Adaptive {
         Err(self.chatter(0, 0.0))
     }
 
-    /// By how much derivatives jump at a crossing, as error tolerances of their states gathered per second; 0 where
-    /// they jump by less than their own tolerance, or change about as much beside the crossing in the same time.
-    fn jump(&mut self, crossing: Crossing) -> f64 {
-        if self.surfaces.bend() {
-            return 0.0;
-        }
-        let n = self.system.n;
-        let width = crossing.far - crossing.near;
-        let beside = [crossing.near - width, crossing.near, crossing.far, crossing.far + width];
-        for (theta, f) in beside.into_iter().zip(self.slopes.chunks_exact_mut(n.max(1))) {
-            self.step.at(theta, &mut self.beside);
-            self.system.slope(self.step.time(theta), &self.beside, f);
-        }
-        let mut rate = 0.0f64;
-        for (i, s) in self.scales.iter().enumerate() {
-            let [before, near, far, after] = [0, 1, 2, 3].map(|row| self.slopes[row * n + i]);
-            let jump = (far - near).abs();
-            // The polynomial says nothing outside its step.
-            let earlier = if beside[0] >= 0.0 { (near - before).abs() } else { 0.0 };
-            let later = if beside[3] <= 1.0 { (after - far).abs() } else { 0.0 };
-            let drift = earlier.max(later);
-            if jump > self.tol * (near.abs() + s) && jump > 4.0 * drift {
-                rate = rate.max(jump / (self.tol * (self.step.x0[i].abs() + s)));
-            }
-        }
-        rate
-    }
-
-    /// By how much the rates of the derivatives jump at a crossing, as error tolerances of their states gathered per
-    /// second and second.
-    fn bend(&mut self, crossing: Crossing) -> f64 {
-        // Long against roundoff, short against the curvature beside the surface.
-        const WIDTH: f64 = 1e-6;
-        let n = self.system.n;
-        let ahead = [crossing.far, crossing.far + WIDTH, crossing.near, crossing.near - WIDTH];
-        for (theta, f) in ahead.into_iter().zip(self.slopes.chunks_exact_mut(n.max(1))) {
-            self.step.at(theta, &mut self.beside);
-            self.system.slope(self.step.time(theta), &self.beside, f);
-        }
-        let rate = |i: usize| {
-            let [far, after, near, before] = [0, 1, 2, 3].map(|row| self.slopes[row * n + i]);
-            let change = ((after - far) - (near - before)).abs();
-            change / (WIDTH * self.step.h * self.tol * (self.step.x0[i].abs() + self.scales[i]))
-        };
-        (0..n).map(rate).fold(0.0, f64::max)
-    }
-
     /// At a stop: the blocks that are due, what follows from them, and from corners of signals.
     fn arrive(&mut self) -> Result<(), Stop> {
         let description = self.system.instance.description().clone();
@@ -815,6 +767,7 @@ impl Adaptive {
         }
         self.settle()?;
         self.x.copy_from_slice(&self.system.instance.block()[self.system.states.clone()]);
+        self.reach();
         self.keep_here()?;
         self.points.here(&mut self.system, self.t, &self.x)?;
         self.restart();
@@ -825,6 +778,7 @@ impl Adaptive {
     fn restart(&mut self) {
         self.moved = true;
         self.surfaces.restart(&mut self.system, self.t, &self.x);
+        self.observed.restart(&mut self.system, self.t, &self.x);
         self.slope_known = false;
         self.jacobian_known = false;
         self.fused.iter_mut().for_each(|fused| fused.ready = false);
@@ -832,11 +786,16 @@ impl Adaptive {
         self.fresh = true;
     }
 
-    /// A length over which no state changes by more than a hundredth of |x| + s.
+    /// A length over which no state changes by more than a hundredth of |x| + s, or by as much as its rate makes of it in a
+    /// hundred-thousandth of the run: one that begins at 0 has no scale yet.
     fn first_step(&mut self) -> f64 {
         self.system.slope(self.t, &self.x, &mut self.step.f0);
         self.slope_known = true;
-        let rate = |i: usize| self.step.f0[i].abs() / (self.x[i].abs() + self.scales[i]);
+        let soon = 1e-5 * self.duration;
+        let rate = |i: usize| {
+            let f = self.step.f0[i].abs();
+            f / (self.x[i].abs() + self.scales[i] + soon * f)
+        };
         let fastest = (0..self.system.n).map(rate).fold(0.0, f64::max);
         if fastest > 0.0 { self.longest.min(0.01 / fastest) } else { self.longest }
     }
@@ -987,6 +946,7 @@ impl Course for Adaptive {
             copy(x, &mut self.x);
             copy(f, &mut self.step.f0);
             self.surfaces.go_on(fused.here(&self.system));
+            copy(fused.scales(&self.system), &mut self.scales);
             self.jacobian_known = false;
         }
         if accepted + refused > 0 {
@@ -1015,7 +975,8 @@ impl Course for Adaptive {
         self.was_stiff = true;
         self.was_fused = judged.is_some();
         self.inside = judged.as_ref().is_some_and(|judged| !judged.outside);
-        self.calm = self.inside && judged.as_ref().is_some_and(|judged| !judged.met);
+        self.met = judged.as_ref().is_some_and(|judged| judged.met);
+        self.calm = self.inside && !self.met;
         let error = match judged {
             Some(Judged { error, .. }) if error.is_nan() => f64::INFINITY,
             Some(Judged { error, defect, .. }) if error <= 1.0 => error.max(defect),

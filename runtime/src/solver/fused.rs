@@ -48,15 +48,16 @@ pub(crate) struct Judged {
 
 impl Fused {
     /// None of a model without that function. `fine`: for each guard the least and the greatest value.
-    pub(crate) fn new(instance: &mut Instance, tol: f64, scales: &[f64], fine: &[(f64, f64)]) -> Option<Fused> {
+    pub(crate) fn new(instance: &mut Instance, tol: f64, fine: &[(f64, f64)]) -> Option<Fused> {
         let trial = Trial::of(&instance.description().layout).filter(|_| instance.has(Function::Rosenbrock))?;
         instance.set(trial.tol(), tol);
         let block = instance.block_mut();
-        block[trial.scales().range()].copy_from_slice(scales);
         for ((low, high), (least, greatest)) in trial.lows().range().zip(trial.highs().range()).zip(fine) {
             (block[low], block[high]) = (*least, *greatest);
         }
-        let (single, from, last) = (trial.single().range(), trial.from().whole().range(), trial.defect().index() + 1);
+        let (from, last) = (trial.from().whole().range(), trial.defect().index() + 1);
+        // With the scales, which grow with the states.
+        let single = trial.single().range().start..trial.scales().range().end;
         Some(Fused {
             trial,
             read: [single.clone(), trial.sides().range().start..from.end],
@@ -90,8 +91,16 @@ impl Fused {
     }
 
     /// How the run stands and where it goes: to `stop`, by no longer steps than `longest`; those that reach `watched` are
-    /// left to be looked at, and all that somebody attends.
-    pub(crate) fn prepare(&self, system: &mut System, pace: Pace, stop: f64, longest: f64, watched: f64, attend: bool) {
+    /// left to be looked at, and all that somebody attends. `scales`: what the size of each state is measured with, SI.
+    pub(crate) fn prepare(
+        &self,
+        system: &mut System,
+        pace: Pace,
+        (stop, longest): (f64, f64),
+        watched: f64,
+        attend: bool,
+        scales: &[f64],
+    ) {
         let trial = self.trial;
         let (last_step, last_root) = pace.last.unwrap_or((0.0, 0.0));
         let numbers = [
@@ -110,6 +119,7 @@ impl Fused {
             (trial.attend(), f64::from(u8::from(attend))),
         ];
         numbers.into_iter().for_each(|(slot, value)| system.instance.set(slot, value));
+        copy(scales, &mut system.instance.block_mut()[trial.scales().range()]);
     }
 
     /// On which side of each surface the model is, and the values at the start.
@@ -132,6 +142,11 @@ impl Fused {
             accepted: get(trial.accepted()) as u64,
         };
         (pace, get(trial.refused()) as u64, get(trial.overruns()) as u64)
+    }
+
+    /// What the size of each state is measured with after the trials, SI.
+    pub(crate) fn scales<'a>(&self, system: &'a System) -> &'a [f64] {
+        &system.instance.block()[self.trial.scales().range()]
     }
 
     /// States at the start, and their derivatives.

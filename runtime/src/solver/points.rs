@@ -1,9 +1,12 @@
-//! Which points of an adaptive run are shown: the ends of its steps, both sides of events, and as many between as make
-//! straight lines do; and wherever a quantity turns, so that no extreme is missed.
+//! Which points of an adaptive run are shown: the ends of its steps, both sides of events, the edges of windows, and as many
+//! between as make straight lines do; and wherever a quantity turns, so that no extreme is missed. Areas are taken from the
+//! polynomials between them.
 //!
-//! In: accepted steps in order. Out: points, to an [`Observer`]. Evaluates outputs only if somebody looks.
+//! In: accepted steps in order. Out: points and areas, to an [`Observer`]. Evaluates outputs only if somebody looks, and
+//! changes no step.
 
 use super::step::{Step, System};
+use crate::measure::{Demand, Wants};
 use crate::observe::{Observer, check_status};
 use crate::outcome::Stop;
 use abi::plan::Experiment;
@@ -15,6 +18,40 @@ const LEAST_POINTS: f64 = 1009.0;
 /// An interval between two shown points is halved at most so often.
 const DEPTH: usize = 8;
 
+/// A part of a step over which an area is taken is halved at most so often.
+const MOST_HALVED: usize = 8;
+
+/// Part of the tolerance that an area may be off by.
+const OF_TOLERANCE: f64 = 0.01;
+
+/// Nodes of a Lobatto rule of four points and of its extension to seven by Kronrod, from −1 to 1; and their weights. Exact up
+/// to degree five and nine: the square of a state between the ends of a step has degree eight.
+/// Source: Gander & Gautschi, Adaptive Quadrature – Revisited, BIT 40 (2000).
+const NODES: [f64; 7] =
+    [-1.0, -0.816_496_580_927_726, -0.447_213_595_499_957_9, 0.0, 0.447_213_595_499_957_9, 0.816_496_580_927_726, 1.0];
+const FINE: [f64; 7] =
+    [77.0 / 1470.0, 432.0 / 1470.0, 625.0 / 1470.0, 672.0 / 1470.0, 625.0 / 1470.0, 432.0 / 1470.0, 77.0 / 1470.0];
+const ROUGH: [f64; 7] = [1.0 / 6.0, 0.0, 5.0 / 6.0, 0.0, 5.0 / 6.0, 0.0, 1.0 / 6.0];
+
+/// An area that a measure takes.
+struct Area {
+    /// Number of the measure.
+    measure: usize,
+    /// Where its quantity stands in a row.
+    column: usize,
+    square: bool,
+    /// Whether the part that is looked at lies in its window.
+    inside: bool,
+    /// Area of the magnitude so far in this window, and over how many seconds.
+    magnitude: (f64, f64),
+}
+
+impl Area {
+    fn of(&self, value: f64) -> f64 {
+        if self.square { value * value } else { value }
+    }
+}
+
 /// The points shown so far.
 pub(crate) struct Points {
     observer: Observer,
@@ -23,36 +60,70 @@ pub(crate) struct Points {
     slots: Vec<usize>,
     /// Whether all that is looked at are states.
     only_states: bool,
-    /// θ of the last point shown.
+    tol: f64,
+    /// Instants in s at which windows begin or end, ascending, and the next of them.
+    edges: Vec<f64>,
+    edge: usize,
+    areas: Vec<Area>,
+    /// Columns of which the turns are wanted exactly.
+    turning: Vec<bool>,
+    /// Values at the seven nodes of an area, row by row.
+    nodes: Vec<f64>,
+    /// θ of the last point shown, and of the ends of the part of the step that is being shown.
     theta: f64,
+    part: (f64, f64),
     /// Rows of values of the slots: the last one shown, then room for those between.
     rows: Vec<f64>,
     /// Least and greatest value of each slot.
     spans: Vec<(f64, f64)>,
     /// A straight line between two points may miss the course by this part of the span.
     bend: f64,
-    /// θ at which quantities turn, between two points.
-    turns: Vec<f64>,
+    /// θ at which quantities turn, between two points, and the column.
+    turns: Vec<(f64, usize)>,
     /// A block in which only time and the slots count.
     block: Vec<f64>,
     x: Vec<f64>,
 }
 
 impl Points {
-    pub(crate) fn new(instance: &Instance, observer: Observer, experiment: &Experiment) -> Points {
+    pub(crate) fn new(instance: &Instance, mut observer: Observer, experiment: &Experiment) -> Points {
         let slots: Vec<usize> = match observer.only_last() {
             true => Vec::new(),
             false => observer.slots().iter().map(|slot| slot.index()).collect(),
         };
         let states = instance.description().layout.states;
+        let tol = experiment.solver.tol;
+        observer.expectations.expect_areas(tol);
+        let demands = observer.expectations.demands();
+        let column = |demand: &Demand| slots.iter().position(|slot| *slot == demand.slot.index());
+        let areas = demands.iter().enumerate().filter_map(|(measure, demand)| {
+            let wanted = matches!(demand.what, Wants::Area | Wants::Square);
+            column(demand).filter(|_| wanted).map(|column| Area {
+                measure,
+                column,
+                square: demand.what == Wants::Square,
+                inside: false,
+                magnitude: (0.0, 0.0),
+            })
+        });
+        let turns = |slot: &usize| demands.iter().any(|d| d.what == Wants::Turns && d.slot.index() == *slot);
+        let lines = demands.iter().any(|demand| demand.what == Wants::Points);
         Points {
+            areas: areas.collect(),
+            turning: slots.iter().map(turns).collect(),
+            nodes: vec![0.0; 7 * slots.len()],
+            edges: observer.expectations.instants(),
+            edge: 0,
+            tol,
             only_states: observer.slots().iter().chain(observer.probe.slots()).all(|slot| states.contains(*slot)),
             duration: experiment.duration,
             theta: 0.0,
+            part: (0.0, 0.0),
             rows: vec![0.0; slots.len() * (DEPTH + 4)],
             spans: vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()],
-            // A plot needs no more than its pixels. Integrals want more; extremes and periods find their own way.
-            bend: if observer.measures() { experiment.solver.tol.max(1e-5) } else { 1e-3 },
+            // A plot needs no more than its pixels. Periods and the like take cubics through points, whose error is about the
+            // square of that of lines; areas and extremes find their own way.
+            bend: if lines { (1e-2 * tol.sqrt()).min(1e-5) } else { 1e-3 },
             turns: Vec::new(),
             block: instance.block().to_vec(),
             x: vec![0.0; instance.description().layout.states.len as usize],
@@ -115,7 +186,23 @@ impl Points {
         if self.slots.is_empty() || theta <= self.theta {
             return Ok(());
         }
+        while let Some(&instant) = self.edges.get(self.edge).filter(|edge| **edge < time) {
+            let edge = (instant - step.t) / step.h;
+            if edge > self.theta && edge < theta {
+                self.span(system, step, edge, instant)?;
+            }
+            self.edge += 1;
+        }
+        self.span(system, step, theta, time)
+    }
+
+    /// The same without an edge on the way.
+    fn span(&mut self, system: &mut System, step: &Step, theta: f64, time: f64) -> Result<(), Stop> {
         let from = self.theta;
+        self.part = (from, theta);
+        if !self.areas.is_empty() {
+            self.area(system, step, (from, theta), MOST_HALVED)?;
+        }
         let pieces = (LEAST_POINTS * step.h * (theta - from) / self.duration).ceil().max(2.0);
         for piece in 1..=pieces as u32 {
             let start = self.theta;
@@ -127,6 +214,57 @@ impl Points {
             let width = self.slots.len();
             self.rows.copy_within(width..2 * width, 0);
             self.theta = end;
+        }
+        Ok(())
+    }
+
+    /// Takes the areas over a part of the step at whose inside no window begins or ends, by halves where that is not enough.
+    fn area(&mut self, system: &mut System, step: &Step, (from, to): (f64, f64), halves: usize) -> Result<(), Stop> {
+        let (middle, half) = (0.5 * (from + to), 0.5 * (to - from));
+        let (now, length) = (step.t + middle * step.h, (to - from) * step.h);
+        for area in &mut self.areas {
+            let (after, before) = self.observer.expectations.window(area.measure);
+            area.inside = after < now && now < before;
+        }
+        if !self.areas.iter().any(|area| area.inside) {
+            return Ok(());
+        }
+        let width = self.slots.len();
+        for (k, node) in NODES.into_iter().enumerate() {
+            step.at((middle + half * node).clamp(from, to), &mut self.x);
+            // What jumps at the end has not jumped before it.
+            system.place(step.time(middle + half * node).min(step.end), &self.x);
+            self.compute(system)?;
+            let (row, block) = (&mut self.nodes[k * width..(k + 1) * width], system.instance.block());
+            row.iter_mut().zip(&self.slots).for_each(|(value, slot)| *value = block[*slot]);
+        }
+        let nodes = &self.nodes;
+        let rule = |area: &Area, weights: &[f64; 7], size: fn(f64) -> f64| {
+            let value = |k: usize| weights[k] * size(area.of(nodes[k * width + area.column]));
+            0.5 * length * (0..7).map(value).sum::<f64>()
+        };
+        let accurate = |area: &Area| {
+            let magnitude = rule(area, &FINE, f64::abs);
+            let usual = area.magnitude.0 * (length / area.magnitude.1.max(length));
+            let off = (rule(area, &FINE, |x| x) - rule(area, &ROUGH, |x| x)).abs();
+            let allowed = OF_TOLERANCE * self.tol * magnitude.max(usual);
+            // The rough rule is of order six, the fine one of order ten: a power of 5/3, of which 7/4 is the next with a root.
+            let part = off / magnitude.max(usual);
+            let foreseen = if part < 1e-3 { 10.0 * off * (part * part.sqrt()).sqrt().min(1.0) } else { off };
+            foreseen <= allowed || off <= 1e-15 * magnitude.max(usual) || !off.is_finite()
+        };
+        if halves > 0 && !self.areas.iter().filter(|area| area.inside).all(accurate) {
+            self.area(system, step, (from, middle), halves - 1)?;
+            return self.area(system, step, (middle, to), halves - 1);
+        }
+        for area in self.areas.iter_mut().filter(|area| area.inside) {
+            let found = |size: fn(f64) -> f64| {
+                let value = |k: usize| FINE[k] * size(area.of(nodes[k * width + area.column]));
+                0.5 * length * (0..7).map(value).sum::<f64>()
+            };
+            let (total, magnitude) = (found(|x| x), found(f64::abs));
+            area.magnitude = (area.magnitude.0 + magnitude, area.magnitude.1 + length);
+            self.observer.expectations.give_area(area.measure, total);
         }
         Ok(())
     }
@@ -183,7 +321,7 @@ impl Points {
             let turn = 0.5 * (a - b) / bend;
             let beyond = 0.25 * (b - a) * turn;
             if turn.abs() < 1.0 && beyond.abs() > 1e-9 * span {
-                self.turns.push(middle + 0.5 * turn * (to - from));
+                self.turns.push((middle + 0.5 * turn * (to - from), i));
             }
         }
         if !straight && depth > 1 {
@@ -192,13 +330,19 @@ impl Points {
             self.emit(row, step.time(middle));
             return self.between(system, step, (middle, row), (to, row_to), depth - 1);
         }
-        self.turns.sort_by(f64::total_cmp);
-        let early = self.turns.partition_point(|turn| *turn < middle);
+        for k in 0..self.turns.len() {
+            let (turn, column) = self.turns[k];
+            if self.turning[column] {
+                self.turns[k].0 = self.refine(system, step, (from, to), (turn, column))?;
+            }
+        }
+        self.turns.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let early = self.turns.partition_point(|(turn, _)| *turn < middle);
         for i in 0..self.turns.len() {
             if i == early {
                 self.emit(row, step.time(middle));
             }
-            let turn = self.turns[i];
+            let (turn, _) = self.turns[i];
             self.sample(system, step, row + 1, turn)?;
             self.emit(row + 1, step.time(turn));
         }
@@ -206,6 +350,45 @@ impl Points {
             self.emit(row, step.time(middle));
         }
         Ok(())
+    }
+
+    /// Where a quantity turns, by Newton's method on its derivative from five points, exact where it is a state. `turn`: about
+    /// where, and the column.
+    fn refine(
+        &mut self,
+        system: &mut System,
+        step: &Step,
+        (from, to): (f64, f64),
+        (turn, column): (f64, usize),
+    ) -> Result<f64, Stop> {
+        // The polynomial holds up to the ends of the part that is shown.
+        let (first, last) = self.part;
+        let d = (0.02 * (to - from)).min(0.4 * (turn - first).min(last - turn));
+        if d < 1e-3 * (to - from) {
+            return Ok(turn);
+        }
+        let mut theta = turn;
+        for _ in 0..6 {
+            let mut y = [0.0; 5];
+            for (y, k) in y.iter_mut().zip([-2.0, -1.0, 0.0, 1.0, 2.0]) {
+                step.at(theta + k * d, &mut self.x);
+                system.place(step.time(theta + k * d), &self.x);
+                self.compute(system)?;
+                *y = system.instance.block()[self.slots[column]];
+            }
+            let slope = (8.0 * (y[3] - y[1]) - (y[4] - y[0])) / (12.0 * d);
+            let bend = (16.0 * (y[3] + y[1]) - (y[4] + y[0]) - 30.0 * y[2]) / (12.0 * d * d);
+            let next = theta - slope / bend;
+            if !(next - 2.0 * d >= first && next + 2.0 * d <= last && next >= from && next <= to) {
+                return Ok(turn);
+            }
+            let by = (next - theta).abs();
+            theta = next;
+            if by <= 1e-9 * (to - from) {
+                break;
+            }
+        }
+        Ok(theta)
     }
 
     /// Puts the values at θ into a row.

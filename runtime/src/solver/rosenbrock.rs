@@ -24,6 +24,8 @@ pub(crate) struct Rosenbrock {
     sparse: Option<Sparse>,
     x: Vec<f64>,
     f: Vec<f64>,
+    /// Where the stages but the first evaluate f, one behind the other.
+    arguments: Vec<f64>,
     attempt: fn(&mut Rosenbrock, &mut System, &mut Step, &[f64]) -> bool,
 }
 
@@ -49,6 +51,7 @@ impl Rosenbrock {
             sparse: coupled.map(|coupled| Sparse::new(n, coupled)),
             x: zeros(),
             f: zeros(),
+            arguments: vec![0.0; (STAGES - 1) * n],
             attempt,
         }
     }
@@ -58,6 +61,14 @@ impl Rosenbrock {
     /// Returns false where the matrix is singular; a shorter step then is the remedy.
     pub(crate) fn attempt(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
         (self.attempt)(self, system, step, jacobian)
+    }
+
+    /// Times in s and states at which the last attempt evaluated f, the start left out.
+    pub(crate) fn arguments(&self, step: &Step) -> impl Iterator<Item = (f64, &[f64])> {
+        let n = self.f.len();
+        let (t, h, end) = (step.t, step.h, step.end);
+        let times = (1..STAGES).map(move |stage| if stage < 5 { t + C[stage] * h } else { end });
+        times.zip(self.arguments.chunks_exact(n.max(1)))
     }
 
     fn stages<const N: usize>(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
@@ -116,6 +127,7 @@ impl Rosenbrock {
                 x[i] =
                     if S < 6 { step.x0[i] + combine::<S>(&A[S % 6], done, n, i) } else { x[i] + done[(S - 1) * n + i] };
             }
+            self.arguments[(S - 1) * n..S * n].copy_from_slice(x);
             let t = if S < 5 { step.t + C[S] * step.h } else { step.end };
             system.sized_slope::<N>(t, x, f);
         }

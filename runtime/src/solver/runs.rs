@@ -44,8 +44,7 @@ fn an_oscillator_goes_explicit_and_its_measures_are_as_good_as_its_states() {
     assert!((value(&outcome, 0) - 1.0).abs() < 1e-6, "{}", value(&outcome, 0));
     assert!((value(&outcome, 1) / std::f64::consts::TAU - 1.0).abs() < 1e-7, "{}", value(&outcome, 1));
     let rms = (0.5 - 200f64.sin() / 400.0).sqrt();
-    // Trapezoidal, so only as good as lines are.
-    assert!((value(&outcome, 2) / rms - 1.0).abs() < 1e-5);
+    assert!((value(&outcome, 2) / rms - 1.0).abs() < 1e-6, "{}", value(&outcome, 2) / rms - 1.0);
     assert!((value(&outcome, 3) - 100f64.sin()).abs() < 2e-6);
     assert!(outcome.work.stiff_steps < outcome.work.steps / 2, "{:?}", outcome.work);
 }
@@ -431,7 +430,8 @@ fn a_large_system_runs_as_a_small_one_does() {
     // Behind the slowest mode each member is larger than the one before by rate/(rate − 1).
     let exact = (1..N).fold((-5f64).exp(), |x, i| x * rate(i) / (rate(i) - 1.0));
     assert!((value(&outcome, 0) - exact).abs() < 1e-8, "{} for {exact}", value(&outcome, 0));
-    assert_eq!(outcome.work.stiff_steps, outcome.work.steps);
+    // As long as nothing has reached the end of the chain, steps are short and the explicit method suits.
+    assert!(outcome.work.stiff_steps > 100 && outcome.work.steps < 1000, "{}", outcome.work);
 }
 
 #[test]

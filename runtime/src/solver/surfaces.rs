@@ -23,7 +23,10 @@ pub(crate) struct Surfaces {
     decides: Vec<bool>,
     /// Whether derivatives at most bend there.
     bends: Vec<bool>,
-    /// Whether only those are looked for.
+    /// Which surfaces are looked for, and whether there is any.
+    sought: Vec<bool>,
+    any: bool,
+    /// Whether of these only conditions are looked for.
     pub(crate) only_conditions: bool,
     /// Values at the end of the last step, or where the search stands within this one.
     here: Vec<f64>,
@@ -45,13 +48,18 @@ pub(crate) struct Surfaces {
 }
 
 impl Surfaces {
-    /// Brackets will be `width` seconds wide.
-    pub(crate) fn new(system: &System, width: f64) -> Surfaces {
+    /// Looks for the surfaces on which the course depends, or for those at which only what is `observed` changes. Brackets will
+    /// be `width` seconds wide.
+    pub(crate) fn new(system: &System, width: f64, observed: bool) -> Surfaces {
         let zeros = || vec![0.0; system.surfaces()];
+        let roots = &system.instance.description().roots[..system.surfaces()];
+        let sought: Vec<bool> = roots.iter().map(|root| root.observed == observed).collect();
         Surfaces {
+            any: sought.contains(&true),
+            sought,
             sides: zeros(),
-            decides: system.instance.description().roots.iter().map(|root| root.decides).collect(),
-            bends: system.instance.description().roots.iter().map(|root| root.bends).collect(),
+            decides: roots.iter().map(|root| root.decides).collect(),
+            bends: roots.iter().map(|root| root.bends).collect(),
             only_conditions: false,
             here: zeros(),
             nodes: Vec::new(),
@@ -68,7 +76,7 @@ impl Surfaces {
 
     /// Takes the sides at (t, x) as they are.
     pub(crate) fn restart(&mut self, system: &mut System, t: f64, x: &[f64]) {
-        if self.sides.is_empty() {
+        if !self.any {
             return;
         }
         system.roots(t, x, &mut self.here);
@@ -79,13 +87,13 @@ impl Surfaces {
 
     /// For a step that was too long: roughly where it first crosses, in θ, if it ends behind a surface.
     pub(crate) fn guess(&mut self, system: &mut System, step: &Step) -> Option<f64> {
-        if self.sides.is_empty() || !step.x1.iter().all(|x| x.is_finite()) {
+        if !self.any || !step.x1.iter().all(|x| x.is_finite()) {
             return None;
         }
         system.roots(step.end, &step.x1, &mut self.trial);
         let mut first = None;
         for i in 0..self.sides.len() {
-            if self.sides[i] * self.trial[i] < 0.0 {
+            if self.sought[i] && self.sides[i] * self.trial[i] < 0.0 {
                 self.met[i] += 1;
                 let theta = self.here[i] / (self.here[i] - self.trial[i]);
                 first = Some(first.map_or(theta, |first: f64| first.min(theta)));
@@ -107,6 +115,17 @@ impl Surfaces {
     /// Steps that crossed nothing have led to a point with these values.
     pub(crate) fn go_on(&mut self, here: &[f64]) {
         copy(here, &mut self.here);
+    }
+
+    /// Whether any surface is looked for.
+    pub(crate) fn any(&self) -> bool {
+        self.any
+    }
+
+    /// Whether the model would be on the other side of a surface at (t, x).
+    pub(crate) fn turned(&mut self, system: &mut System, t: f64, x: &[f64]) -> bool {
+        system.roots(t, x, &mut self.trial);
+        (0..self.sides.len()).any(|i| self.sought[i] && self.sides[i] * self.trial[i] < 0.0)
     }
 
     /// The surfaces met most often since `forget`.
@@ -134,14 +153,15 @@ impl Surfaces {
         let m = self.sides.len();
         self.nodes.clear();
         self.values.clear();
-        if m == 0 {
+        if !self.any {
             return;
         }
         copy(&self.here, &mut self.start);
         copy(&self.sides, &mut self.start_sides);
         if fresh {
-            [1e-6, 1e-4, 1e-2, 0.1, 0.25].into_iter().for_each(|theta| self.look(system, step, theta));
+            [1e-6, 1e-4, 1e-2, 0.1].into_iter().for_each(|theta| self.look(system, step, theta));
         }
+        [0.25, 0.75].into_iter().for_each(|theta| self.look(system, step, theta));
         match known {
             Some(fused) => {
                 for (theta, values) in [0.5, 1.0].into_iter().zip(fused.surfaces(system)) {
@@ -151,19 +171,28 @@ impl Surfaces {
             }
             None => [0.5, 1.0].into_iter().for_each(|theta| self.look(system, step, theta)),
         }
-        let (middle, end) = (self.values.len() - 2 * m, self.values.len() - m);
+        let first = self.values.len() - 4 * m;
+        let [early, late, middle, end] = [0, 1, 2, 3].map(|row| first + row * m);
         for i in 0..m {
-            let (a, b, c) = (self.here[i], self.values[middle + i], self.values[end + i]);
-            if self.sides[i] * b <= 0.0 || self.sides[i] * c <= 0.0 {
+            if !self.sought[i] {
                 continue;
             }
-            // a + θ (4b − 3a − c) + 2 θ² (a − 2b + c), least where its slope is 0.
-            let (slope, bend) = (4.0 * b - 3.0 * a - c, 2.0 * (a - 2.0 * b + c));
-            let theta = -0.5 * slope / bend;
-            let least = a + 0.5 * theta * slope;
-            let near = 0.2 * a.abs().min(b.abs()).min(c.abs());
-            if theta > 0.0 && theta < 1.0 && self.sides[i] * least < near && !self.nodes.contains(&theta) {
-                self.look(system, step, theta);
+            let a = self.here[i];
+            let [early, late, middle, end] = [early, late, middle, end].map(|row| self.values[row + i]);
+            let parts = [(0.0, 1.0, [a, middle, end]), (0.0, 0.5, [a, early, middle]), (0.5, 0.5, [middle, late, end])];
+            for (from, width, [a, b, c]) in parts {
+                if self.sides[i] * a < 0.0 || self.sides[i] * b <= 0.0 || self.sides[i] * c <= 0.0 {
+                    continue;
+                }
+                // a + θ (4b − 3a − c) + 2 θ² (a − 2b + c), least where its slope is 0.
+                let (slope, bend) = (4.0 * b - 3.0 * a - c, 2.0 * (a - 2.0 * b + c));
+                let part = -0.5 * slope / bend;
+                let least = a + 0.5 * part * slope;
+                let near = 0.2 * a.abs().min(b.abs()).min(c.abs());
+                let theta = from + width * part;
+                if part > 0.0 && part < 1.0 && self.sides[i] * least < near && !self.nodes.contains(&theta) {
+                    self.look(system, step, theta);
+                }
             }
         }
         // Few, and nearly sorted: by insertion.
@@ -240,7 +269,7 @@ impl Surfaces {
 
     /// Whether surface i has been crossed where its value is g.
     fn crosses(&self, i: usize, g: f64) -> bool {
-        if self.only_conditions && !self.decides[i] {
+        if !self.sought[i] || self.only_conditions && !self.decides[i] {
             return false;
         }
         self.sides[i] * g < 0.0 || (self.decides[i] && self.sides[i] == 0.0 && g != 0.0 && !g.is_nan())
