@@ -82,7 +82,7 @@ fn main() {
         };
         let [as_written, plain, watched] = [(false, false), (true, false), (true, true)].map(|(regrouped, watched)| {
             let func = step(&servo(watched), method);
-            let func = if regrouped { contract(&regroup(&func), &layout) } else { func };
+            let func = if regrouped { contract(&regroup(&func, false), &layout) } else { func };
             let funcs = [(Function::Step, expand(&func))];
             let begun = Instant::now();
             let (machine, stats) = compile(&funcs, &layout, POOL.len()).expect("this processor can");
@@ -166,7 +166,7 @@ fn lanes(method: Method, name: &str, hand: Hand) {
     println!("{name}, many instances with their own parameters, on one core:");
     let program = servo(true);
     let layout = &program.description.layout;
-    let func = contract(&regroup(&step(&program, method)), layout);
+    let func = contract(&regroup(&step(&program, method), program.balanced), layout);
     let mut codes = Vec::new();
     for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
         for vectors in [1, 2, 3, 4, 5, 6, 8] {

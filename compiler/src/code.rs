@@ -48,7 +48,10 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 /// # Panics
 /// For the adaptive method, which is no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
-    watched(&limited(&contract(&regroup(&discretize::step(program, method)), &program.description.layout)))
+    watched(&limited(&contract(
+        &regroup(&discretize::step(program, method), program.balanced),
+        &program.description.layout,
+    )))
 }
 
 /// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;

@@ -121,7 +121,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
             plain: step.ops.len(),
             operations: expanded.ops.len(),
             divisions,
-            code: code_size(&crate::math::expand(&regroup(&step))),
+            code: code_size(&crate::math::expand(&regroup(&step, program.balanced))),
             stable: bench.as_ref().map(|bench| bench.largest_stable(method)),
         }
     });

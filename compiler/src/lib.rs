@@ -10,6 +10,7 @@ pub mod math;
 pub mod opt;
 pub mod program;
 pub mod derive;
+pub mod impulse;
 pub mod questions;
 pub mod coupled;
 pub mod elimination;
@@ -321,8 +322,17 @@ struct Made {
 impl Made {
     /// Whether the code of a program is the same: it differs in the values of parameters at most.
     fn fits(&self, program: &program::Program, method: Method) -> bool {
-        let program::Program { description, params: _, start, outputs, derivatives, tick, transitions, roots } =
-            program;
+        let program::Program {
+            description,
+            params: _,
+            start,
+            outputs,
+            derivatives,
+            tick,
+            transitions,
+            roots,
+            balanced: _,
+        } = program;
         let made = &self.program;
         self.method == method
             && (&made.description, &made.start, &made.outputs) == (description, start, outputs)

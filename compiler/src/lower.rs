@@ -5,6 +5,7 @@
 
 use crate::causality::{Phase, rate_of, value_of};
 use crate::delays;
+use crate::impulse;
 use crate::ir::build::{Build, Env};
 use crate::ir::{Binary, Func, Type, Unary, Value};
 use crate::lookup::Lookup;
@@ -57,7 +58,8 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let derivatives = plan.derivatives(emit("derivatives", Phase::Now));
     let tick = (!system.blocks.is_empty()).then(|| plan.tick(emit("tick", Phase::Tick)));
     let moves = !system.automata.is_empty() || !system.events.is_empty() || !system.crossings.is_empty();
-    let transitions = moves.then(|| plan.transitions(emit("transitions", Phase::Now)));
+    let mut balanced = false;
+    let transitions = moves.then(|| plan.transitions(emit("transitions", Phase::Now), &mut balanced));
     let (roots, surfaces) = plan.roots(emit("roots", Phase::Now));
     let params = evaluate_in(&plan, &plan.param_values);
 
@@ -97,7 +99,7 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     description.roots = surfaces;
     let roots = (description.layout.roots.len > 0).then_some(roots);
     let observed = plan.observed.clone();
-    let program = Program { description, params, start, outputs, derivatives, tick, transitions, roots };
+    let program = Program { description, params, start, outputs, derivatives, tick, transitions, roots, balanced };
     Lowered { program, observed }
 }
 
@@ -595,7 +597,8 @@ impl<'a> Plan<'a> {
         emit.build.finish()
     }
 
-    fn transitions(&self, mut emit: Emit) -> Func {
+    /// `balanced` becomes whether a contact stops what it acts on.
+    fn transitions(&self, mut emit: Emit, balanced: &mut bool) -> Func {
         // For each state: what is reset when, in the order of the text.
         let mut resets: HashMap<VarId, Vec<(Value, Value)>> = HashMap::new();
         let mut order: Vec<VarId> = Vec::new();
@@ -637,7 +640,26 @@ impl<'a> Plan<'a> {
             let fires = emit.build.and(condition, was_false);
             note(&mut emit, fires, &event.resets);
         }
-        for var in order {
+        let (inputs, states): (Vec<VarId>, Vec<VarId>) =
+            order.into_iter().partition(|var| self.system.var(*var).kind == VarKind::Input);
+        // What an impulse needs, in slots of its own behind each other: whether it acts, the value, the force.
+        let mut impulses: Vec<(Func, [Slot; 3])> = Vec::new();
+        for var in inputs {
+            let Some((func, force)) = self.impulse(var) else { continue };
+            let (mut acts, mut target) = (emit.build.truth(false), emit.build.real(0.0));
+            for (fires, value) in resets[&var].iter().rev() {
+                acts = emit.build.or(acts, *fires);
+                target = emit.build.select(*fires, *value, target);
+            }
+            // What bounces is not held.
+            let holds = resets[&var].iter().all(|(_, value)| emit.build.constant(*value) == Some(0.0));
+            let force = if holds { emit.var(force) } else { emit.build.real(0.0) };
+            let values = [emit.number(acts), target, force];
+            let slots = [0, 1, 2].map(|k| Slot(impulse::PRESENT.0 - 1 - (3 * impulses.len() + k) as u32));
+            slots.into_iter().zip(values).for_each(|(slot, value)| emit.build.store(slot, value));
+            impulses.push((func, slots));
+        }
+        for var in states {
             let slot = self.slot(var).expect("a state is stored");
             let mut value = emit.build.load(slot);
             // The first in the text wins: it is applied last.
@@ -646,19 +668,56 @@ impl<'a> Plan<'a> {
             }
             emit.build.store(slot, value);
         }
-        // What the next instant is compared with is what this one holds after its resets.
         let changes = emit.build.finish();
         let memory = self.memory();
-        let (mut both, mut env) = (Build::new("transitions").with_pool(self.description.pool.clone()), Env::new());
-        both.inline(&changes, &mut env);
-        both.inline(&memory, &mut env);
-        both.store_env(&env, |_| true);
-        both.finish()
+        let (mut all, mut env) = (Build::new("transitions").with_pool(self.description.pool.clone()), Env::new());
+        all.inline(&changes, &mut env);
+        for (func, slots) in &impulses {
+            for (slot, of) in [impulse::ACTS, impulse::TARGET, impulse::PRESENT].into_iter().zip(slots) {
+                let value = all.read(*of, &env);
+                env.insert(slot, value);
+            }
+            all.inline(func, &mut env);
+        }
+        *balanced = !impulses.is_empty();
+        // What the next instant is compared with is what this one holds after its resets.
+        all.inline(&memory, &mut env);
+        let size = self.description.layout.size() as u32;
+        all.store_env(&env, |slot| slot.0 < size);
+        all.finish()
     }
 
-    /// Remembers the sides of crossings and whether events hold.
+    /// How an input is set: by an impulse of the first output of its part that moves a state on which the input depends;
+    /// and that output. None for what no output moves, as a measured speed.
+    fn impulse(&self, input: VarId) -> Option<(Func, VarId)> {
+        let mut emit = Emit::new(self, "speed", Phase::Now);
+        let value = emit.var(input);
+        emit.build.store(impulse::SPEED, value);
+        let speed = emit.build.finish();
+        let part = self.system.var(input).instance;
+        let force = |id: &VarId| {
+            let var = self.system.var(*id);
+            var.instance == part && var.kind == VarKind::Output && !self.types.boolean_vars[id.0 as usize]
+        };
+        let slots = |segment: abi::description::Segment| -> Vec<Slot> {
+            (0..segment.len as usize).map(|k| segment.slot(k)).collect()
+        };
+        let layout = &self.description.layout;
+        let (states, derivatives) = (slots(layout.states), slots(layout.derivatives));
+        self.system.var_ids().filter(force).find_map(|output| {
+            let mut emit = Emit::new(self, "rates", Phase::Now);
+            emit.replaced = Some(output);
+            let rates = self.derivatives(emit);
+            let func = impulse::impulse(&speed, &rates, &states, &derivatives, &self.description.pool)?;
+            Some((func, output))
+        })
+    }
+
+    /// Remembers the sides of crossings and whether events hold. A crossing is an instant: it holds no longer afterwards,
+    /// so that an event happens at every crossing, even at one in each step.
     fn memory(&self) -> Func {
         let mut emit = Emit::new(self, "memory", Phase::Now);
+        emit.between = true;
         for (event, slot) in self.system.events.iter().zip(&self.events) {
             let condition = emit.value(event.condition);
             let held = emit.number(condition);
@@ -866,19 +925,25 @@ struct Emit<'a> {
     inline_params: bool,
     /// But parameters that depend on no other are read from their slots.
     loads_params: bool,
+    /// Whether nothing crosses anything: between two instants.
+    between: bool,
+    /// A quantity that is read from [`impulse::FORCE`] instead of computed.
+    replaced: Option<VarId>,
 }
 
 impl<'a> Emit<'a> {
     fn new(plan: &'a Plan<'a>, name: &str, phase: Phase) -> Emit<'a> {
         let build = Build::new(name).with_pool(plan.description.pool.clone());
         let nodes = vec![None; plan.system.nodes.len()];
-        Emit { plan, phase, build, nodes, inline_params: false, loads_params: false }
+        let [inline_params, loads_params, between] = [false; 3];
+        Emit { plan, phase, build, nodes, inline_params, loads_params, between, replaced: None }
     }
 
     /// The expression that a node hands on to, if it does not compute its value from its operands.
     fn behind(&self, node: &Node) -> Option<ExprId> {
         let system = self.plan.system;
         match node {
+            Node::Var(id) if self.replaced == Some(*id) => None,
             Node::Var(id) => {
                 let stored = matches!(self.plan.places[id.0 as usize], Place::Slot(_));
                 let var = system.var(*id);
@@ -997,6 +1062,9 @@ impl<'a> Emit<'a> {
     }
 
     fn leaf(&mut self, id: VarId) -> Value {
+        if self.replaced == Some(id) {
+            return self.build.load(impulse::FORCE);
+        }
         match self.plan.places[id.0 as usize] {
             Place::Slot(slot) if !self.inline_params || self.loads_params && self.is_param(slot) => {
                 let value = self.build.load(slot);
@@ -1144,7 +1212,7 @@ impl<'a> Emit<'a> {
     }
 
     fn crossing(&mut self, k: usize) -> Value {
-        if self.phase == Phase::Start {
+        if self.phase == Phase::Start || self.between {
             return self.build.truth(false);
         }
         let crossing = &self.plan.system.crossings[k];

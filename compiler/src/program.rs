@@ -22,6 +22,8 @@ pub struct Program {
     pub transitions: Option<Func>,
     /// Switching surfaces.
     pub roots: Option<Func>,
+    /// Whether a contact stops what it acts on: then forces that balance must leave exactly 0.
+    pub balanced: bool,
 }
 
 impl Program {

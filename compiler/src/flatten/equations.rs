@@ -380,14 +380,14 @@ impl<'a> Flattener<'a> {
         for reset in resets {
             let value = self.expr(&reset.value, env);
             match self.var_named(id, &reset.name.text) {
-                Some(var) if self.system.var(var).kind == VarKind::State => {
+                Some(var) if matches!(self.system.var(var).kind, VarKind::State | VarKind::Input) => {
                     self.system.reset_places.push((value, reset.name.span));
                     out.push((var, value));
                 }
                 Some(var) => {
                     let error =
                         Diagnostic::error("E0307", format!("`{}` is no state: it cannot be reset", reset.name.text))
-                            .label(reset.name.span, "only a state keeps a value")
+                            .label(reset.name.span, "only a state keeps a value, or an input that is one elsewhere")
                             .label(self.system.var(var).span, "declared here");
                     self.report(error);
                 }

@@ -26,13 +26,14 @@ const EARLY: i32 = i32::MIN / 2;
 /// Cycles, of two sums, from which on it is worth to split a sum on the way to what is affine throughout.
 const WORTH: i32 = 6;
 
-/// Regroups a function that is iterated.
-pub fn regroup(func: &Func) -> Func {
+/// Regroups a function that is iterated. `balanced`: differences of equal forces must stay exactly 0, as a contact at rest
+/// needs it, so no sum is split.
+pub fn regroup(func: &Func, balanced: bool) -> Func {
     let carried = carried(func);
     let after = after(func, &carried);
     // First everything, to learn how short the longest chain can be; then only what is needed for that.
-    let (_, shortest) = rebuilt(func, Pass::new(func, &carried), &after, 0);
-    rebuilt(func, Pass::new(func, &carried), &after, shortest).0
+    let (_, shortest) = rebuilt(func, Pass::new(func, &carried, balanced), &after, 0);
+    rebuilt(func, Pass::new(func, &carried, balanced), &after, shortest).0
 }
 
 /// Slots that an iteration takes over from the one before, time and the count of steps apart: no state holds them back.
@@ -118,6 +119,7 @@ struct Pass<'a> {
     /// Of every value of the builder.
     ready: Vec<Ready>,
     carried: &'a HashSet<Slot>,
+    balanced: bool,
 }
 
 /// A product of values over a product of values.
@@ -128,8 +130,8 @@ struct Product {
 }
 
 impl<'a> Pass<'a> {
-    fn new(func: &Func, carried: &'a HashSet<Slot>) -> Pass<'a> {
-        Pass { build: Build::new(&func.name), ready: Vec::new(), carried }
+    fn new(func: &Func, carried: &'a HashSet<Slot>, balanced: bool) -> Pass<'a> {
+        Pass { build: Build::new(&func.name), ready: Vec::new(), carried, balanced }
     }
 
     fn op(&mut self, op: Op) -> Value {
@@ -166,7 +168,7 @@ impl<'a> Pass<'a> {
     fn sooner(&mut self, plain: Value) -> Value {
         let other = match self.build.get(plain) {
             Op::Mul(..) | Op::Div(..) => self.product(plain),
-            Op::Add(..) | Op::Sub(..) => self.split(plain),
+            Op::Add(..) | Op::Sub(..) if !self.balanced => self.split(plain),
             _ => plain,
         };
         if self.at(other) < self.at(plain) { other } else { plain }
@@ -321,7 +323,7 @@ mod tests {
 
     #[track_caller]
     fn check(func: &Func, expected: &str) {
-        let listing = regroup(func).to_string();
+        let listing = regroup(func, false).to_string();
         let found: Vec<&str> = listing.lines().skip(1).map(str::trim).collect();
         assert_eq!(found.join("; "), expected);
     }
@@ -338,7 +340,7 @@ mod tests {
     fn what_has_time_keeps_its_order() {
         // The second state is there long before the first: its division and its sum stay as they are.
         let func = built(|[p, q, _], [x, y]| [(-(x * x).of(Unary::Exp)).of(Unary::Exp), y / p + q * (x * x - x)]);
-        assert_eq!(regroup(&func).to_string(), func.to_string());
+        assert_eq!(regroup(&func, false).to_string(), func.to_string());
     }
 
     #[test]
@@ -348,7 +350,7 @@ mod tests {
             let g = q + (x * x).of(Unary::Exp);
             [p * x.abs() / g * y, y]
         });
-        let listing = regroup(&func).to_string();
+        let listing = regroup(&func, false).to_string();
         let last: Vec<&str> = listing.lines().rev().take(2).collect();
         assert!(last[1].contains("= div"), "{listing}");
     }
@@ -357,7 +359,7 @@ mod tests {
     fn what_is_affine_in_something_late_is_split() {
         // x + p (y − q exp(x)): the exponential enters last, with p q before it.
         let func = built(|[p, q, _], [x, y]| [x + p * (y - q * x.of(Unary::Exp)), y]);
-        let listing = regroup(&func).to_string();
+        let listing = regroup(&func, false).to_string();
         let expected = "v0 = load 3; v1 = load 4; v2 = load 6; v3 = load 7; v4 = exp v2; v5 = mul v0 v3; \
                         v6 = mul v0 v1; v7 = add v2 v5; v8 = mul v4 v6; v9 = sub v7 v8; store 6 = v9";
         let found: Vec<&str> = listing.lines().skip(1).map(str::trim).collect();
@@ -377,7 +379,7 @@ mod tests {
         let next = (z + h * (v - p * v.abs() / g * z)).value;
         let mut build = build.into_inner();
         build.store(layout.states.slot(0), next);
-        let func = crate::opt::contract::contract(&regroup(&build.finish()), &layout);
+        let func = crate::opt::contract::contract(&regroup(&build.finish(), false), &layout);
         assert!(critical_path(&func) <= 11, "{func}");
     }
 
@@ -392,7 +394,7 @@ mod tests {
             }
             [place, speed]
         });
-        let [plain, regrouped] = [func.clone(), regroup(&func)].map(|func| critical_path(&func));
+        let [plain, regrouped] = [func.clone(), regroup(&func, false)].map(|func| critical_path(&func));
         assert!(regrouped + 9 <= plain, "{plain} cycles, {regrouped} regrouped");
     }
 
@@ -405,7 +407,7 @@ mod tests {
             let force = p * y + q * (x - late) + 0.4 * x;
             [x + 1e-3 * ((m - force) / m), y + 1e-3 * (x - late)]
         });
-        let [one, other] = [&func, &regroup(&func)].map(crate::math::expand);
+        let [one, other] = [&func, &regroup(&func, false)].map(crate::math::expand);
         let mut random = Random(5);
         for _ in 0..1000 {
             let mut block: Vec<f64> = (0..layout().size()).map(|_| random.within(0.1, 2.0)).collect();
