@@ -636,6 +636,16 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
         _ => at,
     };
     let left = operand_before(source, piece, at);
+    if let word @ ("after" | "before") = source.word(at) {
+        let error =
+            Diagnostic::error("E0111", format!("`{word}` begins a window, which belongs to the whole expectation"));
+        let help = format!("write it behind the comparison: `expect first(…) < 10 s {word} 9 s`");
+        return Some(error.label(source.span(at), "").help(help));
+    }
+    if left == "inf" {
+        let error = Diagnostic::error("E0111", "`inf` has no unit");
+        return Some(error.label(source.span(at), "").help("leave the unit out: `inf` fits every quantity"));
+    }
     let right = match (source.word(at), source.is_symbol(at + 1, "(")) {
         ("(", _) => "(...)".to_string(),
         (word, true) if source.kind(at) == Some(TokenKind::Word) => format!("{word}(...)"),
