@@ -19,6 +19,7 @@ use compiler::opt::regroup;
 pub use compiler::resolve::{Lookup, Space};
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
 pub use compiler::stability::LONGEST as LONGEST_STEP;
+pub use compiler::system::LINTS;
 pub use compiler::unstable::two_digits_time;
 pub use compiler::vary::{Fitted, Varying};
 pub use compiler::{

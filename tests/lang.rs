@@ -186,21 +186,24 @@ macro_rules! files {
     };
 }
 
-files! { rigs steps units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values }
+files! { rigs steps units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values proofs }
 
 /// Cases whose text makes several mistakes, each with a message of its own.
 const SEVERAL: &[&str] = &[
+    "a-division-in-a-range",
     "a-mistake-does-not-hide-the-next-model",
     "a-name-in-foreign-letters",
     "a-name-that-the-instance-does-not-have",
+    "a-negative-power-has-a-size",
     "a-range-in-another-unit",
-    "a-straight-system-on-a-shaft",
     "a-step-too-long-with-a-reason",
     "a-step-too-long-without-an-end",
+    "a-straight-system-on-a-shaft",
     "a-torque-too-coarse",
-    "an-encoder-too-coarse",
     "an-empty-window",
+    "an-encoder-too-coarse",
     "an-expectation-in-another-unit",
+    "an-odd-negative-power-has-a-sign",
     "an-unknown-function",
     "each-unknown-name-is-reported",
     "inf-true-and-false-cannot-be-declared",
@@ -212,6 +215,7 @@ const SEVERAL: &[&str] = &[
     "two-circles-are-two-messages",
     "two-regimes-that-nothing-reaches",
     "what-is-never-read",
+    "zero-to-a-negative-power",
 ];
 
 #[test]

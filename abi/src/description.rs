@@ -212,6 +212,10 @@ pub struct Automaton {
     pub slot: Slot,
 }
 
+/// The least number above 0 that a range `in > 0` allows, in SI: nothing that is measured is smaller, and products and
+/// quotients of some such numbers are no zero of a double.
+pub const TINY: f64 = 1e-40;
+
 /// A range that is watched while running. A step that leaves it returns the number of the guard, counted from 1.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Guard {
@@ -219,10 +223,21 @@ pub struct Guard {
     pub path: String,
     /// Where its value lies.
     pub slot: Slot,
-    /// Smallest and largest value in SI, as declared.
+    /// Smallest and largest value in SI, as declared; a bound of [`TINY`] is that of a range without its zero.
     pub range: (f64, f64),
     /// For messages.
     pub unit: Unit,
+}
+
+impl Guard {
+    /// Both bounds in words, each shown by `show` from its value in SI.
+    pub fn bounds(&self, show: impl Fn(f64) -> String) -> (String, String) {
+        let side = |bound: f64, word: &str| match bound.abs() == TINY {
+            true => format!("{word} {}", show(0.0)),
+            false => show(bound),
+        };
+        (side(self.range.0, "above"), side(self.range.1, "below"))
+    }
 }
 
 /// A switching surface of an adaptive run.

@@ -5,7 +5,7 @@
 //! of its numbers in that block. Only the compiler knows how they come about. It also says of each parameter whether the
 //! step reads it, so that it may change while the rig runs, or why only a start does.
 
-use crate::description::Slot;
+use crate::description::{Slot, TINY};
 use crate::encode::{Encode, Malformed, Reader};
 use crate::encode_structs;
 use crate::unit::{Unit, three_digits};
@@ -181,13 +181,32 @@ pub struct Beyond {
 
 /// The bound that a value breaks; each bound with whether it is excluded.
 pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> Option<Beyond> {
-    let below = low.filter(|(bound, strict)| value < *bound || *strict && value == *bound);
-    let above = high.filter(|(bound, strict)| value > *bound || *strict && value == *bound);
-    match (below, above) {
+    let below = low.filter(|(bound, strict)| value < least(*bound, *strict));
+    let above = high.filter(|(bound, strict)| value > greatest(*bound, *strict));
+    // 0 is left out with all that is too small to be told from it.
+    let tiny = value != 0.0 && value.abs() < TINY;
+    let named = |(bound, strict): (f64, bool)| {
+        if strict && bound == 0.0 && tiny { (TINY.copysign(value), strict) } else { (bound, strict) }
+    };
+    match (below.map(named), above.map(named)) {
         (Some((bound, strict)), _) => Some(Beyond { word: if strict { "above" } else { "at least" }, bound }),
         (None, Some((bound, strict))) => Some(Beyond { word: if strict { "below" } else { "at most" }, bound }),
         (None, None) => None,
     }
+}
+
+/// The least value of a range with this lower bound, which may be excluded.
+pub fn least(bound: f64, strict: bool) -> f64 {
+    match strict {
+        true if bound == 0.0 => TINY,
+        true => bound.next_up(),
+        false => bound,
+    }
+}
+
+/// The greatest value of a range with this upper bound, which may be excluded.
+pub fn greatest(bound: f64, strict: bool) -> f64 {
+    -least(-bound, strict)
 }
 
 /// Whether the lower bound is above the upper one.

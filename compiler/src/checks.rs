@@ -57,20 +57,25 @@ fn moving(system: &System, id: ExprId) -> Option<ExprId> {
 fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     let mut exprs = Vec::new();
     let mut checked = Vec::new();
+    // What has no value yet still has a range that must hold something.
+    let open = ExprId(u32::MAX);
     for id in system.var_ids() {
         let var = system.var(id);
         let value = match (&var.definition, var.kind) {
             (Definition::Value(value, _), VarKind::Param | VarKind::Input) => *value,
             (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => *initial,
-            _ => continue,
+            _ => open,
         };
         let bounds = [var.range.low, var.range.high];
         if bounds.iter().all(Option::is_none) {
             continue;
         }
         checked.push((id, value, exprs.len()));
-        exprs.push(value);
-        exprs.extend(bounds.iter().flatten().map(|(bound, _)| *bound));
+        let bounds = bounds.into_iter().flatten().map(|(bound, _)| bound);
+        let mut bounds = bounds.collect::<Vec<_>>();
+        let first = if value == open { bounds[0] } else { value };
+        bounds.insert(0, first);
+        exprs.extend(bounds);
     }
     let values = evaluate(system, types, &exprs);
     for (id, node, at) in checked {
@@ -94,6 +99,9 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
                 Some((low, high)) => error.help(format!("write `{} .. {}`", high.trim(), low.trim())),
                 None => error,
             });
+            continue;
+        }
+        if node == open {
             continue;
         }
         let Some(beyond) = live::beyond(value, low, high) else { continue };
@@ -151,11 +159,22 @@ pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>
     }
 }
 
-/// `reset` sets a continuous state.
+/// `reset` sets a continuous state, each once.
 fn resets(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     let transitions = system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
-    let all = transitions.flat_map(|t| &t.resets).chain(system.events.iter().flat_map(|event| &event.resets));
-    for (var, value) in all {
+    let all: Vec<&Vec<(VarId, ExprId)>> =
+        transitions.map(|t| &t.resets).chain(system.events.iter().map(|event| &event.resets)).collect();
+    for resets in &all {
+        for (k, (var, value)) in resets.iter().enumerate() {
+            let Some((_, first)) = resets[..k].iter().find(|(other, _)| other == var) else { continue };
+            let name = &system.var(*var).name;
+            let error = Diagnostic::error("E0301", format!("`{name}` is reset twice at the same instant"))
+                .label(system.reset_place(*value), "again here")
+                .label(system.reset_place(*first), "first here");
+            diagnostics.push(error.help("keep the one that is meant, or choose between both values with `if`"));
+        }
+    }
+    for (var, value) in all.into_iter().flatten() {
         let var = system.var(*var);
         if matches!(var.definition, Definition::Sampled { .. }) {
             let error = Diagnostic::error("E0307", format!("`{}` is a sampled state: it cannot be reset", var.name))

@@ -12,7 +12,7 @@ use crate::resolve::Loaded;
 use crate::rig::{self, Prepared};
 use crate::source::Sources;
 use crate::system::*;
-use crate::tables::columns;
+use crate::tables::columns as columns_of;
 use crate::units::{self, Types, literal};
 use crate::{causality, checks, delays};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
@@ -50,6 +50,8 @@ pub enum Place {
     Duration,
     /// Fixed step.
     Step,
+    /// Tolerance of an adaptive run.
+    Tolerance,
     /// Start of the window of this expectation.
     After(usize),
     /// End of the window of this expectation.
@@ -362,8 +364,6 @@ fn recording(
     data: &ast::Data,
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<(String, Table, Unit)>> {
-    let wanted: Vec<bool> = data.columns.iter().map(|column| column.name.text != "_").collect();
-    let values = columns(loaded, sources, root, &data.file, &wanted, diagnostics)?;
     let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
         let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
         diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
@@ -379,14 +379,20 @@ fn recording(
             None
         }
     };
-    let t_unit = unit(&data.columns[time])?;
-    let t: Vec<f64> = values[time].iter().map(|t| t_unit.to_si(*t)).collect();
+    let mut units = Vec::new();
     let mut columns = Vec::new();
     for (k, column) in data.columns.iter().enumerate() {
-        if column.name.text != "_" {
-            columns.push((k, column, unit(column)?));
+        if column.name.text == "_" {
+            units.push(None);
+            continue;
         }
+        let unit = unit(column)?;
+        units.push(Some(unit.clone()));
+        columns.push((k, column, unit));
     }
+    let mut values = columns_of(loaded, sources, root, &data.file, &units, diagnostics)?;
+    let t = std::mem::take(&mut values[time]);
+    values[time].clone_from(&t);
     if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
         let error = Diagnostic::error("E0903", "the times of a recording must increase")
             .label(data.file.span, format!("row {} is not after the one before", row + 1));
@@ -400,7 +406,7 @@ fn recording(
             y_dimension: unit.dimension,
             smooth: false,
             x: t.clone(),
-            y: values[k].iter().map(|y| unit.to_si(*y)).collect(),
+            y: values[k].clone(),
         };
         out.push((column.name.text.clone(), table, unit));
     }
@@ -880,6 +886,9 @@ impl Reader<'_> {
             self.places.push((Place::Step, step));
         }
         let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
+        if let (None, Some(tol)) = (given.tol, tol) {
+            self.places.push((Place::Tolerance, tol));
+        }
         let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
         if !(tol > 0.0 && tol < 1.0) {
             let span = parts.solver.map_or(parts.run.span, |solver| solver.span);

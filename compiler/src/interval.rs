@@ -1,124 +1,160 @@
-//! Intervals of reals whose ends may be left out: what a quantity can be.
+//! Intervals of doubles: what a quantity can be, rounding included.
+//!
+//! An interval is a closed set of doubles between two ends, without those nearer to 0 than `away`. A strict bound `x > a`
+//! is the closed bound at the next double, so nothing here is lost to an end that is "left out". Ends of results are
+//! rounded outwards (Moore, Interval Analysis), so that they hold for every order in which code may compute a result:
+//! with products fused into sums, and quotients as products with a reciprocal. −0 and 0 are one number.
+//!
+//! A result too small for a double is 0, and the interval of such a result contains 0. One that is too large ends at
+//! infinity; infinite operands are not promised anything.
 
-/// All reals between two ends. An end that is left out is not reached; infinite ends never are.
+/// The smallest positive double.
+const LEAST: f64 = f64::from_bits(1);
+
+/// Relative error that an elementary function may have; the accuracy of `math` is within one unit in the last place.
+const ELEMENTARY: f64 = 4.0 * f64::EPSILON;
+
+/// All doubles x with `low` ≤ x ≤ `high` and |x| ≥ `away`.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Interval {
-    /// Lower end.
+    /// Least value.
     pub low: f64,
-    /// Upper end.
+    /// Greatest value; below `low` if there is no value.
     pub high: f64,
-    /// Whether the lower end is left out.
-    pub above_low: bool,
-    /// Whether the upper end is left out.
-    pub below_high: bool,
-    /// Whether 0 is known to be left out, wherever it lies.
-    pub not_zero: bool,
+    /// Least magnitude. Above 0, it keeps 0 out of an interval with both signs.
+    pub away: f64,
 }
 
 impl Interval {
     /// Everything.
-    pub const ALL: Interval =
-        Interval { low: f64::NEG_INFINITY, high: f64::INFINITY, above_low: true, below_high: true, not_zero: false };
+    pub const ALL: Interval = Interval { low: f64::NEG_INFINITY, high: f64::INFINITY, away: 0.0 };
+
+    /// Nothing: what is computed where contradicting conditions hold.
+    pub const EMPTY: Interval = Interval { low: f64::INFINITY, high: f64::NEG_INFINITY, away: f64::INFINITY };
+
+    /// Everything but 0.
+    pub const NOT_ZERO: Interval = Interval { away: LEAST, ..Interval::ALL };
 
     /// One number; everything, if it is NaN.
     pub fn point(x: f64) -> Interval {
         if x.is_nan() { Interval::ALL } else { Interval::closed(x, x) }
     }
 
-    /// Both ends included.
+    /// Both ends included; an end that is NaN is open.
     pub fn closed(low: f64, high: f64) -> Interval {
-        Interval { low, high, above_low: false, below_high: false, not_zero: false }
+        Interval { low, high, away: 0.0 }.normal()
     }
 
-    /// Both ends left out.
-    pub fn open(low: f64, high: f64) -> Interval {
-        Interval { low, high, above_low: true, below_high: true, not_zero: false }
+    /// Everything from `low` on.
+    pub fn from(low: f64) -> Interval {
+        Interval::closed(low, f64::INFINITY)
+    }
+
+    /// Everything up to `high`.
+    pub fn to(high: f64) -> Interval {
+        Interval::closed(f64::NEG_INFINITY, high)
+    }
+
+    /// All numbers of at least this magnitude.
+    pub fn beyond(away: f64) -> Interval {
+        Interval { away: away.max(0.0), ..Interval::ALL }
+    }
+
+    /// Whether there is no value.
+    pub fn is_empty(self) -> bool {
+        self.low > self.high
     }
 
     /// Whether 0 can be reached.
     pub fn has_zero(self) -> bool {
-        let under = self.low < 0.0 || (self.low == 0.0 && !self.above_low);
-        let over = self.high > 0.0 || (self.high == 0.0 && !self.below_high);
-        under && over && !self.not_zero
+        self.low <= 0.0 && self.high >= 0.0 && self.away == 0.0
     }
 
     /// Whether every number in it is at least 0.
     pub fn is_not_negative(self) -> bool {
-        self.low >= 0.0
+        self.low >= 0.0 || self.is_empty()
     }
 
     /// Whether every number in it is above 0.
     pub fn is_positive(self) -> bool {
-        self.low > 0.0 || (self.low == 0.0 && (self.above_low || self.not_zero))
+        self.low > 0.0 || self.is_empty()
+    }
+
+    /// Greatest magnitude.
+    pub fn size(self) -> f64 {
+        if self.is_empty() { 0.0 } else { self.high.max(-self.low) }
+    }
+
+    /// The same set with ends and magnitude as narrow as they say together.
+    fn normal(self) -> Interval {
+        let mut low = if self.low.is_nan() { f64::NEG_INFINITY } else { self.low + 0.0 };
+        let mut high = if self.high.is_nan() { f64::INFINITY } else { self.high + 0.0 };
+        let mut away = if self.away.is_nan() { 0.0 } else { self.away };
+        if away > 0.0 {
+            if low > -away {
+                low = low.max(away);
+            }
+            if high < away {
+                high = high.min(-away);
+            }
+        }
+        if low > high {
+            return Interval::EMPTY;
+        }
+        away = away.max(low).max(-high);
+        Interval { low, high, away }
     }
 
     /// What lies in both.
     pub fn and(self, other: Interval) -> Interval {
-        let (low, above_low) = match self.low.total_cmp(&other.low) {
-            std::cmp::Ordering::Less => (other.low, other.above_low),
-            std::cmp::Ordering::Greater => (self.low, self.above_low),
-            std::cmp::Ordering::Equal => (self.low, self.above_low || other.above_low),
-        };
-        let (high, below_high) = match self.high.total_cmp(&other.high) {
-            std::cmp::Ordering::Less => (self.high, self.below_high),
-            std::cmp::Ordering::Greater => (other.high, other.below_high),
-            std::cmp::Ordering::Equal => (self.high, self.below_high || other.below_high),
-        };
-        Interval { low, high, above_low, below_high, not_zero: self.not_zero || other.not_zero }
+        let (low, high) = (self.low.max(other.low), self.high.min(other.high));
+        Interval { low, high, away: self.away.max(other.away) }.normal()
     }
 
     /// The smallest interval around both.
     pub fn hull(self, other: Interval) -> Interval {
-        let (low, above_low) = match self.low.total_cmp(&other.low) {
-            std::cmp::Ordering::Less => (self.low, self.above_low),
-            std::cmp::Ordering::Greater => (other.low, other.above_low),
-            std::cmp::Ordering::Equal => (self.low, self.above_low && other.above_low),
-        };
-        let (high, below_high) = match self.high.total_cmp(&other.high) {
-            std::cmp::Ordering::Less => (other.high, other.below_high),
-            std::cmp::Ordering::Greater => (self.high, self.below_high),
-            std::cmp::Ordering::Equal => (self.high, self.below_high && other.below_high),
-        };
-        Interval { low, high, above_low, below_high, not_zero: !self.has_zero() && !other.has_zero() }
+        let (low, high) = (self.low.min(other.low), self.high.max(other.high));
+        Interval { low, high, away: self.away.min(other.away) }.normal()
     }
 
     /// −a
     pub fn negate(self) -> Interval {
-        Interval {
-            low: -self.high,
-            high: -self.low,
-            above_low: self.below_high,
-            below_high: self.above_low,
-            not_zero: self.not_zero,
+        if self.is_empty() {
+            return self;
         }
+        Interval { low: -self.high, high: -self.low, away: self.away }.normal()
     }
 
     /// a + b
     pub fn plus(self, other: Interval) -> Interval {
-        Interval {
-            low: self.low + other.low,
-            high: self.high + other.high,
-            above_low: self.above_low || other.above_low,
-            below_high: self.below_high || other.below_high,
-            not_zero: false,
+        if self.is_empty() || other.is_empty() {
+            return Interval::EMPTY;
         }
-        .sound()
+        let apart = |a: Interval, b: Interval| sum(a.away, -b.size()).0;
+        let away = apart(self, other).max(apart(other, self)).max(0.0);
+        let (low, high) = (sum(self.low, other.low).0, sum(self.high, other.high).1);
+        Interval { low, high, away }.normal()
+    }
+
+    /// a − b
+    pub fn minus(self, other: Interval) -> Interval {
+        self.plus(other.negate())
     }
 
     /// a · b
     pub fn multiply(self, other: Interval) -> Interval {
-        let ends = |i: Interval| [(i.low, i.above_low), (i.high, i.below_high)];
-        let mut products = Vec::with_capacity(4);
-        for (a, a_open) in ends(self) {
-            for (b, b_open) in ends(other) {
-                // A zero that is reached makes the product 0, however far the other goes.
-                let zero = (a == 0.0 && !a_open) || (b == 0.0 && !b_open);
-                let product = if a == 0.0 || b == 0.0 { 0.0 } else { a * b };
-                products.push((product, !zero && (a_open || b_open)));
+        if self.is_empty() || other.is_empty() {
+            return Interval::EMPTY;
+        }
+        let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
+        for a in [self.low, self.high] {
+            for b in [other.low, other.high] {
+                let (below, above) = product(a, b);
+                low = low.min(below);
+                high = high.max(above);
             }
         }
-        let not_zero = !self.has_zero() && !other.has_zero();
-        Interval { not_zero, ..around(&products) }.sound()
+        Interval { low, high, away: product(self.away, other.away).0 }.normal()
     }
 
     /// a / b, where b is not 0.
@@ -126,44 +162,40 @@ impl Interval {
         self.multiply(other.reciprocal())
     }
 
-    fn reciprocal(self) -> Interval {
+    /// 1 / a, where a is not 0.
+    pub fn reciprocal(self) -> Interval {
+        if self.is_empty() {
+            return self;
+        }
         if self.low >= 0.0 {
-            let high = if self.low == 0.0 { f64::INFINITY } else { 1.0 / self.low };
-            let low = if self.high.is_infinite() { 0.0 } else { 1.0 / self.high };
-            Interval {
-                low,
-                high,
-                above_low: self.below_high || self.high.is_infinite(),
-                below_high: self.above_low || self.low == 0.0,
-                not_zero: true,
-            }
+            Interval::closed(quotient(1.0, self.high).0.max(0.0), quotient(1.0, self.low).1)
         } else if self.high <= 0.0 {
             self.negate().reciprocal().negate()
         } else {
-            Interval { not_zero: true, ..Interval::ALL }
+            let most = quotient(1.0, self.away).1;
+            Interval { low: -most, high: most, away: quotient(1.0, self.size()).0.max(0.0) }.normal()
         }
     }
 
     /// |a|
     pub fn abs(self) -> Interval {
-        if self.low >= 0.0 {
-            self
-        } else if self.high <= 0.0 {
-            self.negate()
-        } else {
-            let (high, below_high) = match self.high.total_cmp(&-self.low) {
-                std::cmp::Ordering::Less => (-self.low, self.above_low),
-                std::cmp::Ordering::Greater => (self.high, self.below_high),
-                std::cmp::Ordering::Equal => (self.high, self.below_high && self.above_low),
-            };
-            Interval { low: 0.0, high, above_low: self.not_zero, below_high, not_zero: self.not_zero }
-        }
+        if self.is_empty() { self } else { Interval { low: self.away, high: self.size(), away: self.away }.normal() }
     }
 
     /// a multiplied with itself.
     pub fn square(self) -> Interval {
         let size = self.abs();
         size.multiply(size)
+    }
+
+    /// a^n by repeated multiplication.
+    pub fn power(self, n: u32) -> Interval {
+        let mut out = if n % 2 == 1 { self } else { Interval::point(1.0) };
+        let square = self.square();
+        for _ in 0..n / 2 {
+            out = out.multiply(square);
+        }
+        out
     }
 
     /// The smaller of both.
@@ -173,85 +205,192 @@ impl Interval {
 
     /// The larger of both.
     pub fn max(self, other: Interval) -> Interval {
-        let pick = |a: (f64, bool), b: (f64, bool)| match a.0.total_cmp(&b.0) {
-            std::cmp::Ordering::Less => b,
-            std::cmp::Ordering::Greater => a,
-            std::cmp::Ordering::Equal => (a.0, a.1 && b.1),
-        };
-        let (low, above_low) = match self.low.total_cmp(&other.low) {
-            std::cmp::Ordering::Equal => (self.low, self.above_low || other.above_low),
-            _ => pick((self.low, self.above_low), (other.low, other.above_low)),
-        };
-        let (high, below_high) = pick((self.high, self.below_high), (other.high, other.below_high));
-        Interval { low, high, above_low, below_high, not_zero: self.not_zero && other.not_zero }
+        if self.is_empty() || other.is_empty() {
+            return Interval::EMPTY;
+        }
+        let (low, high) = (self.low.max(other.low), self.high.max(other.high));
+        Interval { low, high, away: self.away.min(other.away) }.normal()
     }
 
-    /// The image under a function that rises everywhere; `ends` are its limits at −inf and inf.
-    pub fn rising(self, f: impl Fn(f64) -> f64, ends: (f64, f64)) -> Interval {
-        let at = |x: f64| {
-            if x == f64::NEG_INFINITY {
-                ends.0
-            } else if x == f64::INFINITY {
-                ends.1
-            } else {
-                f(x)
-            }
-        };
-        let (low, high) = (at(self.low), at(self.high));
-        Interval {
-            low,
-            high,
-            above_low: self.above_low || self.low.is_infinite(),
-            below_high: self.below_high || self.high.is_infinite(),
-            not_zero: false,
+    /// The root, of what is not negative.
+    pub fn sqrt(self) -> Interval {
+        let inside = self.and(Interval::from(0.0));
+        if inside.is_empty() {
+            return inside;
         }
-        .sound()
+        let [low, high] = [inside.low, inside.high].map(f64::sqrt);
+        let exact = |root: f64, x: f64| root.is_infinite() || root.mul_add(root, -x) == 0.0;
+        let low = if exact(low, inside.low) { low } else { low.next_down() };
+        Interval::closed(low, if exact(high, inside.high) { high } else { high.next_up() })
     }
 
-    /// Everything where an end is NaN: inf − inf.
-    fn sound(self) -> Interval {
-        let low = if self.low.is_nan() { f64::NEG_INFINITY } else { self.low };
-        let high = if self.high.is_nan() { f64::INFINITY } else { self.high };
-        Interval {
-            low,
-            high,
-            above_low: self.above_low || low.is_infinite(),
-            below_high: self.below_high || high.is_infinite(),
-            ..self
+    /// The image under an elementary function that rises everywhere and whose values lie within `limits`.
+    pub fn rising(self, f: impl Fn(f64) -> f64, limits: (f64, f64)) -> Interval {
+        if self.is_empty() {
+            return self;
         }
+        let (low, high) = (f(self.low), f(self.high));
+        // Of a value too small to be a normal number the relative error is larger.
+        let low = if low.abs() < f64::MIN_POSITIVE && low > 0.0 { 0.0 } else { low - ELEMENTARY * low.abs() };
+        let high = if high.abs() < f64::MIN_POSITIVE && high < 0.0 { 0.0 } else { high + ELEMENTARY * high.abs() };
+        // f(x) keeps the sign that it has at the ends: a value of 0 there is exact or too small.
+        Interval::closed(low.max(limits.0), high.min(limits.1))
+    }
+
+    /// The same with each end further outwards, by a part of its own magnitude.
+    pub fn loosened(self) -> Interval {
+        if self.is_empty() {
+            return self;
+        }
+        let (low, high) = (self.low - ELEMENTARY * self.low.abs(), self.high + ELEMENTARY * self.high.abs());
+        let low = if self.low.is_infinite() { self.low } else { low };
+        let high = if self.high.is_infinite() { self.high } else { high };
+        Interval { low, high, away: if self.away.is_finite() { self.away * (1.0 - ELEMENTARY) } else { 0.0 } }.normal()
+    }
+
+    /// The same with both ends further outwards, by a part of the greatest magnitude: for what is interpolated.
+    pub fn rounded(self) -> Interval {
+        let slack = ELEMENTARY * self.size();
+        if self.is_empty() { self } else { Interval::closed(self.low - slack, self.high + slack) }
     }
 }
 
-/// The smallest interval around ends, each with whether it is left out.
-fn around(ends: &[(f64, bool)]) -> Interval {
-    let mut out =
-        Interval { low: f64::INFINITY, high: f64::NEG_INFINITY, above_low: true, below_high: true, not_zero: false };
-    for &(x, open) in ends {
-        if x < out.low || (x == out.low && !open) {
-            (out.low, out.above_low) = (x, open);
-        }
-        if x > out.high || (x == out.high && !open) {
-            (out.high, out.below_high) = (x, open);
-        }
+/// a + b rounded down and up. Knuth's two-sum gives the error of the rounded sum exactly.
+fn sum(a: f64, b: f64) -> (f64, f64) {
+    let s = a + b;
+    if planted::is("ends do not round") && s.is_finite() {
+        return (s, s);
     }
-    out
+    if !s.is_finite() {
+        return match a.is_finite() && b.is_finite() {
+            // Too large: it may be the greatest double or infinite.
+            true if s > 0.0 => (f64::MAX, s),
+            true => (s, f64::MIN),
+            false if s.is_nan() => (f64::NEG_INFINITY, f64::INFINITY),
+            false => (s, s),
+        };
+    }
+    let part = s - a;
+    let error = (a - (s - part)) + (b - part);
+    (if error < 0.0 { s.next_down() } else { s }, if error > 0.0 { s.next_up() } else { s })
+}
+
+/// a · b rounded down and up; 0 · ∞ is 0, since the infinite end stands for large numbers.
+fn product(a: f64, b: f64) -> (f64, f64) {
+    if a == 0.0 || b == 0.0 {
+        return (0.0, 0.0);
+    }
+    let p = a * b;
+    if !p.is_finite() {
+        return match a.is_finite() && b.is_finite() {
+            true if p > 0.0 => (f64::MAX, p),
+            true => (p, f64::MIN),
+            false => (p, p),
+        };
+    }
+    if p.abs() < 1e-280 {
+        if planted::is("products are never too small") {
+            let p = p.abs().max(LEAST) * a.signum() * b.signum();
+            return (p, p);
+        }
+        // The error of the product may itself be too small to see. A product keeps the sign of its factors, and is 0 at worst.
+        let below = p.next_down();
+        let above = p.next_up();
+        return if (a > 0.0) == (b > 0.0) { (below.max(0.0), above) } else { (below, above.min(0.0)) };
+    }
+    let error = if planted::is("ends do not round") { 0.0 } else { a.mul_add(b, -p) };
+    (if error < 0.0 { p.next_down() } else { p }, if error > 0.0 { p.next_up() } else { p })
+}
+
+/// a / b of numbers that are not negative, rounded down and up.
+fn quotient(a: f64, b: f64) -> (f64, f64) {
+    let q = a / b;
+    if !q.is_finite() || b.is_infinite() {
+        return (if q.is_finite() { q } else { f64::MAX }, q);
+    }
+    let exact = q.abs() > 1e-280 && q.mul_add(b, -a) == 0.0;
+    if exact { (q, q) } else { (q.next_down(), q.next_up()) }
+}
+
+/// Mistakes that tests plant in the rules of proofs, by name: each must be found.
+#[cfg(test)]
+pub(crate) mod planted {
+    use std::cell::Cell;
+
+    /// All names.
+    pub const ALL: &[&str] = &[
+        "products are never too small",
+        "exponentials are never zero",
+        "tanh never reaches 1",
+        "the floor of a positive number is positive",
+        "x^-n is 1/x^2",
+        "zero has any power",
+        "arguments are not walked",
+        "beliefs are not watched",
+        "or is and",
+        "not is forgotten",
+        "one branch only",
+        "ends do not round",
+        "mixtures need no order",
+    ];
+
+    thread_local! { static PLANTED: Cell<&'static str> = const { Cell::new("") } }
+
+    /// Plants a mistake in this thread; none: "".
+    pub fn plant(name: &'static str) {
+        assert!(name.is_empty() || ALL.contains(&name), "{name}");
+        PLANTED.set(name);
+    }
+
+    /// Whether this mistake is planted.
+    pub fn is(name: &str) -> bool {
+        debug_assert!(ALL.contains(&name), "{name}");
+        PLANTED.get() == name
+    }
+}
+
+/// Mistakes are planted in tests only.
+#[cfg(not(test))]
+pub(crate) mod planted {
+    /// Never.
+    pub const fn is(_: &str) -> bool {
+        false
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const POSITIVE: Interval = Interval { low: 1e-40, high: 1e40, away: 1e-40 };
+    const NOT_NEGATIVE: Interval = Interval { low: 0.0, high: 1e40, away: 0.0 };
+
     #[test]
-    fn what_is_left_out_stays_out() {
-        let positive = Interval { low: 0.0, high: f64::INFINITY, above_low: true, below_high: true, not_zero: false };
-        let not_negative = Interval { above_low: false, ..positive };
-        assert!(!positive.has_zero() && not_negative.has_zero());
-        assert!(!positive.multiply(positive).has_zero());
-        assert!(!positive.divide(positive).has_zero());
-        assert!(!positive.plus(not_negative).has_zero());
-        assert!(positive.multiply(not_negative).has_zero());
-        let bell = Interval::ALL.square().negate().rising(|x| x, (f64::NEG_INFINITY, f64::INFINITY));
-        assert_eq!((bell.high, bell.below_high), (0.0, false));
+    fn what_is_kept_out_stays_out() {
+        assert!(!POSITIVE.has_zero() && NOT_NEGATIVE.has_zero());
+        assert!(!POSITIVE.multiply(POSITIVE).has_zero());
+        assert!(!POSITIVE.divide(POSITIVE).has_zero());
+        assert!(!POSITIVE.plus(NOT_NEGATIVE).has_zero());
+        assert!(POSITIVE.multiply(NOT_NEGATIVE).has_zero());
+        assert!(POSITIVE.power(9).has_zero(), "too small for a double");
+        assert!(!Interval::NOT_ZERO.reciprocal().negate().abs().is_empty());
+        assert!(Interval::NOT_ZERO.square().has_zero(), "too small for a double");
+    }
+
+    #[test]
+    fn zero_has_no_sign() {
+        let negative = Interval::to(-LEAST);
+        assert!(negative.negate().hull(NOT_NEGATIVE).has_zero());
+        assert!(negative.negate().min(NOT_NEGATIVE).has_zero());
+        assert!(Interval::closed(-0.0, -0.0).hull(Interval::from(1.0)).has_zero());
+    }
+
+    #[test]
+    fn contradictions_leave_nothing() {
+        let nothing = Interval::to(-1.7).and(Interval::point(2.0));
+        assert!(nothing.is_empty() && !nothing.has_zero());
+        assert!(Interval::point(1.0).divide(Interval::point(1.0).plus(nothing.square())).is_empty());
+        assert_eq!(nothing.hull(POSITIVE), POSITIVE);
     }
 
     #[test]
@@ -264,5 +403,64 @@ mod tests {
         assert_eq!((a.abs().low, a.abs().high), (0.0, 3.0));
         assert_eq!(a.max(b), Interval::closed(-2.0, 4.0));
         assert_eq!(a.min(b), Interval::closed(-5.0, 3.0));
+    }
+
+    /// What operations give for numbers of two intervals lies in their interval, for numbers of all sizes.
+    #[test]
+    fn numbers_stay_inside() {
+        inside();
+    }
+
+    #[test]
+    fn ends_that_do_not_round_are_found() {
+        planted::plant("ends do not round");
+        let found = std::panic::catch_unwind(inside);
+        planted::plant("");
+        assert!(found.is_err());
+    }
+
+    fn inside() {
+        let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(0x1A7E);
+        let mut random = crate::ir::random::Random(seed);
+        let ends = [0.0, -0.0, LEAST, 1e-300, 1e-160, 1e-40, 0.1, 1.0 / 3.0, 1.0, 3.0, 7.3, 1e40, 1e160];
+        let mut number = || {
+            let x = ends[random.below(ends.len())] * (1.0 + random.below(5) as f64 * f64::EPSILON);
+            if random.below(2) == 0 { x } else { -x }
+        };
+        for case in 0..200_000 {
+            let mut interval = || {
+                let (a, b) = (number(), number());
+                let inside = if number() < 0.0 { a } else { b };
+                let whole = Interval::closed(a.min(b), a.max(b));
+                // Sometimes without its middle.
+                let whole = if number() > 1.0 { whole.and(Interval::beyond(a.abs().min(b.abs()))) } else { whole };
+                (whole, inside)
+            };
+            let ((x, a), (y, b)) = (interval(), interval());
+            let fits = |what: &str, interval: Interval, value: f64| {
+                let inside = value >= interval.low && value <= interval.high && value.abs() >= interval.away;
+                assert!(
+                    inside || !value.is_finite(),
+                    "seed {seed}, case {case}: {what} of {a:e}, {b:e} in {x:?}, {y:?}: {value:e} in {interval:?}"
+                );
+            };
+            fits("sum", x.plus(y), a + b);
+            fits("difference", x.minus(y), a - b);
+            fits("product", x.multiply(y), a * b);
+            fits("hull", x.hull(y), b);
+            fits("least", x.min(y), a.min(b));
+            fits("greatest", x.max(y), a.max(b));
+            fits("size", x.abs(), a.abs());
+            fits("square", x.square(), a * a);
+            fits("fused", x.multiply(y).plus(x), a.mul_add(b, a));
+            fits("cube", x.power(3), a * a * a);
+            if b != 0.0 {
+                fits("quotient", x.divide(y), a / b);
+                fits("with a reciprocal", x.divide(y), a * (1.0 / b));
+            }
+            if a >= 0.0 {
+                fits("root", x.sqrt(), a.sqrt());
+            }
+        }
     }
 }

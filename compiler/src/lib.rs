@@ -24,15 +24,17 @@ pub mod names;
 pub mod source;
 pub mod resolve;
 pub mod system;
+pub mod columns;
 pub mod tables;
 pub mod flatten;
 pub mod units;
 pub mod delays;
 pub mod causality;
+pub mod interval;
+pub mod reach;
 pub mod lookup;
 pub mod lower;
 pub mod checks;
-pub mod interval;
 pub mod domains;
 pub mod remembered;
 pub mod proof;
@@ -45,6 +47,8 @@ pub mod linearise;
 pub mod rig;
 pub mod experiment;
 pub mod vary;
+#[cfg(test)]
+mod soundness;
 
 pub use code::{code, functions};
 pub use experiment::Changes;
@@ -114,6 +118,9 @@ pub fn varying(
 ) -> Result<Vec<vary::Varying>, Vec<Diagnostic>> {
     let paths = &options.changes.vary;
     let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
+    if let Some(error) = variants.iter().find_map(|variant| vary::built_in(variant, paths)) {
+        return Err(vec![error]);
+    }
     let one = |variant: experiment::Variant| {
         // What is described keeps its ranges; the code of a fixed step loses those that change.
         let mut coded = variant.program.clone();
@@ -148,15 +155,14 @@ pub fn build(
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<Built, Vec<Diagnostic>> {
     let root = loaded.root();
-    let ast = loaded.files.get(root).ast.clone();
-    let Some(model) = model_of(&ast, name) else {
+    let Some((model, file)) = model_of(loaded, name) else {
         let variant = first(loaded, sources, name, changes, warnings)?;
         return Ok(Built { program: variant.program, solver: Some(variant.experiment.solver) });
     };
     let given = experiment::overrides(loaded, changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
     let step = changes.step.filter(|_| changes.method != Some(Method::Adaptive));
-    let (system, types, ()) = sound(loaded, sources, model, overrides, warnings, |system, diagnostics| {
+    let (system, types, ()) = sound(loaded, sources, (&model, file), overrides, warnings, |system, diagnostics| {
         delays::check(system, diagnostics);
         if let Some(step) = step {
             delays::fits(system, step, None, diagnostics);
@@ -182,8 +188,7 @@ pub fn linear(
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<linearise::Linear, Vec<Diagnostic>> {
     let root = loaded.root();
-    let ast = loaded.files.get(root).ast.clone();
-    let Some(model) = model_of(&ast, name) else {
+    let Some((model, file)) = model_of(loaded, name) else {
         let variant = first(loaded, sources, name, &options.changes, warnings)?;
         if let Some(error) = delays::linear(&variant.system) {
             return Err(vec![error]);
@@ -201,10 +206,11 @@ pub fn linear(
     let given = experiment::overrides(loaded, &options.changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
     let ports = options.changes.ports.clone().unwrap_or_default();
-    let (system, types, opened) = sound(loaded, sources, model, overrides, warnings, |system, diagnostics| {
-        diagnostics.extend(delays::linear(system));
-        linearise::open(system, &ports, diagnostics)
-    })?;
+    let (system, types, opened) =
+        sound(loaded, sources, (&model, file), overrides, warnings, |system, diagnostics| {
+            diagnostics.extend(delays::linear(system));
+            linearise::open(system, &ports, diagnostics)
+        })?;
     let wanted: Vec<lower::Wanted> = opened
         .outputs
         .iter()
@@ -503,24 +509,24 @@ fn first(
     Ok(variants.into_iter().next().expect("there is at least one combination"))
 }
 
-/// The model of this name.
-fn model_of<'a>(file: &'a grammar::ast::File, name: &str) -> Option<&'a grammar::ast::Model> {
-    file.items.iter().find_map(|item| match item {
-        Item::Model(model) if model.name.text == name => Some(model),
-        _ => None,
-    })
+/// The model that this name stands for in the first text, and its file: an imported one too, if no experiment has the name.
+fn model_of(loaded: &Loaded, name: &str) -> Option<(grammar::ast::Model, FileId)> {
+    if loaded.experiments().iter().any(|experiment| experiment.name == name) {
+        return loaded.models().into_iter().find(|model| model.name.text == name).map(|m| (m.clone(), loaded.root()));
+    }
+    loaded.model_named(name)
 }
 
 /// A model of the text on its own, changed by `open` before its units are checked, if nothing is wrong with it.
 fn sound<T>(
     loaded: &Loaded,
     sources: &dyn Sources,
-    model: &grammar::ast::Model,
+    (model, file): (&grammar::ast::Model, FileId),
     overrides: Vec<flatten::Override>,
     warnings: &mut Vec<Diagnostic>,
     open: impl FnOnce(&mut system::System, &mut Vec<Diagnostic>) -> T,
 ) -> Result<(system::System, units::Types, T), Vec<Diagnostic>> {
-    let (system, types, mut diagnostics, opened) = opened(loaded, sources, model, loaded.root(), overrides, open);
+    let (system, types, mut diagnostics, opened) = opened(loaded, sources, model, file, overrides, open);
     if !diagnostics.iter().any(Diagnostic::is_error) {
         checks::values(&system, &types, &loaded.files, &mut diagnostics);
     }
@@ -614,7 +620,8 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     Err(errors) => all.extend(errors),
                 }
             }
-            Item::Import(_) | Item::Interface(_) | Item::Device(_) => {}
+            Item::Interface(interface) => all.extend(check_interface(loaded, sources, interface)),
+            Item::Import(_) | Item::Device(_) => {}
         }
     }
     // What cannot be read elsewhere is missing here: say the cause.
@@ -687,11 +694,63 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(lints::check(&system, &types, &loaded.files, physics));
     }
+    diagnostics.extend(with_defaults(loaded, sources, model));
     if loaded.misread(model.span) {
         // What could not be read is missing elsewhere: say the cause.
         diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
     }
     lints::silence(&system, &mut diagnostics);
+    diagnostics
+}
+
+/// What is wrong with the defaults of a model's inputs: on its own they come from outside.
+fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model) -> Vec<Diagnostic> {
+    use grammar::ast::{DeclarationKind, Statement};
+    let given = model.body.iter().any(|statement| match statement {
+        Statement::Declaration(port) => port.kind == DeclarationKind::Input && port.value.is_some(),
+        _ => false,
+    });
+    if !given {
+        return Vec::new();
+    }
+    let request = flatten::Request {
+        instance: flatten::Instance::WithDefaults(model, loaded.root()),
+        overrides: Vec::new(),
+        observed: Vec::new(),
+        data: Vec::new(),
+        frame: None,
+    };
+    let flatten::Flat { system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        causality::check(&system, &loaded.files, &mut diagnostics);
+    }
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        if !loaded.has_errors() {
+            domains::check(&system, &types, &loaded.files, &mut diagnostics);
+        }
+    }
+    diagnostics.retain(Diagnostic::is_error);
+    diagnostics
+}
+
+/// Checks the ports of an interface: their units, defaults and ranges.
+fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::ast::Interface) -> Vec<Diagnostic> {
+    use grammar::ast::{DeclarationKind, Model, Statement};
+    let grammar::ast::Interface { name, ports, doc, span } = interface.clone();
+    // An output has no equation here: it is checked as an input is, if it states its unit.
+    let port = |port: grammar::ast::Declaration| {
+        let stated = port.kind == DeclarationKind::Input || port.unit.is_some();
+        stated.then_some(Statement::Declaration(grammar::ast::Declaration { kind: DeclarationKind::Input, ..port }))
+    };
+    let model = Model { name, body: ports.into_iter().filter_map(port).collect(), doc, span };
+    let (system, types, mut diagnostics) = alone(loaded, sources, &model, loaded.root(), Vec::new());
+    if !diagnostics.iter().any(Diagnostic::is_error) {
+        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        diagnostics.extend(with_defaults(loaded, sources, &model));
+    }
+    diagnostics.retain(Diagnostic::is_error);
     diagnostics
 }
 

@@ -1,12 +1,11 @@
 //! What deserves a look in a model that compiles: names that nothing reads, regimes that nothing reaches, and the
 //! physics of friction. Each has a name and can be silenced by `allow NAME "reason"`.
 
-use crate::domains::Prover;
 use crate::friction;
+use crate::reach::Reach;
 use crate::source::Files;
 use crate::system::*;
 use crate::units::Types;
-use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 
 /// All warnings of a model on its own; `physics`: those of friction too, which take longer.
@@ -55,7 +54,7 @@ fn unused(system: &System, found: &mut Vec<Diagnostic>) {
 }
 
 fn regimes(system: &System, files: &Files, found: &mut Vec<Diagnostic>) {
-    let mut prover = Prover::new(system);
+    let mut reach = Reach::new(system);
     for automaton in system.automata.iter().filter(|automaton| automaton.instance == InstanceId(0)) {
         let mut reached = vec![false; automaton.regimes.len()];
         let mut stack = vec![automaton.initial as usize];
@@ -73,7 +72,7 @@ fn regimes(system: &System, files: &Files, found: &mut Vec<Diagnostic>) {
                 continue;
             }
             for transition in &regime.transitions {
-                if never(system, &mut prover, transition.condition) {
+                if reach.decide(transition.condition) == Some(false) {
                     let text = files.slice(system.span(transition.condition)).to_string();
                     let warning = Diagnostic::warning("W0312", format!("`{text}` can never hold"))
                         .label(transition.span, "this transition is never taken")
@@ -82,25 +81,5 @@ fn regimes(system: &System, files: &Files, found: &mut Vec<Diagnostic>) {
                 }
             }
         }
-    }
-}
-
-/// Whether a condition is false for all values within the declared ranges.
-fn never(system: &System, prover: &mut Prover, id: ExprId) -> bool {
-    match system.node(id) {
-        Node::Bool(truth) => !truth,
-        Node::Binary(BinaryOp::And, a, b) => never(system, prover, *a) || never(system, prover, *b),
-        Node::Binary(BinaryOp::Or, a, b) => never(system, prover, *a) && never(system, prover, *b),
-        Node::Binary(op, a, b) => {
-            let (a, b) = (prover.interval(*a), prover.interval(*b));
-            match op {
-                BinaryOp::Less => a.low >= b.high,
-                BinaryOp::LessEqual => a.low > b.high,
-                BinaryOp::Greater => a.high <= b.low,
-                BinaryOp::GreaterEqual => a.high < b.low,
-                _ => false,
-            }
-        }
-        _ => false,
     }
 }

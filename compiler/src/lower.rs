@@ -10,9 +10,10 @@ use crate::ir::build::{Build, Env};
 use crate::ir::{Binary, Func, Type, Unary, Value};
 use crate::lookup::Lookup;
 use crate::program::Program;
+use crate::reach::Reach;
 use crate::system::*;
 use crate::units::Types;
-use abi::description::{Automaton, Delay, Description, Guard, Kind, Layout, Quantity, Root, Slot, Tick};
+use abi::description::{Automaton, Delay, Description, Guard, Kind, Layout, Quantity, Root, Slot, TINY, Tick};
 use abi::unit::Unit;
 use grammar::ast::BinaryOp;
 use std::collections::{HashMap, HashSet};
@@ -49,7 +50,7 @@ pub struct Lowered {
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let mut pool = [&crate::math::POOL, crate::rosenbrock::constants()].concat();
     let tables = Lookup::place_all(&system.tables, &mut pool);
-    let mut plan = Plan::new(system, types, wanted, tables);
+    let mut plan = Plan::new(system, types, wanted, &believed(system), tables);
     plan.description.pool = Arc::from(pool);
     let emit = |name: &str, phase: Phase| Emit::new(&plan, name, phase);
 
@@ -118,7 +119,7 @@ fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
-    let mut plan = Plan::new(system, types, &[], tables);
+    let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     evaluate_in(&plan, exprs)
 }
@@ -128,7 +129,7 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
 pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
-    let mut plan = Plan::new(system, types, &[], tables);
+    let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "formulas", Phase::Start);
     let from = plan.description.layout.size();
@@ -159,7 +160,7 @@ pub enum Sought {
 pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program, Vec<(VarId, Slot)>) {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
-    let mut plan = Plan::new(system, types, &[], tables);
+    let mut plan = Plan::new(system, types, &[], &[], tables);
     plan.description.pool = Arc::from(pool);
     let mut emit = Emit::new(&plan, "of params", Phase::Start);
     emit.inline_params = true;
@@ -251,7 +252,14 @@ fn added(outputs: &mut Vec<Output>, output: Output) -> usize {
 }
 
 impl<'a> Plan<'a> {
-    fn new(system: &'a System, types: &'a Types, wanted: &[Wanted], tables: Vec<Lookup>) -> Plan<'a> {
+    /// `watched`: computed quantities whose declared ranges are watched, beside outputs.
+    fn new(
+        system: &'a System,
+        types: &'a Types,
+        wanted: &[Wanted],
+        watched: &[VarId],
+        tables: Vec<Lookup>,
+    ) -> Plan<'a> {
         let independent = independent_params(system);
         let by = |test: &dyn Fn(&Var) -> bool| -> Vec<VarId> {
             system.var_ids().filter(|id| test(system.var(*id))).collect()
@@ -270,6 +278,7 @@ impl<'a> Plan<'a> {
         .into_iter()
         .map(Output::Var)
         .collect();
+        outputs.extend(watched.iter().copied().map(Output::Var));
         // Plain names that have a slot already need no other.
         let stored =
             |id: VarId| !matches!(system.var(id).definition, Definition::Value(..)) || independent[id.0 as usize];
@@ -387,7 +396,7 @@ impl<'a> Plan<'a> {
             wanted: wanted.iter().map(|one| one.expr).collect(),
             tables,
         };
-        plan.describe(wanted);
+        plan.describe(wanted, watched);
         plan
     }
 
@@ -401,7 +410,7 @@ impl<'a> Plan<'a> {
         }
     }
 
-    fn describe(&mut self, wanted: &[Wanted]) {
+    fn describe(&mut self, wanted: &[Wanted], watched: &[VarId]) {
         let system = self.system;
         let top = system.instances.first().map_or(String::new(), |top| top.model.clone());
         let mut quantities = Vec::new();
@@ -425,6 +434,8 @@ impl<'a> Plan<'a> {
             };
             let kind = match (var.kind, &var.definition) {
                 (VarKind::Param, _) => Kind::Param,
+                // Nothing can be put in where an argument says what it is.
+                (VarKind::Input, _) if watched.contains(&id) => Kind::Let,
                 (VarKind::Input, _) => Kind::Input,
                 (VarKind::State, Definition::Sampled { .. }) => Kind::SampledState,
                 (VarKind::State, _) => Kind::State,
@@ -484,33 +495,47 @@ impl<'a> Plan<'a> {
     /// Declared ranges of what is stored, and the guards that watch them.
     fn ranges(&mut self, quantities: &mut [Quantity]) {
         let mut bounds: Vec<ExprId> = Vec::new();
-        let mut of: Vec<(usize, bool)> = Vec::new();
+        let mut of: Vec<(usize, bool, bool)> = Vec::new();
+        let mut strict_zero = vec![(false, false); quantities.len()];
         let index: HashMap<&str, usize> = quantities.iter().enumerate().map(|(k, q)| (q.path.as_str(), k)).collect();
         for var in &self.system.vars {
             let Some(&k) = index.get(var.path.as_str()) else { continue };
             for (bound, high) in [(var.range.low, false), (var.range.high, true)] {
-                if let Some((bound, _)) = bound {
+                if let Some((bound, strict)) = bound {
                     bounds.push(bound);
-                    of.push((k, high));
+                    of.push((k, high, strict));
                 }
             }
         }
         drop(index);
         let values = evaluate_in(self, &bounds);
-        for ((k, high), value) in of.into_iter().zip(values) {
+        for ((k, high, strict), value) in of.into_iter().zip(values) {
             // A bound that is not constant is not watched: the check of ranges reports it.
             if !value.is_nan() {
                 let range = &mut quantities[k].range;
-                if high { range.1 = value } else { range.0 = value }
+                if high {
+                    range.1 = value
+                } else {
+                    range.0 = value
+                }
+                let side = &mut strict_zero[k];
+                *(if high { &mut side.1 } else { &mut side.0 }) = strict && value == 0.0;
             }
         }
-        self.description.guards = quantities
-            .iter()
-            .filter(|q| {
-                !q.boolean && matches!(q.kind, Kind::State | Kind::SampledState | Kind::Output | Kind::Observed)
-            })
-            .map(|q| Guard { path: q.path.clone(), slot: q.slot, range: q.range, unit: q.unit.clone() })
-            .collect();
+        let guards = quantities.iter().zip(strict_zero).filter(|(q, _)| !q.boolean).filter_map(|(q, strict)| {
+            let mut range = q.range;
+            match q.kind {
+                Kind::State | Kind::SampledState | Kind::Output | Kind::Observed => {}
+                // What is proven of other quantities rests on these ranges, and nothing else would notice.
+                Kind::Input | Kind::Let if range != (f64::NEG_INFINITY, f64::INFINITY) => {
+                    range.0 = if strict.0 { TINY } else { range.0 };
+                    range.1 = if strict.1 { -TINY } else { range.1 };
+                }
+                Kind::Input | Kind::Let | Kind::Param | Kind::Regime => return None,
+            }
+            Some(Guard { path: q.path.clone(), slot: q.slot, range, unit: q.unit.clone() })
+        });
+        self.description.guards = guards.collect();
     }
 
     fn start(&self, mut emit: Emit) -> Func {
@@ -888,6 +913,29 @@ pub const MOST_DENSE: usize = 2000;
 
 /// Largest number of states whose adaptive step is one function.
 const MOST_FUSED: u32 = 8;
+
+/// Inputs and `let`s that are computed, and of which nothing but their declared range says that they lie in it.
+fn believed(system: &System) -> Vec<VarId> {
+    let mut reach: Option<Reach> = None;
+    let ids = system.var_ids().filter(|id| {
+        let var = system.var(*id);
+        let ranged = var.range.low.is_some() || var.range.high.is_some();
+        let computed = matches!(var.definition, Definition::Value(..));
+        if crate::interval::planted::is("beliefs are not watched") {
+            return false;
+        }
+        if !ranged || !computed || !matches!(var.kind, VarKind::Input | VarKind::Let) {
+            return false;
+        }
+        let reach = reach.get_or_insert_with(|| Reach::new(system));
+        let (value, bounds) = (reach.unbound(*id), reach.bounds(*id));
+        // Above 0 is above 0, however little.
+        let low = value.low >= bounds.low || bounds.low == TINY && value.low > 0.0;
+        let high = value.high <= bounds.high || bounds.high == -TINY && value.high < 0.0;
+        !(low && high)
+    });
+    ids.collect()
+}
 
 /// Which quantities are parameters whose value needs no other quantity.
 fn independent_params(system: &System) -> Vec<bool> {

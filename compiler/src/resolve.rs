@@ -156,6 +156,14 @@ impl Loaded {
             .collect()
     }
 
+    /// The model that a name stands for in the first text, its own or an imported one; and the file that it is in.
+    pub fn model_named(&self, name: &str) -> Option<(ast::Model, FileId)> {
+        match self.find(self.root(), Space::Type, name) {
+            Lookup::Found(item, Item::Model(model)) => Some((model.clone(), item.file)),
+            _ => None,
+        }
+    }
+
     /// Models of the asked-for file, in order.
     pub fn models(&self) -> Vec<&ast::Model> {
         self.files

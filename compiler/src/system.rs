@@ -50,6 +50,8 @@ pub struct System {
     pub requires: Vec<Require>,
     /// `storage` statements.
     pub storages: Vec<(InstanceId, ExprId)>,
+    /// Bounds of repetitions: how many parts there are.
+    pub counts: Vec<ExprId>,
     /// Tables and recordings.
     pub tables: Vec<Table>,
     /// Instants at which a signal has a corner.
@@ -58,7 +60,7 @@ pub struct System {
     pub delays: Vec<ExprId>,
     /// Where the state of a reset is named, by the value it is given.
     pub reset_places: Vec<(ExprId, Span)>,
-    /// Instances that cannot be made rotary: reported, and their units fit everything.
+    /// Instances that cannot be made rotary or do not fit their slot: reported, and their units fit everything.
     pub strangers: Vec<InstanceId>,
     /// Paths of parameters that were read while parts were made: how many there are follows from them.
     pub structural: Vec<String>,

@@ -1,5 +1,6 @@
 //! Reads tables: listed points, or two columns of a file.
 
+use crate::columns;
 use crate::resolve::Loaded;
 use crate::source::Sources;
 use crate::system::Table;
@@ -39,9 +40,10 @@ pub fn read(
             }
         }
         TablePoints::File(path) => {
-            let columns = columns(loaded, sources, file, path, &[true, true], diagnostics)?;
-            x.extend(columns[0].iter().map(|value| x_unit.to_si(*value)));
-            y.extend(columns[1].iter().map(|value| y_unit.to_si(*value)));
+            let units = [Some(x_unit.clone()), Some(y_unit.clone())];
+            let columns = columns(loaded, sources, file, path, &units, diagnostics)?;
+            x.extend(&columns[0]);
+            y.extend(&columns[1]);
             for k in 0..x.len() {
                 check_order(&x[..=k], path.span, diagnostics)?;
             }
@@ -62,18 +64,16 @@ pub fn read(
     })
 }
 
-/// The first columns of a file of numbers, as many as `wanted` has entries; those not wanted may hold anything and are
-/// read as 0. Columns are separated by commas, semicolons, tabs or blanks. A first line that
-/// is no numbers is a heading; lines that begin with `#` are comments.
+/// The first columns of a file of numbers, one for each of `units`: in SI, and each with the unit of its numbers. That of
+/// the heading counts where it states one; it must fit. None is not wanted.
 pub fn columns(
     loaded: &Loaded,
     sources: &dyn Sources,
     file: FileId,
     path: &ast::Text,
-    wanted: &[bool],
+    units: &[Option<Unit>],
     diagnostics: &mut Vec<Diagnostic>,
 ) -> Option<Vec<Vec<f64>>> {
-    let count = wanted.len();
     let from = &loaded.files.get(file).name;
     let text = match sources.file(from, &path.text) {
         Ok((_, text)) => text,
@@ -83,42 +83,37 @@ pub fn columns(
             return None;
         }
     };
-    let mut out = vec![Vec::new(); count];
-    for (row, line) in text.lines().enumerate() {
-        let line = line.trim().trim_start_matches('\u{feff}');
-        if line.is_empty() || line.starts_with('#') {
-            continue;
+    let wanted: Vec<bool> = units.iter().map(Option::is_some).collect();
+    let read = match columns::read(&text, &wanted) {
+        Ok(read) => read,
+        Err(what) => {
+            let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
+            diagnostics.push(error);
+            return None;
         }
-        let fields: Vec<&str> = match line.contains([',', ';', '\t']) {
-            true => line.split([',', ';', '\t']).map(str::trim).collect(),
-            false => line.split_whitespace().collect(),
-        };
-        let number = |(k, field): (usize, &&str)| match wanted.get(k) {
-            Some(true) => field.trim_matches('"').parse().ok().filter(|x: &f64| x.is_finite()),
-            Some(false) | None => Some(0.0),
-        };
-        let numbers: Option<Vec<f64>> = fields.iter().enumerate().map(number).collect();
-        match numbers {
-            Some(numbers) if numbers.len() >= count => {
-                out.iter_mut().zip(numbers).for_each(|(column, number)| column.push(number));
-            }
-            None if row == 0 => {}
-            found => {
-                let what = match found {
-                    Some(numbers) => format!("line {} has {} columns, {count} are needed", row + 1, numbers.len()),
-                    None => format!("line {} has something that is no finite number", row + 1),
-                };
-                let error =
-                    Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
-                diagnostics.push(error);
-                return None;
-            }
-        }
-    }
-    if out[0].is_empty() {
+    };
+    let first = wanted.iter().position(|wanted| *wanted).unwrap_or(0);
+    if read.numbers[first].is_empty() {
         let error = Diagnostic::error("E0902", format!("\"{}\" has no rows", path.text)).label(path.span, "empty");
         diagnostics.push(error);
         return None;
+    }
+    let mut out = Vec::new();
+    for (k, ((numbers, stated), unit)) in read.numbers.iter().zip(&read.units).zip(units).enumerate() {
+        let Some(unit) = unit else {
+            out.push(Vec::new());
+            continue;
+        };
+        if let Some(stated) = stated.as_ref().filter(|stated| stated.dimension != unit.dimension) {
+            let shown = |unit: &Unit| if unit.text.is_empty() { "a pure number".to_string() } else { unit.to_string() };
+            let message =
+                format!("column {} of \"{}\" is in {}, not in {}", k + 1, path.text, shown(stated), shown(unit));
+            let error = Diagnostic::error("E0903", message).label(path.span, "its heading says so");
+            diagnostics.push(error.help("change the unit here, the order of the columns, or the heading of the file"));
+            return None;
+        }
+        let unit = stated.as_ref().unwrap_or(unit);
+        out.push(numbers.iter().map(|number| unit.to_si(*number)).collect());
     }
     Some(out)
 }

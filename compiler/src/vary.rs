@@ -8,14 +8,17 @@ use crate::backend::interp::run_once;
 use crate::experiment::{Place, Variant, depends};
 use crate::ir::Func;
 use crate::lower::formulas;
+use crate::reach::{greatest, least};
 use crate::source::Files;
 use crate::system::*;
 use abi::description::{Guard, Kind, Quantity};
 use abi::lanes::Lanes;
+use abi::live::is_multiple;
 use abi::plan::{Edge, Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Window};
 use abi::table::Code;
 use abi::unit::Unit;
 use abi::{Description, Instance, Slot};
+use grammar::diagnostic::Diagnostic;
 use std::sync::Arc;
 
 /// A compiled experiment with parameters that change from run to run.
@@ -57,6 +60,8 @@ enum Use {
     Limit,
     /// What must not be 0, and what to say if it is.
     Require(String),
+    /// A period in s.
+    Period,
 }
 
 /// What a run needs.
@@ -125,6 +130,12 @@ impl Varying {
             let condition = || format!("requires {}", files.slice(require.span));
             uses.push(Use::Require(format!("{owner}{}", require.message.clone().unwrap_or_else(condition))));
         }
+        let fixed = experiment.solver.method != Method::Adaptive;
+        let step_varies = uses.iter().any(|one| matches!(one, Use::Plan(Place::Step)));
+        for block in system.blocks.iter().filter(|block| varies(block.period) || fixed && step_varies) {
+            exprs.push(block.period);
+            uses.push(Use::Period);
+        }
         let (formulas, size) = formulas(&system, &types, &exprs);
         let expects = experiment.expects.len();
         let plots = std::mem::take(&mut experiment.plots);
@@ -189,6 +200,7 @@ impl Varying {
         run_once(&self.formulas, &mut block, &self.description.pool);
         let numbers = &block[self.size - self.uses.len()..];
         let duration = experiment.duration;
+        let fixed = experiment.solver.method != Method::Adaptive;
         let mut corners: Option<Vec<f64>> = None;
         let mut description: Option<Description> = None;
         for (k, (one, number)) in self.uses.iter().zip(numbers).enumerate() {
@@ -211,17 +223,19 @@ impl Varying {
                     }
                 }
                 Use::Range { path, unit, low, high } => {
+                    // The formula of a parameter that has no other quantity in its value is the number as written.
+                    let number = self.param(path).map_or(number, |param| instance.get(param.slot));
                     let shown = |x: f64| {
                         let shown = format!("{}", unit.from_si(x));
                         if unit.text.is_empty() { shown } else { format!("{shown} {unit}") }
                     };
                     let below = low.map(|strict| (numbers[k + 1], strict));
                     let above = high.map(|strict| (numbers[k + 1 + usize::from(low.is_some())], strict));
-                    if let Some((bound, strict)) = below.filter(|(b, strict)| number < *b || *strict && number == *b) {
+                    if let Some((bound, strict)) = below.filter(|(b, strict)| number < least(*b, *strict)) {
                         let word = if strict { "above" } else { "at least" };
                         return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
                     }
-                    if let Some((bound, strict)) = above.filter(|(b, strict)| number > *b || *strict && number == *b) {
+                    if let Some((bound, strict)) = above.filter(|(b, strict)| number > greatest(*b, *strict)) {
                         let word = if strict { "below" } else { "at most" };
                         return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
                     }
@@ -229,6 +243,14 @@ impl Varying {
                 Use::Limit => {}
                 Use::Require(text) if number == 0.0 => return Err(text.clone()),
                 Use::Require(_) => {}
+                Use::Period if !(number > 0.0 && number.is_finite()) => {
+                    return Err(format!("a period must be positive, not {number} s"));
+                }
+                Use::Period if fixed && !is_multiple(number, experiment.solver.step) => {
+                    let step = experiment.solver.step;
+                    return Err(format!("a period of {number} s is no multiple of the step of {step} s"));
+                }
+                Use::Period => {}
             }
         }
         if experiment.duration != duration {
@@ -267,6 +289,30 @@ impl Varying {
             })
         })
     }
+}
+
+/// Why a parameter cannot change from run to run of one program: it decides what is compiled.
+pub fn built_in(variant: &Variant, vary: &[String]) -> Option<Diagnostic> {
+    let system = &variant.system;
+    let varied = |expr: ExprId| vary.iter().find(|path| depends(system, expr, &|var| var.path == **path));
+    let repeats = system.counts.iter().find_map(|expr| Some((*expr, varied(*expr)?)));
+    if let Some((expr, path)) = repeats {
+        let error = Diagnostic::error("E0905", format!("`{path}` cannot be varied in one program"))
+            .label(system.span(expr), "decides how many parts there are");
+        return Some(error.help(format!(
+            "let the experiment sweep it, `sweep {path} = …`, which compiles each, or run it with `--set {path}=…`"
+        )));
+    }
+    if system.delays.is_empty() {
+        return None;
+    }
+    let steps = variant.places.iter().filter(|(place, _)| *place == Place::Step);
+    let (expr, path) = steps.into_iter().find_map(|(_, expr)| Some((*expr, varied(*expr)?)))?;
+    let error = Diagnostic::error("E0905", format!("`{path}` cannot be varied in one program"))
+        .label(system.span(expr), "decides how much of the past `delay` keeps");
+    Some(error.help(format!(
+        "let the experiment sweep it, `sweep {path} = …`, which compiles each, or run it with `--set {path}=…`"
+    )))
 }
 
 /// The guards as the code of a fixed step may know them: those whose range changes watch only that numbers are finite.
@@ -310,6 +356,8 @@ fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), Str
     match place {
         Place::Duration => experiment.duration = positive("the duration")?,
         Place::Step => experiment.solver.step = positive("the step")?,
+        Place::Tolerance if number > 0.0 && number < 1.0 => experiment.solver.tol = number,
+        Place::Tolerance => return Err(format!("a tolerance lies between 0 and 1: {number} does not")),
         Place::After(k) => experiment.expects[k].after = number,
         Place::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
         Place::MeasureAfter(k, j) => experiment.expects[k].measures[j].window.after = Edge::At(number),

@@ -177,9 +177,10 @@ impl fmt::Display for Failure {
         let time = show::time(self.time);
         match &self.cause {
             Cause::Guard { guard, value } => {
-                let Guard { path, range, unit, .. } = &**guard;
+                let Guard { path, unit, .. } = &**guard;
                 let value = show::quantity(*value, unit);
-                let (low, high) = (show::plain(unit.from_si(range.0)), show::quantity(range.1, unit));
+                let (low, _) = guard.bounds(|bound| show::plain(unit.from_si(bound)));
+                let (_, high) = guard.bounds(|bound| show::quantity(bound, unit));
                 write!(f, "`{path}` left its range {low} .. {high}: it is {value} at {time}")
             }
             Cause::NotFinite { path, value } if value.is_nan() => {

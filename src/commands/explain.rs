@@ -16,7 +16,8 @@ pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
     if args.subject.ends_with(".fric") || Path::new(&args.subject).is_file() {
         return models(args, terminal);
     }
-    let code = args.subject.trim().to_uppercase();
+    let named = compile::LINTS.iter().find(|(lint, _)| *lint == args.subject.trim());
+    let code = named.map_or_else(|| args.subject.trim().to_uppercase(), |(_, code)| code.to_string());
     if let Some(page) = page(&code) {
         terminal.print(page);
         return End::Fine;
@@ -29,7 +30,10 @@ pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
     End::Failed
 }
 
-/// Explains models of a file.
+/// Models that a message names at most.
+const MOST_NAMED: usize = 8;
+
+/// Explains models of a file, or models that it imports.
 fn models(args: &Explain, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
     let Some(loaded) = super::load(Path::new(&args.subject), terminal, &mut watch) else { return End::Failed };
@@ -41,18 +45,27 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     }
     let mut end = End::Fine;
     for name in wanted {
-        if !all.contains(name) {
+        let imported = !all.contains(name) && loaded.model_named(name).is_some();
+        if !all.contains(name) && !imported {
             let help = match compile::nearest(name, all.iter().map(String::as_str)) {
                 Some(near) => format!("did you mean `{near}`?"),
-                None => format!("it has {}", all.join(", ")),
+                None if all.len() > MOST_NAMED => {
+                    format!("it has {} and {} more", all[..MOST_NAMED].join(", "), all.len() - MOST_NAMED)
+                }
+                None if all.is_empty() => "it has none, and imports none of this name".into(),
+                None => format!("it has {}, and imports none of this name", all.join(", ")),
             };
             terminal.error(&format!("{} has no model `{name}`; {help}", args.subject));
             end = End::Failed;
             continue;
         }
-        match compile::explain(&loaded, &project::Disk, name) {
+        let explained = match imported {
+            true => compile::explain_in(&loaded, &project::Disk, name, loaded.root()),
+            false => compile::explain(&loaded, &project::Disk, name),
+        };
+        match explained {
             Ok(explanation) => {
-                let bounds = if args.step { bounds(&loaded, &explanation) } else { Vec::new() };
+                let bounds = if args.step && !imported { bounds(&loaded, &explanation) } else { Vec::new() };
                 match args.json {
                     true => terminal.line(&as_json(&explanation, &bounds).to_string()),
                     false => tell(&explanation, &bounds, terminal),

@@ -99,7 +99,13 @@ impl<'a> Flattener<'a> {
                 Definition::Value(value, origin)
             }
             (Some(_), _) => Definition::Missing, // Reported with the arguments.
-            (None, _) if declaration.kind == DeclarationKind::Input && self.tree(id).alone => Definition::Free,
+            (None, value)
+                if declaration.kind == DeclarationKind::Input
+                    && self.tree(id).alone
+                    && (value.is_none() || !self.tree(id).defaults) =>
+            {
+                Definition::Free
+            }
             (None, _) if declaration.kind == DeclarationKind::Input && self.tree(id).on_bus => Definition::Free,
             (None, Some(value)) => {
                 let value = match declaration.kind {

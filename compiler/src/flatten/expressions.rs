@@ -13,7 +13,7 @@ impl<'a> Flattener<'a> {
     pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
         let tree = self.tree(id);
         let model = tree.model;
-        if self.explained(name, tree.file) {
+        if self.explained(name, tree.file) || self.system.strangers.contains(&id) {
             return;
         }
         let error = Diagnostic::error("E0204", format!("there is no `{}` in {}", name.text, model.name.text))

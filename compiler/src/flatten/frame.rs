@@ -117,6 +117,7 @@ impl<'a> Flattener<'a> {
             names,
             args: Vec::new(),
             alone: false,
+            defaults: false,
             on_bus: false,
             scope: true,
             locals: Rc::default(),

@@ -118,7 +118,17 @@ impl<'a> Flattener<'a> {
             }
         }
         let (names, locals) = (HashMap::new(), Rc::default());
-        self.instances.push(Tree { model, file, names, args, alone, on_bus: false, scope: false, locals });
+        self.instances.push(Tree {
+            model,
+            file,
+            names,
+            args,
+            alone,
+            defaults: false,
+            on_bus: false,
+            scope: false,
+            locals,
+        });
         self.declare(id);
         self.parts(id, deeper);
         self.check_arguments(id);
@@ -304,9 +314,13 @@ impl<'a> Flattener<'a> {
             }
             self.system.strangers.push(id);
         }
-        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(
-            "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin",
-        );
+        let help = match why.contains("speaks of an angle") {
+            true => "leave out `rotary`: a model in rad and N·m is rotary as it is, and fits a rotary slot",
+            false => {
+                "`rotary` maps m to rad and kg to kg·m^2 throughout: only a model in straight units has a rotary twin"
+            }
+        };
+        let error = Diagnostic::error("E0109", "this model cannot be made rotary").label(span, why).help(help);
         self.report(error);
     }
 
@@ -362,8 +376,8 @@ impl<'a> Flattener<'a> {
         changes: Vec<Change<'a>>,
     ) {
         // Read as expressions too, so that what they mention counts as read.
-        self.expr(&repeat.first, env);
-        self.expr(&repeat.last, env);
+        let counts = [self.expr(&repeat.first, env), self.expr(&repeat.last, env)];
+        self.system.counts.extend(counts);
         let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
         let (Some(first), Some(last)) = bounds else { return };
         if last < first || (last - first) as usize >= MOST_VARS {
@@ -417,7 +431,10 @@ impl<'a> Flattener<'a> {
                             Diagnostic::error("E0205", format!("`{}` of {owner} is not a slot", part.name.text))
                                 .label(arg.span, "another model cannot be put here")
                                 .label(part.name.span, "declared without an interface")
-                                .help(format!("a slot is declared as `part {} : INTERFACE = …`", part.name.text));
+                                .help(format!(
+                                    "a slot is declared as `part {0} : INTERFACE = …`; what is inside of `{0}` is changed by its path, `sweep {0}.NAME = …` or `--set {0}.NAME=…`",
+                                    part.name.text
+                                ));
                         self.report(error);
                     } else {
                         chosen = (instance, arg.env);
@@ -451,22 +468,17 @@ impl<'a> Flattener<'a> {
         }
         let parent_rotary = self.system.instance(id).rotary;
         let rotary = instance.rotary || instance_env.rotary;
-        if replaced && parent_rotary && !rotary {
-            let error = Diagnostic::error("E0108", format!("{} is straight, but the slot is rotary", model.name.text))
-                .label(instance.model.span, "a straight model")
-                .help(format!("write `rotary {}(…)`", model.name.text));
-            self.report(error);
-        }
         if self.full(part.repeat.as_ref().map_or(instance.model.span, |repeat| repeat.span)) {
             return None;
         }
         let mut args = args_of(&instance.args, &instance_env);
+        let mut fits = true;
         if let Some(slot) = &part.slot {
             let wiring = args_of(&part.instance.args, env);
             let file = self.tree(id).file;
             let slot_rotary = slot.rotary || parent_rotary;
             let ports = self.interface(file, slot)?;
-            self.check_fit(model, instance, rotary, ports, slot, slot_rotary);
+            fits = self.check_fit(model, instance, rotary, ports, slot, slot_rotary);
             let has = |name: &str| declarations(model).any(|d| d.kind == DeclarationKind::Input && d.name.text == name);
             let port = |name: &str| ports.ports.iter().any(|port| port.name.text == name);
             if replaced {
@@ -482,6 +494,10 @@ impl<'a> Flattener<'a> {
         let made = Making { path, rotary, span: instance.model.span, args, overrides: changes };
         let made = self.instantiate(model, item.file, made, false);
         self.models.pop();
+        if !fits {
+            // What it lacks, and what its units do not fit, has been said.
+            self.system.strangers.push(made);
+        }
         Some(made)
     }
 
@@ -508,7 +524,7 @@ impl<'a> Flattener<'a> {
         None
     }
 
-    /// Whether a model has the ports of an interface.
+    /// Whether a model has the ports of an interface; or a report.
     #[allow(clippy::too_many_arguments)]
     pub(super) fn check_fit(
         &mut self,
@@ -518,7 +534,7 @@ impl<'a> Flattener<'a> {
         interface: &'a ast::Interface,
         slot: &'a ast::SlotType,
         slot_rotary: bool,
-    ) {
+    ) -> bool {
         for port in &interface.ports {
             let found = declarations(model).find(|d| d.name.text == port.name.text);
             let dimension = |unit: &Option<ast::UnitText>, rotary: bool| {
@@ -550,7 +566,7 @@ impl<'a> Flattener<'a> {
                                     )
                                     .label(slot.interface.span, format!("expects {}", Unit::si(needs)));
                             self.report(error.help(help));
-                            return;
+                            return false;
                         }
                         format!("its `{}` is {}, not {}", d.name.text, has.describe(), needs.describe())
                     }
@@ -565,8 +581,9 @@ impl<'a> Flattener<'a> {
                     interface.name.text
                 ));
             self.report(error);
-            return;
+            return false;
         }
+        true
     }
 
     /// Every argument must name a port, parameter or slot.

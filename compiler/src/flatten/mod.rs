@@ -54,6 +54,8 @@ pub enum Instance<'a> {
     Written(&'a ast::Instance, FileId),
     /// A model on its own: inputs come from outside, parameters without a default stay open.
     Alone(&'a ast::Model, FileId),
+    /// A model on its own, whose inputs have their defaults.
+    WithDefaults(&'a ast::Model, FileId),
 }
 
 /// A change from outside: `fr.Fs = 2 N`, `fr = LuGre()`.
@@ -115,10 +117,13 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
             let env = Env::file(*file);
             f.written(instance, &env, overrides);
         }
-        Instance::Alone(model, file) => {
+        Instance::Alone(model, file) | Instance::WithDefaults(model, file) => {
             let made =
                 Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
             f.instantiate(model, *file, made, true);
+            if let (Instance::WithDefaults(..), Some(top)) = (&request.instance, f.instances.first_mut()) {
+                top.defaults = true;
+            }
         }
     }
     let mut framed = match (&request.frame, f.instances.is_empty()) {
@@ -141,7 +146,7 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
     let observed = match f.instances.first().map(|top| top.file) {
         Some(_) => {
             let file = match &request.instance {
-                Instance::Written(_, file) | Instance::Alone(_, file) => *file,
+                Instance::Written(_, file) | Instance::Alone(_, file) | Instance::WithDefaults(_, file) => *file,
             };
             let instance = framed.as_ref().map_or(InstanceId(0), |framed| framed.rig);
             let env = Env { instance: Some(instance), outside: true, ..Env::file(file) };
@@ -241,6 +246,8 @@ struct Tree<'a> {
     names: HashMap<&'a str, Binding>,
     args: Vec<Arg<'a>>,
     alone: bool,
+    /// Alone, but inputs with a default have it.
+    defaults: bool,
     /// A drive or device: inputs come from the bus.
     on_bus: bool,
     /// A rig, which only lends its names.

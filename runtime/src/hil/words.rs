@@ -39,8 +39,8 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
         Cause::NotFinite(i) => format!("the model gave no number for {}", output(i)),
         Cause::Guard(status) => match model.guards.get(usize::try_from(status).unwrap_or(0).wrapping_sub(1)) {
             Some(guard) => {
-                let bound = |value: f64| show::quantity(value, &guard.unit);
-                format!("{} left its range {} .. {}", guard.path, bound(guard.range.0), bound(guard.range.1))
+                let (low, high) = guard.bounds(|bound| show::quantity(bound, &guard.unit));
+                format!("{} left its range {low} .. {high}", guard.path)
             }
             None => format!("the model could not go on (status {status})"),
         },
