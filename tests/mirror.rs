@@ -21,7 +21,7 @@ const ODD: &str = "Coulomb(), CoulombViscous(), StribeckGauss(), StribeckLorentz
     PointsFriction(), LoadedStribeck(), LoadedLuGre(), LuGreCurve(), LuGreAsymmetric(), BlimanSorine1(), DahlPower(), \
     ResetIntegrator(), Armstrong(), BristleMass(), RateState(), GearM1(), GearM2(), \
     GearM3(F_m = 3 N), GearM4(F_m = 3 N), GearM5(F_m = 3 N), GearM6(F_m = 3 N), MaxwellElement(), Asymmetric(), \
-    BittencourtGunnarsson(), KarnoppPublished(), MaxwellSlip4(), GMS4(), LeuvenModified4()";
+    BittencourtGunnarsson()";
 
 /// Moves every odd model to and fro, and the other way round: one program, its amplitude of the other sign.
 fn mirrored(solver: &str, h: f64, steps: u32) {
