@@ -169,6 +169,8 @@ pub struct Judge {
     blind_ns: Option<u64>,
     /// What a drive tells may be wrong.
     lies: bool,
+    /// Our end of a bus may be cut off for good.
+    cut: bool,
 }
 
 impl Judge {
@@ -185,6 +187,8 @@ impl Judge {
             let unheard = |what: What| match what {
                 What::Frame(_, FRAME_COMMAND, _) | What::Short(_) | What::Unplugged(_) | What::Alone(_) => true,
                 What::Down(_) | What::Babble(_) | What::Frozen(_) => true,
+                // Frames that fail again and again take their node off the bus.
+                What::Frame(_, _, Ill::Disturbed) => true,
                 What::Frame(..) | What::Node(..) | What::Foreign(..) => false,
             };
             let deaf = script.faults.iter().any(|f| silent(f.what) || mode.is_none() && unheard(f.what));
@@ -229,6 +233,7 @@ impl Judge {
             far: script.rig.far,
             speeds: VecDeque::with_capacity(SEEN + 1),
             blind_ns: None,
+            cut: script.faults.iter().any(|fault| cuts(fault.what)),
             lies: script.faults.iter().any(|fault| lies(fault.what)),
         }
     }
@@ -494,7 +499,8 @@ impl Judge {
             let Some(drive) = bench.drive(watched.node) else { continue };
             let (torque, state) = (drive.torque(), drive.state());
             // A drive described by frames that hears nobody pushes for ever; against it a quick stop does not come to its end, or leaves some torque for a moment.
-            if pushed && state != State::Enabled {
+            // So does one that hears nobody at all: it brakes on its own ramp, for as long as that takes.
+            if (pushed || self.cut) && state != State::Enabled {
                 continue;
             }
             if state.powered() || torque.abs() > watched.step {
@@ -503,6 +509,15 @@ impl Judge {
             }
         }
         Ok(())
+    }
+}
+
+/// Whether a fault may cut a bus for good: no frame of ours arrives any more, whichever it is.
+fn cuts(what: What) -> bool {
+    match what {
+        What::Short(_) | What::Unplugged(_) | What::Alone(_) | What::Down(_) | What::Babble(_) => true,
+        What::Frame(_, _, ill) => ill == Ill::Disturbed,
+        What::Node(..) | What::Foreign(..) | What::Frozen(_) => false,
     }
 }
 
