@@ -27,7 +27,13 @@ pub enum Shape {
     Broken,
     /// All else: it is iterated.
     Bent,
+    /// Of several states that need each other: affine in all of them, with coefficients that no state changes. The
+    /// exponential of their matrix is exact.
+    Linear,
 }
+
+/// Most states whose joint exponential is taken.
+const MOST_LINEAR: usize = 8;
 
 /// How a value depends on a state, the other states and the answers to all questions given.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -70,6 +76,8 @@ pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
                 Some(on) if on.asks => Shape::Broken,
                 _ => Shape::Straight,
             }
+        } else if component.len() <= MOST_LINEAR && is_linear(func, rates, states, &component) {
+            Shape::Linear
         } else {
             Shape::Bent
         };
@@ -80,6 +88,58 @@ pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
         Group { states, shape }
     };
     Coupling { groups: groups.into_iter().map(group).collect(), fades }
+}
+
+/// How a value depends on the states of a component.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
+enum Joint {
+    /// On no state at all.
+    Given,
+    /// On other states only.
+    Moving,
+    /// Affine in those of the component, with given coefficients.
+    Affine,
+    /// All else.
+    Bent,
+}
+
+/// Whether the rates of a component are affine in all its states together, with coefficients that no state changes.
+fn is_linear(func: &Func, rates: &[Slot], states: &[Slot], component: &[usize]) -> bool {
+    use Joint::{Affine, Bent, Given, Moving};
+    let times = |a: Joint, b: Joint| match (a.min(b), a.max(b)) {
+        (Given, Affine) => Affine,
+        (_, Affine | Bent) => Bent,
+        (_, most) => most,
+    };
+    let mut of: Vec<Joint> = Vec::with_capacity(func.ops.len());
+    for op in &func.ops {
+        let at = |value: Value| of[value.index()];
+        of.push(match *op {
+            Op::Load(slot) => match states.iter().position(|state| *state == slot) {
+                Some(k) if component.binary_search(&k).is_ok() => Affine,
+                Some(_) => Moving,
+                None => Given,
+            },
+            Op::Add(a, b) | Op::Sub(a, b) => at(a).max(at(b)),
+            Op::Neg(a) => at(a),
+            Op::Mul(a, b) => times(at(a), at(b)),
+            Op::Fma(a, b, c) => times(at(a), at(b)).max(at(c)),
+            Op::Div(a, b) if at(b) <= Moving => times(at(a), at(b)),
+            Op::Select(c, a, b) => match (at(c), at(a).max(at(b))) {
+                (Given, most) => most,
+                (Moving, most) if most <= Moving => Moving,
+                _ => Bent,
+            },
+            op => {
+                let mut most = Given;
+                op.each_operand(|operand| most = most.max(at(operand)));
+                if most == Affine { Bent } else { most }
+            }
+        });
+    }
+    let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
+    let rate = |k: &usize| stored.get(&rates[*k]).map_or(Given, |value| of[value.index()]);
+    component.iter().all(|k| rate(k) <= Affine)
 }
 
 /// For each rate, what it depends on.
@@ -173,7 +233,7 @@ fn joined(a: &Depends, b: &Depends, both: impl Fn(u8, u8) -> u8) -> Depends {
 
 #[cfg(test)]
 mod tests {
-    use super::Shape::{Bent, Broken, Straight};
+    use super::Shape::{Bent, Broken, Linear, Straight};
     use super::*;
     use crate::ir::build::Build;
     use crate::ir::expr::{Real, Shared};
@@ -208,7 +268,10 @@ mod tests {
 
     #[test]
     fn what_goes_in_a_circle_is_iterated() {
-        check(|[x, v, z]| [v, -x, v.abs() * (1.0 - z)], &[(&[0, 1], Bent), (&[2], Straight)]);
+        check(|[x, v, z]| [v, -x, v.abs() * (1.0 - z)], &[(&[0, 1], Linear), (&[2], Straight)]);
+        check(|[x, v, z]| [v, z.abs() - x, 1.0 - z], &[(&[2], Straight), (&[0, 1], Linear)]);
+        check(|[x, v, z]| [v, -(z * x), 1.0 - z], &[(&[2], Straight), (&[0, 1], Bent)]);
+        check(|[x, v]| [v, -x.abs()], &[(&[0, 1], Bent)]);
     }
 
     #[test]
