@@ -6,6 +6,7 @@ mod chance;
 mod crossings;
 mod estimate;
 mod invariance;
+mod methods;
 mod rest;
 
 #[path = "../support/mod.rs"]
