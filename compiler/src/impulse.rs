@@ -118,6 +118,7 @@ mod tests {
         build.store_env(&env, |slot| slot.0 < 10);
         let mut block = [0.0, 0.0, 0.0, 4.0, -1.0, 0.0, 0.0];
         run_once(&expand(&build.finish()), &mut block, &POOL);
-        assert_eq!(block[3..5], [1.0, 1.0]);
+        // 2 · 4 − 3 · 1 is 5 · 1: equal but for rounding.
+        assert!(block[3..5].iter().all(|speed| (speed - 1.0).abs() < 1e-15), "{:?}", &block[3..5]);
     }
 }
