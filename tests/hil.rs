@@ -429,13 +429,13 @@ fn what_the_drives_are_like_is_measured() {
 fn wrong_usage_is_told() {
     let folder = folder("hil-usage");
     let example = example();
-    let said = run(&folder, &["hil", &example], 1);
-    assert!(said.contains("can0") && said.contains("--sim"), "{said}");
     let said = run(&folder, &["hil", "--fast", &example], 2);
     assert!(said.contains("--fast needs --sim"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--fast", &example], 2);
     assert!(said.contains("--fast needs --for"), "{said}");
     assert!(!folder.join("out").exists(), "nothing was written");
+    let said = run(&folder, &["hil", &example], 1);
+    assert!(said.contains("can0") && said.contains("--sim"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--bus", "can1=sim:x", &example], 2);
     assert!(said.contains("no bus `can1`; it has can0"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--inject", "load explodes at 3 s", &example], 2);

@@ -300,7 +300,7 @@ fn halving_the_step_shows_the_order_of_every_method() {
 #[test]
 fn another_solver_is_asked_and_its_distance_told() {
     let folder = Folder::new("cross");
-    let (out, _) = folder.run(&["run", "m.fric", "coast", "--cross", "--csv", "c.csv"], 0);
+    let (out, _) = folder.run(&["run", "m.fric", "coast", "--cross"], 0);
     assert!(out.contains("adaptive tol 1e-6 against expo step 100 µs") && out.contains("would do"), "{out}");
     let (out, _) = folder.run(&["run", "m.fric", "coast", "--cross", "--json", "--solver", "expo", "--step", "1ms"], 0);
     let object: Value = serde_json::from_str(out.trim()).unwrap();

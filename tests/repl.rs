@@ -367,7 +367,8 @@ fn mistakes_are_named_with_their_remedy() {
     says("f = LuGre()\nplot f.F against f.w = 0 m/s .. 1 m/s", "there is no `f.w` here; did you mean `f.v`?");
     says("f = LuGre()\nplot f.F against f.v = 0 m .. 1 m", "`f.v` is a velocity, in m/s, and 0 m is a length");
     says("f = LuGre()\nplot f.F against f.z = 0 um .. 1 um", "`f.z` is computed: a curve goes over an input");
-    says("f = LuGre()\nplot f.F against f.Fs = 0 N .. 2 N", "requires Fs >= Fc");
+    says("f = LuGre()\nplot f.F against f.Fs = 0 N .. 2 N", "`f.Fs` must be above 0 N");
+    says("f = LuGre()\nplot f.F against f.Fs = 0.5 N .. 2 N", "requires Fs >= Fc");
     says("f = LuGre(Fss = 1 N)", "did you mean `Fs`");
     says("f = LuGree()", "did you mean `LuGre`?");
     says("f.Fs = 1 N", "there is no `f` here to set");

@@ -42,7 +42,7 @@ def dictionary():
     for name, index, kind, value, access in [
         ("device type", 0x1000, long, 0x00020192, "const"),
         ("error register", 0x1001, byte, 0, "ro"),
-        ("device name", 0x1008, kinds.VISIBLE_STRING, "canopen for Python", "const"),
+        ("device name", 0x1008, kinds.VISIBLE_STRING, "fric simulated", "const"),
         ("heartbeat", 0x1017, word, 0, "rw"),
         ("abort option", 0x6007, kinds.INTEGER16, 1, "rw"),
         ("error code", 0x603F, word, 0, "ro"),
@@ -62,7 +62,7 @@ def dictionary():
     ]:
         objects.add_object(variable(name, index, 0, kind, value, access))
     group(ODArray, "watched heartbeats", 0x1016, (byte, 1), (long, 0))
-    group(ODRecord, "identity", 0x1018, (byte, 4), (long, 0), (long, 402), (long, 1), (long, 1))
+    group(ODRecord, "identity", 0x1018, (byte, 4), (long, 0), (long, 402), (long, 1), (long, 0x66726963))
     group(ODRecord, "interpolation", 0x60C2, (byte, 2), (byte, 1), (kinds.INTEGER8, -3))
     for base, cob, kind in [(0x1400, 0x200, 255), (0x1800, 0x180, 1), (0x1801, 0x280, 1)]:
         group(ODRecord, "communication", base, (byte, 2), (long, cob + NODE | 0x80000000), (byte, kind))
