@@ -289,10 +289,15 @@ mod tests {
         for mut experiment in [fixed(1.0, 0.1), adaptive(1.0, 1e-3)] {
             let solver = experiment.solver;
             let mut expect = reading(&instance, MeasureKind::Final, "x");
-            // Beside the truth by a part of the error of the run.
-            let (error, _) = decay(experiment.clone());
-            let limit = (-1f64).exp() + 0.2 * error;
-            expect.condition = Formula::Less(Box::new(Formula::Measure(0)), Box::new(Formula::Number(limit)));
+            // Between the truth and what the run gives, nearer to the truth: what decides is on the other side of the limit.
+            let truth = (-1f64).exp();
+            experiment.expects.push(expect.clone());
+            let found = judged(&instance, &experiment).verdicts[0].readings[0].value;
+            experiment.expects.clear();
+            let (measure, limit) =
+                (Box::new(Formula::Measure(0)), Box::new(Formula::Number(truth + 0.2 * (found - truth))));
+            expect.condition =
+                if found > truth { Formula::Less(measure, limit) } else { Formula::Greater(measure, limit) };
             experiment.expects.push(expect);
             let outcome = judged(&instance, &experiment);
             assert!(!outcome.verdicts[0].decided && !outcome.passed(), "{solver:?}");
