@@ -2,47 +2,21 @@
 
 #![allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions")]
 
+#[path = "../runtime/src/hil/faults/heap.rs"]
+mod heap;
 mod support;
 
 use abi::rig::{Kind, Rig, Signal, What};
 use compiler::{Changes, Options, Ready};
+use heap::asked;
 use runtime::hil::cycle::{End, Hil, Options as HilOptions};
 use runtime::hil::simulated::{Pace, World};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::fs;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use support::{Texts, root};
-
-/// Counts what a thread asks of the heap.
-struct Counting;
-
-thread_local! {
-    static ASKED: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call goes to the system's allocator as it came.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = ASKED.try_with(|asked| asked.set(asked.get() + 1));
-        // SAFETY: as the caller promised.
-        unsafe { System.alloc(layout) }
-    }
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promised.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static HEAP: Counting = Counting;
-
-fn asked() -> u64 {
-    ASKED.with(Cell::get)
-}
 
 /// The example, changed by settings such as `fr = rotary Karnopp()`.
 fn ready(set: &[&str]) -> Ready {
@@ -429,13 +403,13 @@ fn what_the_drives_are_like_is_measured() {
 fn wrong_usage_is_told() {
     let folder = folder("hil-usage");
     let example = example();
+    let said = run(&folder, &["hil", &example], 1);
+    assert!(said.contains("can0") && said.contains("--sim"), "{said}");
     let said = run(&folder, &["hil", "--fast", &example], 2);
     assert!(said.contains("--fast needs --sim"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--fast", &example], 2);
     assert!(said.contains("--fast needs --for"), "{said}");
     assert!(!folder.join("out").exists(), "nothing was written");
-    let said = run(&folder, &["hil", &example], 1);
-    assert!(said.contains("can0") && said.contains("--sim"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--bus", "can1=sim:x", &example], 2);
     assert!(said.contains("no bus `can1`; it has can0"), "{said}");
     let said = run(&folder, &["hil", "--sim", "--inject", "load explodes at 3 s", &example], 2);

@@ -234,9 +234,6 @@ fn log(wanted: &Wanted, open: &Open, rig: &Rig) -> Result<(Settings, Sections), 
         Some(path) => path.to_path_buf(),
         None => wanted.dir.join("log").join(format!("{}-{}.friclog", rig.name, now.as_millis())),
     };
-    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        fs::create_dir_all(folder).map_err(|error| format!("cannot write {}: {error}", folder.display()))?;
-    }
     let cycles_per_block = u32::try_from((BLOCK_NS / rig.period_ns).max(1)).unwrap_or(u32::MAX);
     let settings = Settings { sink: Sink::File(path, wanted.limits), cycles_per_block, patient: repeatable };
     Ok((settings, head))
@@ -340,7 +337,7 @@ fn tell(dir: &Path, target: &Path, gauges: &Gauges) {
     let _ = fs::write(&fresh, text).and_then(|()| fs::rename(&fresh, dir.join("state")));
 }
 
-/// Where the commands of all who speak to the rig come together.
+/// Merges the commands of all clients of the control socket.
 struct Desk {
     operator: Mutex<Operator>,
     stopper: Stopper,
@@ -373,7 +370,7 @@ impl Desk {
             "enable" => Command::Enable,
             "arm" => Command::Arm,
             "reset" => Command::Reset,
-            // It waits for nobody, whoever else speaks.
+            // Speakers do not wait for each other.
             "stop" => {
                 self.stopper.stop();
                 return Ok(());

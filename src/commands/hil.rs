@@ -82,13 +82,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         .with("started", started(simulated && args.fast));
     drop(loaded);
     let head = keeping.into(head);
-    let log = match log_settings(args, &name, &ready, simulated) {
-        Ok(settings) => settings.map(|settings| (settings, head)),
-        Err(why) => {
-            terminal.error(&why);
-            return End::Failed;
-        }
-    };
+    let log = Some((log_settings(args, &name, &ready, simulated), head));
     if args.identify {
         return identified(args, ready, simulated, terminal);
     }
@@ -162,7 +156,7 @@ fn started(repeatable: bool) -> String {
     if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) }
 }
 
-fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Result<Option<Settings>, String> {
+fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Settings {
     let cycles = |ns: u64| u32::try_from((ns / ready.rig.period_ns).max(1)).unwrap_or(u32::MAX);
     let path = args.log.clone().unwrap_or_else(|| PathBuf::from("out").join(format!("{name}.friclog")));
     let sink = if args.no_log {
@@ -171,11 +165,9 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Resu
     } else {
         Sink::File(path, Limits { part: args.roll, keep: args.keep, ..Limits::default() })
     };
-    let (Sink::File(path, _) | Sink::BlackBox(path, _)) = &sink;
-    project::make_folder_of(path).map_err(|error| format!("cannot write {}: {error}", path.display()))?;
     let cycles_per_block = cycles(BLOCK_NS);
     // Where time stands meanwhile, the log may take its time.
-    Ok(Some(Settings { sink, cycles_per_block, patient: simulated && args.fast }))
+    Settings { sink, cycles_per_block, patient: simulated && args.fast }
 }
 
 fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
@@ -443,8 +435,9 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
 
 /// Where the log goes, and the space that is free there.
 fn room(log: &Path) -> String {
-    let folder = log.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let free = parts::free(folder).map_or(String::new(), |free| format!(", {} free on its disk", parts::size(free)));
+    // The folder is made when the log begins.
+    let there = log.ancestors().skip(1).find(|folder| folder.is_dir()).unwrap_or(Path::new("."));
+    let free = parts::free(there).map_or(String::new(), |free| format!(", {} free on its disk", parts::size(free)));
     format!("  log {}{free}", log.display())
 }
 

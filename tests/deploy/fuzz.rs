@@ -4,6 +4,7 @@
 
 use crate::{FRIC_RIG, fine, folder, said, text};
 use abi::image::Image;
+use runtime::chance::Chance;
 use runtime::package::Package;
 use std::fs;
 use std::path::Path;
@@ -13,20 +14,12 @@ use std::time::{Duration, Instant};
 /// A run of 20 ms in simulated time takes a second or two here, with its start-up.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// SplitMix64.
-struct Dice(u64);
+/// The runtime's generator, with whole numbers by remainder.
+struct Dice(Chance);
 
 impl Dice {
-    fn number(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut x = self.0;
-        x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        x ^ (x >> 31)
-    }
-
     fn below(&mut self, n: usize) -> usize {
-        (self.number() % n as u64) as usize
+        (self.0.number() % n as u64) as usize
     }
 }
 
@@ -59,7 +52,7 @@ fn spoil(bytes: &mut Vec<u8>, dice: &mut Dice) {
 
 /// A package with one section changed, its hashes mended.
 fn changed(package: &Package, seed: u64) -> (Package, &'static str) {
-    let mut dice = Dice(seed);
+    let mut dice = Dice(Chance(seed));
     let mut package = package.clone();
     // The plan most of all. What a program says of itself is a promise about its code, which only a signature holds:
     // a change there must not upset who reads it, and is not run.
@@ -105,7 +98,7 @@ fn within(command: &mut Command) -> Option<Output> {
     Some(child.wait_with_output().unwrap())
 }
 
-/// Why a change is a failure, if it is one; whether the package was accepted.
+/// Runs one change. Returns the reason if it is a failure, and whether `check` accepted the package.
 fn judged(package: &Package, section: &str, folder: &Path, name: &str) -> Result<bool, String> {
     let bytes = package.to_bytes();
     let accepted = Package::read(&bytes).and_then(|package| package.contents()).is_ok();

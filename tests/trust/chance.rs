@@ -1,26 +1,22 @@
 //! Chance for properties: a seeded generator, and how many cases are tried.
 
-/// SplitMix64. Source: Steele, Lea, Flood, OOPSLA 2014.
-pub struct Chance(u64);
+/// The runtime's generator, with the draws that cases are made of.
+pub struct Chance(runtime::chance::Chance);
 
 impl Chance {
     /// The generator of one case.
     pub fn new(seed: u64) -> Chance {
-        let mut of_seed = Chance(seed);
-        Chance(of_seed.bits())
+        Chance(runtime::chance::Chance(runtime::chance::Chance(seed).number()))
     }
 
-    fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
+    /// The generator whose first number is that of the seed itself.
+    pub fn plain(seed: u64) -> Chance {
+        Chance(runtime::chance::Chance(seed))
     }
 
     /// Uniform in [low, high).
     pub fn within(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * (self.bits() >> 11) as f64 / (1u64 << 53) as f64
+        self.0.between(low, high)
     }
 
     /// Its logarithm is uniform in [low, high); both positive.
@@ -30,9 +26,14 @@ impl Chance {
         self.within(low, high).exp()
     }
 
+    /// From 0 up to `n`, without it.
+    pub fn below(&mut self, n: usize) -> usize {
+        (self.0.number() % n as u64) as usize
+    }
+
     /// One of these.
     pub fn of<T: Copy>(&mut self, all: &[T]) -> T {
-        all[(self.bits() % all.len() as u64) as usize]
+        all[self.below(all.len())]
     }
 }
 

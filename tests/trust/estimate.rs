@@ -30,7 +30,7 @@ const MOST_STEPS: f64 = 4e5;
 struct Count {
     measures: u64,
     covered: u64,
-    /// Measures without an estimate: a companion failed.
+    /// Number of measures without an estimate, since a companion run failed.
     unknown: u64,
     /// Estimates of more than ten times the true error, of those whose error is more than rounding.
     generous: u64,

@@ -6,37 +6,15 @@
 
 #![allow(clippy::disallowed_methods, reason = "a bound of a test may use the platform's functions")]
 
+use crate::chance::Chance;
 use crate::support::Texts;
 use compiler::{Case, Changes, Options};
 use runtime::engine::{self, Continue, Outcome};
 use std::fmt::Write;
 
-/// Numbers of a generator of Marsaglia's kind (SplitMix64): the same everywhere.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    /// From 0 up to `n`, without it.
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n as u64) as usize
-    }
-
-    fn pick<T: Copy>(&mut self, from: &[T]) -> T {
-        from[self.below(from.len())]
-    }
-
-    /// Even in its logarithm, with three digits so that texts stay short.
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        let part = (self.next() >> 11) as f64 / (1u64 << 53) as f64;
-        format!("{:.2e}", low * (high / low).powf(part)).parse().expect("it was printed")
-    }
+/// Even in its logarithm, with three digits so that texts stay short.
+fn between(chance: &mut Chance, low: f64, high: f64) -> f64 {
+    format!("{:.2e}", low * (high / low).powf(chance.within(0.0, 1.0))).parse().expect("it was printed")
 }
 
 /// One experiment: its instance, its length in s, and statements that only look.
@@ -105,54 +83,54 @@ impl Drawn {
 }
 
 /// A contact of the library.
-fn contact(random: &mut Random) -> String {
-    let fv = random.pick(&[0.0, 0.4]);
+fn contact(random: &mut Chance) -> String {
+    let fv = random.of(&[0.0, 0.4]);
     match random.below(16) {
         0..=2 => {
-            let band = random.pick(&["1 um/s", "10 um/s", "0.1 mm/s", "1 mm/s"]);
+            let band = random.of(&["1 um/s", "10 um/s", "0.1 mm/s", "1 mm/s"]);
             format!("Karnopp(Fc = 1 N, Fs = 1.5 N, Fv = {fv} N·s/m, Dv = {band})")
         }
-        3 | 4 => format!("LuGre(sigma1 = {} N·s/m)", random.between(50.0, 600.0)),
-        5 => format!("LuGre(vs = {} mm/s, vd = 10 mm/s)", random.between(0.5, 20.0)),
+        3 | 4 => format!("LuGre(sigma1 = {} N·s/m)", between(random, 50.0, 600.0)),
+        5 => format!("LuGre(vs = {} mm/s, vd = 10 mm/s)", between(random, 0.5, 20.0)),
         6 => "KFM()".into(),
         7 => "Dahl()".into(),
-        8 => format!("DahlPower(i = {})", random.pick(&[0.1, 0.3, 0.5, 1.0, 1.5, 2.0])),
+        8 => format!("DahlPower(i = {})", random.of(&[0.1, 0.3, 0.5, 1.0, 1.5, 2.0])),
         9 => "ElastoPlastic()".into(),
         10 => "Smoothed()".into(),
         11 => "KFMSmooth()".into(),
         12 => "BrownMcPhee()".into(),
         13 => "Sticking()".into(),
         14 => "MaxwellSlip()".into(),
-        _ => format!("Viscous(Fv = {} N·s/m)", random.between(0.1, 3.0)),
+        _ => format!("Viscous(Fv = {} N·s/m)", between(random, 0.1, 3.0)),
     }
 }
 
 /// A bench that moves the contact, and whether it is one of those on which it sticks and slips.
-fn instance(random: &mut Random) -> String {
+fn instance(random: &mut Chance) -> String {
     let contact = contact(random);
     match random.below(4) {
         0 | 1 => {
-            let (k, vp) = (random.between(0.5, 50.0), random.between(0.01, 0.3));
+            let (k, vp) = (between(random, 0.5, 50.0), between(random, 0.01, 0.3));
             format!("SpringBench(fr = {contact}, k = {k} N/m, vp = {vp} m/s)")
         }
         2 => {
-            let (size, frequency) = (random.between(1.0, 4.0), random.between(0.1, 2.0));
+            let (size, frequency) = (between(random, 1.0, 4.0), between(random, 0.1, 2.0));
             format!("ForceBench(fr = {contact}, u = sine({size} N, {frequency} Hz))")
         }
         _ => {
-            let speed = random.between(0.05, 1.0);
+            let speed = between(random, 0.05, 1.0);
             format!("ForceBench(fr = {contact}, v_start = {speed} m/s, u = ramp(1 s, 0 N, 1 N/s))")
         }
     }
 }
 
 /// Statements that look at a run, none of which may change it.
-fn observers(random: &mut Random, duration: f64) -> Vec<String> {
-    let quantity = |random: &mut Random| random.pick(&["x", "v", "F", "abs(v)", "F * v", "max(v, 0.1 m/s)"]);
-    let one = |random: &mut Random| {
+fn observers(random: &mut Chance, duration: f64) -> Vec<String> {
+    let quantity = |random: &mut Chance| random.of(&["x", "v", "F", "abs(v)", "F * v", "max(v, 0.1 m/s)"]);
+    let one = |random: &mut Chance| {
         let window = match random.below(4) {
-            0 => format!(" before {} s", random.between(0.01 * duration, duration)),
-            1 => format!(" after {} s", random.between(0.01 * duration, 0.9 * duration)),
+            0 => format!(" before {} s", between(random, 0.01 * duration, duration)),
+            1 => format!(" after {} s", between(random, 0.01 * duration, 0.9 * duration)),
             _ => String::new(),
         };
         let of = quantity(random);
@@ -160,17 +138,17 @@ fn observers(random: &mut Random, duration: f64) -> Vec<String> {
             0 => format!("plot {of}"),
             1 => format!("expect max({of}) / max(abs({of})) > -10{window}"),
             2 => format!("expect crossings({of}) >= 0{window}"),
-            3 => format!("expect at({of}, {} s) / max(abs({of})) > -10", random.between(0.01 * duration, duration)),
-            4 => format!("expect first(v > {} m/s) >= 0 s{window}", random.between(1e-6, 0.1)),
+            3 => format!("expect at({of}, {} s) / max(abs({of})) > -10", between(random, 0.01 * duration, duration)),
+            4 => format!("expect first(v > {} m/s) >= 0 s{window}", between(random, 1e-6, 0.1)),
             _ => format!("expect abs(integral({of})) / integral(abs({of})) > -10{window}"),
         }
     };
     (0..1 + random.below(3)).map(|_| one(random)).collect()
 }
 
-fn drawn(random: &mut Random) -> Drawn {
+fn drawn(random: &mut Chance) -> Drawn {
     let run = instance(random);
-    Drawn { models: String::new(), run, duration: random.between(5.0, 60.0), observers: Vec::new() }
+    Drawn { models: String::new(), run, duration: between(random, 5.0, 60.0), observers: Vec::new() }
 }
 
 /// How often each property is tried; more with `TRUST_CASES`, from another one on with `TRUST_SEED`.
@@ -210,10 +188,10 @@ fn difference(a: &[f64], b: &[f64]) -> f64 {
 #[test]
 fn whoever_looks_changes_nothing() {
     for seed in cases(60) {
-        let mut random = Random(seed);
+        let mut random = Chance::plain(seed);
         let mut case = drawn(&mut random);
         case.observers = observers(&mut random, case.duration);
-        let tol = random.pick(&[1e-4, 1e-6, 1e-8]);
+        let tol = random.of(&[1e-4, 1e-6, 1e-8]);
         let mut fails = |case: &Drawn| {
             let bare = Drawn { observers: Vec::new(), ..case.clone() };
             let (with, without) = (case.end(tol), bare.end(tol));
@@ -229,9 +207,9 @@ fn whoever_looks_changes_nothing() {
 #[test]
 fn a_longer_run_goes_the_same_way() {
     for seed in cases(40) {
-        let mut random = Random(1000 + seed);
+        let mut random = Chance::plain(1000 + seed);
         let case = drawn(&mut random);
-        let factor = random.pick(&[1.5, 2.0, 4.0]);
+        let factor = random.of(&[1.5, 2.0, 4.0]);
         let mut fails = |case: &Drawn| {
             let longer = Drawn { duration: factor * case.duration, ..case.clone() };
             let paths = ["body.x"];
@@ -252,9 +230,9 @@ fn a_longer_run_goes_the_same_way() {
 #[test]
 fn a_tolerance_holds_its_promise() {
     for seed in cases(40) {
-        let mut random = Random(2000 + seed);
+        let mut random = Chance::plain(2000 + seed);
         let case = drawn(&mut random);
-        let tol = random.pick(&[1e-5, 1e-6, 1e-7, 1e-8]);
+        let tol = random.of(&[1e-5, 1e-6, 1e-7, 1e-8]);
         let mut fails = |case: &Drawn| {
             let paths = ["body.x"];
             let (rough, fine) = (case.course(tol, case.duration, &paths), case.course(1e-11, case.duration, &paths));
@@ -272,10 +250,10 @@ fn a_tolerance_holds_its_promise() {
 
 /// A bristle on a spring in a text of one's own, every quantity written in drawn units; `length`, `force` and `time`
 /// multiply all lengths, forces and times.
-fn own_text(random: &mut Random, units: bool, length: f64, force: f64) -> Drawn {
+fn own_text(random: &mut Chance, units: bool, length: f64, force: f64) -> Drawn {
     // A value in SI in one of these units.
     let mut write = |value: f64, names: &[(&str, f64)]| {
-        let (name, size) = if units { random.pick(names) } else { names[0] };
+        let (name, size) = if units { random.of(names) } else { names[0] };
         (name.to_string(), format!("{} {name}", value / size))
     };
     let lengths = [("m", 1.0), ("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9), ("km", 1e3)];
@@ -314,8 +292,8 @@ fn own_text(random: &mut Random, units: bool, length: f64, force: f64) -> Drawn 
 #[test]
 fn a_text_in_other_units_says_the_same() {
     for seed in cases(30) {
-        let mut random = Random(3000 + seed);
-        let tol = random.pick(&[1e-6, 1e-8]);
+        let mut random = Chance::plain(3000 + seed);
+        let tol = random.of(&[1e-6, 1e-8]);
         let paths = ["x", "z"];
         let rewritten = own_text(&mut random, true, 1.0, 1.0);
         let course = |drawn: &Drawn| drawn.course(tol, drawn.duration, &paths).unwrap();
@@ -330,9 +308,9 @@ fn a_text_in_other_units_says_the_same() {
 #[test]
 fn a_system_of_another_size_does_the_same() {
     for seed in cases(30) {
-        let mut random = Random(4000 + seed);
-        let tol = random.pick(&[1e-6, 1e-8]);
-        let (length, force) = (random.pick(&[1e-6, 1e-3, 1.0, 1e3]), random.pick(&[1e-6, 1e-3, 1.0, 1e3, 1e6]));
+        let mut random = Chance::plain(4000 + seed);
+        let tol = random.of(&[1e-6, 1e-8]);
+        let (length, force) = (random.of(&[1e-6, 1e-3, 1.0, 1e3]), random.of(&[1e-6, 1e-3, 1.0, 1e3, 1e6]));
         let scaled = own_text(&mut random, false, length, force);
         let course = |drawn: &Drawn| drawn.course(tol, drawn.duration, &["x"]).unwrap();
         let (a, b) = (course(&own_text(&mut random, false, 1.0, 1.0)), course(&scaled));

@@ -40,7 +40,7 @@ struct Stand {
 }
 
 /// A quick start, for tests of what comes after it.
-fn quick() -> Options {
+pub(super) fn quick() -> Options {
     let start = drive::Options {
         listen_ns: 5 * MS,
         steady_ns: 20 * MS,

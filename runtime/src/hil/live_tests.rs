@@ -2,14 +2,14 @@
 //! everything holds that a start checks.
 
 use super::bench;
+use super::campaign::quick;
 use super::control;
 use super::cycle::{Hil, Options, look_ahead};
 use super::live::{Judge, Objection, Set};
 use super::operator::{Answer, Command, Operator, PLACES, Stamp, Ticket, Why};
 use super::simulated::{Pace, World};
 use crate::chance::Chance;
-use crate::drive::sign::SignTest;
-use crate::drive::{self, Step};
+use crate::drive::Step;
 use abi::Slot;
 use std::collections::HashMap;
 
@@ -26,16 +26,10 @@ struct Stand {
 impl Stand {
     fn new(arms_itself: bool) -> Stand {
         let (rig, model, plant) = bench::pair();
-        let start = drive::Options {
-            listen_ns: 5 * MS,
-            steady_ns: 20 * MS,
-            sign_test: SignTest::Skip,
-            timeout_test: false,
-            ..drive::Options::default()
-        };
-        let control = control::Options { ramp_ns: 10 * MS, ..control::Options::default() };
         let look = look_ahead(&rig, &plant).unwrap();
-        let options = Options { control, start, arms_itself, look, ..Options::default() };
+        let mut options = Options { arms_itself, look, ..quick() };
+        // A command may stay at its limit as long as on a rig.
+        options.control.clamped_ns = control::Options::default().clamped_ns;
         let judge = bench::judge(&model);
         let slots = [0, 1, 2].map(|i| model.description().layout.params.slot(i));
         let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
@@ -176,7 +170,7 @@ fn what_was_asked_for_long_ago_is_refused_but_a_stop() {
     let mut stand = Stand::new(false);
     stand.reach(Step::AwaitEnable);
     let old = Stamp::Rig(0);
-    // The rig is not late: whoever gave the command was.
+    // The rig is not late: the command was.
     while stand.world.clock().now_ns() < 1_100 * MS {
         stand.hil.cycle();
     }

@@ -300,6 +300,7 @@ impl Parts {
         if let Some(keep) = limits.keep {
             limits.part = limits.part.min(keep / 4);
         }
+        parts::make_folder_of(&first)?;
         let claim = Claim::on(&first)?;
         let writer = BlockWriter::new(parts::create(&first, 1)?)?;
         Ok(Parts { _claim: claim, first, limits, writer, number: 1, bytes: 0, head: Vec::new() })
@@ -471,6 +472,7 @@ impl Carrier {
     /// Writes a black box.
     fn write_out(&self) -> io::Result<()> {
         let Out::Ring { path, head, blocks: kept, .. } = &self.out else { return Ok(()) };
+        parts::make_folder_of(path)?;
         let _claim = Claim::on(path)?;
         let mut writer = BlockWriter::new(File::create(path)?)?;
         let all = [(PACKED_HEAD, head)].into_iter().chain(kept.iter().map(|block| (PACKED, block)));

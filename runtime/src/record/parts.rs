@@ -12,7 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// So little free space is told while a rig runs: some hours of a log at 1 kHz.
+/// Below this, the free space is reported while a rig runs: some hours of a log at 1 kHz.
 const LITTLE: u64 = 1_000_000_000;
 
 /// The ending of logs.
@@ -89,6 +89,17 @@ pub fn following(this: &Path, number: u32) -> PathBuf {
         _ => name.to_string(),
     };
     path(&this.with_file_name(first), number + 1)
+}
+
+/// Makes the folder of a file, if there is none.
+///
+/// # Errors
+/// Those of the system.
+pub fn make_folder_of(path: &Path) -> io::Result<()> {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => fs::create_dir_all(folder),
+        _ => Ok(()),
+    }
 }
 
 /// Opens part `number`. The first part removes the parts of an earlier log of its name, so that no reader takes them for

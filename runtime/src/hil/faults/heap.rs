@@ -1,4 +1,4 @@
-//! Counts what this thread asks of the heap, in tests of this crate.
+//! Counts what this thread asks of the heap, in tests of this crate and of the rig (tests/hil.rs).
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
