@@ -86,7 +86,7 @@ impl crate::compile::Sources for Disk {
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
         let folder = Path::new(from).parent().unwrap_or(Path::new(""));
         let path = tidy(&folder.join(path));
-        // Whoever names a text waits for a pipe on purpose; a text that names a pipe would have others wait for ever.
+        // A user who names a pipe waits for it on purpose; a text that names one would make `check` wait for ever.
         if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
             return Err("it is a pipe or a device, not a file".into());
         }

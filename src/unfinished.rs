@@ -2,7 +2,7 @@
 //!
 //! In: the path of a table, what a sweep is asked for, its rows as they are appended. Out: the right to write it, for one
 //! process at a time, and where to go on after an interruption. A neighbour of the table, `.NAME.unfinished`, is locked by
-//! whoever writes and holds what was asked, an empty line, and marks: rows, bytes and a hash of all bytes until there. The
+//! the writing process; it holds the request, an empty line, and marks: rows, bytes and a hash of all bytes until there. The
 //! system lets go of the lock however the process ends. Knows nothing of what rows mean.
 
 use runtime::record::claim::open_alone;

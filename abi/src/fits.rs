@@ -1,4 +1,4 @@
-//! Whether the plan of a rig fits its two programs: everything that whoever runs it takes for granted.
+//! Whether the plan of a rig fits its two programs: everything that the code running it takes for granted.
 //!
 //! In: a [`Rig`] and what its programs say of themselves. Out: nothing, or the first thing that does not fit, in words. The
 //! compiler asserts it of what it makes; a package is refused by it, whatever its hashes say. Ranges are those that the

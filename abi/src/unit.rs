@@ -15,7 +15,7 @@ impl Ratio {
     /// 1
     pub const ONE: Ratio = Ratio { num: 1, den: 1 };
 
-    /// Stands for every fraction whose lowest terms do not fit 32 bits. Exponents of physics are small: whoever makes one
+    /// Stands for every fraction whose lowest terms do not fit 32 bits. Exponents of physics are small: code that makes one
     /// from a text asks [`Ratio::is_beyond`].
     pub const BEYOND: Ratio = Ratio { num: i32::MAX, den: 1 };
 
@@ -494,7 +494,7 @@ fn si_text(dimension: Dimension) -> String {
 pub enum NoQuantity {
     /// It does not begin with a number.
     Number(String),
-    /// What stands behind the number is no unit: the part that is not known.
+    /// The text after the number is not a unit: the part that is not known.
     Unit(String),
 }
 

@@ -1,4 +1,4 @@
-//! Elementary functions by themselves: for whoever needs, outside a model, what every machine computes alike.
+//! Elementary functions by themselves: for code outside a model that needs the same bits on every machine.
 //!
 //! In: the name of a function. Out: something that evaluates it, by the interpreter.
 

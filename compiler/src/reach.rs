@@ -450,7 +450,7 @@ impl<'a> Reach<'a> {
 
     // ---- expressions
 
-    /// A number that comes from outside or from a step: within its range, and of a size that occurs.
+    /// A source (parameter, input, state): anything in its declared range between [`TINY`] and [`HUGE`] in size.
     fn outside(&mut self, id: VarId) -> Interval {
         let sizes = Interval::closed(-HUGE, HUGE);
         let bounds = self.bounds(id);

@@ -290,7 +290,7 @@ impl<'a> Step<'a> {
     fn meets(&self, middle: &[Real<'a>], last: &[Real<'a>]) -> Truth<'a> {
         let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
         let mut met = Truth::from((false, self.build));
-        // What is only observed decides on no step; whoever observes looks at each.
+        // Observed quantities decide on no step; the observer looks at each step.
         let surfaces = sides.into_iter().zip(here).zip(middle).zip(last).zip(&self.program.description.roots);
         for ((((side, a), b), c), _) in surfaces.filter(|(_, root)| !root.observed) {
             met = met | self.passes(side, [a, *b, *c]);

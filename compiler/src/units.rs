@@ -610,7 +610,7 @@ impl Checker<'_> {
             Builtin::Abs => Kind::Real(terms[0].clone()),
             Builtin::Floor => {
                 if !self.unify(&terms[0], &none) {
-                    // To whole numbers of what? SI would be a guess.
+                    // Rounding a quantity needs a unit to round to; SI would be a guess.
                     let (unit, text) = (self.shown(&terms[0]), self.text(args[0]));
                     let message = format!("`floor` needs a pure number, not {}", self.described(&terms[0]));
                     let error = Diagnostic::error("E0104", message)

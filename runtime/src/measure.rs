@@ -93,7 +93,7 @@ impl Expectations {
         instants
     }
 
-    /// Whoever shows the points also gives the areas between them, by [`Expectations::give_area`]; and sides that
+    /// The caller that shows the points also gives the areas between them, by [`Expectations::give_area`]; and sides that
     /// are told apart differ by more than this part of the largest value.
     pub(crate) fn expect_areas(&mut self, tol: f64) {
         for meter in self.meters.iter_mut().flatten() {

@@ -459,7 +459,7 @@ impl Table {
         if !reader.read_record(&mut record).is_ok_and(|found| found) || record.len() != self.columns.len() {
             return false;
         }
-        // A reader of CSV forgives quotes that are missing; whoever reads the whole table would not.
+        // A reader of CSV forgives quotes that are missing; readers of the whole table do not.
         if line(record.iter().map(str::to_string)).strip_suffix(b"\n") != Some(row.as_bytes()) {
             return false;
         }

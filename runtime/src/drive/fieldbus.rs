@@ -166,7 +166,7 @@ const ENABLE_NS: u64 = 5_000_000_000;
 const BY_HAND: f64 = 0.2;
 /// Time in which a drive must show that it obeys a stop, ns: then our life sign ends, and it stops by its own time-out.
 const OBEYS_NS: u64 = 20_000_000;
-/// How often such a drive is told by network management, ns.
+/// Interval between network-management commands to such a drive, ns.
 const INSISTS_NS: u64 = 10_000_000;
 /// Time in which a drive that has turned a shaft for a test brings it back, ns.
 const RETURN_NS: u64 = 500_000_000;

@@ -210,7 +210,7 @@ mod tests {
         (None, apart)
     }
 
-    /// Commands that change every some ticks, by chance.
+    /// A random sequence of commands, all held for the same random number of ticks.
     fn steps(mut random: Chance) -> impl FnMut(u32) -> f64 {
         let (every, mut held) = (1 + random.below(20) as u32, 0.0);
         move |k| {

@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 /// Parameters that can be changed at once.
 pub const SET_MOST: usize = 64;
-/// Conditions of a refused set that are told.
+/// At most so many broken conditions of a refused set are reported.
 pub const TOLD: usize = 3;
 
 /// New values of parameters, SI, which act as one.
@@ -64,7 +64,7 @@ impl Judge {
     /// the program whose parameters change.
     ///
     /// # Errors
-    /// What does not fit together, in words.
+    /// A message, if the conditions and the two programs do not belong together.
     pub fn new(live: Live, program: Instance, control: &Instance) -> Result<Judge, String> {
         let description = control.description();
         match live.fault(description.layout.params.range(), program.block().len()) {

@@ -1,6 +1,6 @@
 //! How an operator is heard by a rig under way, and answered.
 //!
-//! In: commands of whoever holds the [`Operator`], from any thread. Out: for each of them exactly one [`Answer`]. A stop
+//! In: commands of all holders of the [`Operator`], from any thread. Out: for each of them exactly one [`Answer`]. A stop
 //! is a flag and never waits behind other commands; everything else waits in a queue of [`PLACES`] places, is refused at
 //! once where that is full, and by the cycle where it is older than [`OLD_NS`]. The cycle's side neither waits nor
 //! allocates: no more commands are under way than answers have places.

@@ -23,7 +23,7 @@ const RUNS: u64 = 200;
 /// Each so many-th combination of two faults in `cargo test`.
 const STRIDE: usize = 40;
 
-/// Runs a script that must hold all properties.
+/// Runs a script of faults; panics with the script as a test if a property is broken.
 fn holds(script: &Script) {
     if let Err(violation) = run::run(script) {
         panic!("{}", told(script, violation));
