@@ -6,9 +6,9 @@ use crate::solver::surfaces::Crossing;
 impl Adaptive {
     /// Whether the step is made again, for what it meets on its way; and whether it meets anything.
     pub(super) fn is_made_again(&mut self) -> (bool, bool) {
-        let (mut from, mut again, mut met) = (0.0, false, false);
+        let (mut from, mut again, mut met, mut inside) = (0.0, false, false, false);
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
-            met = true;
+            (met, inside) = (true, inside || crossing.near > 0.0);
             let jump = self.jump(crossing);
             let decided = self.surfaces.decided();
             // What swings through a surface at which nothing jumps is no chatter.
@@ -17,7 +17,7 @@ impl Adaptive {
             } else {
                 self.crossings = 0
             }
-            // A surface left at the very start needs no other step.
+            // A surface left at the very start needs no other step, unless the Jacobian there still knows the old side.
             if crossing.near > 0.0 && self.shorten(crossing, jump) {
                 again = true;
                 break;
@@ -29,7 +29,7 @@ impl Adaptive {
             from = crossing.far;
         }
         self.surfaces.again();
-        if !met && self.hides() {
+        if !again && !inside && self.hides() {
             self.suspect = self.step.t + self.step.h;
             self.h = 0.5 * self.step.h;
             self.retake();
