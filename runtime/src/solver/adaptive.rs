@@ -202,12 +202,16 @@ impl Adaptive {
         let fine: Vec<(f64, f64)> = description.guards.iter().map(fine).collect();
         let fused = Fused::new(&mut instance, tol, &fine);
         let system = System::new(instance);
+        let mut corners = experiment.corners.clone();
+        corners.extend(system.history.echoes_of_start());
+        corners.sort_by(f64::total_cmp);
+        corners.dedup();
         let n = system.n;
         let entries = Entries::new(n, &description.coupling);
         Adaptive {
             duration: experiment.duration,
             goal: None,
-            corners: experiment.corners.clone(),
+            corners,
             tol,
             t: 0.0,
             x: system.instance.block()[system.states.clone()].to_vec(),

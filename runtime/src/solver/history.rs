@@ -44,6 +44,14 @@ impl History {
         History { lines: instance.description().delays.iter().map(line).collect() }
     }
 
+    /// The instants at which the start is seen again, s, ascending: the past before it is constant, so what is delayed bends there.
+    pub(crate) fn echoes_of_start(&self) -> Vec<f64> {
+        let seen = self.lines.iter().filter(|line| line.time > 0.0).map(|line| echo(0.0, line.time));
+        let mut seen: Vec<f64> = seen.collect();
+        seen.sort_by(f64::total_cmp);
+        seen
+    }
+
     pub(crate) fn is_empty(&self) -> bool {
         self.lines.is_empty()
     }
