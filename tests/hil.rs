@@ -527,7 +527,7 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
         "E0501: `Fs` is smaller than `Fc`: LuGre requires Fs >= Fc (`fr`)",
         "no parameter `fr.Fz`; did you mean `fr.F",
         "E0101: `fr.Fs` is a",
-        "E0502: `vs` of LuGre must be above 0 rad/s, not 0 rad/s (`fr.vs`)",
+        "E0502: `vs` of LuGre must be above 0 mrad/s, not 0 mrad/s (`fr.vs`)",
         "only a start reads `pid.Ts`: a period follows from it; start with `--set pid.Ts=1.5 ms`",
     ] {
         assert!(said.contains(words), "no `{words}` in {said}");

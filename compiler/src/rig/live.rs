@@ -23,15 +23,12 @@ pub struct Judged {
     params: Vec<Known>,
     checks: Vec<Check>,
     program: Program,
-    /// Paths of quantities with a declared range, and the parameters from which its bounds follow.
-    watched: Vec<(String, Vec<VarId>)>,
     /// The crossed-out part.
     part: String,
 }
 
 #[derive(Clone)]
 struct Known {
-    id: VarId,
     path: String,
     unit: Unit,
     boolean: bool,
@@ -105,20 +102,13 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
         }
     };
     let params = system.var_ids().filter(|id| system.var(*id).kind == VarKind::Param).map(|id| Known {
-        id,
         path: system.var(id).path.clone(),
         unit: types.units[id.0 as usize].clone(),
         boolean: types.boolean_vars[id.0 as usize],
         slot: slots.iter().find(|(own, _)| *own == id).map(|(_, slot)| *slot),
         start: why(id),
     });
-    let watched = system.vars.iter().filter(|var| var.kind != VarKind::Param).filter_map(|var| {
-        let bounds: Vec<ExprId> = [var.range.low, var.range.high].into_iter().flatten().map(|it| it.0).collect();
-        let reached = reached(system, &bounds);
-        let from: Vec<VarId> = system.var_ids().filter(|id| reached[id.0 as usize]).collect();
-        (!from.is_empty()).then(|| (var.path.clone(), from))
-    });
-    Judged { params: params.collect(), watched: watched.collect(), checks, program, part: part.to_string() }
+    Judged { params: params.collect(), checks, program, part: part.to_string() }
 }
 
 /// What the judge computes.
@@ -182,7 +172,7 @@ fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, want
 }
 
 /// Of each quantity whether one of the expressions depends on it, by way of others too.
-fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
+pub(super) fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
     let mut vars = vec![false; system.vars.len()];
     let mut seen = std::collections::HashSet::new();
     let mut stack = exprs.to_vec();
@@ -213,7 +203,6 @@ impl Judged {
         let mut read: Vec<Slot> = steps.chain(others).flat_map(|func| func.loads()).collect();
         read.sort_unstable();
         let at_start = control.start.loads();
-        let guarded = |path: &str| control.description.guards.iter().any(|guard| guard.path == path);
         let param = |program: &Program, path: &str| {
             let found = program.description.quantity(path).filter(|quantity| quantity.kind == QuantityKind::Param);
             found.map(|quantity| quantity.slot).filter(|slot| program.description.layout.params.contains(*slot))
@@ -222,10 +211,6 @@ impl Judged {
             let start = |why: String| Place::Start(why);
             if let Some(why) = &known.start {
                 return start(why.clone());
-            }
-            let watched = self.watched.iter().find(|(path, from)| from.contains(&known.id) && guarded(path));
-            if let Some((path, _)) = watched {
-                return start(format!("the range of `{path}` that is watched follows from it"));
             }
             if param(plant, &known.path).is_some() {
                 return start(format!("`{}`, which the drives replace, depends on it", self.part));

@@ -10,6 +10,7 @@ mod cut;
 mod dbc;
 mod frames;
 mod live;
+mod margins;
 mod nodes;
 mod plan;
 mod statements;
@@ -138,6 +139,8 @@ pub struct Cut {
     commands_read: Vec<ExprId>,
     stops: Vec<ExprId>,
     records: Vec<ExprId>,
+    /// Of quantities whose ranges parameters move.
+    margins: Vec<margins::Margin>,
     applied: Vec<VarId>,
     seen: Vec<VarId>,
     seen_read: Vec<ExprId>,
@@ -595,13 +598,15 @@ impl<'a> Reader<'a, '_> {
         control.events.retain(|event| !inside[event.instance.0 as usize]);
         control.storages.retain(|(instance, _)| !inside[instance.0 as usize]);
         let records: Vec<ExprId> = lists.records.iter().map(|record| at(*record)).collect();
-        let wanted: Vec<ExprId> =
-            observed.iter().chain(&stops).chain(&records).chain(&commands_read).copied().collect();
         let own = |id: &VarId| {
             let var = system.var(*id);
             let framing = var.instance == framed.rig || framed.nodes.contains(&var.instance);
             !framing && !of_part(&system, *id)
         };
+        let margins = margins::of(&mut control, |id| own(&id));
+        let rooms = margins.iter().map(|margin| margin.room);
+        let wanted: Vec<ExprId> =
+            observed.iter().chain(&stops).chain(&records).chain(&commands_read).copied().chain(rooms).collect();
         let roots: Vec<VarId> = system.var_ids().filter(own).chain(commands.iter().copied()).collect();
         let control = pruned(&control, roots.into_iter(), &wanted);
         self.not_given(&control, &system, part, &of_part);
@@ -714,6 +719,7 @@ impl<'a> Reader<'a, '_> {
             commands_read,
             stops,
             records,
+            margins,
             applied: plant.applied,
             seen: plant.seen,
             seen_read: plant.seen_read,

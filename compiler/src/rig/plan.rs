@@ -1,5 +1,6 @@
 //! The plan of a rig: numbers, nodes, messages, limits; and, once there are programs, the slots of everything.
 
+use super::margins::{self, Margin};
 use super::*;
 use crate::lower::{self, lower};
 use crate::program::Program;
@@ -539,7 +540,8 @@ impl Cut {
         let stops = self.stops.iter().zip(&self.rig.stops).map(|(expr, stop)| (*expr, stop.condition.clone()));
         let records = self.records.iter().zip(&self.rig.record).map(|(expr, series)| (*expr, series.label.clone()));
         let all = commands.chain(stops).chain(records);
-        all.map(|(expr, text)| Wanted { expr, text, unit: None }).collect()
+        let all = all.map(|(expr, text)| Wanted { expr, text, unit: None });
+        all.chain(self.margins.iter().map(Margin::wanted)).collect()
     }
 
     /// What the plant program is to give.
@@ -566,7 +568,10 @@ impl Cut {
         let control = lower(&self.control, &self.control_types, &self.wanted(&self.control));
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
         let rig = self.finish(&control.program, &control.observed, &plant);
-        let (mut control, mut plant) = (control.program, plant.program);
+        let rooms = &control.observed[control.observed.len() - self.margins.len()..];
+        let mut program = control.program;
+        margins::watch(&self.margins, rooms, &mut program);
+        let (mut control, mut plant) = (program, plant.program);
         let period = rig.period_ns as f64 * 1e-9;
         control.size_rings(period / f64::from(rig.steps));
         plant.size_rings(period / f64::from(super::PLANT_STEPS));

@@ -1,0 +1,82 @@
+//! Ranges that follow from parameters, watched by their margins.
+//!
+//! In: the control system of a rig. Out: for each bound that a parameter moves, an expression that is not negative within
+//! the range; and guards on these in place of guards with the bounds of the start. So a range follows a parameter that is
+//! set while the rig runs, and the code of a step stays as it is.
+
+use super::live::reached;
+use crate::lower::Wanted;
+use crate::program::Program;
+use crate::system::*;
+use abi::Slot;
+use abi::description::Guard;
+use abi::unit::{Angle, Dimension};
+use grammar::ast::BinaryOp;
+
+/// One end of a range.
+#[derive(Clone)]
+pub struct Margin {
+    /// The quantity: `fr.z`.
+    path: String,
+    /// Which end.
+    high: bool,
+    /// Its distance from that end, with the tolerance of guards.
+    pub room: ExprId,
+}
+
+impl Margin {
+    /// The expression to lower, with its name in messages.
+    pub fn wanted(&self) -> Wanted {
+        let end = if self.high { "upper" } else { "lower" };
+        let text = format!("distance of {} from its {end} bound", self.path);
+        Wanted { expr: self.room, text, unit: None }
+    }
+}
+
+/// The margins of the quantities of a control system that `watched` names.
+pub fn of(system: &mut System, watched: impl Fn(VarId) -> bool) -> Vec<Margin> {
+    let moves = |system: &System, bound: ExprId| {
+        let reached = reached(system, &[bound]);
+        system.var_ids().any(|id| reached[id.0 as usize] && system.var(id).kind == VarKind::Param)
+    };
+    let mut margins = Vec::new();
+    for id in system.var_ids().filter(|id| watched(*id)).collect::<Vec<_>>() {
+        let var = system.var(id);
+        let (path, low, high) = (var.path.clone(), var.range.low, var.range.high);
+        if var.kind == VarKind::Param {
+            continue;
+        }
+        for (bound, other, high) in [(low, high, false), (high, low, true)] {
+            let Some((bound, _)) = bound.filter(|(bound, _)| moves(system, *bound)) else { continue };
+            let span = system.span(bound);
+            let mut push = |node: Node| system.push(node, span);
+            // As guards do: a millionth of the width or, of a range that is open on the other side, of the bound.
+            let size = match other {
+                Some((other, _)) => push(Node::Binary(BinaryOp::Subtract, bound, other)),
+                None => bound,
+            };
+            let size = push(Node::Call(Builtin::Abs, [size].into()));
+            let share = push(Node::Number { value: 1e-6, dimension: Some(Dimension::NONE), angle: Angle::Silent });
+            let slack = push(Node::Binary(BinaryOp::Multiply, share, size));
+            let x = push(Node::Var(id));
+            let (above, below) = if high { (bound, x) } else { (x, bound) };
+            let room = push(Node::Binary(BinaryOp::Subtract, above, below));
+            let room = push(Node::Binary(BinaryOp::Add, room, slack));
+            margins.push(Margin { path: path.clone(), high, room });
+        }
+    }
+    margins
+}
+
+/// Watches the margins, in these slots of the program, in place of the bounds they stand for. Quantities that no guard
+/// watches stay as they are.
+pub fn watch(margins: &[Margin], slots: &[Slot], program: &mut Program) {
+    let description = &mut program.description;
+    for (margin, slot) in margins.iter().zip(slots) {
+        let Some(guard) = description.guards.iter_mut().find(|guard| guard.path == margin.path) else { continue };
+        *(if margin.high { &mut guard.range.1 } else { &mut guard.range.0 }) =
+            if margin.high { f64::INFINITY } else { f64::NEG_INFINITY };
+        let unit = guard.unit.clone();
+        description.guards.push(Guard { path: margin.wanted().text, slot: *slot, range: (0.0, f64::INFINITY), unit });
+    }
+}
