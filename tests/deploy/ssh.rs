@@ -296,7 +296,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     // Parameters change by what the package carries: whole, or refused in the words of a start.
     there.says("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
     for (set, why) in [
-        ("set fr.vs = 0 rad/s", "E0502: `vs` of LuGre must be above 0 rad/s"),
+        ("set fr.vs = 0 rad/s", "E0502: `vs` of LuGre must be above 0 mrad/s"),
         ("set fr.Fs = 0.29 N·m", "E0501: `Fs` is smaller than `Fc`"),
         ("set pid.Ts = 1.5 ms", "only a start reads `pid.Ts`: a period follows from it"),
         ("set fr.Fs = 0.5 N·m, fr.Fx = 1 N·m", "there is no parameter `fr.Fx`"),
