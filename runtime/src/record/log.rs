@@ -1,12 +1,12 @@
 //! The log of a rig: what a cycle leaves behind, carried to a file by a thread of its own.
 //!
 //! In: messages of 64-bit words from the cycle, through a queue that never waits. Out: a file of blocks (see
-//! [`blocks`](super::blocks)) with a head, messages and a tail. Knows nothing of what the words mean.
+//! [`blocks`]) with a head, messages and a tail. Knows nothing of what the words mean.
 //!
 //! A block is closed after a fixed number of messages of kind [`CYCLE`], not after a time: so two equal runs leave equal
 //! files. A full queue drops the message and counts it, and the next one that fits says how many are missing.
 //!
-//! The thread packs each block (see [`packed`](super::packed)) and begins a new file where the last one has become long
+//! The thread packs each block (differences, then deflate) and begins a new file where the last one has become long
 //! enough (see [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
 
 use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK_LONGEST};
