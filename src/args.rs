@@ -105,7 +105,7 @@ pub enum Command {
 /// What of a text is changed before it is compiled.
 #[derive(clap::Args, Clone, Debug)]
 pub struct Set {
-    /// Change a parameter, an input or a slot: `fr.Fs=2N`, `fr=Karnopp()`
+    /// Change a parameter, an input, the start value of a state or a slot: `fr.Fs=2N`, `fr.z=1um`, `fr=Karnopp()`
     #[arg(long = "set", value_name = "PATH=VALUE", value_parser = setting)]
     pub all: Vec<(String, String)>,
 }

@@ -278,4 +278,23 @@ fn parameters_that_only_a_start_reads_say_why() {
     assert_eq!(why("fr.n"), "the number of parts follows from it");
     assert_eq!(why("body.m"), "it belongs to `body`, which the drives replace");
     assert_eq!(why("load.T_rated"), "it describes a drive or device");
+    assert_eq!(why("fr.z"), "it is a state, which is given a value at the start only");
+    assert_eq!(why("body.x"), "it belongs to `body`, which the drives replace");
+}
+
+/// The start value of a state is set at the start, is checked there, and is refused while the rig runs.
+#[test]
+fn a_start_value_is_set_at_the_start_only() {
+    let text =
+        text(&mut Chance((0..100).find(|seed| start(&text(&mut Chance(*seed)), &[]).is_ok()).expect("one starts")));
+    let mut ready = start(&text, &["fr.z = 0.5 N·m".into()]).expect("it lies in the range");
+    let z = ready.control.description().quantity("fr.z").expect("the control has it").slot;
+    ready.control.start(1e-3);
+    assert_eq!(ready.control.get(z), 0.5);
+    let found = start(&text, &["fr.z = 500 N·m".into()]).err().expect("it lies beyond the range");
+    assert!(found.iter().any(|d| d.code == "E0502" && d.message.contains("`z` of Rub")), "{found:#?}");
+    let judge = Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control).unwrap();
+    let said = judge.read("fr.z = 0.5 N·m").unwrap_err();
+    let why = "only a start reads `fr.z`: it is a state, which is given a value at the start only";
+    assert_eq!(said, format!("{why}; start with `--set fr.z=0.5 N·m`"));
 }

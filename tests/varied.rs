@@ -150,6 +150,23 @@ experiment e { run A() for 1 s  solver euler step 1 ms  expect final(o) > 0 }",
         "",
         false,
     ),
+    (
+        "where a state starts, and another state with it",
+        "model A { state p [m] = 1 m in 0 m .. 2 m  state q [m] = 3 * p  dp/dt = -p / (1 s)  dq/dt = p / (1 s)
+  output o [1] = (p + 7 * q) / (1 m) }
+experiment e { run A() for 1 s  expect final(o) > 0 }",
+        &[-1.0, 0.0, 0.5, 1.0, 3.0],
+        "m",
+        false,
+    ),
+    (
+        "where a sampled state starts that follows from an input",
+        "model A { input v [m]  state p [m] = v  every 1 ms { next(p) = p / 2 + v }  output o [1] = p / (1 m) }
+experiment e { run A(v = sine(1 m, 1 Hz)) for 100 ms  solver rk4 step 1 ms  expect final(o) > 0 }",
+        &[-1.0, 0.0, 2.0],
+        "m",
+        false,
+    ),
 ];
 
 #[test]

@@ -46,7 +46,7 @@ fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
 }
 
 /// What in an expression changes while a model runs, if anything does.
-fn moving(system: &System, id: ExprId) -> Option<ExprId> {
+pub fn moving(system: &System, id: ExprId) -> Option<ExprId> {
     match system.node(id) {
         Node::Var(var) => (system.var(*var).kind != VarKind::Param).then_some(id),
         Node::Time | Node::Rate(_) | Node::PathRate(_) | Node::InRegime(..) => Some(id),
@@ -112,6 +112,10 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
         let message = live::beyond_words(&var.name, model, unit, value, beyond);
         let place = match &var.definition {
             Definition::Value(_, Origin::Argument { bind, .. }) => *bind,
+            Definition::Continuous { .. } | Definition::Sampled { .. } => match system.start_origin(id) {
+                Origin::Argument { bind, .. } => bind,
+                _ => system.span(node),
+            },
             _ => system.span(node),
         };
         let mut error = Diagnostic::error("E0502", message).label(place, show(value));

@@ -14,7 +14,7 @@ use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns as columns_of;
 use crate::units::{self, Types, literal};
-use crate::{causality, checks, delays};
+use crate::{causality, checks, delays, starts};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -35,7 +35,8 @@ pub struct Changes {
     pub tol: Option<f64>,
     /// Another duration, in s.
     pub duration: Option<f64>,
-    /// Paths of parameters that will change from run to run without compiling again.
+    /// Paths of parameters, and of states for their start values, that will change from run to run without compiling
+    /// again.
     pub vary: Vec<String>,
     /// What is needed besides to linearise.
     pub ports: Option<Ports>,
@@ -587,6 +588,7 @@ fn variant(
             let flat = flatten(loaded, sources, &request);
             let mut system = flat.system;
             diagnostics = flat.diagnostics;
+            starts::open(&mut system, &given.vary);
             let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
             on_stage("check");
             let types = units::check(&system, &loaded.files, &mut diagnostics);
@@ -612,7 +614,7 @@ fn variant(
         return Err(diagnostics);
     }
     diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
-    let (places, vary) = (Vec::new(), &given.vary[..]);
+    let (places, vary) = (Vec::new(), &starts::params(&system, &given.vary)[..]);
     let mut reader =
         Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
     if let Some(cut) = &cut {

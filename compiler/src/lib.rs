@@ -35,6 +35,7 @@ pub mod reach;
 pub mod lookup;
 pub mod lower;
 pub mod checks;
+pub mod starts;
 pub mod domains;
 pub mod remembered;
 pub mod proof;
@@ -116,12 +117,13 @@ pub fn varying(
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
 ) -> Result<Vec<vary::Varying>, Vec<Diagnostic>> {
-    let paths = &options.changes.vary;
     let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
-    if let Some(error) = variants.iter().find_map(|variant| vary::built_in(variant, paths)) {
+    let varied = |variant: &experiment::Variant| starts::params(&variant.system, &options.changes.vary);
+    if let Some(error) = variants.iter().find_map(|variant| vary::built_in(variant, &varied(variant))) {
         return Err(vec![error]);
     }
     let one = |variant: experiment::Variant| {
+        let paths = &varied(&variant);
         // What is described keeps its ranges; the code of a fixed step loses those that change.
         let mut coded = variant.program.clone();
         coded.description.guards = vary::in_code(&variant, paths);

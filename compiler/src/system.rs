@@ -60,6 +60,8 @@ pub struct System {
     pub delays: Vec<ExprId>,
     /// Where the state of a reset is named, by the value it is given.
     pub reset_places: Vec<(ExprId, Span)>,
+    /// States whose start value is given from outside of their model, and by whom.
+    pub starts: Vec<(VarId, Origin)>,
     /// Instances that cannot be made rotary or do not fit their slot: reported, and their units fit everything.
     pub strangers: Vec<InstanceId>,
     /// Paths of parameters that were read while parts were made: how many there are follows from them.
@@ -548,6 +550,11 @@ impl System {
             Node::Fits { value, .. } => self.alias(*value),
             _ => None,
         }
+    }
+
+    /// Who wrote the start value of a state: its own declaration, or whoever uses the model.
+    pub fn start_origin(&self, state: VarId) -> Origin {
+        self.starts.iter().find(|(of, _)| *of == state).map_or(Origin::Default, |(_, origin)| *origin)
     }
 
     /// Puts a node into the arena.

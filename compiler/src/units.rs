@@ -785,7 +785,7 @@ impl Checker<'_> {
                     self.state(id, &kind, *initial, rate);
                 }
                 Definition::Sampled { initial, next, .. } => {
-                    self.defines(id, &kind, *initial, Origin::Default);
+                    self.defines(id, &kind, *initial, self.system.start_origin(id));
                     self.defines(id, &kind, *next, Origin::Equation(self.system.span(*next)));
                 }
             }
@@ -902,7 +902,7 @@ impl Checker<'_> {
     }
 
     fn state(&mut self, id: VarId, kind: &Kind, initial: ExprId, rate: Option<ExprId>) {
-        self.defines(id, kind, initial, Origin::Default);
+        self.defines(id, kind, initial, self.system.start_origin(id));
         let Some(rate) = rate else { return };
         let (Kind::Real(state), Some(found)) = (kind, self.real(rate)) else { return };
         let wanted = state.times(&Term::known(RATE), Ratio::ONE);

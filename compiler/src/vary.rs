@@ -10,6 +10,7 @@ use crate::ir::Func;
 use crate::lower::formulas;
 use crate::reach::{greatest, least};
 use crate::source::Files;
+use crate::starts;
 use crate::system::*;
 use abi::description::{Guard, Kind, Quantity};
 use abi::lanes::Lanes;
@@ -170,9 +171,11 @@ impl Varying {
         self.lanes.as_ref()
     }
 
-    /// The parameter of this path, if a run can be given another value for it.
+    /// The parameter of this path, or that from which the state of this path starts, if a run can be given another value
+    /// for it.
     pub fn param(&self, path: &str) -> Option<&Quantity> {
-        let found = self.description.quantity(path)?;
+        let start = self.description.quantity(&starts::path(path));
+        let found = start.or_else(|| self.description.quantity(path))?;
         (found.kind == Kind::Param && self.description.layout.params.contains(found.slot)).then_some(found)
     }
 

@@ -160,7 +160,10 @@ impl Table {
             let mut of_case = Vec::new();
             for vary in &args.vary {
                 let Some(param) = case.param(&vary.path) else {
-                    return Err(format!("`{}` is not a parameter: only parameters vary", vary.path));
+                    return Err(format!(
+                        "`{}` is neither a parameter nor a state: only parameters and start values of states vary",
+                        vary.path
+                    ));
                 };
                 if param.unit.dimension != vary.unit.dimension {
                     let (wanted, found) = (param.unit.dimension.describe(), vary.unit.dimension.describe());

@@ -130,13 +130,15 @@ fn argument_of(before: &str) -> Option<String> {
     None
 }
 
-/// Parameters, inputs and slots of a model, ready to be given.
+/// Parameters, inputs, states (their start values) and slots of a model, ready to be given.
 fn arguments(session: &Session, model: &str) -> Vec<Candidate> {
     let mut with_library = session.clone();
     with_library.bring_in(model);
     let Some(model) = with_library.model(model) else { return Vec::new() };
     let argument = |statement: &Statement| match statement {
-        Statement::Declaration(d) if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input) => {
+        Statement::Declaration(d)
+            if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input | DeclarationKind::State) =>
+        {
             let unit = d.unit.as_ref().map_or(String::new(), |unit| format!("[{}]", unit.text));
             let doc = d.doc.as_deref().unwrap_or_default().lines().next().unwrap_or_default();
             let note = format!("{unit} {doc}");

@@ -86,19 +86,30 @@ impl<'a> Flattener<'a> {
             (var.range, var.range_span) = (range, Some(span));
         }
         let given = match declaration.kind {
-            DeclarationKind::Param | DeclarationKind::Input => {
+            DeclarationKind::Param | DeclarationKind::Input | DeclarationKind::State => {
                 self.tree(id).args.iter().find(|arg| arg.name == name.text).cloned()
             }
-            DeclarationKind::Output | DeclarationKind::State | DeclarationKind::Let => None,
+            DeclarationKind::Output | DeclarationKind::Let => None,
         };
         let definition = match (given, &declaration.value) {
             (Some(Arg { value: ArgValue::Expr(expr), env, span, overriding, .. }), _) => {
                 let value = self.expr(expr, &env);
                 let model = self.system.instance(id).span;
                 let origin = if overriding { Origin::Override } else { Origin::Argument { model, bind: span } };
-                Definition::Value(value, origin)
+                match declaration.kind {
+                    DeclarationKind::State => {
+                        self.system.starts.push((var, origin));
+                        Definition::Continuous { initial: value, rate: value, path: None, span: name.span }
+                    }
+                    _ => Definition::Value(value, origin),
+                }
             }
-            (Some(_), _) => Definition::Missing, // Reported with the arguments.
+            (Some(_), _) if declaration.kind != DeclarationKind::State => Definition::Missing, // Reported with the arguments.
+            (Some(_), None) => Definition::Missing,
+            (Some(_), Some(value)) => {
+                let value = self.expr(value, env);
+                Definition::Continuous { initial: value, rate: value, path: None, span: name.span }
+            }
             (None, value)
                 if declaration.kind == DeclarationKind::Input
                     && self.tree(id).alone

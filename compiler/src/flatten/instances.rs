@@ -586,7 +586,7 @@ impl<'a> Flattener<'a> {
         true
     }
 
-    /// Every argument must name a port, parameter or slot.
+    /// Every argument must name a port, parameter, slot, or a state for its start value.
     pub(super) fn check_arguments(&mut self, id: InstanceId) {
         let tree = self.tree(id);
         let model = tree.model;
@@ -605,29 +605,43 @@ impl<'a> Flattener<'a> {
             }
             let declared = declarations(model).find(|d| d.name.text == arg.name);
             let part = model.body.iter().any(|s| matches!(s, Statement::Part(part) if part.name.text == arg.name));
+            let owner = &model.name.text;
             let message = match declared {
                 _ if part => continue,
-                Some(d) if matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input) => match arg.value {
+                Some(d) if takes(d.kind) => match arg.value {
                     ArgValue::Expr(_) => continue,
-                    ArgValue::Instance(_) => {
-                        format!("`{}` of {} takes a value, not a model", arg.name, model.name.text)
+                    ArgValue::Instance(_) if d.kind == DeclarationKind::State => {
+                        format!("state `{}` of {owner} takes its start value, not a model", arg.name)
                     }
+                    ArgValue::Instance(_) => format!("`{}` of {owner} takes a value, not a model", arg.name),
                 },
                 Some(d) => {
                     let kind = d.kind.word();
-                    format!("`{}` is {} {kind} of {}: it cannot be given", arg.name, article(kind), model.name.text)
+                    format!("`{}` is {} {kind} of {owner}: it cannot be given", arg.name, article(kind))
                 }
-                None => format!("{} has no `{}`", model.name.text, arg.name),
+                None if modes(model).any(|mode| mode.name.text == arg.name) => {
+                    let error = Diagnostic::error("E0205", format!("`{}` is a regime of {owner}: it cannot be given", arg.name))
+                        .label(arg.span, "no such argument")
+                        .help("a model starts in its `initial` regime and leaves it at once where a `go` says so: give states and inputs that it asks for");
+                    errors.push(error);
+                    continue;
+                }
+                None => format!("{owner} has no `{}`", arg.name),
             };
             let mut error = Diagnostic::error("E0205", message).label(arg.span, "no such argument");
-            let takes: Vec<&str> = declarations(model)
-                .filter(|d| matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input))
-                .map(|d| d.name.text.as_str())
-                .collect();
-            error = match nearest(arg.name, takes.iter().copied()) {
-                Some(near) => error.help(format!("did you mean `{near}`?")),
-                None if takes.is_empty() => error.help(format!("{} takes no arguments", model.name.text)),
-                None => error.help(format!("{} takes {}", model.name.text, takes.join(", "))),
+            let given = |state: bool| {
+                let of_kind = move |d: &&ast::Declaration| takes(d.kind) && (d.kind == DeclarationKind::State) == state;
+                declarations(model).filter(of_kind).map(|d| d.name.text.as_str()).collect::<Vec<_>>()
+            };
+            let (values, states) = (given(false), given(true));
+            error = match (nearest(arg.name, values.iter().chain(&states).copied()), &*values, &*states) {
+                (Some(near), ..) => error.help(format!("did you mean `{near}`?")),
+                (None, [], []) => error.help(format!("{owner} takes no arguments")),
+                (None, _, []) => error.help(format!("{owner} takes {}", values.join(", "))),
+                (None, [], _) => error.help(format!("{owner} takes start values of {}", states.join(", "))),
+                (None, ..) => {
+                    error.help(format!("{owner} takes {}; start values of {}", values.join(", "), states.join(", ")))
+                }
             };
             errors.push(error);
         }
@@ -637,13 +651,9 @@ impl<'a> Flattener<'a> {
     /// Whether an argument that the model does not have comes closest to this name.
     pub(super) fn misspelt(&self, id: InstanceId, name: &str) -> bool {
         let tree = self.tree(id);
-        let takes = || {
-            let own = declarations(tree.model);
-            own.filter(|d| matches!(d.kind, DeclarationKind::Param | DeclarationKind::Input))
-                .map(|d| d.name.text.as_str())
-        };
+        let taken = || declarations(tree.model).filter(|d| takes(d.kind)).map(|d| d.name.text.as_str());
         let names = |text: &str| tree.names.contains_key(text);
-        tree.args.iter().any(|arg| !names(arg.name) && nearest(arg.name, takes()) == Some(name))
+        tree.args.iter().any(|arg| !names(arg.name) && nearest(arg.name, taken()) == Some(name))
     }
 
     pub(super) fn env(&self, id: InstanceId) -> Env {
@@ -703,7 +713,9 @@ impl<'a> Flattener<'a> {
                 if let Some(id) = env.instance {
                     let tree = self.tree(id);
                     if let Some(declaration) = declarations(tree.model).find(|d| d.name.text == name) {
-                        let arg = tree.args.iter().find(|arg| arg.name == name);
+                        // A state does not keep the value that it starts with.
+                        let keeps = declaration.kind != DeclarationKind::State;
+                        let arg = tree.args.iter().find(|arg| keeps && arg.name == name);
                         let arg = arg.map(|arg| (arg.value, arg.env.clone()));
                         self.system.structural.push(joined(&self.system.instance(id).path, name));
                         if let Some((value, env)) = arg {
@@ -721,5 +733,13 @@ impl<'a> Flattener<'a> {
             }
             _ => None,
         }
+    }
+}
+
+/// Whether an argument may name it: a state is given its start value.
+fn takes(kind: DeclarationKind) -> bool {
+    match kind {
+        DeclarationKind::Param | DeclarationKind::Input | DeclarationKind::State => true,
+        DeclarationKind::Output | DeclarationKind::Let => false,
     }
 }

@@ -93,6 +93,9 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
         if let Some((_, what)) = reasons.iter().find(|(reached, _)| reached[id.0 as usize]) {
             return follows(what);
         }
+        if var.kind == VarKind::State {
+            return Some("it is a state, which is given a value at the start only".into());
+        }
         match var.definition {
             Definition::Value(value, _) if !slots.iter().any(|(own, _)| *own == id) => {
                 let text = files.slice(system.span(value)).split_whitespace().collect::<Vec<_>>().join(" ");
@@ -101,7 +104,9 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
             _ => None,
         }
     };
-    let params = system.var_ids().filter(|id| system.var(*id).kind == VarKind::Param).map(|id| Known {
+    // A state is named too, so that a set of it is answered with its reason.
+    let named = |id: &VarId| matches!(system.var(*id).kind, VarKind::Param | VarKind::State);
+    let params = system.var_ids().filter(named).map(|id| Known {
         path: system.var(id).path.clone(),
         unit: types.units[id.0 as usize].clone(),
         boolean: types.boolean_vars[id.0 as usize],
