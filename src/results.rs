@@ -331,6 +331,7 @@ mod tests {
                 unit: unit.clone(),
                 time: Some(3.0),
                 resolution: 0.0,
+                unseen: 0.0,
                 scale: 1.5,
                 error: None,
             }],

@@ -7,7 +7,8 @@
 //!
 //! The error of a number is the width that all results span, at least; of fixed steps it is extrapolated to the step 0
 //! besides (Richardson) with the order that three runs show, at least 1 and at most that of the method. Two companions
-//! rather than one since two results may agree by accident.
+//! rather than one since two results may agree by accident. Points that all runs share are no accident: what an extreme may
+//! reach between those of the finest run is added, and the end of an experiment lies within a step of each companion.
 
 use crate::engine::{self, Cause, Continue, Estimate, Outcome};
 use crate::verdict::{Reading, Runs, Verdict, judged};
@@ -26,23 +27,48 @@ const STEPS: [f64; 2] = [0.5, 0.25];
 /// A run that is tried to see whether it decides takes so many times the steps of the run itself at most.
 const MOST_WORK: f64 = 64.0;
 
-/// Estimates the errors of an outcome; `instance` and `experiment` as they were given to [`engine::run`]. An experiment that
-/// expects nothing needs no companion. `watch` may end it: then the outcome stays as it was.
+/// Estimates the errors of an outcome, as [`errors`] does, and looks for a solver that decides what they leave open.
 pub fn judge(
     instance: &Instance,
     experiment: &Experiment,
     outcome: &mut Outcome,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) {
+    let Some(mut ladder) = climbed(instance, experiment, outcome, watch) else { return };
+    let failed = outcome.estimate.as_ref().is_some_and(|estimate| estimate.failed.is_some());
+    if !failed && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
+        let decides = ladder.decides(&outcome.verdicts, outcome.work.steps, watch);
+        outcome.estimate.get_or_insert_default().decides = decides;
+    }
+}
+
+/// Estimates the errors of an outcome; `instance` and `experiment` as they were given to [`engine::run`]. An experiment that
+/// expects nothing needs no companion. `watch` may end it: then the outcome stays as it was.
+pub fn errors(
+    instance: &Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) {
+    climbed(instance, experiment, outcome, watch);
+}
+
+/// Puts the errors into the outcome and gives the runs that they follow from; none where it stays as it was.
+fn climbed<'a>(
+    instance: &'a Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Option<Ladder<'a>> {
     if experiment.expects.is_empty() {
-        return;
+        return None;
     }
     let bare = Experiment { plots: Vec::new(), ..experiment.clone() };
     let mut ladder = Ladder { instance, bare, runs: Vec::new() };
     ladder.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
     for solver in companions(&experiment.solver) {
         if !ladder.run(solver, watch) {
-            return;
+            return None;
         }
     }
     let mut estimate = Estimate::default();
@@ -53,10 +79,8 @@ pub fn judge(
     if experiment.stepped && experiment.solver.method != Method::Adaptive {
         outcome.verdicts.iter_mut().for_each(|verdict| verdict.decided = true);
     }
-    if estimate.failed.is_none() && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
-        estimate.decides = ladder.decides(&outcome.verdicts, outcome.work.steps, watch);
-    }
     outcome.estimate = Some(estimate);
+    Some(ladder)
 }
 
 /// The solvers of the companions of a run, finer and finer; coarser ones where none can be finer.
@@ -90,7 +114,8 @@ impl Ladder<'_> {
         let stepped = plant.unwrap_or(self.instance).description();
         let (mut going, mut result) = (true, Err("its delays reach back over more steps than are kept".into()));
         if solver.method == Method::Adaptive || has_room(stepped, solver.step) {
-            let experiment = Experiment { solver, ..self.bare.clone() };
+            let duration = covering(&self.bare, &solver);
+            let experiment = Experiment { solver, duration, ..self.bare.clone() };
             let ended = engine::run(self.instance.clone(), &experiment, watch);
             going = !ended.as_ref().is_err_and(|failure| failure.cause == Cause::Stopped);
             result = ended.map(|outcome| outcome.verdicts).map_err(|failure| failure.to_string());
@@ -178,6 +203,21 @@ impl Ladder<'_> {
             }
         }
         None
+    }
+}
+
+/// The duration of a companion in s. Fixed steps that do not divide that of the experiment would all end at the same instant
+/// beside it, and agree: a companion goes on to the end of the step in which the experiment ends, and its windows are cut there.
+fn covering(experiment: &Experiment, solver: &Solver) -> f64 {
+    let duration = experiment.duration;
+    if solver.method == Method::Adaptive || experiment.bench.is_some() {
+        return duration;
+    }
+    let steps = duration / solver.step;
+    if (steps.round() * solver.step - duration).abs() <= 1e-9 * duration {
+        duration
+    } else {
+        steps.ceil() * solver.step
     }
 }
 
@@ -274,6 +314,20 @@ mod tests {
             let (error, estimate) = decay(experiment.clone());
             let fits = error > 0.0 && error <= 3.0 * estimate && estimate <= 10.0 * error + 1e-15;
             assert!(fits, "{:?}: {error:e}, {estimate:e}", experiment.solver);
+        }
+    }
+
+    #[test]
+    fn a_run_that_ends_beside_its_duration_is_judged_there() {
+        // Exact but for where it ends: at 1 s and at 1.1 s.
+        let instance = models::decay();
+        for (duration, kind) in [(1.04, MeasureKind::Final), (1.06, MeasureKind::Final), (1.04, MeasureKind::Min)] {
+            let mut experiment = fixed(duration, 0.1);
+            experiment.solver.method = Method::Rk4;
+            experiment.expects.push(reading(&instance, kind, "x"));
+            let reading = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+            let (error, estimate) = ((reading.value - (-duration).exp()).abs(), reading.error.unwrap());
+            assert!(error > 1e-2 && error <= 1.5 * estimate && estimate <= 3.0 * error, "{error:e}, {estimate:e}");
         }
     }
 

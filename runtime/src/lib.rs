@@ -11,6 +11,7 @@ pub mod show;
 pub mod queue;
 
 pub mod verdict;
+mod peak;
 pub mod measure;
 pub mod record;
 

@@ -6,6 +6,7 @@
 //! between two points. An adaptive run shows a point at each edge and gives the areas under its own course; of other runs
 //! the areas are those of the trapezoidal rule with the end corrections of Gregory, of order four where steps are even.
 
+use crate::peak::{Peak, Point};
 use crate::show;
 use crate::verdict::{self, Reading, Verdict};
 use abi::Slot;
@@ -21,6 +22,8 @@ const NOTHING: f64 = 1e-15;
 pub struct Expectations {
     expects: Vec<Expect>,
     meters: Vec<Vec<Meter>>,
+    /// Instants in s, ascending, at which quantities may jump and at which points are shown.
+    corners: Vec<f64>,
 }
 
 /// What an adaptive run must know of one measure to show it the right points.
@@ -51,7 +54,12 @@ impl Expectations {
         let meters = expects.iter().map(|expect| {
             expect.measures.iter().map(|measure| Meter::new(measure, expect.after, expect.before)).collect()
         });
-        Expectations { expects: expects.to_vec(), meters: meters.collect() }
+        Expectations { expects: expects.to_vec(), meters: meters.collect(), corners: Vec::new() }
+    }
+
+    /// Instants in s, ascending, at which quantities may jump. The run shows points there.
+    pub(crate) fn jumps_at(&mut self, corners: &[f64]) {
+        self.corners = corners.to_vec();
     }
 
     /// Whether only the last point of the run counts, so that the others need not be shown.
@@ -93,12 +101,13 @@ impl Expectations {
         instants
     }
 
-    /// The caller that shows the points also gives the areas between them, by [`Expectations::give_area`]; and sides that
-    /// are told apart differ by more than this part of the largest value.
+    /// The caller that shows the points also gives the areas between them, by [`Expectations::give_area`], and shows a point
+    /// wherever a quantity turns whose extreme is wanted; and sides that are told apart differ by more than this part of the largest value.
     pub(crate) fn expect_areas(&mut self, tol: f64) {
         for meter in self.meters.iter_mut().flatten() {
             match &mut meter.tally {
                 Tally::Sum { given, .. } => *given = true,
+                Tally::Extremes { .. } | Tally::TimeOf { .. } | Tally::AtPeak { .. } => meter.located = true,
                 Tally::Crossings { lobes } => lobes.band = tol,
                 _ => {}
             }
@@ -123,19 +132,19 @@ impl Expectations {
 
     /// The verdicts, in the order of the experiment.
     pub fn verdicts(&self) -> Vec<Verdict> {
-        self.expects.iter().zip(&self.meters).map(|(expect, meters)| verdict(expect, meters)).collect()
+        self.expects.iter().zip(&self.meters).map(|(expect, meters)| verdict(expect, meters, &self.corners)).collect()
     }
 }
 
-fn verdict(expect: &Expect, meters: &[Meter]) -> Verdict {
+fn verdict(expect: &Expect, meters: &[Meter], corners: &[f64]) -> Verdict {
     let mut readings = Vec::new();
     let mut problem = None;
     for (measure, meter) in expect.measures.iter().zip(meters) {
         match meter.reading() {
             Ok((value, time)) => {
                 let (text, unit) = (measure.text.clone(), measure.unit.clone());
-                let (resolution, scale) = (meter.resolution(), meter.scale);
-                readings.push(Reading { text, value, unit, time, resolution, scale, error: None });
+                let (resolution, unseen, scale) = (meter.resolution(), meter.unseen(corners), meter.scale);
+                readings.push(Reading { text, value, unit, time, resolution, unseen, scale, error: None });
             }
             Err(reason) => {
                 problem.get_or_insert(format!("{}: {reason}", measure.text));
@@ -147,9 +156,6 @@ fn verdict(expect: &Expect, meters: &[Meter]) -> Verdict {
         None => verdict::verdict(expect, readings),
     }
 }
-
-/// A point of a run: time in s, value in SI.
-type Point = (f64, f64);
 
 /// One measure at work: cuts its window exactly and tallies what lies inside.
 struct Meter {
@@ -170,20 +176,61 @@ struct Meter {
     counted: bool,
     /// The greatest magnitude counted.
     scale: f64,
+    /// Whether a point is shown wherever a quantity turns.
+    located: bool,
     tally: Tally,
 }
 
 enum Tally {
-    Extremes { min: Point, max: Point, kind: Extreme },
-    Sum { square: bool, kind: Average, sum: Sum, given: bool, even: Even },
+    Extremes {
+        min: Peak,
+        max: Peak,
+        kind: Extreme,
+    },
+    Sum {
+        square: bool,
+        kind: Average,
+        sum: Sum,
+        given: bool,
+        even: Even,
+    },
     Final,
-    At { instant: f64, value: Option<f64> },
-    Crossings { lobes: Lobes },
-    First { after: Before, time: f64, gap: f64 },
-    AtMoment { moment: Moment, best: f64, found: Option<Point>, gap: f64 },
-    TimeOf { sign: f64, best: f64, time: f64 },
-    Period { kept: Kept },
-    Settling { band: f64, kept: Kept },
+    At {
+        instant: f64,
+        value: Option<f64>,
+    },
+    Crossings {
+        lobes: Lobes,
+    },
+    First {
+        after: Before,
+        time: f64,
+        gap: f64,
+    },
+    /// `rises`: only where the condition `was` not true at the point before.
+    AtMoment {
+        rises: bool,
+        was: bool,
+        found: Option<Point>,
+        gap: f64,
+    },
+    /// The value at an extreme of what tells the moment. `near`: how far the values beside it are from it; the second
+    /// once it is there.
+    AtPeak {
+        peak: Peak,
+        found: f64,
+        near: (f64, Option<f64>),
+    },
+    TimeOf {
+        peak: Peak,
+    },
+    Period {
+        kept: Kept,
+    },
+    Settling {
+        band: f64,
+        kept: Kept,
+    },
 }
 
 /// What a condition must have been before it counts as first.
@@ -209,7 +256,8 @@ enum Average {
 
 impl Meter {
     fn new(measure: &Measure, after: f64, before: f64) -> Meter {
-        let extremes = |kind| Tally::Extremes { min: (0.0, f64::INFINITY), max: (0.0, f64::NEG_INFINITY), kind };
+        let extremes = |kind| Tally::Extremes { min: Peak::least(), max: Peak::greatest(), kind };
+        let at_peak = |peak| Tally::AtPeak { peak, found: 0.0, near: (0.0, None) };
         let sum = |kind, square| {
             let (sum, even) = (Sum::default(), Even::default());
             Tally::Sum { square, kind, sum, given: false, even }
@@ -227,9 +275,16 @@ impl Meter {
             MeasureKind::First => Tally::First { after: Before::Anything, time: f64::INFINITY, gap: 0.0 },
             MeasureKind::Rises => Tally::First { after: Before::False, time: f64::INFINITY, gap: 0.0 },
             MeasureKind::Turns => Tally::First { after: Before::Other, time: f64::INFINITY, gap: 0.0 },
-            MeasureKind::AtMoment(moment) => Tally::AtMoment { moment, best: f64::INFINITY, found: None, gap: 0.0 },
-            MeasureKind::TimeOfLeast => Tally::TimeOf { sign: 1.0, best: f64::INFINITY, time: 0.0 },
-            MeasureKind::TimeOfGreatest => Tally::TimeOf { sign: -1.0, best: f64::INFINITY, time: 0.0 },
+            MeasureKind::AtMoment(Moment::Least(_)) => at_peak(Peak::least()),
+            MeasureKind::AtMoment(Moment::Greatest(_)) => at_peak(Peak::greatest()),
+            MeasureKind::AtMoment(Moment::First(_)) => {
+                Tally::AtMoment { rises: false, was: true, found: None, gap: 0.0 }
+            }
+            MeasureKind::AtMoment(Moment::Rises(_)) => {
+                Tally::AtMoment { rises: true, was: true, found: None, gap: 0.0 }
+            }
+            MeasureKind::TimeOfLeast => Tally::TimeOf { peak: Peak::least() },
+            MeasureKind::TimeOfGreatest => Tally::TimeOf { peak: Peak::greatest() },
             MeasureKind::Period => Tally::Period { kept: Kept::default() },
             MeasureKind::Settling(band) => Tally::Settling { band, kept: Kept::default() },
         };
@@ -266,6 +321,7 @@ impl Meter {
             end: none,
             counted,
             scale,
+            located: false,
             tally,
         }
     }
@@ -288,8 +344,8 @@ impl Meter {
     fn demand(&self) -> Demand {
         let what = match &self.tally {
             Tally::Extremes { .. } | Tally::TimeOf { .. } => Wants::Turns,
-            Tally::AtMoment { moment: Moment::Least(slot) | Moment::Greatest(slot), .. } => {
-                return Demand { slot: *slot, what: Wants::Turns };
+            Tally::AtPeak { .. } => {
+                return Demand { slot: self.moment.unwrap_or(self.slot), what: Wants::Turns };
             }
             Tally::Sum { square: false, .. } => Wants::Area,
             Tally::Sum { square: true, .. } => Wants::Square,
@@ -329,12 +385,8 @@ impl Meter {
         }
         match &mut self.tally {
             Tally::Extremes { min, max, .. } => {
-                if v < min.1 {
-                    *min = (t, v);
-                }
-                if v > max.1 {
-                    *max = (t, v);
-                }
+                min.see(t, v);
+                max.see(t, v);
             }
             Tally::Sum { given: true, .. } => {}
             Tally::Sum { square, sum, even, given: false, .. } => {
@@ -357,33 +409,26 @@ impl Meter {
                 }
             }
             Tally::Crossings { lobes } => lobes.push(t, v),
-            Tally::AtMoment { moment, best, found, gap } => {
-                let telling = self.telling;
-                let now = match moment {
-                    Moment::First(_) => found.is_none() && telling != 0.0,
-                    Moment::Rises(_) => found.is_none() && telling != 0.0 && *best == 0.0,
-                    Moment::Least(_) => telling < *best,
-                    Moment::Greatest(_) => -telling < *best,
-                };
-                match moment {
-                    Moment::First(_) | Moment::Rises(_) => {
-                        if now && self.counted && t > previous.0 {
-                            // It lies somewhere since the point before.
-                            *gap = (v - previous.1).abs();
-                        }
-                        *best = telling;
-                    }
-                    Moment::Least(_) => *best = best.min(telling),
-                    Moment::Greatest(_) => *best = best.min(-telling),
-                }
-                if now {
+            Tally::AtMoment { rises, was, found, gap } => {
+                let holds = self.telling != 0.0;
+                if found.is_none() && holds && !(*rises && *was) {
                     *found = Some((t, v));
+                    if self.counted && t > previous.0 {
+                        // It lies somewhere since the point before.
+                        *gap = (v - previous.1).abs();
+                    }
+                }
+                *was = holds;
+            }
+            Tally::AtPeak { peak, found, near } => {
+                if peak.see(t, self.telling) {
+                    (*found, *near) = (v, (if self.counted { (v - previous.1).abs() } else { 0.0 }, None));
+                } else {
+                    near.1.get_or_insert((v - *found).abs());
                 }
             }
-            Tally::TimeOf { sign, best, time } => {
-                if *sign * v < *best {
-                    (*best, *time) = (*sign * v, t);
-                }
+            Tally::TimeOf { peak } => {
+                peak.see(t, v);
             }
             Tally::First { after, time, gap } => {
                 let was = if self.counted { Some(previous.1 != 0.0) } else { None };
@@ -414,7 +459,31 @@ impl Meter {
             | Tally::Final
             | Tally::At { .. }
             | Tally::Crossings { .. }
+            | Tally::AtPeak { .. }
             | Tally::TimeOf { .. }
+            | Tally::Period { .. }
+            | Tally::Settling { .. } => 0.0,
+        }
+    }
+
+    /// How far an extreme between the points may be from the one that was seen, SI: its value, its time, or what another
+    /// quantity is then.
+    fn unseen(&self, corners: &[f64]) -> f64 {
+        match &self.tally {
+            _ if self.located => 0.0,
+            Tally::Extremes { min, max, kind } => match kind {
+                Extreme::Min => min.unseen(corners),
+                Extreme::Max => max.unseen(corners),
+                Extreme::Between => min.unseen(corners) + max.unseen(corners),
+            },
+            Tally::AtPeak { near: (before, after), .. } => before.max(after.unwrap_or(0.0)),
+            Tally::TimeOf { peak } => peak.gap(),
+            Tally::Sum { .. }
+            | Tally::Final
+            | Tally::At { .. }
+            | Tally::Crossings { .. }
+            | Tally::First { .. }
+            | Tally::AtMoment { .. }
             | Tally::Period { .. }
             | Tally::Settling { .. } => 0.0,
         }
@@ -436,11 +505,14 @@ impl Meter {
         let (first, last) = (self.first, self.end);
         let width = last.0 - first.0;
         match &self.tally {
-            Tally::Extremes { min, max, kind } => Ok(match kind {
-                Extreme::Min => (min.1, Some(min.0)),
-                Extreme::Max => (max.1, Some(max.0)),
-                Extreme::Between => (max.1 - min.1, Some(min.0.max(max.0))),
-            }),
+            Tally::Extremes { min, max, kind } => {
+                let (min, max) = (min.found(), max.found());
+                Ok(match kind {
+                    Extreme::Min => (min.1, Some(min.0)),
+                    Extreme::Max => (max.1, Some(max.0)),
+                    Extreme::Between => (max.1 - min.1, Some(min.0.max(max.0))),
+                })
+            }
             Tally::Sum { kind, sum, even, .. } => {
                 let total = sum.total() + even.correction();
                 let value = match kind {
@@ -475,7 +547,8 @@ impl Meter {
                 let (time, value) = found.ok_or("its event does not happen in the window")?;
                 Ok((value, Some(time)))
             }
-            Tally::TimeOf { time, .. } => Ok((*time, Some(*time))),
+            Tally::AtPeak { peak, found, .. } => Ok((*found, Some(peak.found().0))),
+            Tally::TimeOf { peak } => Ok((peak.found().0, Some(peak.found().0))),
             Tally::First { time, .. } => Ok((*time, time.is_finite().then_some(*time))),
             Tally::Period { kept } => Ok((period(kept.whole()?)?, None)),
             Tally::Settling { band, kept } => {

@@ -62,7 +62,8 @@ impl Observer {
         for expect in expects.iter_mut().filter(|expect| expect.before >= experiment.duration) {
             expect.before = f64::INFINITY;
         }
-        let expectations = Expectations::new(&expects);
+        let mut expectations = Expectations::new(&expects);
+        expectations.jumps_at(&experiment.corners);
         let recorder = Recorder::new(&experiment.plots);
         let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
         slots.sort();

@@ -11,6 +11,9 @@ use abi::unit::Unit;
 /// power is nowhere negative is not in doubt because it is -1e-25 W at rest.
 const ROUNDING: f64 = 1e-11;
 
+/// A quantity that never exceeds this in SI consists of rounding errors.
+const NOTHING: f64 = 1e-15;
+
 /// What became of one expectation.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Verdict {
@@ -50,6 +53,8 @@ pub struct Reading {
     pub time: Option<f64>,
     /// How far it may be off because only the points of the run were looked at, SI: half of what a denser set could change.
     pub resolution: f64,
+    /// Of extremes seen at the points of fixed steps: how far the one between them may be from it, SI.
+    pub unseen: f64,
     /// The greatest magnitude that the measured quantity reached, SI.
     pub scale: f64,
     /// Estimated distance to the exact solution of the model, SI; infinite where it could not be estimated, none where nobody
@@ -90,9 +95,14 @@ pub fn verdict(expect: &Expect, readings: Vec<Reading>) -> Verdict {
 /// The verdict on the first of several runs, with its error.
 pub fn judged(expect: &Expect, runs: &Runs) -> Verdict {
     let mut readings = runs.readings[0].to_vec();
+    let finest = runs.readings[runs.readings.len() - 1];
     for (k, reading) in readings.iter_mut().enumerate() {
         let values: Vec<f64> = runs.readings.iter().map(|readings| readings[k].value).collect();
-        reading.error = (runs.error)(&values).map(|error| error.max(reading.resolution));
+        // Points that several runs have in common are no news of the course between them: that is as wide open as in the
+        // finest of the runs.
+        let beyond = finest[k].unseen + distance(reading.value, finest[k].value);
+        let rounding = if reading.scale <= NOTHING { reading.value.abs() } else { 0.0 };
+        reading.error = (runs.error)(&values).map(|error| error.max(reading.resolution).max(beyond).max(rounding));
     }
     if let Formula::Shown(unit, value) = &expect.condition {
         return shown(expect, runs, readings, unit, value);
@@ -132,8 +142,16 @@ fn shown(expect: &Expect, runs: &Runs, readings: Vec<Reading>, unit: &Unit, form
         _ => None,
     };
     let text = expect.text.clone();
-    let shown =
-        Reading { text: text.clone(), value, unit: unit.clone(), time, resolution: 0.0, scale: value.abs(), error };
+    let shown = Reading {
+        text: text.clone(),
+        value,
+        unit: unit.clone(),
+        time,
+        resolution: 0.0,
+        unseen: 0.0,
+        scale: value.abs(),
+        error,
+    };
     Verdict { text, holds: true, decided: true, readings, margin: None, problem: None, shown: Some(shown) }
 }
 
@@ -257,18 +275,26 @@ impl Evaluation<'_> {
         let of = |part: fn(&(f64, f64)) -> f64| (self.runs.error)(&all.iter().map(part).collect::<Vec<f64>>());
         let error = of(|side| side.0)?.max(of(|side| side.1)?);
         // What a denser look could change in each measure, through the formula.
-        let own = self.runs.readings[0];
-        let (mut moved, mut coarse) = (own.to_vec(), 0.0);
-        for k in 0..own.len() {
-            if own[k].resolution > 0.0 {
-                moved[k].value = own[k].value + own[k].resolution;
-                let (there, here) = (sides(formula, &moved), sides(formula, own));
-                coarse += (there.0 - here.0).abs().max((there.1 - here.1).abs());
-                moved[k].value = own[k].value;
-            }
-        }
-        Some(error.max(coarse))
+        let readings = self.runs.readings;
+        let coarse = opened(formula, readings[0], |reading| reading.resolution);
+        let finest = readings[readings.len() - 1];
+        let ((own, own_width), (fine, fine_width)) = (all[0], all[all.len() - 1]);
+        let moved = distance(own, fine).max(distance(own_width, fine_width));
+        let unseen = moved + opened(formula, finest, |reading| reading.unseen);
+        Some(error.max(coarse).max(unseen))
     }
+}
+
+/// How far a formula moves where each reading is larger by what `by` says, added up.
+fn opened(formula: &Formula, readings: &[Reading], by: fn(&Reading) -> f64) -> f64 {
+    let (mut moved, mut sum) = (readings.to_vec(), 0.0);
+    for (k, reading) in readings.iter().enumerate().filter(|(_, reading)| by(reading) > 0.0) {
+        moved[k].value = reading.value + by(reading);
+        let (there, here) = (sides(formula, &moved), sides(formula, readings));
+        sum += (there.0 - here.0).abs().max((there.1 - here.1).abs());
+        moved[k].value = reading.value;
+    }
+    sum
 }
 
 /// Of a comparison, how far its sides are apart, and the width that this may have; of a number it itself.
@@ -397,7 +423,7 @@ mod tests {
     fn readings(max: f64, min: f64) -> Vec<Reading> {
         let reading = |text: &str, value, time| {
             let (text, unit) = (text.into(), Unit::parse("m").unwrap());
-            Reading { text, value, unit, time: Some(time), resolution: 0.0, scale: 2.0, error: None }
+            Reading { text, value, unit, time: Some(time), resolution: 0.0, unseen: 0.0, scale: 2.0, error: None }
         };
         vec![reading("max(x)", max, 1.0), reading("min(x)", min, 3.0)]
     }

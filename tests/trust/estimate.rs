@@ -2,10 +2,11 @@
 //!
 //! Every experiment of the library and its tests is run by each method, at several tolerances or steps; the truth is an adaptive
 //! run at tol 1e-13. A measure counts as covered if its distance to the truth is at most three times its estimate and what is
-//! not known of the truth: twice its distance to a run at tol 1e-12, and rounding. The tests take a part of the space, chosen
-//! by a seed that is printed; `cargo test --test trust -- --ignored --nocapture survey` takes all and prints the table of
-//! docs/numerics.md.
+//! not known of the truth: twice its distance to a run at tol 1e-12, and rounding. `cargo test` takes a sample of the space,
+//! chosen by a seed that is printed (`FRIC_SEED=7` takes another one); `cargo test --test trust -- --ignored --nocapture survey`
+//! takes all and prints the table of docs/numerics.md, `EVERY=6` every sixth experiment.
 
+use crate::chance::{Chance, seeds};
 use crate::support::{Texts, root, texts_below};
 use abi::plan::{Experiment, Method, Solver};
 use compiler::{Case, Changes, Loaded, Options};
@@ -22,14 +23,44 @@ const SHARE: f64 = 0.99;
 /// Tolerances of adaptive runs, and steps in s of fixed ones.
 const TOLERANCES: [f64; 4] = [1e-4, 1e-6, 1e-8, 1e-10];
 const STEPS: [f64; 2] = [1e-3, 1e-4];
-/// Most fixed steps of a run of the survey.
+/// Most fixed steps of a run of the survey, and of a run of the sample.
 const MOST_STEPS: f64 = 4e5;
+const FEW_STEPS: f64 = 3e4;
+
+/// A sample has so many measures at least, by so many solvers of each experiment drawn.
+const SAMPLE: u64 = 300;
+const SOLVERS: usize = 4;
+/// Part of a sample that must be covered: the share of the whole, less three deviations of a sample of this size.
+const SHARE_OF_SAMPLE: f64 = 0.972;
+/// Part of a sample whose error is at most the estimate itself. Fewer: estimates are too small altogether.
+const WITHIN_ONE: f64 = 0.80;
+
+/// How an experiment is run: its method, and its tolerance or its step in s.
+type Setting = (Method, f64);
+
+fn settings() -> Vec<Setting> {
+    let adaptive = TOLERANCES.map(|tol| (Method::Adaptive, tol));
+    let fixed = Method::ALL.into_iter().filter(|method| *method != Method::Adaptive);
+    adaptive.into_iter().chain(fixed.flat_map(|method| STEPS.map(|step| (method, step)))).collect()
+}
+
+fn shown_setting((method, number): Setting) -> String {
+    match method {
+        Method::Adaptive => format!("adaptive tol {number:e}"),
+        method => format!("{} step {number:e} s", method.name()),
+    }
+}
 
 /// Measures of one method at one tolerance or step.
 #[derive(Default, Clone)]
 struct Count {
     measures: u64,
     covered: u64,
+    /// Of these, within the estimate itself.
+    within: u64,
+    /// What of these two counts would be left if all estimates were half as large, or a tenth.
+    halved: u64,
+    tenth: u64,
     /// Number of measures without an estimate, since a companion run failed.
     unknown: u64,
     /// Estimates of more than ten times the true error, of those whose error is more than rounding.
@@ -69,45 +100,111 @@ fn readings(outcome: &Outcome) -> Vec<&Reading> {
     outcome.verdicts.iter().flat_map(|verdict| &verdict.readings).collect()
 }
 
-/// Judges the estimates of one experiment; `tell` gets every measure that is not covered.
-fn survey(subject: &Subject, table: &mut BTreeMap<String, Count>, tell: &mut dyn FnMut(String)) {
-    let text = std::fs::read_to_string(&subject.path).unwrap();
-    let mut loaded = compiler::load(&subject.path.display().to_string(), &text, &Texts::default());
-    let adaptive = Changes { method: Some(Method::Adaptive), tol: Some(1e-6), ..Changes::default() };
-    let Some(cases) = compiled(&mut loaded, &subject.name, adaptive) else { return };
-    if cases.iter().any(|case| case.experiment.bench.is_some()) {
-        return; // A dry run has no exact solution: its rig is stepped.
-    }
-    // Of a sweep the first and the last.
-    let chosen: Vec<usize> = [0, cases.len() - 1].into_iter().take(cases.len()).collect();
-    let truths: Vec<Option<Vec<(f64, f64)>>> = chosen.iter().map(|k| truth(&cases[*k])).collect();
-    for (k, truth) in chosen.iter().zip(&truths) {
-        let Some(truth) = truth else { continue };
-        for tol in TOLERANCES {
-            let solver = Solver { tol, ..cases[*k].experiment.solver };
-            judge(subject, &cases[*k], solver, truth, &format!("adaptive tol {tol:e}"), table, tell);
+/// What is judged, and how.
+struct Survey<'a> {
+    table: BTreeMap<String, Count>,
+    /// Gets every measure that is not covered.
+    tell: &'a mut dyn FnMut(String),
+    /// Most fixed steps of a run.
+    steps: f64,
+}
+
+impl Survey<'_> {
+    /// Judges the estimates of one experiment by these solvers; number of measures judged.
+    fn take(&mut self, subject: &Subject, settings: &[Setting]) {
+        let text = std::fs::read_to_string(&subject.path).unwrap();
+        let mut loaded = compiler::load(&subject.path.display().to_string(), &text, &Texts::default());
+        let adaptive = Changes { method: Some(Method::Adaptive), tol: Some(1e-6), ..Changes::default() };
+        let Some(cases) = compiled(&mut loaded, &subject.name, adaptive) else { return };
+        if cases.iter().any(|case| case.experiment.bench.is_some()) {
+            return; // A dry run has no exact solution: its rig is stepped.
         }
-    }
-    for method in Method::ALL.into_iter().filter(|method| *method != Method::Adaptive) {
-        for step in STEPS {
-            let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
-            let Some(cases) = compiled(&mut loaded, &subject.name, changes) else { continue };
-            for (k, truth) in chosen.iter().zip(&truths) {
-                let (Some(truth), case) = (truth, &cases[*k]) else { continue };
-                if case.experiment.duration / step > MOST_STEPS {
-                    continue;
+        // Of a sweep the first and the last.
+        let chosen: Vec<usize> = [0, cases.len() - 1].into_iter().take(cases.len()).collect();
+        let truths: Vec<Option<Vec<(f64, f64)>>> = chosen.iter().map(|k| truth(&cases[*k])).collect();
+        for setting in settings {
+            let fixed = match *setting {
+                (Method::Adaptive, _) => None,
+                (method, step) => {
+                    let changes = Changes { method: Some(method), step: Some(step), ..Changes::default() };
+                    let Some(cases) = compiled(&mut loaded, &subject.name, changes) else { continue };
+                    Some(cases)
                 }
-                let label = format!("{} step {step:e} s", method.name());
-                judge(subject, case, case.experiment.solver, truth, &label, table, tell);
+            };
+            for (k, truth) in chosen.iter().zip(&truths) {
+                let (Some(truth), case) = (truth, &fixed.as_ref().unwrap_or(&cases)[*k]) else { continue };
+                let solver = match *setting {
+                    (Method::Adaptive, tol) => Solver { tol, ..case.experiment.solver },
+                    (_, step) if case.experiment.duration / step > self.steps => continue,
+                    (_, _) => case.experiment.solver,
+                };
+                self.judge(subject, case, solver, truth, &shown_setting(*setting));
             }
         }
     }
+
+    fn judge(&mut self, subject: &Subject, case: &Case, solver: Solver, truth: &[(f64, f64)], label: &str) {
+        let Some(mut outcome) = go(case, solver) else { return };
+        let experiment = Experiment { solver, plots: Vec::new(), ..case.experiment.clone() };
+        let before = outcome.clone();
+        estimate::errors(&case.instance, &experiment, &mut outcome, &mut |_| Continue::Continue(()));
+        let found = readings(&outcome);
+        if found.len() != truth.len() {
+            return;
+        }
+        let count = self.table.entry(label.into()).or_default();
+        for ((reading, (true_value, unsure)), own) in found.iter().zip(truth).zip(readings(&before)) {
+            assert_eq!(reading.value.to_bits(), own.value.to_bits(), "an estimate changed {}", reading.text);
+            let estimate = reading.error.expect("it was asked for");
+            if estimate == f64::INFINITY && reading.value.is_finite() && true_value.is_finite() {
+                count.unknown += 1;
+                continue;
+            }
+            let error = if reading.value == *true_value { 0.0 } else { (reading.value - true_value).abs() };
+            count.measures += 1;
+            // Rounding, of the quantity and of what is as good as nothing in any unit of the library.
+            let unsure = &(unsure + 1e-11 * reading.scale + 1e-18);
+            let covered = error <= TIMES * estimate + unsure;
+            count.covered += u64::from(covered);
+            count.within += u64::from(error <= estimate + unsure);
+            count.halved += u64::from(error <= 0.5 * estimate + unsure);
+            count.tenth += u64::from(error <= 0.1 * TIMES * estimate + unsure);
+            if error > *unsure {
+                count.tallied += 1;
+                count.generous += u64::from(estimate > 10.0 * error);
+            }
+            if !covered {
+                let Subject { path, name } = subject;
+                let file = path.strip_prefix(root()).unwrap_or(path).display();
+                let case = if case.label.is_empty() { String::new() } else { format!(" ({})", case.label) };
+                let (text, value) = (&reading.text, reading.value);
+                (self.tell)(format!(
+                    "{label}: {file} {name}{case}: {text} = {value:?}, true {true_value:?}: off by {error:.2e}, estimated {estimate:.2e}, the truth is known to {unsure:.1e}"
+                ));
+            }
+        }
+    }
+
+    fn total(&self) -> Count {
+        self.table.values().fold(Count::default(), |mut all, count| {
+            all.measures += count.measures;
+            all.covered += count.covered;
+            all.within += count.within;
+            all.halved += count.halved;
+            all.tenth += count.tenth;
+            all.unknown += count.unknown;
+            all.generous += count.generous;
+            all.tallied += count.tallied;
+            all
+        })
+    }
 }
 
-/// Each measure of the exact solution, and how far it may be off.
+/// Each measure of the exact solution, and how far it may be off. The two runs have other longest steps, for where these decide
+/// all steps, two runs agree whatever their tolerance.
 fn truth(case: &Case) -> Option<Vec<(f64, f64)>> {
-    let at = |tol| go(case, Solver { tol, parts: 200.0, ..case.experiment.solver });
-    let (best, second) = (at(1e-13)?, at(1e-12)?);
+    let at = |tol, parts| go(case, Solver { tol, parts, ..case.experiment.solver });
+    let (best, second) = (at(1e-13, 200.0)?, at(1e-12, 137.0)?);
     let (best, second) = (readings(&best), readings(&second));
     if best.len() != second.len() {
         return None;
@@ -119,94 +216,64 @@ fn truth(case: &Case) -> Option<Vec<(f64, f64)>> {
     Some(best.iter().zip(&second).map(one).collect())
 }
 
-fn judge(
-    subject: &Subject,
-    case: &Case,
-    solver: Solver,
-    truth: &[(f64, f64)],
-    label: &str,
-    table: &mut BTreeMap<String, Count>,
-    tell: &mut dyn FnMut(String),
-) {
-    let Some(mut outcome) = go(case, solver) else { return };
-    let experiment = Experiment { solver, plots: Vec::new(), ..case.experiment.clone() };
-    let before = outcome.clone();
-    estimate::judge(&case.instance, &experiment, &mut outcome, &mut |_| Continue::Continue(()));
-    let found = readings(&outcome);
-    if found.len() != truth.len() {
-        return;
-    }
-    let count = table.entry(label.into()).or_default();
-    for ((reading, (true_value, unsure)), own) in found.iter().zip(truth).zip(readings(&before)) {
-        assert_eq!(reading.value.to_bits(), own.value.to_bits(), "an estimate changed {}", reading.text);
-        let estimate = reading.error.expect("it was asked for");
-        if estimate == f64::INFINITY && reading.value.is_finite() && true_value.is_finite() {
-            count.unknown += 1;
-            continue;
-        }
-        let error = if reading.value == *true_value { 0.0 } else { (reading.value - true_value).abs() };
-        count.measures += 1;
-        // Rounding, of the quantity and of what is as good as nothing in any unit of the library.
-        let unsure = &(unsure + 1e-11 * reading.scale + 1e-18);
-        let covered = error <= TIMES * estimate + unsure;
-        count.covered += u64::from(covered);
-        if error > *unsure {
-            count.tallied += 1;
-            count.generous += u64::from(estimate > 10.0 * error);
-        }
-        if !covered {
-            let Subject { path, name } = subject;
-            let file = path.strip_prefix(root()).unwrap_or(path).display();
-            let case = if case.label.is_empty() { String::new() } else { format!(" ({})", case.label) };
-            let (text, value) = (&reading.text, reading.value);
-            tell(format!(
-                "{label}: {file} {name}{case}: {text} = {value:?}, true {true_value:?}: off by {error:.2e}, estimated {estimate:.2e}, the truth is known to {unsure:.1e}"
-            ));
-        }
-    }
+fn part(part: u64, whole: u64) -> f64 {
+    part as f64 / whole.max(1) as f64
 }
 
-fn shown(table: &BTreeMap<String, Count>) -> String {
+fn shown(survey: &Survey) -> String {
     let mut out = String::from(
-        "| run | measures | within 3 × the estimate | not known | estimate > 10 × the error |\n|---|---|---|---|---|\n",
+        "| run | measures | within 3 × the estimate | within the estimate | not known | estimate > 10 × the error |\n|---|---|---|---|---|---|\n",
     );
-    let mut all = Count::default();
-    let row = |label: &str, count: &Count| {
-        let percent = |part: u64, whole: u64| 100.0 * part as f64 / whole.max(1) as f64;
-        format!(
-            "| {label} | {} | {:.2} % | {} | {:.0} % |\n",
-            count.measures,
-            percent(count.covered, count.measures),
-            count.unknown,
-            percent(count.generous, count.tallied)
-        )
-    };
-    for (label, count) in table {
-        out += &row(label, count);
-        all.measures += count.measures;
-        all.covered += count.covered;
-        all.unknown += count.unknown;
-        all.generous += count.generous;
-        all.tallied += count.tallied;
+    for (label, count) in
+        survey.table.iter().map(|(label, count)| (label.as_str(), count.clone())).chain([("all", survey.total())])
+    {
+        let Count { measures, covered, within, unknown, generous, tallied, .. } = count;
+        let percent = |some, whole| 100.0 * part(some, whole);
+        out += &format!(
+            "| {label} | {measures} | {:.2} % | {:.1} % | {unknown} | {:.1} % |\n",
+            percent(covered, measures),
+            percent(within, measures),
+            percent(generous, tallied)
+        );
     }
-    out + &row("all", &all)
-}
-
-fn share(table: &BTreeMap<String, Count>) -> (u64, f64) {
-    let (measures, covered) = table.values().fold((0, 0), |(m, c), count| (m + count.measures, c + count.covered));
-    (measures, covered as f64 / measures.max(1) as f64)
+    out
 }
 
 #[test]
 #[ignore = "takes minutes; prints the table of docs/numerics.md"]
 fn survey_of_the_whole_library() {
-    let mut table = BTreeMap::new();
     let every: usize = std::env::var("EVERY").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
+    let mut tell = |missed| println!("{missed}");
+    let mut survey = Survey { table: BTreeMap::new(), tell: &mut tell, steps: MOST_STEPS };
     for subject in subjects().iter().step_by(every) {
-        survey(subject, &mut table, &mut |missed| println!("{missed}"));
+        survey.take(subject, &settings());
     }
-    println!("{}", shown(&table));
-    let (measures, share) = share(&table);
-    println!("{measures} measures, {:.2} % covered", 100.0 * share);
-    assert!(share >= SHARE);
+    println!("{}", shown(&survey));
+    let Count { measures, covered, .. } = survey.total();
+    println!("{measures} measures, {:.2} % covered", 100.0 * part(covered, measures));
+    assert!(part(covered, measures) >= SHARE);
+}
+
+#[test]
+fn estimates_cover_the_true_error_of_a_sample() {
+    for seed in seeds(1) {
+        let (mut chance, subjects) = (Chance::new(seed), subjects());
+        let mut missed = String::new();
+        let mut tell = |one: String| missed += &format!("{one}\n");
+        let mut survey = Survey { table: BTreeMap::new(), tell: &mut tell, steps: FEW_STEPS };
+        while survey.total().measures < SAMPLE {
+            let mut left = settings();
+            let drawn: Vec<Setting> = (0..SOLVERS).map(|_| left.swap_remove(chance.below(left.len()))).collect();
+            survey.take(&subjects[chance.below(subjects.len())], &drawn);
+        }
+        let Count { measures, covered, within, halved, tenth, unknown, .. } = survey.total();
+        let [covered, within, halved, tenth] = [covered, within, halved, tenth].map(|n| part(n, measures));
+        let counts = format!(
+            "FRIC_SEED={seed}: {measures} measures, {covered:.4} within 3 estimates, {within:.4} within one, {unknown} not known; estimates halved: {halved:.4} within one; a tenth: {tenth:.4} within 3"
+        );
+        println!("{counts}");
+        assert!(covered >= SHARE_OF_SAMPLE && within >= WITHIN_ONE, "{counts}\n{missed}");
+        // Estimates that are too small altogether would be noticed.
+        assert!(halved < WITHIN_ONE && tenth < SHARE_OF_SAMPLE, "{counts}");
+    }
 }

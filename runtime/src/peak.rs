@@ -1,0 +1,196 @@
+//! The greatest of values seen one by one at fixed steps, and by how much the course between them may exceed it.
+//!
+//! In: points in order of time. Out: the greatest, and an estimate of its distance to the maximum of the course: through the
+//! two points on either side a parabola where they show a smooth course, else straight lines from both sides. Runs with half
+//! the step have a point at the same place, so their agreement says nothing about the course between.
+
+/// A point: time in s, value in SI.
+pub(crate) type Point = (f64, f64);
+
+/// The greatest of values, or the least.
+pub(crate) struct Peak {
+    /// 1 for the greatest, −1 for the least.
+    sign: f64,
+    /// The greatest so far; −∞ before the first.
+    at: Point,
+    /// The two points before the greatest, nearer one first; those after it.
+    before: [Option<Point>; 2],
+    after: [Option<Point>; 2],
+    /// The last two points seen, later one first.
+    last: [Option<Point>; 2],
+}
+
+impl Peak {
+    pub(crate) fn greatest() -> Peak {
+        Peak { sign: 1.0, at: (0.0, f64::NEG_INFINITY), before: [None; 2], after: [None; 2], last: [None; 2] }
+    }
+
+    pub(crate) fn least() -> Peak {
+        Peak { sign: -1.0, ..Peak::greatest() }
+    }
+
+    /// One more point; says whether it is the new extreme.
+    pub(crate) fn see(&mut self, t: f64, v: f64) -> bool {
+        let point = (t, self.sign * v);
+        let higher = point.1 > self.at.1;
+        if higher {
+            (self.at, self.before, self.after) = (point, self.last, [None; 2]);
+        } else if self.after[1].is_none() {
+            let free = usize::from(self.after[0].is_some());
+            self.after[free] = Some(point);
+        }
+        self.last = [Some(point), self.last[0]];
+        higher
+    }
+
+    /// The extreme as it was seen: time in s, value in SI.
+    pub(crate) fn found(&self) -> Point {
+        (self.at.0, self.sign * self.at.1)
+    }
+
+    /// By how much the course may exceed the extreme between the points, SI. `corners`: instants in s, ascending, at which the
+    /// course may jump and of which it is known that points lie there.
+    pub(crate) fn unseen(&self, corners: &[f64]) -> f64 {
+        // Two points at one time are the sides of a jump: beyond it lies another course, and so it does at a corner.
+        let one_side = |points: [Option<Point>; 2]| {
+            let near = points[0].filter(|point| point.0 != self.at.0);
+            [near, points[1].filter(|point| near.is_some_and(|near| near.0 != point.0))]
+        };
+        let [b1, b2] = if is_at(corners, self.at.0) { [None; 2] } else { one_side(self.before) };
+        let [a1, a2] = one_side(self.after);
+        let peak = self.at;
+        let unseen = match (b2, b1, a1, a2) {
+            (Some(b2), Some(b1), Some(a1), Some(a2)) if !is_smooth([b2, b1, peak, a1, a2]) => {
+                let right = by_lines([b1, peak, a1, a2]);
+                let turned = |point: Point| (-point.0, point.1);
+                right.max(by_lines([a1, peak, b1, b2].map(turned)))
+            }
+            (_, Some(b1), Some(a1), _) => above([b1, peak, a1], peak, (b1.0, a1.0)),
+            (Some(b2), Some(b1), None, _) => above([b2, b1, peak], peak, (b1.0, peak.0)),
+            (_, None, Some(a1), Some(a2)) => above([peak, a1, a2], peak, (peak.0, a1.0)),
+            _ => 0.0,
+        };
+        if unseen.is_finite() { unseen } else { 0.0 }
+    }
+
+    /// Time in s between the extreme and its neighbours, the longer one.
+    pub(crate) fn gap(&self) -> f64 {
+        let far = |point: Option<Point>| point.map_or(0.0, |point| (point.0 - self.at.0).abs());
+        far(self.before[0]).max(far(self.after[0]))
+    }
+}
+
+/// Whether one of these instants is `t`, up to rounding.
+fn is_at(instants: &[f64], t: f64) -> bool {
+    let slack = 1e-9 * t.abs();
+    instants.get(instants.partition_point(|instant| *instant < t - slack)).is_some_and(|instant| *instant <= t + slack)
+}
+
+fn slope(a: Point, b: Point) -> f64 {
+    (b.1 - a.1) / (b.0 - a.0)
+}
+
+/// Second difference of three points, per s².
+fn bend([a, b, c]: [Point; 3]) -> f64 {
+    2.0 * (slope(b, c) - slope(a, b)) / (c.0 - a.0)
+}
+
+/// Whether the bend about the middle of five points is, to a half, that about its neighbours.
+fn is_smooth([a, b, c, d, e]: [Point; 5]) -> bool {
+    let middle = bend([b, c, d]);
+    let alike = |other: f64| (other - middle).abs() <= 0.5 * middle.abs();
+    alike(bend([a, b, c])) && alike(bend([c, d, e]))
+}
+
+/// How far the parabola through three points rises above `peak` between two times.
+fn above(points: [Point; 3], peak: Point, (from, to): (f64, f64)) -> f64 {
+    let [a, b, _] = points;
+    let bend = bend(points);
+    if bend >= 0.0 {
+        return 0.0;
+    }
+    let vertex = 0.5 * (a.0 + b.0) - slope(a, b) / bend;
+    if vertex <= from || vertex >= to {
+        return 0.0;
+    }
+    let height = a.1 + (vertex - a.0) * (slope(a, b) + 0.5 * bend * (vertex - b.0));
+    (height - peak.1).max(0.0)
+}
+
+/// How far the course may rise above `peak` before the next point `down`, from what it does before and after. Where the lines
+/// through both sides meet, it has a kink at most: a concave course stays below them. Where the line of the right side
+/// lies below the peak, the course jumps; from a peak it may have risen up to there.
+fn by_lines([before, peak, down, after]: [Point; 4]) -> f64 {
+    let h = down.0 - peak.0;
+    let (rise, back) = ((slope(before, peak) * h).max(0.0), -slope(down, after) * h);
+    let drop = peak.1 - down.1;
+    if back >= drop { rise * (back - drop) / (rise + back).max(f64::MIN_POSITIVE) } else { rise.min(drop - back) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What was found and what may be unseen of a course at steps of 1 s, shifted by a part of a step.
+    fn seen(course: impl Fn(f64) -> f64, shift: f64) -> (f64, f64) {
+        let mut peak = Peak::greatest();
+        (-10..=10).for_each(|k| {
+            peak.see(f64::from(k), course(f64::from(k) + shift));
+        });
+        (peak.found().1, peak.unseen(&[]))
+    }
+
+    const SHIFTS: [f64; 9] = [-0.5, -0.4, -0.2, -0.1, 0.0, 0.13, 0.27, 0.4, 0.5];
+
+    #[test]
+    fn a_smooth_peak_is_estimated_closely() {
+        for shift in SHIFTS {
+            for (course, most) in [(&(|t: f64| -t * t) as &dyn Fn(f64) -> f64, 0.0), (&|t: f64| (0.4 * t).cos(), 1.0)] {
+                let (found, unseen) = seen(course, shift);
+                let lacks = most - found;
+                assert!(lacks <= 1.3 * unseen + 1e-12 && unseen <= 1.3 * lacks + 1e-12, "{shift}: {lacks} {unseen}");
+            }
+        }
+    }
+
+    #[test]
+    fn kinks_and_jumps_are_bounded() {
+        let roof = |t: f64| if t < 0.0 { 2.0 * t } else { -3.0 * t };
+        let ramp = |t: f64| if t <= 0.0 { 2.0 * t } else { -30.0 };
+        let fall = |t: f64| if t < 0.0 { -30.0 } else { -0.7 * t };
+        for shift in SHIFTS {
+            for (name, course) in [("roof", &roof as &dyn Fn(f64) -> f64), ("ramp", &ramp), ("fall", &fall)] {
+                let (found, unseen) = seen(course, shift);
+                assert!(-found <= unseen + 1e-12 && unseen <= 3.0, "{name} {shift}: {found} {unseen}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_jump_at_a_known_instant_hides_nothing_before_it() {
+        let mut peak = Peak::greatest();
+        for (t, v) in [(1.0, 0.0), (2.0, 0.0), (3.0, 5.0), (4.0, 4.0), (5.0, 3.1)] {
+            peak.see(t, v);
+        }
+        assert_eq!((peak.unseen(&[]), peak.unseen(&[2.0, 4.0]), peak.unseen(&[2.0, 3.0, 4.0])), (1.0, 1.0, 0.0));
+    }
+
+    #[test]
+    fn nothing_is_unseen_where_a_value_is_held() {
+        let held = |t: f64| (0.5 * (t / 4.0).floor()).sin();
+        let level = |t: f64| t.clamp(-3.0, 3.0);
+        assert_eq!([seen(held, 0.5).1, seen(level, 0.0).1, seen(|_| 7.0, 0.0).1], [0.0; 3]);
+    }
+
+    #[test]
+    fn at_the_ends_the_parabola_of_three_points_decides() {
+        // The vertex lies at 9.7, inside of the last step; at 10.2, outside of it.
+        let (found, unseen) = seen(|t| -(t - 9.7) * (t - 9.7), 0.0);
+        assert!((unseen + found).abs() < 1e-9 && unseen > 0.0, "{found} {unseen}");
+        assert_eq!(seen(|t| -(t - 10.2) * (t - 10.2), 0.0).1, 0.0);
+        assert_eq!((seen(|t| t, 0.0).1, seen(|t| -t, 0.0).1), (0.0, 0.0));
+        let mut one = Peak::least();
+        one.see(0.0, 5.0);
+        assert_eq!((one.found(), one.unseen(&[]), one.gap()), ((0.0, 5.0), 0.0, 0.0));
+    }
+}
