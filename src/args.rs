@@ -273,6 +273,9 @@ pub struct Sweep {
     /// What of the experiment is changed
     #[command(flatten)]
     pub changed: Changed,
+    /// Leave out the companion runs that estimate the numerical errors of ten of the runs
+    #[arg(long)]
+    pub no_error: bool,
     /// Print nothing but errors
     #[arg(long, short)]
     pub quiet: bool,

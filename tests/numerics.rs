@@ -415,6 +415,78 @@ fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
     }
 }
 
+/// Coarse steps of a decay, so that errors are large: x(1 s) = e^(−1 s / T).
+const COARSE: &str = r#"
+model Decay {
+  param T = 1 s
+  state x [mm] = 1000 mm
+  dx/dt = -x / T
+}
+experiment coarse {
+  run    Decay() for 1 s
+  solver euler step 20 ms
+  expect final(x) > 367 mm
+  expect max(x) <= 1 m
+}
+"#;
+
+#[test]
+fn a_sweep_says_how_far_a_sample_of_its_runs_may_be_off() {
+    let folder = Folder::new("sweep-errors");
+    fs::write(folder.0.join("coarse.fric"), COARSE).unwrap();
+    let read = |name: &str| fs::read_to_string(folder.0.join(name)).unwrap();
+    let sweep = |vary: &str, more: &[&str]| {
+        let all = [&["sweep", "coarse.fric", "coarse", "--vary", vary], more].concat();
+        folder.run(&all, 0).0
+    };
+    let errors_in = |out: &str| -> String {
+        let at = out.find("  errors").unwrap_or_else(|| panic!("no errors in {out}"));
+        out[at..].lines().take_while(|line| !line.contains("wrote")).map(|line| format!("{line}\n")).collect()
+    };
+    let grid = "T = 0.5 s .. 2 s by 0.05 s";
+    let one = errors_in(&sweep(grid, &["--threads", "1", "--out", "one.csv"]));
+    let three = errors_in(&sweep(grid, &["--threads", "3", "--out", "three.csv"]));
+    assert_eq!(one, three);
+    assert!(one.starts_with("  errors of 10 of 31 runs, discretisation by steps of 10 ms and 5 ms\n"), "{one}");
+    // The table itself is the same without, and nothing is said then.
+    let without = sweep(grid, &["--no-error", "--out", "without.csv"]);
+    assert!(!without.contains("error") && read("one.csv") == read("without.csv"), "{without}");
+    // The largest error of the sample, in its unit, is that of its run, and covers the true one.
+    let line = one.lines().find(|line| line.contains("final(x)")).unwrap();
+    let words: Vec<&str> = line.split_whitespace().collect();
+    assert_eq!((words[..3].join(" ").as_str(), words[4]), ("final(x) at most", "mm"), "{line}");
+    let (said, run): (f64, usize) = (words[3].parse().unwrap(), words[6].trim_end_matches(')').parse().unwrap());
+    let rows: Vec<Vec<String>> =
+        read("one.csv").lines().skip(1).map(|row| row.split(',').map(str::to_string).collect()).collect();
+    let errors: Vec<f64> = (0..10)
+        .map(|k| {
+            let row = &rows[30 * k / 9];
+            let (lag, found): (f64, f64) = (row[1].parse().unwrap(), row[2].parse().unwrap());
+            (found - 1e3 * (-1.0 / lag).exp()).abs()
+        })
+        .collect();
+    let greatest = errors.iter().copied().fold(0.0, f64::max);
+    let at_run = (0..10).find(|k| 30 * k / 9 == run).expect("it is a run of the sample");
+    assert_eq!(errors[at_run], greatest, "{errors:?} and {run}");
+    assert!(greatest <= 3.0 * said && said <= 3.0 * greatest, "{greatest} mm is said to be at most {said} mm");
+    // Verdicts that these errors leave open are counted: e^-1 is 367.9 mm, the steps of 20 ms give 364 mm.
+    let open = errors_in(&sweep("T = 1 s, 2 s, 3 s", &["--out", "open.csv"]));
+    assert!(
+        open.contains("errors of 3 of 3 runs") && open.contains("1 of 6 verdicts undecided, first final(x) > "),
+        "{open}"
+    );
+    // Shards estimate those of the sample that are theirs.
+    let parts: Vec<String> =
+        (1..=4).map(|k| errors_in(&sweep(grid, &["--shard", &format!("{k}/4"), "--out", "shard.csv"]))).collect();
+    let sampled = |part: &String| part.split_whitespace().nth(2).unwrap().parse::<u64>().unwrap();
+    assert_eq!(parts.iter().map(sampled).sum::<u64>(), 10, "{parts:?}");
+    // A run that is not made has no error, and is said.
+    let text = COARSE.replace("param T = 1 s", "param T = 1 s in 0.1 s .. 1.5 s");
+    fs::write(folder.0.join("coarse.fric"), text).unwrap();
+    let out = errors_in(&sweep("T = 1 s, 2 s", &["--out", "lost.csv"]));
+    assert!(out.contains("errors of 1 of 2 runs") && out.contains("; 1 more did not come to its end"), "{out}");
+}
+
 #[test]
 fn each_run_is_checked_and_measured_with_its_own_values() {
     let folder = Folder::new("checked");

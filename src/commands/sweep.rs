@@ -3,6 +3,9 @@
 //! Rows are appended in the order of the runs as they are done, so a file that was interrupted is the beginning of the
 //! whole one, and shards written one behind the other are the whole. Until it is complete, [`Unfinished`] keeps others from
 //! writing it and knows what was asked for: nobody goes on with another sweep, or with rows that are not as they were.
+//! Once it is complete, [`errors`] estimates the numerical errors of a sample of its runs.
+
+mod errors;
 
 use super::{End, has_experiment, load, reported};
 use crate::args::Sweep;
@@ -20,6 +23,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
 use runtime::lanes::{self, Next};
 use runtime::sweep::{self, Desk, Ticket};
+use runtime::verdict::Verdict;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::ops::Range;
@@ -293,13 +297,7 @@ impl Table {
             Err(failure) => format!("stopped: {failure}"),
             Ok(outcome) => {
                 let (own, watched) = outcome.verdicts.split_at(case.expects());
-                let extremes: Vec<(f64, f64)> = watched
-                    .iter()
-                    .map(|verdict| {
-                        let value = |k: usize| verdict.readings.get(k).map_or(f64::NAN, |reading| reading.value);
-                        (value(0), value(1))
-                    })
-                    .collect();
+                let extremes: Vec<(f64, f64)> = watched.iter().map(extremes).collect();
                 for verdict in own {
                     let read = |r: &runtime::verdict::Reading| (r.text.clone(), r.unit.from_si(r.value));
                     readings.push(verdict.readings.iter().map(read).collect());
@@ -407,7 +405,9 @@ impl Table {
         let threads = args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from));
         let from = range.start + mark.rows;
         let into = Writing { file: &mut file, unfinished: &mut unfinished, mark };
-        let written = self.append(args, into, from..range.end, threads, &dice).map_err(|error| told("write", error))?;
+        let stopped = stopped_by_ctrl_c();
+        let written =
+            self.append(args, into, from..range.end, threads, &dice, &stopped).map_err(|error| told("write", error))?;
         let reached = from + written;
         let wall = begin.elapsed().as_secs_f64();
         if reached < range.end {
@@ -448,6 +448,17 @@ impl Table {
                 terminal.line(&format!("  note: {note}"));
             }
             terminal.print(&summary.words());
+            if !args.no_error {
+                match self.errors(&range, threads, &dice, &stopped) {
+                    Some(errors) => terminal.print(&errors.words()),
+                    None if stopped.load(Ordering::Relaxed) => {
+                        terminal
+                            .report("stopped before the errors of a sample were estimated; the table is complete\n");
+                        return Ok(End::Failed);
+                    }
+                    None => {}
+                }
+            }
             let files = args.plot.iter().map(|path| format!(", {}", path.display())).collect::<String>();
             terminal.line(&format!("  wrote {}{files}", out.display()));
         }
@@ -481,16 +492,16 @@ impl Table {
     }
 
     /// Appends rows; returns how many.
-    fn append(&self, args: &Sweep, into: Writing, range: Range<u64>, threads: usize, dice: &Dice) -> io::Result<u64> {
+    fn append(
+        &self,
+        args: &Sweep,
+        into: Writing,
+        range: Range<u64>,
+        threads: usize,
+        dice: &Dice,
+        stopped: &AtomicBool,
+    ) -> io::Result<u64> {
         let Writing { file, unfinished, mut mark } = into;
-        let stopped = Arc::new(AtomicBool::new(false));
-        let flag = stopped.clone();
-        // A second Ctrl-C ends the process at once; what is written is whole rows but for the last, which --resume drops.
-        let _ = ctrlc::set_handler(move || {
-            if flag.swap(true, Ordering::Relaxed) {
-                std::process::exit(130);
-            }
-        });
         let target = if args.quiet { ProgressDrawTarget::hidden() } else { ProgressDrawTarget::stderr() };
         let bar = ProgressBar::with_draw_target(Some(range.end - range.start), target);
         let template = "  {bar:40} {human_pos} of {human_len}  {per_sec}  {eta} left";
@@ -501,7 +512,7 @@ impl Table {
         let (mut written, mut failed) = (0, None);
         let mut flushed = Instant::now();
         let each = (range.end - range.start) / threads.max(1) as u64;
-        let worker = |desk: &Desk<Vec<u8>>| self.work(desk, dice, &stopped, each);
+        let worker = |desk: &Desk<Vec<u8>>| self.work(desk, dice, stopped, each);
         sweep::ordered(range, threads, &worker, &mut |_, row: Vec<u8>| {
             let mut put = || {
                 writer.write_all(&row)?;
@@ -631,6 +642,25 @@ impl Table {
             panels: shown.into_iter().map(panel).collect(),
         })
     }
+}
+
+/// A flag that Ctrl-C sets. A second Ctrl-C ends the process at once: the table then holds whole rows but for the last, which
+/// --resume drops.
+fn stopped_by_ctrl_c() -> Arc<AtomicBool> {
+    let stopped = Arc::new(AtomicBool::new(false));
+    let flag = stopped.clone();
+    let _ = ctrlc::set_handler(move || {
+        if flag.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    });
+    stopped
+}
+
+/// Least and greatest value of a range that is watched.
+fn extremes(watched: &Verdict) -> (f64, f64) {
+    let value = |k: usize| watched.readings.get(k).map_or(f64::NAN, |reading| reading.value);
+    (value(0), value(1))
 }
 
 fn columns(cases: &[Varying], vary: &[Vary]) -> Vec<Column> {
