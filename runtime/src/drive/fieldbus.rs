@@ -9,7 +9,7 @@ use super::device::Device;
 use super::master::{Drive, Limits, Setting, Status};
 use super::profiles::{self, Transport};
 use super::script::Watching;
-use super::sign::{Bounds, Push, Sample, SignTest, Verdict};
+use super::sign::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
 use super::state::{Goal, State};
 use super::trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 use crate::can::Frame;
@@ -813,6 +813,10 @@ impl Fieldbus {
                     send(bus, Nmt::Start.frame(drive.node()));
                 }
             }
+        let turning = |drive: &Drive| match drive.config().mode {
+            Mode::Position => 1.5 * BY_HAND,
+            Mode::Torque | Mode::Speed => bounds(drive).command,
+        };
             self.go(Step::Reenable);
         }
     }
@@ -843,12 +847,14 @@ impl Fieldbus {
             if turned {
                 bounds.angle = BY_HAND.max(bounds.angle);
             }
-            self.push = Some((at, Push::new(bounds, turned), holder));
+            let patience = match holder.and_then(|holder| drive_of(&self.nodes[holder])) {
+                // At the speed that it is told, three times as long as it takes.
+                Some(holder) if holder.config().mode == Mode::Speed => PATIENCE + 3.0 * bounds.angle / turning(holder),
+                Some(_) => 2.0 * PATIENCE,
+                None => PATIENCE_BY_HAND,
+            };
+            self.push = Some((at, Push::new(bounds, turned.then_some(patience)), holder));
         }
-        let turning = |drive: &Drive| match drive.config().mode {
-            Mode::Position => 1.5 * BY_HAND,
-            Mode::Torque | Mode::Speed => bounds(drive).command,
-        };
         let Some((at, push, holder)) = &mut self.push else { return };
         let (at, holder) = (*at, *holder);
         let drive = drive_of(&self.nodes[at]).expect("found as one");

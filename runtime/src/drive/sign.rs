@@ -59,9 +59,9 @@ const CALM: f64 = 0.1;
 /// Time in which the greatest command is reached, s.
 const RISE: f64 = 0.5;
 /// Time a shaft is given to turn, s.
-const PATIENCE: f64 = 1.5;
+pub const PATIENCE: f64 = 1.5;
 /// Time somebody is given to turn it by hand, s.
-const PATIENCE_BY_HAND: f64 = 60.0;
+pub const PATIENCE_BY_HAND: f64 = 60.0;
 /// Time for the last motion to end, s.
 const SETTLE: f64 = 0.2;
 /// Time constant with which it is damped, s.
@@ -71,7 +71,8 @@ const DAMPING: f64 = 0.03;
 #[derive(Clone, Debug)]
 pub struct Push {
     bounds: Bounds,
-    by_hand: bool,
+    /// Something else turns the shaft, within so many s.
+    turned: Option<f64>,
     phase: Phase,
     /// Time in this phase, s.
     t: f64,
@@ -100,12 +101,13 @@ pub enum Verdict {
 }
 
 impl Push {
-    /// A test that has not begun.
-    pub fn new(bounds: Bounds, by_hand: bool) -> Push {
+    /// A test that has not begun. `turned`: the time in which somebody, or another drive, turns the shaft, s; without one the
+    /// drive pushes it.
+    pub fn new(bounds: Bounds, turned: Option<f64>) -> Push {
         Push {
             bounds,
-            by_hand,
-            phase: if by_hand { Phase::Push } else { Phase::Calm },
+            turned,
+            phase: if turned.is_some() { Phase::Push } else { Phase::Calm },
             t: 0.0,
             start: None,
             drift: 0.0,
@@ -140,19 +142,24 @@ impl Push {
         }
         self.t += dt;
         let bounds = self.bounds;
-        if !self.by_hand && (turned.abs() > bounds.angle_most || speed.abs() > bounds.speed_most) {
+        if self.turned.is_none() && (turned.abs() > bounds.angle_most || speed.abs() > bounds.speed_most) {
             return Verdict::Wrong(Why::Ran(turned, speed));
         }
-        let patience = if self.by_hand { PATIENCE_BY_HAND } else { PATIENCE };
+        let patience = self.turned.unwrap_or(PATIENCE);
         let slope = bounds.command / RISE;
         match self.phase {
             Phase::Push if turned.abs() >= bounds.angle => {
-                if turned < 0.0 && !self.by_hand {
+                if turned < 0.0 && self.turned.is_none() {
                     return Verdict::Wrong(Why::WrongSign);
                 }
                 (self.phase, self.rise, self.t) = (Phase::Back, self.t, 0.0);
             }
-            Phase::Push if self.t > patience => return Verdict::Wrong(Why::Stuck(bounds.command)),
+            Phase::Push if self.t > patience => {
+                return Verdict::Wrong(match self.turned {
+                    None => Why::Stuck(bounds.command),
+                    Some(_) => Why::NotTurned(bounds.angle),
+                });
+            }
             Phase::Push => {}
             // The motion has ended or turned round: friction has done part of it.
             Phase::Back if self.t >= self.rise || turned < self.last => {
@@ -168,7 +175,7 @@ impl Push {
         self.last = turned;
         self.command = match (self.phase, bounds.mode) {
             (Phase::Calm, _) => 0.0,
-            _ if self.by_hand => 0.0,
+            _ if self.turned.is_some() => 0.0,
             (Phase::Push, Mode::Torque) => (slope * self.t).min(bounds.command),
             (Phase::Back, Mode::Torque) => -(slope * (self.rise - self.t)).clamp(0.0, bounds.command),
             (Phase::Push, Mode::Speed) => bounds.command,
@@ -199,7 +206,7 @@ impl Push {
             return Some(Why::Scale(turned, self.turned_by_speed));
         }
         let slack = 0.5 * self.told + bounds.torque_unit * seconds;
-        let has_torque = bounds.mode == Mode::Torque && !self.by_hand && sample.torque.is_some();
+        let has_torque = bounds.mode == Mode::Torque && self.turned.is_none() && sample.torque.is_some();
         if has_torque && (self.reported - self.told).abs() > slack {
             return Some(Why::Torque(self.told, self.reported));
         }
@@ -223,7 +230,7 @@ mod tests {
 
     /// A shaft of 0.012 kg·m² under dry friction, with these factors on what it reports.
     fn run(bounds: Bounds, friction: f64, [torque, speed, position]: [f64; 3]) -> (Verdict, f64, f64) {
-        let (mut push, mut x, mut w, mut wanted) = (Push::new(bounds, false), 0.0f64, 0.0f64, 0.0);
+        let (mut push, mut x, mut w, mut wanted) = (Push::new(bounds, None), 0.0f64, 0.0f64, 0.0);
         for _ in 0..5000 {
             for _ in 0..100 {
                 let push = torque.signum() * wanted;
@@ -261,6 +268,12 @@ mod tests {
         let (verdict, ..) = run(BOUNDS, 0.1, [4.0, 1.0, 1.0]);
         assert!(matches!(verdict, Verdict::Wrong(Why::Torque(..))), "{verdict:?}");
         assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, Verdict::Wrong(Why::Stuck(1.0)));
+        // Somebody else is to turn it, and it does not see that.
+        let mut turned = Push::new(BOUNDS, Some(0.5));
+        let still = Sample { position: 1.0, speed: Some(0.0), torque: Some(0.0) };
+        let verdicts: Vec<Verdict> = (0..502).map(|_| turned.tick(still, 1e-3)).collect();
+        assert_eq!(verdicts[..499], [Verdict::Wants(0.0); 499]);
+        assert_eq!(verdicts[501], Verdict::Wrong(Why::NotTurned(BOUNDS.angle)));
         let tight = Bounds { speed_most: 0.01, ..BOUNDS };
         assert!(matches!(run(tight, 0.0, [1.0; 3]).0, Verdict::Wrong(Why::Ran(..))));
     }

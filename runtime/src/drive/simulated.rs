@@ -358,7 +358,10 @@ impl SimulatedDrive {
             }
             Effect::PreOperational => {
                 let state = if on { NmtState::PreOperational } else { NmtState::Operational };
-                self.node.go(state);
+                // A node that was reset meanwhile boots.
+                if on || self.node.state() == NmtState::PreOperational {
+                    self.node.go(state);
+                }
                 if on {
                     self.abort_connection(now_ns);
                 }

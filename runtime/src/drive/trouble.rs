@@ -160,6 +160,8 @@ pub enum Why {
     TimeoutIgnored(u64),
     /// It didn't move at this torque, N·m, or at this command.
     Stuck(f64),
+    /// Something else was to turn it, and its position did not change by this angle, rad.
+    NotTurned(f64),
     /// It moved the other way.
     WrongSign,
     /// It turned further or faster than the test allows: rad, rad/s.
@@ -224,6 +226,11 @@ impl fmt::Display for Why {
                 write!(f, "our life sign had stopped for {ms} ms and it was still enabled: its time-out does not work")
             }
             Why::Stuck(command) => write!(f, "it did not move at {command:.3}: is it blocked, or its brake closed?"),
+            Why::NotTurned(angle) => write!(
+                f,
+                "its position did not change by {angle:.2} rad although the shaft was to be turned: is its encoder connected, \
+                 and the shaft coupled?"
+            ),
             Why::WrongSign => write!(f, "it turned against the command: sign of torque or of position is swapped"),
             Why::Ran(angle, speed) => {
                 write!(f, "the first motion went too far: {angle:.3} rad at {speed:.2} rad/s")

@@ -33,6 +33,9 @@ const BEYOND_NS: u64 = 10 * MS;
 const SEEN: usize = 8;
 /// What a brake of the drive itself leaves.
 const BRAKE_NS: u64 = 5 * MS;
+/// A drive that keeps an old set-point gives it once it is enabled, until it has not followed for five ticks: these, the way
+/// there and back, and its lag.
+const KEPT_NS: u64 = 15 * MS;
 /// The time after which a drive misses its set-points, and a slack for a late cycle.
 const DEADLINE_NS: u64 = 25 * MS;
 /// After the time-outs of a controlled stop: the drives' own time-out, their reaction, their lag.
@@ -135,6 +138,8 @@ struct Watched {
     counts: i32,
     /// Its set-points may be wrong in spite of their checksum.
     garbled: bool,
+    /// It may keep an old set-point.
+    keeps: bool,
     /// A drive that hears nobody, or whose command cannot be heard back: nothing on the bus stops it.
     deaf: bool,
 }
@@ -191,6 +196,7 @@ impl Judge {
                 What::Frame(_, _, Ill::Disturbed) => true,
                 What::Frame(..) | What::Node(..) | What::Foreign(..) => false,
             };
+            let keeps = |what: What| matches!(what, What::Node(at, Effect::IgnoresCommands) if at == node);
             let deaf = script.faults.iter().any(|f| silent(f.what) || mode.is_none() && unheard(f.what));
             Watched {
                 node,
@@ -210,6 +216,7 @@ impl Judge {
                 heard_ns: 0,
                 counts: 0,
                 garbled: script.faults.iter().any(|f| matches!(f.what, What::Frame(_, _, Ill::Corrupted))),
+                keeps: script.faults.iter().any(|f| keeps(f.what)),
                 deaf,
             }
         });
@@ -414,11 +421,16 @@ impl Judge {
             }
             // A test of signs, or a ramp of the drive itself, ends with what its lag leaves.
             let quiet = self.armed.is_none() && now_ns > self.pushed_ns.max(watched.braked_ns) + 20 * MS;
-            let loose = quiet && watched.mode == Some(Mode::Torque) && torque.abs() > watched.step;
+            // What a frame says wrongly under a right checksum acts until the drive has told of it, and as far as that is seen.
+            let room = if watched.garbled { watched.room() } else { watched.step };
+            let loose = quiet && watched.mode == Some(Mode::Torque) && torque.abs() > room;
             watched.loose_ns = if loose { watched.loose_ns.or(Some(now_ns)) } else { None };
-            // A brake of the drive itself may end between two looks; what a frame says wrongly under a right checksum acts until
-            // the drive has told of it.
-            let patience_ns = if watched.garbled { FOLLOW_NS } else { BRAKE_NS };
+            // A brake of the drive itself may end between two looks.
+            let patience_ns = match (watched.garbled, watched.keeps) {
+                (true, _) => FOLLOW_NS,
+                (false, true) => KEPT_NS,
+                (false, false) => BRAKE_NS,
+            };
             let refused = self.tripped_ns.is_some();
             if watched.loose_ns.is_some_and(|since| now_ns - since >= patience_ns) && !(refused && watched.garbled) {
                 return Err((Broken::BeforeArm, format!("{torque} N·m of node {node} while {step}")));
@@ -430,7 +442,7 @@ impl Judge {
             let origin = *self.origin.get_or_insert(shaft.position);
             let (is, room, patience_ns) = match watched.mode {
                 None => continue,
-                Some(Mode::Torque) => (torque, 0.02 * watched.most + 50.0 * watched.step, FOLLOW_NS),
+                Some(Mode::Torque) => (torque, watched.room(), FOLLOW_NS),
                 Some(Mode::Speed) => (shaft.speed, 0.2 * watched.most + 0.5, SLOW_FOLLOW_NS),
                 Some(Mode::Position) => (shaft.position - origin, 0.2 * watched.most + 0.05, SLOW_FOLLOW_NS),
             };
@@ -544,6 +556,11 @@ impl Watched {
             self.history.pop_front();
         }
         self.history.push_back((now_ns, permitted));
+    }
+
+    /// How far a torque may be from what is permitted without being noticed, N·m.
+    fn room(&self) -> f64 {
+        0.02 * self.most + 50.0 * self.step
     }
 
     /// Least and greatest value permitted while a command could have acted.

@@ -72,3 +72,29 @@ fn a_quick_stop_that_does_not_end() {
 fn many_sets_of_parameters_at_once() {
     holds(&Script { sets: 40, ..Script::plain(Pair) });
 }
+
+/// A drive that takes no set-points keeps an old one, and gives it until it is seen not to follow: found with seed 21824.
+#[test]
+fn an_old_set_point_at_the_next_start() {
+    for node in [0, 1] {
+        let fault = Fault { what: Node(node, Effect::IgnoresCommands), phase: Moving, after: 179_687, lasts: EVER };
+        holds(&Script { again: true, faults: vec![fault], ..Script::plain(Pair) });
+    }
+}
+
+/// A drive that turned the shaft for another one's test of signs, whose encoder stood still, did so for a minute: found with
+/// seed 13685.
+#[test]
+fn an_encoder_that_stands_still_while_another_drive_turns_it() {
+    for sort in [SpeedServo, PositionServo] {
+        let fault = Fault { what: Node(0, Effect::EncoderFrozen), phase: StartUp, after: 0, lasts: EVER };
+        holds(&Script { tested: true, faults: vec![fault], ..Script::plain(sort) });
+    }
+}
+
+/// Small torques by wrong frames before arming, below what a watch can see: found with seed 10000.
+#[test]
+fn set_points_that_are_wrong_from_the_start() {
+    let fault = Fault { what: Frame(0, 0x203, Corrupted), phase: StartUp, after: 0, lasts: EVER };
+    holds(&Script { seed: 10_000, tested: true, faults: vec![fault], ..Script::plain(Pair) });
+}
