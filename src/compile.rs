@@ -221,10 +221,10 @@ impl Stopwatch {
     }
 }
 
-/// A rig for a processor: its plan and its two programs, as sections of a package.
+/// A rig for a processor: its programs, as sections of a package.
 pub struct PackedRig {
-    /// [`abi::rig::Rig`], encoded.
-    pub rig: Vec<u8>,
+    /// The same in this process, interpreted.
+    pub ready: Ready,
     /// The system with one part crossed out: an [`abi::image::Image`].
     pub control: Vec<u8>,
     /// That part alone.
@@ -270,6 +270,6 @@ pub fn packed_rig(
         plant: image(&ready.plant_program, &functions(&ready.plant_program, Method::Expo))?,
         judge: image(&ready.judge_program, &compiler::judging(&ready.judge_program))?,
         live: ready.live.to_bytes(),
-        rig: ready.rig.to_bytes(),
+        ready,
     })
 }

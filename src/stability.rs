@@ -9,7 +9,6 @@ use abi::Slot;
 use abi::rig::{Kind, Mode, Signal, What};
 use runtime::lookahead::Wired;
 use runtime::predict::{Ahead, Late, Loop, Shaft, Step};
-use std::time::Instant;
 
 /// The emulated contact of one drive.
 pub struct Contact {
@@ -142,25 +141,6 @@ impl Contact {
         let kept = |j: usize| (0..step.states).map(|i| step.c[i] * step.b[i * signals + j]).sum::<f64>();
         (0..signals).map(kept).sum::<f64>().abs() / near.period
     }
-}
-
-/// Dry steps that are timed.
-const STEPS: usize = 1000;
-
-/// What one step of the control program takes on this machine, s: median and greatest of 1,000.
-pub fn step_time(ready: &Ready) -> (f64, f64) {
-    let steps = u64::from(ready.rig.steps.max(1));
-    let mut control = ready.control.clone();
-    control.start(ready.rig.period_ns as f64 * 1e-9 / steps as f64);
-    let mut times: Vec<f64> = (0..STEPS)
-        .map(|_| {
-            let begin = Instant::now();
-            control.advance(steps);
-            begin.elapsed().as_secs_f64()
-        })
-        .collect();
-    times.sort_by(f64::total_cmp);
-    (times[STEPS / 2], times[STEPS - 1])
 }
 
 /// What forbids to let a rig move, in words; and whether it is stable only while its commands look ahead.

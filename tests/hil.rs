@@ -12,7 +12,7 @@ use heap::asked;
 use runtime::hil::cycle::{End, Hil, Options as HilOptions};
 use runtime::hil::simulated::{Pace, World};
 use std::fs;
-use std::io::{Read, Write};
+use std::io::{BufRead, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -457,7 +457,7 @@ fn options_for_simulated_drives_are_refused_to_a_drive_that_proves_nothing() {
     let mut served = served.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let mut said = String::new();
     let mut lines = std::io::BufReader::new(served.stderr.take().unwrap());
-    std::io::BufRead::read_line(&mut lines, &mut said).unwrap();
+    lines.read_line(&mut said).unwrap();
     let port = said.split("port ").nth(1).and_then(|rest| rest.split(|c: char| !c.is_ascii_digit()).next());
     let bus = format!("can0=socketcand:127.0.0.1:{}/can0", port.unwrap_or_else(|| panic!("{said}")));
     for option in ["--arm", "--accept-jitter", "--count-overruns", "--accept-unstable"] {
@@ -538,6 +538,53 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
 
 /// Files of a log, the first one first.
 fn parts_of(first: &Path) -> Vec<PathBuf> {
+/// The stability of a contact is judged with the values of a set as at a start, and before a package leaves. `FRIC_SEED`
+/// gives other stiffnesses, `FRIC_RUNS` more of them.
+#[test]
+fn a_set_is_refused_where_a_start_and_a_package_would_be() {
+    let folder = folder("hil-set-stability");
+    let number = |name: &str, plain| std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(plain);
+    let mut chance = runtime::chance::Chance(number("FRIC_SEED", 22));
+    let stiffnesses: Vec<String> =
+        (0..number("FRIC_RUNS", 4)).map(|_| format!("{:.1} N·m/rad", 10f64.powf(chance.between(2.5, 3.5)))).collect();
+    let mut child = under_way(&folder, "log");
+    let mut stdin = child.stdin.take().unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    for stiffness in &stiffnesses {
+        writeln!(stdin, "set fr.sigma0 = {stiffness}").unwrap();
+    }
+    // Lines are carried out in their order: after this one all sets are answered.
+    writeln!(stdin, "set fr.Fz = 1 N·m").unwrap();
+    let mut errors = String::new();
+    let mut lines = std::io::BufReader::new(child.stderr.take().unwrap()).lines();
+    while !errors.contains("fr.Fz") {
+        errors += &(lines.next().unwrap_or_else(|| panic!("it ended: {errors}")).unwrap() + "\n");
+    }
+    writeln!(stdin, "stop").unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(0), "{errors}");
+    assert!(run(&folder, &["replay", "log"], 0).contains("agree to the bit"));
+    let mut counts = [0; 2];
+    for stiffness in &stiffnesses {
+        let set = format!("fr.sigma0={stiffness}");
+        let refused = |args: &[&str]| {
+            let out = fric(&folder, &[args, &["--set", &set, &example()]].concat()).output().unwrap();
+            let said = String::from_utf8_lossy(&out.stderr).into_owned();
+            match out.status.code() {
+                Some(0) => false,
+                Some(1) if said.contains("the contact that `load` plays is not stable") => true,
+                code => panic!("{set}: {code:?}, {said}"),
+            }
+        };
+        let start = refused(&["hil", "--sim", "--fast", "--for", "5ms", "--no-log"]);
+        let package = refused(&["build", "-o", "set.fricpkg"]);
+        let set =
+            errors.contains(&format!("`set fr.sigma0 = {stiffness}` is refused: the contact that `load` plays is"));
+        assert_eq!((set, package), (start, start), "{stiffness}: {errors}");
+        counts[usize::from(start)] += 1;
+    }
+    assert!(number("FRIC_SEED", 22) != 22 || counts.iter().all(|count| *count > 0), "{counts:?}");
+}
+
     (1..).map(|number| runtime::record::parts::path(first, number)).take_while(|path| path.exists()).collect()
 }
 

@@ -387,6 +387,7 @@ mod tests {
             stops: vec![Stop { slot: Slot(6), condition: "v > 1".into(), why: "too fast".into() }],
             record: vec![Series { label: "v".into(), slot: Slot(5), unit: Unit::none(), boolean: false }],
             predict: Some(0),
+            needs_look: false,
             plant: Plant {
                 applied: vec![(signal(0, What::Torque), Slot(3))],
                 seen: vec![(signal(0, What::Speed), Slot(5))],

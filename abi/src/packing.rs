@@ -18,7 +18,7 @@ encode_structs! {
     Series { label, slot, unit, boolean }
     Rig {
         name, period_ns, method, steps, buses, nodes, inputs, outputs, watchdog_ns, overrun, stops, record, predict,
-        plant,
+        needs_look, plant,
     }
     Bus { name, address, bit_rate }
     Node { name, bus, kind, moves, delay, lag, timeout_ns, within }
@@ -180,6 +180,7 @@ mod tests {
             stops: vec![Stop { slot: Slot(6), condition: "x > 1 m".into(), why: "too far".into() }],
             record: vec![series],
             predict: Some(0),
+            needs_look: true,
             plant: Plant {
                 applied: vec![(signal(0, What::Torque), Slot(3))],
                 seen: vec![(signal(0, What::Position), Slot(7))],

@@ -40,6 +40,9 @@ pub struct Rig {
     pub record: Vec<Series>,
     /// The drive (index into `nodes`) whose command is computed for the moment it acts.
     pub predict: Option<usize>,
+    /// Its contacts are stable only while commands are computed ahead: a rig that loses sight of its shaft stops. Judged after
+    /// the compiler, when it is run or packed.
+    pub needs_look: bool,
     /// The crossed-out part as a program of its own.
     pub plant: Plant,
 }

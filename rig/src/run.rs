@@ -146,7 +146,12 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
     }
     options.duration_ns = wanted.duration.map(|seconds| (seconds * 1e9).round() as u64);
     options.look = look_ahead(&rig, &open.program("plant")?)?;
+    options.control.needs_look = rig.needs_look;
     let fast = simulated && wanted.fast;
+    // Simulated time stands still meanwhile.
+    if let Some(why) = watches::too_slow(&rig, &control).filter(|_| !fast) {
+        return Err(format!("refused: {why}"));
+    }
     let world;
     let (clock, buses): (Box<dyn Clock>, Vec<Box<dyn Bus>>) = if simulated {
         let pace = if fast { Pace::Fast } else { Pace::Wall };
@@ -413,6 +418,10 @@ pub fn say(dir: &Path, what: &str) -> Result<String, String> {
         return Err(format!("the rig in {} did not answer: {what} is not known to act", dir.display()));
     }
     match line.trim() {
+        // Stability takes a compiler.
+        "ok" if what.starts_with("set ") => Ok(format!(
+            "{what}\n  not judged: whether the fixed step (E0702) and the contacts are stable with it; `fric predict --set` is\n"
+        )),
         "ok" => Ok(format!("{what}\n")),
         why => Err(why.into()),
     }

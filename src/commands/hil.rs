@@ -1,5 +1,6 @@
 //! `fric hil`: runs a rig against drives on its buses, real or simulated.
 
+use super::prompt::{Rehearsal, prompt};
 use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
 use crate::compile::{self, Options, Ready, Stopwatch};
@@ -14,16 +15,15 @@ use runtime::clock::Clock;
 use runtime::drive::profiles::Life;
 use runtime::drive::sign::SignTest;
 use runtime::hil::control::PATIENT_NS;
-use runtime::hil::cycle::{Command, Gauges, Hil, Options as HilOptions};
+use runtime::hil::cycle::{Gauges, Hil, Options as HilOptions};
 use runtime::hil::identify::{self, Identification};
 use runtime::hil::live::Judge;
-use runtime::hil::operator::{Answer, Operator, Why};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, watches, words};
 use runtime::realtime::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
-use std::io::{BufRead, IsTerminal};
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -80,15 +80,26 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         .with("source", root.text.as_bytes())
         .with("set", set.join("\n"))
         .with("started", started(simulated && args.fast));
-    drop(loaded);
     let head = keeping.into(head);
-    let log = Some((log_settings(args, &name, &ready, simulated), head));
+    let log = Some((log_settings(args, &name, &ready, simulated), head.clone()));
     if args.identify {
         return identified(args, ready, simulated, terminal);
     }
     let Some(needs_look) = bearable(args, &ready, terminal) else { return End::Failed };
+    ready.rig.needs_look = needs_look;
     emergency::guard();
-    let asked = Asked { log, needs_look, ..Asked::default() };
+    let rehearsal = Rehearsal {
+        judge: Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control)
+            .expect("the compiler made them for each other"),
+        control: ready.control.clone(),
+        loaded,
+        kept: head,
+        name,
+        set: args.set.all.clone(),
+        accept_unstable: args.accept_unstable,
+        needs_look,
+    };
+    let asked = Asked { log, rehearsal: Some(rehearsal), ..Asked::default() };
     if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
 }
 
@@ -98,14 +109,9 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
     if args.accept_unstable {
         against.clear();
     }
-    let (median, period) = (stability::step_time(ready).0, ready.rig.period_ns as f64 * 1e-9);
-    // Time that stands meanwhile bears any step.
-    if median > 0.5 * period && !args.fast {
-        against.push(format!(
-            "a step takes {} on this computer, more than half of a period of {}",
-            value::duration(median),
-            value::duration(period)
-        ));
+    // Simulated time stands still meanwhile.
+    if !args.fast {
+        against.extend(watches::too_slow(&ready.rig, &ready.control));
     }
     for why in &against {
         terminal.error(&format!("refused: {why}"));
@@ -232,8 +238,8 @@ struct Asked<'a> {
     log: Option<(Settings, Sections)>,
     /// Torque pulses in place of the model.
     pulses: Option<&'a Identification>,
-    /// It is stable only while it looks ahead.
-    needs_look: bool,
+    /// What judges sets of parameters.
+    rehearsal: Option<Rehearsal>,
 }
 
 /// Buses, drives and devices in this process.
@@ -295,19 +301,14 @@ fn run(
     asked: Asked,
     terminal: &mut Terminal,
 ) -> End {
-    let Asked { log, pulses: asked, needs_look } = asked;
-    let Ready { rig, control, plant, notes, live, judge, .. } = ready;
-    let judge = match asked {
-        // What gives torque pulses has no parameters.
-        Some(_) => None,
-        None => Some(Judge::new(live, judge, &control).expect("the compiler made them for each other")),
-    };
+    let Asked { log, pulses: asked, rehearsal } = asked;
+    let Ready { rig, control, plant, notes, .. } = ready;
     let log_path = log.as_ref().map(|(settings, _)| match &settings.sink {
         Sink::File(path, _) | Sink::BlackBox(path, _) => path.clone(),
     });
     let fast = simulated && args.fast;
     let mut options = hil_options(args, &rig, simulated);
-    options.control.needs_look = needs_look;
+    options.control.needs_look = rig.needs_look;
     options.control.energy_stops = args.stop_on_energy;
     match cycle::look_ahead(&rig, &plant) {
         Ok(look) => options.look = look,
@@ -337,8 +338,8 @@ fn run(
             return End::Failed;
         }
     };
-    if let Some(judge) = &judge {
-        hil.judged_by(judge.clone());
+    if let Some(rehearsal) = &rehearsal {
+        hil.judged_by(rehearsal.judge.clone());
     }
     if !fast {
         let patience = Duration::from_nanos(rig.watchdog_ns);
@@ -361,7 +362,7 @@ fn run(
         std::thread::spawn(move || view(&gauges, &rig, &over))
     });
     if !fast {
-        std::thread::spawn(move || prompt(operator.by_the_wall(), judge.as_ref()));
+        std::thread::spawn(move || prompt(operator.by_the_wall(), rehearsal));
     }
     if let Some(asked) = asked {
         let rows = identify::rows(&mut hil, asked);
@@ -526,47 +527,5 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
             return;
         }
         std::thread::sleep(Duration::from_millis(100));
-    }
-}
-
-/// Reads what the operator types, a line at a time, and says what became of it.
-fn prompt(mut operator: Operator, judge: Option<&Judge>) {
-    let mut terminal = Terminal::new();
-    for line in std::io::stdin().lock().lines() {
-        let Ok(line) = line else { return };
-        let line = line.trim();
-        let command = match line {
-            "" => continue,
-            "enable" => Command::Enable,
-            "arm" => Command::Arm,
-            "stop" | "quit" => Command::Stop,
-            "reset" => Command::Reset,
-            _ => match (line.strip_prefix("set "), judge) {
-                (Some(set), Some(judge)) => match judge.read(set) {
-                    Ok(set) => Command::Set(set),
-                    Err(why) => {
-                        terminal.error(&why);
-                        continue;
-                    }
-                },
-                (Some(_), None) => {
-                    terminal.error(&Why::Unjudged.words());
-                    continue;
-                }
-                (None, _) => {
-                    terminal.error("type enable, arm, set PATH = VALUE, stop or reset");
-                    continue;
-                }
-            },
-        };
-        match operator.wait(command) {
-            Answer::Taken if matches!(command, Command::Set(_)) => terminal.line(&format!("  {line}")),
-            Answer::Taken => {}
-            Answer::Refused(Why::Set(objection)) => {
-                let why = judge.map_or_else(String::new, |judge| judge.words(&objection));
-                terminal.error(&format!("`{line}` is refused: {why}"));
-            }
-            Answer::Refused(why) => terminal.error(&format!("`{line}` is refused: {}", why.words())),
-        }
     }
 }

@@ -21,6 +21,7 @@ mod live;
 mod new;
 mod pack;
 mod predict;
+mod prompt;
 mod repl;
 mod replay;
 mod run;

@@ -6,9 +6,10 @@ use crate::compile::{self, Stopwatch};
 use crate::kept::Keeping;
 use crate::sign::Signing;
 use crate::terminal::Terminal;
-use crate::{project, report};
+use crate::{project, report, stability};
 use abi::encode::Encode;
 use abi::image::Feature;
+use abi::rig::Rig;
 use runtime::package::signature::{beside, comment};
 use runtime::package::{Package, here};
 use runtime::record::log::Sections;
@@ -94,7 +95,13 @@ pub(super) fn packed(
     let built = built.map_err(|why| why.unwrap_or_else(reported))?;
     let mut package =
         Package { fric: env!("CARGO_PKG_VERSION").into(), target: target.into(), rig: name, sections: Vec::new() };
-    package.add("rig", built.rig);
+    // The rig's computer has no compiler to judge it with.
+    let (against, needs_look) = stability::objections(&built.ready);
+    if !against.is_empty() {
+        return Err(format!("refused: {}; `fric predict` says what would help", against.join("; ")));
+    }
+    let plan = Rig { needs_look, ..built.ready.rig };
+    package.add("rig", plan.to_bytes());
     package.add("control", built.control);
     package.add("plant", built.plant);
     package.add("live", built.live);

@@ -5,7 +5,7 @@
 use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
 use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
-use crate::stability::{self, Contact, contacts};
+use crate::stability::{Contact, contacts};
 use crate::terminal::Terminal;
 use crate::value::significant;
 use crate::{project, report};
@@ -15,6 +15,7 @@ use abi::rig::Kind;
 use grammar::ast::{ExperimentStatement, Item};
 use runtime::engine::{self, Continue};
 use runtime::hil::standard::{self, Figures, Pair};
+use runtime::hil::watches;
 use runtime::modes::modes;
 use runtime::predict::Loop;
 use serde_json::{Value, json};
@@ -312,7 +313,7 @@ fn resolution(ready: &Ready) -> (String, Value) {
 
 /// What a step takes on this machine, and of its period.
 fn step_time(ready: &Ready) -> (String, Value) {
-    let (median, greatest) = stability::step_time(ready);
+    let (median, greatest) = watches::step_time(&ready.rig, &ready.control);
     let period = ready.rig.period_ns as f64 * 1e-9;
     let words = format!(
         "step        {} here, at most {}, of {}\n",

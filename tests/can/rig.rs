@@ -61,6 +61,7 @@ pub fn pulsed(period_ns: u64) -> Identification {
         stops: Vec::new(),
         record: Vec::new(),
         predict: None,
+        needs_look: false,
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },
     };
     Identification::new(&rig).expect("its drives take torques")

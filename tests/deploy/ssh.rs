@@ -294,7 +294,8 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     let (_, _, cycles) = there.wait("running", |state| state.2 > 20);
 
     // Parameters change by what the package carries: whole, or refused in the words of a start.
-    there.says("set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m");
+    let taken = there.local(&["say", "set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m"]);
+    assert!(taken.status.success() && said(&taken).contains("not judged: whether the fixed step"), "{}", said(&taken));
     for (set, why) in [
         ("set fr.vs = 0 rad/s", "E0502: `vs` of LuGre must be above 0 mrad/s"),
         ("set fr.Fs = 0.29 N·m", "E0501: `Fs` is smaller than `Fc`"),

@@ -105,6 +105,7 @@ impl Reader<'_, '_> {
             stops: stops.collect(),
             record: Vec::new(),
             predict,
+            needs_look: false,
             plant: rig::Plant { applied: Vec::new(), seen: Vec::new(), inertia: None },
         };
         for (k, (bus, statement)) in plan.buses.iter().zip(&self.statements.buses).enumerate() {

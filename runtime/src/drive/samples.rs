@@ -110,6 +110,7 @@ pub fn rig(mode: Mode) -> Rig {
         stops: Vec::new(),
         record: Vec::new(),
         predict: Some(LOAD),
+        needs_look: false,
         plant: Plant {
             applied: vec![(signal(LOAD, What::Torque), load), (signal(SERVO, What::Torque), servo)],
             seen: vec![

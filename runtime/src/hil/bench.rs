@@ -80,6 +80,7 @@ pub fn rig() -> (Rig, Instance) {
         stops: Vec::new(),
         record: Vec::new(),
         predict: None,
+        needs_look: false,
         plant: Plant { applied: Vec::new(), seen: Vec::new(), inertia: Some(0.012) },
     };
     (rig, model)

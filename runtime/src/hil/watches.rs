@@ -4,8 +4,11 @@
 //! profile has all of them; one described by frames those for which it tells something and the rig names a limit.
 
 use super::control::Bounds;
+use crate::clock::monotonic_ns;
 use crate::safety::{DriveLimits, OutputLimits, Protection, Refused, is_present};
+use abi::Instance;
 use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
+use abi::unit::three_digits;
 
 /// The signal by which a node tells its torque, its speed or its position.
 pub fn told(rig: &Rig, node: usize, what: What) -> Option<Signal> {
@@ -69,6 +72,36 @@ pub fn may_start(rig: &Rig) -> Result<(), String> {
             rig.nodes[output.signal.node].name, output.safe
         )),
     }
+}
+
+/// Dry steps that are timed.
+const STEPS: usize = 1000;
+
+/// What the steps of one period of the control program take on this machine, s: median and greatest of 1,000.
+pub fn step_time(rig: &Rig, control: &Instance) -> (f64, f64) {
+    let steps = u64::from(rig.steps.max(1));
+    let mut control = control.clone();
+    control.start(rig.period_ns as f64 * 1e-9 / steps as f64);
+    let mut times: Vec<u64> = (0..STEPS)
+        .map(|_| {
+            let begin_ns = monotonic_ns();
+            control.advance(steps);
+            monotonic_ns() - begin_ns
+        })
+        .collect();
+    times.sort_unstable();
+    let seconds = |ns: u64| ns as f64 * 1e-9;
+    (seconds(times[STEPS / 2]), seconds(times[STEPS - 1]))
+}
+
+/// Why this computer is too slow for a rig, in words; none if it is not.
+pub fn too_slow(rig: &Rig, control: &Instance) -> Option<String> {
+    let (median, period) = (step_time(rig, control).0, rig.period_ns as f64 * 1e-9);
+    let ms = |seconds: f64| three_digits(1e3 * seconds);
+    (median > 0.5 * period).then(|| {
+        let (step, period) = (ms(median), ms(period));
+        format!("a step takes {step} ms on this computer, more than half of a period of {period} ms")
+    })
 }
 
 /// Greatest torque and speed of a node: as the rig says, else as the drive says.

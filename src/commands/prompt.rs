@@ -1,0 +1,140 @@
+//! What an operator types while `fric hil` runs: one thread reads, another one carries out.
+//!
+//! In: lines. Out: commands, and what became of each. The thread that reads hands `stop` over itself: a stop never waits for a
+//! set that is being judged.
+
+use crate::compile::{self, Changes, Loaded, Options};
+use crate::kept::Kept;
+use crate::stability;
+use crate::terminal::Terminal;
+use abi::Instance;
+use grammar::diagnostic::Diagnostic;
+use runtime::hil::live::{Judge, Set};
+use runtime::hil::operator::{Answer, Command, Operator, Why};
+use runtime::record::log::Sections;
+use std::io::BufRead;
+use std::sync::mpsc::{Receiver, channel};
+
+/// Judges sets of parameters before the cycle gets them.
+///
+/// The cycle's judge knows the conditions of a start. The stability of the fixed step and of the contacts takes a compiler:
+/// the rig is compiled once more with the values of the set, from the texts of the run, whatever has become of the files.
+pub struct Rehearsal {
+    /// The conditions.
+    pub judge: Judge,
+    /// The control program with the values that act.
+    pub control: Instance,
+    /// The texts as they were read.
+    pub loaded: Loaded,
+    /// What they import: the head of the log.
+    pub kept: Sections,
+    /// The rig.
+    pub name: String,
+    /// `--set` of the start, then the sets that act: path and value.
+    pub set: Vec<(String, String)>,
+    /// Contacts may be unstable.
+    pub accept_unstable: bool,
+    /// This run stops when its commands cannot look ahead.
+    pub needs_look: bool,
+}
+
+impl Rehearsal {
+    /// The values of a start, with those of `set PATH = VALUE, …` in place of theirs.
+    fn with(&self, set: &str) -> Vec<(String, String)> {
+        let mut all = self.set.clone();
+        for (path, value) in set.split(',').filter_map(|one| one.split_once('=')) {
+            all.retain(|(other, _)| other != path.trim());
+            all.push((path.trim().into(), value.trim().into()));
+        }
+        all
+    }
+
+    /// Judges a set; `all`: the values of a start that would lead to it.
+    ///
+    /// # Errors
+    /// What a start would refuse, in words.
+    fn judge(&mut self, set: &Set, all: &[(String, String)]) -> Result<(), String> {
+        let broken = self.judge.judge(self.control.block(), set.values());
+        broken.map_err(|objection| self.judge.words(&objection))?;
+        let set = all.iter().map(|(path, value)| format!("{path}={value}")).collect();
+        let options = Options { changes: Changes { set, ..Changes::default() }, interpret: true };
+        let ready = compile::rig(&mut self.loaded, &Kept(&self.kept), &self.name, &options, &mut Vec::new());
+        let ready = ready.map_err(|errors| {
+            let words = |error: &Diagnostic| format!("{}: {}", error.code, error.message);
+            errors.iter().filter(|error| error.is_error()).map(words).collect::<Vec<_>>().join("; ")
+        })?;
+        if self.accept_unstable {
+            return Ok(());
+        }
+        let (against, needs_look) = stability::objections(&ready);
+        if !against.is_empty() {
+            return Err(against.join("; "));
+        }
+        if needs_look && !self.needs_look {
+            let why = "its contact would be stable only while commands look ahead, and this run does not stop when they \
+                       cannot; start with `--set`";
+            return Err(why.into());
+        }
+        Ok(())
+    }
+
+    /// Hands a set over if a start would take it.
+    fn change(&mut self, operator: &mut Operator, text: &str) -> Result<(), String> {
+        let set = self.judge.read(text)?;
+        let all = self.with(text);
+        self.judge(&set, &all)?;
+        match operator.wait(Command::Set(set)) {
+            Answer::Taken => {}
+            Answer::Refused(Why::Set(objection)) => return Err(self.judge.words(&objection)),
+            Answer::Refused(why) => return Err(why.words()),
+        }
+        set.values().iter().for_each(|(slot, value)| self.control.set(*slot, *value));
+        self.set = all;
+        Ok(())
+    }
+}
+
+/// Reads what the operator types, a line at a time. Without a rehearsal no parameter may change.
+pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>) {
+    let stopper = operator.stopper();
+    let (lines, typed) = channel::<String>();
+    let carrying = std::thread::spawn(move || carry_out(operator, rehearsal, &typed));
+    for line in std::io::stdin().lock().lines() {
+        let Ok(line) = line else { break };
+        match line.trim() {
+            "" => {}
+            "stop" | "quit" => stopper.stop(),
+            line if lines.send(line.into()).is_err() => break,
+            _ => {}
+        }
+    }
+    drop(lines);
+    let _ = carrying.join();
+}
+
+/// Carries lines out in their order, and says what became of each.
+fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &Receiver<String>) {
+    let mut terminal = Terminal::new();
+    for line in typed {
+        let mut wait = |command| match operator.wait(command) {
+            Answer::Taken => Ok(()),
+            Answer::Refused(why) => Err(why.words()),
+        };
+        let done = match (line.as_str(), line.strip_prefix("set "), &mut rehearsal) {
+            ("enable", ..) => wait(Command::Enable),
+            ("arm", ..) => wait(Command::Arm),
+            ("reset", ..) => wait(Command::Reset),
+            (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set).map(|()| {
+                terminal.line(&format!("  {line}"));
+            }),
+            (_, Some(_), None) => Err(Why::Unjudged.words()),
+            (_, None, _) => {
+                terminal.error("type enable, arm, set PATH = VALUE, stop or reset");
+                continue;
+            }
+        };
+        if let Err(why) = done {
+            terminal.error(&format!("`{line}` is refused: {why}"));
+        }
+    }
+}
