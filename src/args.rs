@@ -436,7 +436,7 @@ pub struct Hil {
     pub interpret: bool,
 }
 
-const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, stop, reset.\n\
+const HIL_HELP: &str = "While it runs, type: enable, arm, set PATH = VALUE, stop.\n\
     Exit codes: 0 ended as asked (Ctrl-C included), 1 refused or bad input, 2 wrong usage, 3 stopped by safety.";
 
 /// `fric predict`

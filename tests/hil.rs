@@ -519,6 +519,7 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     say("set fr.vs = 0 rad/s");
     say("set fr.Fs = 0.2 N·m");
     say("set pid.Ts = 1.5 ms");
+    say("reset");
     say("stop");
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr);
@@ -529,6 +530,7 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
         "E0101: `fr.Fs` is a",
         "E0502: `vs` of LuGre must be above 0 mrad/s, not 0 mrad/s (`fr.vs`)",
         "only a start reads `pid.Ts`: a period follows from it; start with `--set pid.Ts=1.5 ms`",
+        "`reset` is refused: a stop is final",
     ] {
         assert!(said.contains(words), "no `{words}` in {said}");
     }
@@ -536,8 +538,6 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     assert!(said.contains("agree to the bit"), "{said}");
 }
 
-/// Files of a log, the first one first.
-fn parts_of(first: &Path) -> Vec<PathBuf> {
 /// The stability of a contact is judged with the values of a set as at a start, and before a package leaves. `FRIC_SEED`
 /// gives other stiffnesses, `FRIC_RUNS` more of them.
 #[test]
@@ -585,6 +585,8 @@ fn a_set_is_refused_where_a_start_and_a_package_would_be() {
     assert!(number("FRIC_SEED", 22) != 22 || counts.iter().all(|count| *count > 0), "{counts:?}");
 }
 
+/// Files of a log, the first one first.
+fn parts_of(first: &Path) -> Vec<PathBuf> {
     (1..).map(|number| runtime::record::parts::path(first, number)).take_while(|path| path.exists()).collect()
 }
 

@@ -45,7 +45,7 @@ enum Command {
     Start(Start),
     /// Simulate the drives and devices of a package on a bus that other programs can reach
     Drives(Drives),
-    /// Tell the rig that runs: enable, arm, set PATH = VALUE, stop or reset
+    /// Tell the rig that runs: enable, arm, set PATH = VALUE or stop
     Say(Say),
     /// Say whether this computer can keep time, and what to change
     Doctor,
@@ -167,7 +167,7 @@ struct Drives {
 
 #[derive(clap::Args, Debug)]
 struct Say {
-    /// enable, arm, stop, reset; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it acts as one or not at all
+    /// enable, arm, stop; or a set of parameters, `set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m`: it acts as one or not at all
     #[arg(value_name = "COMMAND", required = true, allow_negative_numbers = true)]
     what: Vec<String>,
     #[command(flatten)]
@@ -320,7 +320,7 @@ fn main() -> ExitCode {
         Command::Say(say) => match said(&say.what) {
             Some(what) => run::say(&say.store.dir, &what),
             None => {
-                words::error("say enable, arm, stop, reset or `set PATH = VALUE`");
+                words::error("say enable, arm, stop or `set PATH = VALUE`");
                 return ExitCode::from(2);
             }
         },

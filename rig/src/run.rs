@@ -14,7 +14,7 @@ use runtime::clock::Clock;
 use runtime::drive::sign::SignTest;
 use runtime::hil::cycle::{Command, End, Gauges, Hil, Options, look_ahead};
 use runtime::hil::live::Judge;
-use runtime::hil::operator::{Answer, Operator, Stamp, Stopper, Why};
+use runtime::hil::operator::{Answer, NO_RESET, Operator, Stamp, Stopper, Why};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, watches, words as told};
 use runtime::realtime::{self, Wishes};
@@ -374,7 +374,7 @@ impl Desk {
         let command = match said {
             "enable" => Command::Enable,
             "arm" => Command::Arm,
-            "reset" => Command::Reset,
+            "reset" => return Err(format!("refused: {NO_RESET}")),
             // Speakers do not wait for each other.
             "stop" => {
                 self.stopper.stop();
@@ -382,7 +382,7 @@ impl Desk {
             }
             _ => match said.strip_prefix("set ") {
                 Some(set) => Command::Set(self.judge.read(set)?),
-                None => return Err("say enable, arm, set PATH = VALUE, stop or reset".into()),
+                None => return Err("say enable, arm, set PATH = VALUE or stop".into()),
             },
         };
         let operator = || self.operator.lock().unwrap_or_else(std::sync::PoisonError::into_inner);

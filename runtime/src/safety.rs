@@ -3,7 +3,7 @@
 //! In: what the model asks for, what was measured, what went wrong anywhere. Out: what is permitted, and whether the
 //! drives follow, stop quickly or are disabled. Knows neither buses nor models.
 //!
-//! It decides in the cycle in which it is told. A trip latches until the operator resets it. Limits can be narrowed
+//! It decides in the cycle in which it is told. A trip latches: nothing leads out of it. Limits can be narrowed
 //! while running and never widened. It allocates nothing after [`Supervisor::new`] and holds no unsafe code.
 //!
 //! Software is not the safety function of a machine: the emergency stop acts by wire on the safe torque off of the
@@ -436,16 +436,6 @@ impl Supervisor {
         free
     }
 
-    /// The operator has seen why the rig stopped: back to where arming begins. Only after the stop is over.
-    pub fn reset(&mut self) -> bool {
-        let over = self.stage == Stage::Disabled;
-        if over {
-            self.stage = Stage::Idle;
-            self.cause = None;
-        }
-        over
-    }
-
     /// Narrows the limits of an output.
     ///
     /// # Errors
@@ -867,11 +857,11 @@ mod tests {
     }
 
     #[test]
-    fn a_trip_latches_until_the_operator_resets_it() {
+    fn a_trip_latches() {
         let mut supervisor = armed(FREE, PATIENCE);
         supervisor.trip(Cause::Lost(3));
         for cycle in 0..6 {
-            assert!(!supervisor.arm() && !supervisor.reset());
+            assert!(!supervisor.arm());
             assert_eq!(supervisor.judge(&[1.0], &at(50.0)), Order::QuickStop, "cycle {cycle}");
             assert_eq!(supervisor.permitted(), [0.0]);
         }
@@ -879,10 +869,8 @@ mod tests {
         assert!(!supervisor.arm(), "latched");
         supervisor.trip(Cause::Bus(0));
         assert_eq!(supervisor.cause(), Some(Cause::Lost(3)), "the first cause is kept");
-        assert!(supervisor.is_disabled() && supervisor.reset());
-        assert_eq!(supervisor.cause(), None);
-        assert!(supervisor.arm());
-        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+        assert!(supervisor.is_disabled() && !supervisor.arm());
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Disable, "at rest, and for good");
     }
 
     #[test]

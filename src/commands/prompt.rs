@@ -10,7 +10,7 @@ use crate::terminal::Terminal;
 use abi::Instance;
 use grammar::diagnostic::Diagnostic;
 use runtime::hil::live::{Judge, Set};
-use runtime::hil::operator::{Answer, Command, Operator, Why};
+use runtime::hil::operator::{Answer, Command, NO_RESET, Operator, Why};
 use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
@@ -123,13 +123,13 @@ fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &R
         let done = match (line.as_str(), line.strip_prefix("set "), &mut rehearsal) {
             ("enable", ..) => wait(Command::Enable),
             ("arm", ..) => wait(Command::Arm),
-            ("reset", ..) => wait(Command::Reset),
+            ("reset", ..) => Err(NO_RESET.into()),
             (_, Some(set), Some(rehearsal)) => rehearsal.change(&mut operator, set).map(|()| {
                 terminal.line(&format!("  {line}"));
             }),
             (_, Some(_), None) => Err(Why::Unjudged.words()),
             (_, None, _) => {
-                terminal.error("type enable, arm, set PATH = VALUE, stop or reset");
+                terminal.error("type enable, arm, set PATH = VALUE or stop");
                 continue;
             }
         };

@@ -80,9 +80,9 @@ pub enum Step {
     AwaitArm,
     /// Commands act.
     Armed,
-    /// Stopped; only [`Request::Reset`] leads out.
+    /// Stopped, for good: a start makes a new [`Fieldbus`], which identifies and tests the drives anew.
     Stopped,
-    /// Refused; only [`Request::Reset`] leads out.
+    /// Refused, for good.
     Refused,
 }
 
@@ -142,8 +142,6 @@ pub enum Request {
     QuickStop,
     /// Torque off; always.
     Disable,
-    /// From [`Step::Stopped`] or [`Step::Refused`]: start anew.
-    Reset,
 }
 
 #[derive(Clone, Debug)]
@@ -517,11 +515,6 @@ impl Fieldbus {
                 self.go(Step::Enable);
             }
             (Request::Arm, Step::AwaitArm) => self.go(Step::Armed),
-            (Request::Reset, Step::Stopped | Step::Refused) => {
-                self.refusal = None;
-                self.running = false;
-                self.go(Step::Reset);
-            }
             (Request::QuickStop, Step::Refused | Step::Stopped) => self.aim(Goal::Stopped, false),
             (Request::Disable, Step::Refused | Step::Stopped) => self.aim(Goal::Off, false),
             (Request::QuickStop | Request::Disable, _) => {
@@ -534,7 +527,7 @@ impl Fieldbus {
                 }
                 self.go(Step::Stopped);
             }
-            (Request::Enable | Request::Arm | Request::Reset, _) => return false,
+            (Request::Enable | Request::Arm, _) => return false,
         }
         true
     }
@@ -813,10 +806,6 @@ impl Fieldbus {
                     send(bus, Nmt::Start.frame(drive.node()));
                 }
             }
-        let turning = |drive: &Drive| match drive.config().mode {
-            Mode::Position => 1.5 * BY_HAND,
-            Mode::Torque | Mode::Speed => bounds(drive).command,
-        };
             self.go(Step::Reenable);
         }
     }
@@ -824,6 +813,10 @@ impl Fieldbus {
     /// One drive after the other.
     fn test_signs(&mut self, lasted_ns: u64) {
         let by_hand = self.options.sign_test == SignTest::ByHand;
+        let turning = |drive: &Drive| match drive.config().mode {
+            Mode::Position => 1.5 * BY_HAND,
+            Mode::Torque | Mode::Speed => bounds(drive).command,
+        };
         if self.push.is_none() {
             let next = (0..self.nodes.len()).find(|at| drive_of(&self.nodes[*at]).is_some() && !self.done[*at]);
             let Some(at) = next else {

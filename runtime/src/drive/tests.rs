@@ -110,8 +110,7 @@ fn armed_the_shaft_follows_the_torque() {
     assert!(table.bench.shaft(LOAD).speed.abs() < 0.06);
     assert_eq!(table.fieldbus.status(SERVO).unwrap().state, State::SwitchOnDisabled);
     assert!(!table.fieldbus.request(Request::Arm), "not without the whole start-up");
-    table.fieldbus.request(Request::Reset);
-    table.arm();
+    assert!(!table.fieldbus.request(Request::Enable), "a stop latches");
 }
 
 #[test]

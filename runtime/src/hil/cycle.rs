@@ -441,7 +441,6 @@ impl Hil {
     /// What the operator asked for since the last cycle.
     fn operate(&mut self) {
         self.cycle.arms = false;
-        self.cycle.resets = false;
         self.cycle.set.clear();
         let now_ns = self.wires.clock.now_ns();
         self.commands.begin(now_ns);
@@ -458,7 +457,6 @@ impl Hil {
                 }
                 Command::Enable => self.fieldbus.request(Request::Enable),
                 Command::Arm => self.fieldbus.request(Request::Arm),
-                Command::Reset => self.reset(),
                 Command::Stop | Command::Set(_) => unreachable!("neither comes this way"),
             };
             let answer = if has_effect { Answer::Taken } else { Answer::Refused(Why::NotNow(self.stage())) };
@@ -513,23 +511,6 @@ impl Hil {
             Some(_) => self.wires.report(Cause::Asked),
             None => self.end = Some(End::Asked),
         }
-    }
-
-    /// Whether it has an effect.
-    fn reset(&mut self) -> bool {
-        let Some(control) = &mut self.control else { return false };
-        let resets = control.supervisor_mut().reset() && self.fieldbus.request(Request::Reset);
-        if resets {
-            self.cycle.resets = true;
-            self.first_trouble = None;
-            self.resting_ns = None;
-            self.overload = 0;
-            if let Some(watchdog) = &self.wires.watchdog {
-                watchdog.reset();
-                self.wires.acknowledged = false;
-            }
-        }
-        resets
     }
 
     /// What the nodes and buses have said against going on.

@@ -223,11 +223,6 @@ impl Watchdog {
     pub fn watch(&self, awake: bool) {
         self.shared.awake.store(awake, Ordering::Release);
     }
-
-    /// The operator has reset the trip.
-    pub fn reset(&self) {
-        self.shared.bitten.store(false, Ordering::Release);
-    }
 }
 
 impl Drop for Watchdog {
@@ -271,8 +266,6 @@ mod tests {
             std::thread::sleep(Duration::from_millis(10));
         }
         assert!(!watchdog.beat(), "a late cycle learns of it");
-        watchdog.reset();
-        assert!(watchdog.beat());
     }
 
     #[test]

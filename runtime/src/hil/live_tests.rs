@@ -75,10 +75,9 @@ fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_tak
             // Bursts that overfill the queue.
             let burst = [0, 0, 1, 3, 90][chance.below(5) as usize];
             for _ in 0..burst {
-                let command = match chance.below(12) {
-                    0 => Command::Enable,
-                    1 => Command::Arm,
-                    2 => Command::Reset,
+                let command = match 1 + chance.below(11) {
+                    1 => Command::Enable,
+                    2 => Command::Arm,
                     3 => stand.set(&[(0, f64::NAN)]),
                     4 => Command::Set(Set::new(&[(Slot(2), 1.0)]).unwrap()),
                     k if k < 8 => stand.set(&[(0, chance.between(-0.1, 1.1))]),

@@ -21,6 +21,10 @@ pub const PLACES: usize = 64;
 /// two periods, so that a slow rig can be commanded at all.
 pub const OLD_NS: u64 = 1_000_000_000;
 
+/// Why `reset` is refused at any time, in words.
+pub const NO_RESET: &str = "a stop is final: the rig ends as soon as its drives are at rest. Start it again, so that drives \
+                            are identified and tested anew";
+
 /// How often a thread that waits for an answer looks for it.
 const LOOK: Duration = Duration::from_millis(2);
 
@@ -34,8 +38,6 @@ pub enum Command {
     Arm,
     /// A controlled stop.
     Stop,
-    /// After a stop: start anew.
-    Reset,
     /// New values of parameters, as one set.
     Set(Set),
 }
@@ -47,7 +49,6 @@ impl Command {
             Command::Enable => "enable",
             Command::Arm => "arm",
             Command::Stop => "stop",
-            Command::Reset => "reset",
             Command::Set(_) => "set",
         }
     }

@@ -136,9 +136,6 @@ impl<'a> Replay<'a> {
         if recorded.arms {
             self.control.supervisor_mut().arm();
         }
-        if recorded.resets {
-            self.control.supervisor_mut().reset();
-        }
         let order = self.control.cycle(&Told {
             ticks: recorded.ticks,
             late_ns: trace::within_tick(recorded.late_ns, recorded.ticks, self.rig.period_ns),

@@ -32,8 +32,6 @@ pub struct Cycle {
     pub order: Order,
     /// The outputs were given to whoever asks, just before this cycle.
     pub arms: bool,
-    /// The operator reset a trip, just before this cycle.
-    pub resets: bool,
     /// Where the start-up was.
     pub step: u8,
     /// Status word of each drive that moves.
@@ -122,7 +120,6 @@ impl Cycle {
             source: Source::Nobody,
             order: Order::Wait,
             arms: false,
-            resets: false,
             step: 0,
             statuses: vec![0; shape.drives],
             readings: vec![Reading { value: 0.0, age: Reading::NEVER }; shape.signals],
@@ -142,9 +139,8 @@ impl Cycle {
         let [receive, compute, send] = self.phases_ns.map(u64::from);
         words.extend([self.k, self.due_ns, u64::from(self.late_ns) | u64::from(self.ticks) << 32]);
         words.push(receive | compute << 32);
-        let begins = u64::from(self.arms) | u64::from(self.resets) << 1;
         let (source, order) = (source_number(self.source), order_number(self.order));
-        words.push(send | source << 32 | order << 40 | u64::from(self.step) << 48 | begins << 56);
+        words.push(send | source << 32 | order << 40 | u64::from(self.step) << 48 | u64::from(self.arms) << 56);
         words.push(self.causes.len() as u64 | (self.set.len() as u64) << 16 | (self.wanted.len() as u64) << 32);
         words.extend(self.readings.iter().map(|reading| reading.value.to_bits()));
         let ages = self.readings.iter().map(|reading| match reading.age {
@@ -199,7 +195,6 @@ impl Cycle {
                 _ => return None,
             },
             arms: fifth >> 56 & 1 == 1,
-            resets: fifth >> 57 & 1 == 1,
             step: (fifth >> 48 & 0xff) as u8,
             statuses: statuses.iter().map(|status| *status as u16).collect(),
             readings: values
@@ -353,7 +348,6 @@ mod tests {
             source: Source::StartUp,
             order: Order::QuickStop,
             arms: true,
-            resets: false,
             step: 11,
             statuses: vec![0x1637, 0x0218],
             readings: [0, 1, 5, 0xfffe, Reading::NEVER].map(|age| Reading { value: -0.1, age }).to_vec(),
