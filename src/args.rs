@@ -804,6 +804,12 @@ pub struct Deploy {
     /// Tell its state until Ctrl-C also where the output is no terminal
     #[arg(long, requires = "start")]
     pub follow: bool,
+    /// As it is started: go on in a further file after so many bytes of log [default: 256MB]
+    #[arg(long, requires = "start", value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
+    pub roll: Option<u64>,
+    /// As it is started: remove its oldest logs, so that all together have so many bytes at most [default: keep all]
+    #[arg(long, requires = "start", value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
+    pub keep: Option<u64>,
 }
 
 /// `fric fetch-log`

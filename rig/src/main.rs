@@ -21,6 +21,7 @@ mod drives;
 
 use clap::{Parser, Subcommand, ValueHint};
 use runtime::drive::serve::Doors;
+use runtime::record::parts;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -123,16 +124,28 @@ struct Run {
     /// The log [default: DIR/log/RIG-TIME.friclog]
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     log: Option<PathBuf>,
-    /// Go on in a further file, RIG-TIME.2.friclog, after so many bytes of log
-    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes, default_value = "256MB")]
-    roll: u64,
-    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
-    #[arg(long, value_name = "SIZE", value_parser = runtime::record::parts::bytes)]
-    keep: Option<u64>,
+    #[command(flatten)]
+    sizes: Sizes,
     #[command(flatten)]
     store: Store,
     #[command(flatten)]
     trust: Trust,
+}
+
+#[derive(clap::Args, Debug)]
+struct Sizes {
+    /// Go on in a further file, RIG-TIME.2.friclog, after so many bytes of log
+    #[arg(long, value_name = "SIZE", value_parser = parts::bytes, default_value = "256MB")]
+    roll: u64,
+    /// Remove the oldest logs in the folder of the log, so that all together have so many bytes at most [default: keep all]
+    #[arg(long, value_name = "SIZE", value_parser = parts::bytes)]
+    keep: Option<u64>,
+}
+
+impl Sizes {
+    fn limits(&self) -> parts::Limits {
+        parts::Limits { part: self.roll, keep: self.keep, ..Default::default() }
+    }
 }
 
 #[derive(clap::Args, Debug)]
@@ -193,6 +206,8 @@ struct Start {
     /// SHA-256 of the package that must be the current one: else the rig has gone back from it
     #[arg(long)]
     hash: Option<String>,
+    #[command(flatten)]
+    sizes: Sizes,
     #[command(flatten)]
     store: Store,
     #[command(flatten)]
@@ -286,7 +301,7 @@ fn ran(args: &Run) -> Result<u8, String> {
         duration: args.duration,
         buses: &args.bus,
         log: args.log.as_deref(),
-        limits: runtime::record::parts::Limits { part: args.roll, keep: args.keep, ..Default::default() },
+        limits: args.sizes.limits(),
     };
     run::run(&wanted)
 }
@@ -315,7 +330,7 @@ fn main() -> ExitCode {
         Command::Drives(drives) => return ended(served(drives)),
         Command::Start(start) => {
             let trust = run::Trust { trusted: &start.trust.keys.trusted, allow_unsigned: start.trust.allow_unsigned };
-            run::start(&start.store.dir, start.hash.as_deref(), trust)
+            run::start(&start.store.dir, start.hash.as_deref(), trust, start.sizes.limits())
         }
         Command::Say(say) => match said(&say.what) {
             Some(what) => run::say(&say.store.dir, &what),

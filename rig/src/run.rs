@@ -477,11 +477,12 @@ pub struct Trust<'a> {
     pub allow_unsigned: bool,
 }
 
-/// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be it.
+/// Starts the current package in a process of its own, which outlives this one. `hash`: of the package that must be it;
+/// `limits`: how large its logs may become.
 ///
 /// # Errors
 /// What the rig said if it ended within its first second, or runs another package than the current one.
-pub fn start(dir: &Path, hash: Option<&str>, trust: Trust) -> Result<String, String> {
+pub fn start(dir: &Path, hash: Option<&str>, trust: Trust, limits: Limits) -> Result<String, String> {
     let store = Store::at(dir);
     let Some(current) = store.current_target() else {
         return Err(format!("nothing is installed in {}", dir.display()));
@@ -499,6 +500,8 @@ pub fn start(dir: &Path, hash: Option<&str>, trust: Trust) -> Result<String, Str
         let mut command = std::process::Command::new(program);
         command.arg("run").arg("--dir").arg(dir).arg("--trusted").arg(trust.trusted);
         command.args(trust.allow_unsigned.then_some("--allow-unsigned")).stdin(std::process::Stdio::null());
+        command.arg("--roll").arg(parts::option(limits.part));
+        limits.keep.map(|keep| command.arg("--keep").arg(parts::option(keep)));
         command.stdout(file.try_clone().map_err(about)?).stderr(file);
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         child = Some(command.spawn().map_err(about)?);

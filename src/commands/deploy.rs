@@ -13,6 +13,7 @@ use crate::terminal::Terminal;
 use abi::foreign::is_component;
 use runtime::package::signature::{EXTENSION as SIGNATURE, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
+use runtime::record::parts;
 use std::fs;
 use std::io::IsTerminal;
 use std::os::unix::fs::PermissionsExt;
@@ -78,7 +79,11 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     // What has been installed is kept under its hash; the copy has done its work.
     drop(arrived);
     if args.start {
-        start(args, &remote, &with(&[rig, "start", "--hash", &hash(&bytes), "--dir", dir]), terminal)?;
+        let mut words = with(&[rig, "start", "--hash", &hash(&bytes), "--dir", dir]);
+        for (option, size) in [("--roll", args.roll), ("--keep", args.keep)] {
+            words.extend(size.into_iter().flat_map(|size| [option.into(), parts::option(size)]));
+        }
+        start(args, &remote, &words, terminal)?;
     }
     Ok(())
 }

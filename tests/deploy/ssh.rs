@@ -235,9 +235,15 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     assert_eq!(there.current().as_ref(), Some(&first));
 
     // The good one starts and runs by itself on its simulated drives; another one is refused beside it.
-    let started = there.local(&["start"]);
+    let started = there.local(&["start", "--roll", "1.5MB", "--keep", "20MB"]);
     assert!(started.status.success(), "{}", said(&started));
     there.wait("running", |state| state.2 > 10);
+    // The sizes of logs are those of the process that runs.
+    let process = said(&started).lines().find_map(|line| line.strip_prefix("started, process ").map(str::to_string));
+    let words = fs::read_to_string(format!("/proc/{}/cmdline", process.unwrap().trim())).unwrap().replace('\0', " ");
+    assert!(words.contains("--roll 1500kB") && words.contains("--keep 20000kB"), "{words}");
+    let reset = there.local(&["say", "reset"]);
+    assert!(reset.status.code() == Some(1) && said(&reset).contains("a stop is final"), "{}", said(&reset));
     let second = there.local(&["run"]);
     assert!(second.status.code() == Some(1) && said(&second).contains("a rig runs in "), "{}", said(&second));
     assert!(said(&there.local(&["start"])).contains("it runs"));

@@ -56,6 +56,11 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     }
 }
 
+/// The same number of bytes as an option: [`bytes`] reads it back.
+pub fn option(bytes: u64) -> String {
+    format!("{}kB", bytes as f64 / 1e3)
+}
+
 /// Bytes in words: `12.3 MB`, `45.2 GB`.
 pub fn size(bytes: u64) -> String {
     match bytes as f64 {
@@ -227,6 +232,9 @@ mod tests {
             ["256MB", " 1.5 GB ", "2TB", "1kB"].map(bytes),
             [256_000_000, 1_500_000_000, 2_000_000_000_000, 1000].map(Ok)
         );
+        for size in [1, 999, 1500, 256_000_000, 12_345_678_901] {
+            assert_eq!(bytes(&option(size)), Ok(size));
+        }
         for wrong in ["", "12", "MB", "-1 MB", "0 GB", "nan GB", "inf TB", "1e20 TB", "3 mB", "3 MBs"] {
             assert!(bytes(wrong).is_err(), "{wrong}");
         }
