@@ -98,6 +98,8 @@ struct Run<'a> {
     others: Vec<Port>,
     passed: Passed,
     words: Vec<u64>,
+    /// The second program is under way.
+    second: bool,
 }
 
 /// Runs a script; a panic of our own code is a failure like any other.
@@ -165,6 +167,7 @@ impl<'a> Run<'a> {
             others: Vec::new(),
             passed: Passed { hash: 0xcbf2_9ce4_8422_2325, ..Passed::default() },
             words: Vec::with_capacity(1 << 12),
+            second: false,
         }
     }
 
@@ -179,6 +182,7 @@ impl<'a> Run<'a> {
     fn all(mut self) -> Result<Passed, Violation> {
         self.program(false)?;
         if self.script.again {
+            self.second = true;
             self.program(true)?;
         }
         Ok(self.passed)
@@ -403,8 +407,7 @@ impl<'a> Run<'a> {
 
     fn cycle(&mut self, program: &mut Program) -> Result<(), Violation> {
         self.disturb();
-        let strange = matches!(self.script.only, Only::OtherVendor | Only::OtherName);
-        if strange && program.hil.step() <= Step::Identity {
+        if self.is_strange() && program.hil.step() <= Step::Identity {
             // A reset takes back what it says of itself.
             imitate(self.world.bench().drive(0).unwrap().objects(), self.script.only);
         }
@@ -436,15 +439,20 @@ impl<'a> Run<'a> {
         self.replay(program)
     }
 
+    /// Whether the first drive says that it is another one.
+    fn is_strange(&self) -> bool {
+        match self.script.only {
+            Only::Any | Only::Simulated => false,
+            Only::OtherVendor | Only::OtherName => true,
+            Only::OtherLater => self.second,
+        }
+    }
+
     /// What only simulated drives may have is given to no other.
     fn judge_permission(&self, program: &Program) -> Result<(), Violation> {
-        let framed = self.script.rig.sort == super::rigs::Sort::FramesServo;
-        let strange = match self.script.only {
-            Only::Any => false,
-            Only::Simulated => framed,
-            Only::OtherVendor | Only::OtherName => true,
-        };
-        if strange && program.hil.step() > Step::AwaitEnable && program.hil.step() < Step::Stopped {
+        let framed = self.script.rig.sort == super::rigs::Sort::FramesServo && self.script.only != Only::Any;
+        if (framed || self.is_strange()) && program.hil.step() > Step::AwaitEnable && program.hil.step() < Step::Stopped
+        {
             return Err(
                 self.broken(Broken::Permission, format!("{} with a drive that is not ours", program.hil.step()))
             );

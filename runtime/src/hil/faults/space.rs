@@ -41,6 +41,8 @@ pub enum Only {
     OtherVendor,
     /// Yes, and its first drive says another name.
     OtherName,
+    /// Yes, and another device answers for its first drive when the second program starts.
+    OtherLater,
 }
 
 /// One fault.
@@ -203,8 +205,10 @@ impl Script {
             0 => Only::OtherVendor,
             1 => Only::OtherName,
             2..=5 => Only::Simulated,
+            6 => Only::OtherLater,
             _ => Only::Any,
         };
+        let again = again || only == Only::OtherLater;
         Script { seed, rig, tested, again, sets, only, faults }
     }
 }
