@@ -291,11 +291,14 @@ pub enum Protection {
     Judged,
     Old,
     Late,
+    Patient,
+    Recorded,
+    Reused,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 26] = [
+    pub const ALL: [(&'static str, Protection); 29] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -322,6 +325,9 @@ impl Protection {
         ("judged", Protection::Judged),
         ("old", Protection::Old),
         ("late", Protection::Late),
+        ("patient", Protection::Patient),
+        ("recorded", Protection::Recorded),
+        ("reused", Protection::Reused),
     ];
 }
 

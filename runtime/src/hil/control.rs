@@ -429,7 +429,8 @@ impl Control {
             }
             // An answer that is late in each tick is never believed: it is as good as lost.
             let missing = if watched.answers && is_present(Protection::Late) { watched.late } else { 0 };
-            if watched.timeout.is_some_and(|timeout| reading.age.max(missing) >= timeout) {
+            let patience = |timeout| if is_present(Protection::Patient) { timeout } else { 1 };
+            if watched.timeout.is_some_and(|timeout| reading.age.max(missing) >= patience(timeout)) {
                 self.supervisor.trip(Cause::Lost(i));
             }
             if watched.odd >= self.odd {

@@ -400,6 +400,9 @@ impl Hil {
         let ticks = u32::try_from(missed + 1).unwrap_or(u32::MAX);
 
         self.wires.frames.clear();
+        if !is_present(Protection::Reused) {
+            self.wires.frames = Vec::with_capacity(self.wires.frames.capacity());
+        }
         if !is_present(Protection::Kept) {
             self.wires.causes.clear();
         }
@@ -592,6 +595,9 @@ impl Hil {
             let refused = control.refused_set().map(|status| Answer::Refused(Why::Set(Objection::Model(status))));
             self.counts.refused_sets += u64::from(refused.is_some());
             self.commands.answer(number, refused.unwrap_or(Answer::Taken));
+        }
+        if !is_present(Protection::Recorded) {
+            cycle.set.clear();
         }
         cycle.order = order;
         cycle.requests.copy_from_slice(control.requests());

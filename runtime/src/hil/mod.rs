@@ -33,3 +33,6 @@ mod live_tests;
 
 #[cfg(test)]
 mod faults;
+
+#[cfg(test)]
+mod endings;

@@ -127,22 +127,26 @@ fn the_same_seed_gives_the_same_bits() {
     }
 }
 
-/// Protections of the process, not of a cycle: signal handlers, their stack and their table of frames. Tests of
-/// [`emergency`](crate::hil::emergency) hold them, with real signals.
+/// Protections of the process, not of a cycle: signal handlers, their stack and their table of frames. Random
+/// [`endings`](crate::hil::endings) of real processes hold them.
 #[cfg(feature = "mutants")]
 const OUTSIDE: [&str; 2] = ["table", "own-stack"];
 
-/// Each protection taken away makes the fault space fail. `FRIC_ONLY=name` tries one alone.
+/// Each protection taken away makes the fault space, or the endings of processes, fail. `FRIC_ONLY=name` tries one alone.
 #[cfg(feature = "mutants")]
 #[test]
 fn mutants_are_caught_by_the_fault_space() {
     let only = std::env::var("FRIC_ONLY").ok();
-    let all = crate::safety::Protection::ALL.iter().map(|(name, _)| *name).filter(|name| !OUTSIDE.contains(name));
+    let all = crate::safety::Protection::ALL.iter().map(|(name, _)| *name);
     let mut missed = Vec::new();
     for name in all.filter(|name| only.as_deref().is_none_or(|only| only == *name)) {
         let mut test = std::process::Command::new(std::env::current_exe().unwrap());
-        test.args(["hil::faults::random_faults", "--nocapture"]).env("FRIC_MUTANT", name);
-        let out = test.env("FRIC_RUNS", "4000").output().unwrap();
+        let (generator, runs) = match OUTSIDE.contains(&name) {
+            true => ("hil::endings", "100"),
+            false => ("hil::faults::random_faults", "4000"),
+        };
+        test.args([generator, "--nocapture"]).env("FRIC_MUTANT", name).env("FRIC_RUNS", runs);
+        let out = test.output().unwrap();
         let text = [out.stdout, out.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
         let why = text.lines().find(|line| line.starts_with("mutant")).unwrap_or_default();
         println!("{name}: {why}");
