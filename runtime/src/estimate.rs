@@ -331,6 +331,25 @@ mod tests {
         }
     }
 
+    /// sin t has its maximum of 1 at π/2: at many steps a point that all three runs share is the nearest one to it.
+    #[test]
+    fn an_extreme_between_points_that_all_runs_share_is_judged() {
+        let instance = models::oscillator();
+        let mut shared = 0;
+        for k in 0..200 {
+            let step = 0.01 + 0.0007 * f64::from(k);
+            let mut experiment = fixed((2.0 / step).ceil() * step, step);
+            experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+            let found = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+            let (error, estimate) = (1.0 - found.value, found.error.unwrap());
+            assert!(error.abs() <= 1.5 * estimate + 1e-9, "step {step}: off by {error:e}, estimated {estimate:e}");
+            // The nearest point is a shared one if it is nearest by less than half of the finest step.
+            let from_peak = std::f64::consts::FRAC_PI_2 / step - (std::f64::consts::FRAC_PI_2 / step).round();
+            shared += u32::from(from_peak.abs() < 0.125);
+        }
+        assert!(shared > 30, "{shared} steps of 200 have it at a shared point");
+    }
+
     #[test]
     fn the_tightest_tolerance_is_judged_by_a_looser_one() {
         let (error, estimate) = decay(adaptive(1.0, 1e-13));

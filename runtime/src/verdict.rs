@@ -530,6 +530,26 @@ mod tests {
     }
 
     #[test]
+    fn agreement_on_an_extreme_leaves_the_course_of_the_finest_run_open() {
+        let [mut own, mut fine] = [readings(2.0, -2.0), readings(2.01, -2.0)];
+        (own[0].unseen, fine[0].unseen) = (0.5, 0.02);
+        let condition = Formula::Less(Box::new(Formula::Multiply(number(3.0), max())), number(6.08));
+        let judged = judged(&expect(condition), &Runs { readings: &[&own, &fine], error: &|_| Some(0.0) });
+        assert!(judged.holds && !judged.decided);
+        assert!((judged.readings[0].error.unwrap() - 0.03).abs() < 1e-12 && judged.readings[1].error == Some(0.0));
+        assert!((judged.margin.unwrap().error.unwrap() - 0.09).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_quantity_that_is_all_rounding_is_as_uncertain_as_it_is_large() {
+        let mut noise = readings(4e-16, 0.0);
+        noise.iter_mut().for_each(|reading| reading.scale = 4e-16);
+        let below = |limit: f64| Formula::Less(max(), number(limit));
+        let judged = judged(&expect(below(1e-12)), &Runs { readings: &[&noise, &noise], error: &|_| Some(0.0) });
+        assert!(judged.passed() && judged.readings[0].error == Some(4e-16) && judged.readings[1].error == Some(0.0));
+    }
+
+    #[test]
     fn what_is_seen_at_points_alone_is_as_coarse_as_they_are() {
         let mut coarse = readings(2.0, -2.0);
         coarse[0].resolution = 0.1;
