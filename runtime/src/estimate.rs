@@ -115,7 +115,11 @@ impl Ladder<'_> {
         let (mut going, mut result) = (true, Err("its delays reach back over more steps than are kept".into()));
         if solver.method == Method::Adaptive || has_room(stepped, solver.step) {
             let duration = covering(&self.bare, &solver);
-            let experiment = Experiment { solver, duration, ..self.bare.clone() };
+            let mut experiment = Experiment { solver, duration, ..self.bare.clone() };
+            if duration > self.bare.duration {
+                // No window reaches beyond the experiment.
+                experiment.expects.iter_mut().for_each(|expect| expect.before = expect.before.min(self.bare.duration));
+            }
             let ended = engine::run(self.instance.clone(), &experiment, watch);
             going = !ended.as_ref().is_err_and(|failure| failure.cause == Cause::Stopped);
             result = ended.map(|outcome| outcome.verdicts).map_err(|failure| failure.to_string());
@@ -319,15 +323,15 @@ mod tests {
 
     #[test]
     fn a_run_that_ends_beside_its_duration_is_judged_there() {
-        // Exact but for where it ends: at 1 s and at 1.1 s.
+        // Exact but for where it ends: at 1 s and at 1.1 s, with half and a quarter of the step too.
         let instance = models::decay();
-        for (duration, kind) in [(1.04, MeasureKind::Final), (1.06, MeasureKind::Final), (1.04, MeasureKind::Min)] {
+        for (duration, kind) in [(1.004, MeasureKind::Final), (1.096, MeasureKind::Final), (1.004, MeasureKind::Min)] {
             let mut experiment = fixed(duration, 0.1);
             experiment.solver.method = Method::Rk4;
             experiment.expects.push(reading(&instance, kind, "x"));
             let reading = judged(&instance, &experiment).verdicts[0].readings[0].clone();
             let (error, estimate) = ((reading.value - (-duration).exp()).abs(), reading.error.unwrap());
-            assert!(error > 1e-2 && error <= 1.5 * estimate && estimate <= 3.0 * error, "{error:e}, {estimate:e}");
+            assert!(error > 1e-3 && error <= 1.5 * estimate && estimate <= 3.0 * error, "{error:e}, {estimate:e}");
         }
     }
 
