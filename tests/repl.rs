@@ -374,13 +374,58 @@ fn mistakes_are_named_with_their_remedy() {
     says("f.Fs = 1 N", "there is no `f` here to set");
     says("use \"nowhere.fric\"", "there is no such file");
     says("use std.frictoin", "did you mean `std.friction`?");
-    says("explain Nothing", "there is no model `Nothing`");
+    says("explain Nothing", "there is no quantity, part, model or experiment `Nothing` here");
+    says("doc Nothing", "there is no model `Nothing`");
     says("ans", "there is no `ans` yet");
     says("save try.txt", "`save try.fric`");
     says("save try.fric", "there is nothing to save yet");
     says("f = LuGre()\nplot f.F against f.v = 0 m/s .. 1 m/s to x.gif", "ends in .svg or .png");
     says("why E9999", "there is no page about `E9999`");
+    says("why chater", "did you mean chatter?");
     says("watch", "watch what?");
+}
+
+/// An experiment whose window lies beyond 1 s, and whose quantities have names like models.
+const PULLED: &str = "import std.bench\nimport std.friction\n\nexperiment drawn {\n  run    SpringBench(k = 2 N/m, vp = 0.1 m/s, fr = LuGre()) for 3 s\n  expect max(v) < 9 m/s after 2 s\n}\n";
+
+#[test]
+fn what_was_run_last_can_be_asked_whatever_its_windows() {
+    let folder = folder("asked");
+    fs::write(folder.join("p.fric"), PULLED).unwrap();
+    let answers = [
+        ("names", "of drawn, run last: pull, x, v, F, spring, fr.v"),
+        ("x", "µm\n"),
+        ("x + 1 m", "m\n"),
+        ("unit F", "N   a force"),
+        ("fr.z", "µm"),
+        ("max(v)", "m/s"),
+        ("explain F", "F: output [N]"),
+        ("explain fr.z", "fr.z: state [µm]"),
+        ("explain fr", "fr.sigma0"),
+        ("explain drawn", "body.dx/dt"),
+        ("explain SpringBench", "in this order:"),
+        ("explain E0902", "## E0902"),
+        ("explain chatter", "## W0705"),
+        ("why chatter", "## W0705"),
+        ("deps F", "F  output [N]\n  fr.F"),
+        ("step 1 ms", "t = "),
+    ];
+    for (asked, expected) in answers {
+        let output = piped(&folder, &["repl"], &format!("use \"p.fric\"\nrun drawn\n{asked}\n"));
+        let shown = text(&output.stdout);
+        let answer = shown.split_once("margin").map_or("", |(_, rest)| rest);
+        assert!(answer.contains(expected), "{asked}: {shown}\n{}", text(&output.stderr));
+        assert_eq!(output.status.code(), Some(0), "{asked}: {}", text(&output.stderr));
+    }
+    for (asked, expected) in [
+        ("use \"p.fric\"\nnames", ""),
+        ("use \"p.fric\"\nexplain F", "once it has been run, `run drawn`"),
+        ("use \"p.fric\"\ndoc drawn", "`drawn` is an experiment; `explain drawn` shows what it runs"),
+    ] {
+        let output = piped(&folder, &["repl"], asked);
+        assert!(text(&output.stderr).contains(expected), "{asked}: {}", text(&output.stderr));
+        assert!(!text(&output.stdout).contains("nothing yet"), "{asked}");
+    }
 }
 
 #[test]

@@ -42,6 +42,9 @@ pub struct Changes {
     pub ports: Option<Ports>,
     /// Statements that the experiment gets besides its own, as text: `expect max(x) < 1 mm`.
     pub also: Vec<String>,
+    /// Leaves the experiment's own expectations out: a question at the prompt judges nothing, and a window of one may lie
+    /// beyond the time for which it is compiled.
+    pub unjudged: bool,
 }
 
 /// A number of a plan that was computed from an expression.
@@ -143,6 +146,9 @@ pub fn read(
     };
     let misread = loaded.misread(experiment.span);
     let mut experiment = std::borrow::Cow::Borrowed(experiment);
+    if changes.unjudged {
+        experiment.to_mut().body.retain(|statement| !matches!(statement, ExperimentStatement::Expect(_)));
+    }
     if !also.is_empty() {
         experiment.to_mut().body.extend(also);
     }
@@ -1018,9 +1024,12 @@ impl Reader<'_> {
             None => {
                 if !self.types.boolean[nodes[at.value].0 as usize] {
                     let error = Diagnostic::error("E0901", "an expectation is a condition")
-                        .label(self.system.span(nodes[at.value]), "neither true nor false")
-                        .help("compare it: `expect max(F) < 2 N`, `expect final(x) ~= 1 m +- 1 %`");
-                    self.diagnostics.push(error);
+                        .label(self.system.span(nodes[at.value]), "neither true nor false");
+                    let window = self.window_first(expect);
+                    self.diagnostics.push(match window {
+                        Some(help) => error.help(help),
+                        None => error.help("compare it: `expect max(F) < 2 N`, `expect final(x) ~= 1 m +- 1 %`"),
+                    });
                     return None;
                 }
                 value
@@ -1071,6 +1080,24 @@ impl Reader<'_> {
             return None;
         }
         Some(plan::Expect { text, measures, condition, after, before })
+    }
+
+    /// `expect max(x) after 5 s < 1 m`: the window stands before the comparison. The expectation as it should be.
+    fn window_first(&mut self, expect: &ast::Expect) -> Option<String> {
+        let compares =
+            |op| matches!(op, BinaryOp::Less | BinaryOp::LessEqual | BinaryOp::Greater | BinaryOp::GreaterEqual);
+        let compared = |edge: &&Expr| matches!(&edge.kind, ast::ExprKind::Binary(op, ..) if compares(*op));
+        let (word, edge) = match (expect.after.as_ref().filter(compared), expect.before.as_ref().filter(compared)) {
+            (Some(edge), _) => ("after", edge),
+            (None, Some(edge)) => ("before", edge),
+            (None, None) => return None,
+        };
+        let ast::ExprKind::Binary(op, _, time, limit) = &edge.kind else { return None };
+        // That a time is compared with something else is the same mistake.
+        let edge = edge.span;
+        self.diagnostics.retain(|d| d.span().start < edge.start || d.span().end > edge.end);
+        let [value, time, limit] = [expect.value.span, time.span, limit.span].map(|span| self.loaded.files.slice(span));
+        Some(format!("the window stands behind the comparison: `expect {value} {} {limit} {word} {time}`", op.text()))
     }
 
     /// Arithmetic over measures. The slot of a measure is the number of what it measures among the wanted ones.

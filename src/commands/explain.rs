@@ -16,18 +16,35 @@ pub fn explain(args: &Explain, terminal: &mut Terminal) -> End {
     if args.subject.ends_with(".fric") || Path::new(&args.subject).is_file() {
         return models(args, terminal);
     }
-    let named = compile::LINTS.iter().find(|(lint, _)| *lint == args.subject.trim());
-    let code = named.map_or_else(|| args.subject.trim().to_uppercase(), |(_, code)| code.to_string());
-    if let Some(page) = page(&code) {
+    if let Some(page) = page_of(&args.subject) {
         terminal.print(page);
         return End::Fine;
     }
-    let help = match compile::nearest(&code, codes()) {
-        Some(near) => format!("did you mean {near}?"),
-        None => "codes look like E0101 or W0703".into(),
-    };
-    terminal.error(&format!("there is no page about `{}`; {help}", args.subject));
+    terminal.error(&no_page(&args.subject));
     End::Failed
+}
+
+/// The page of a code or of a lint, `E0101`, `not-dissipative`.
+pub(super) fn page_of(subject: &str) -> Option<&'static str> {
+    let named = compile::LINTS.iter().find(|(lint, _)| *lint == subject.trim());
+    page(&named.map_or_else(|| subject.trim().to_uppercase(), |(_, code)| code.to_string()))
+}
+
+/// That there is no such page, and what was probably meant.
+pub(super) fn no_page(subject: &str) -> String {
+    let subject = subject.trim();
+    let lints = compile::LINTS.iter().map(|(lint, _)| *lint);
+    let near = compile::nearest(&subject.to_uppercase(), codes()).or(compile::nearest(subject, lints));
+    let help = match near {
+        Some(near) => format!("did you mean {near}?"),
+        None if crate::repl::library_models().contains(&subject) => {
+            format!(
+                "a model is explained in a file that imports it, `fric explain FILE.fric {subject}`, or at the prompt"
+            )
+        }
+        None => "codes look like E0101 or W0703, lints like `not-dissipative`".into(),
+    };
+    format!("there is no page about `{subject}`; {help}")
 }
 
 /// Models that a message names at most.

@@ -174,9 +174,9 @@ impl Prompt<'_> {
             Command::Diagram => self.diagram(rest)?,
             Command::Names => self.names(),
             Command::Lints => self.lints(),
-            Command::Why => match super::explain::page(&rest.to_uppercase()) {
+            Command::Why => match super::explain::page_of(rest) {
                 Some(page) => self.terminal.print(page),
-                None => return Err(Fault::Words(format!("there is no page about `{rest}`; codes look like E0101"))),
+                None => return Err(Fault::Words(super::explain::no_page(rest))),
             },
             Command::Watch => {
                 let (file, name) = split_file(rest);
@@ -331,7 +331,17 @@ impl Prompt<'_> {
         if rest.is_empty() {
             return Err("explain what? `explain f.z`, `explain LuGre`, `why E0401`".into());
         }
-        let (explanation, path) = self.session.explained(rest)?;
+        let (explanation, path) = match self.session.explained(rest) {
+            // Codes and lints are explained on the command line; so they are here.
+            Err(Fault::Words(words)) => match super::explain::page_of(rest) {
+                Some(page) => {
+                    self.terminal.print(page);
+                    return Ok(());
+                }
+                None => return Err(Fault::Words(words)),
+            },
+            other => other?,
+        };
         match path {
             Some(path) if !path.is_empty() => self.quantity(&explanation, &path),
             _ => super::explain::tell(&explanation, &[], self.terminal),
@@ -378,7 +388,7 @@ impl Prompt<'_> {
 
     fn doc(&mut self, rest: &str) -> Result<(), Fault> {
         let Some(model) = self.session.model(rest) else {
-            return Err(Fault::Words(format!("there is no model `{rest}`; `names` shows what there is")));
+            return Err(self.session.no_model(rest));
         };
         self.terminal.line(&self.terminal.styled(Style::Bold, &model.name.text));
         for line in model.doc.iter().flat_map(|doc| doc.lines()) {
@@ -436,7 +446,7 @@ impl Prompt<'_> {
     fn diagram(&mut self, rest: &str) -> Result<(), Fault> {
         let (name, file) = repl::cut_to(rest)?;
         let Some(model) = self.session.model(name) else {
-            return Err(Fault::Words(format!("there is no model `{name}`; `names` shows what there is")));
+            return Err(self.session.no_model(name));
         };
         match file {
             None => self.terminal.print(&diagram::text(&model)),
@@ -462,7 +472,11 @@ impl Prompt<'_> {
         if !experiments.is_empty() {
             self.terminal.line(&format!("experiments: {}", experiments.join(", ")));
         }
-        if instances.is_empty() && models.is_empty() {
+        let staged = self.session.staged();
+        if let Some((name, quantities)) = &staged {
+            self.terminal.line(&format!("of {name}, run last: {}", quantities.join(", ")));
+        }
+        if instances.is_empty() && models.is_empty() && experiments.is_empty() && staged.is_none() {
             self.terminal.line("nothing yet: `f = LuGre()` makes an instance, `use \"FILE.fric\"` brings a file");
         }
     }

@@ -14,4 +14,4 @@ mod line;
 pub use command::{COMMANDS, Command, Line, cut_to, inputs, read};
 pub use complete::{Candidate, meant};
 pub use line::{Editor, Input, as_typed};
-pub use session::{Cut, Fault, Ran, Session, Value, plain};
+pub use session::{Cut, Fault, Ran, Session, Value, library_models, plain};

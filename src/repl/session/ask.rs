@@ -113,54 +113,83 @@ impl Session {
     /// Every quantity of what is meant; none if it cannot be compiled as it stands.
     pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[Listed]> {
         let (mut loaded, name) = self.loaded(what, "");
-        let changes = Changes { set: setup.set.clone(), duration: Some(1.0), ..Changes::default() };
+        let changes = Changes { set: setup.set.clone(), unjudged: true, ..Changes::default() };
         compile::quantities(&mut loaded, &project::Disk, &name, &changes).unwrap_or_default().into()
     }
 
-    /// What is known of the model behind a name or a path: its explanation, and the path within it; none for the whole.
+    /// What is known of a quantity, a part, an experiment or a model: its explanation, and the path within it; none for a
+    /// model, empty for another whole. What was run last and the instances come before models of the same name.
     pub fn explained(&mut self, name: &str) -> Result<(Explanation, Option<String>), Fault> {
-        let head = name.split(['.', '[']).next().unwrap_or(name);
-        if head.starts_with(|c: char| c.is_ascii_uppercase()) {
-            let own = compile::load(TEXT, &self.text("", "").0, &project::Disk);
-            let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
-            for loaded in texts.clone() {
-                if let Lookup::Found(item, Item::Model(_)) = loaded.find(loaded.root(), Space::Type, head) {
-                    let explanation = compile::explain_in(loaded, &project::Disk, head, item.file);
-                    return explanation
-                        .map(|explanation| (explanation, None))
-                        .map_err(|errors| found(loaded, &errors, name, None));
-                }
-            }
-            let visible = texts.flat_map(|loaded| loaded.visible(loaded.root(), Space::Type));
-            let help = match compile::nearest(head, visible) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => "`names` shows what there is".into(),
-            };
-            return Err(Fault::Words(format!("there is no model `{head}`; {help}")));
-        }
         let what = self.meant(name).unwrap_or_else(|| self.current());
         let known = self.setup(&what).known.clone();
-        let whole = self.parts.iter().any(|part| part.name == name);
-        if !whole && !known.iter().any(|q| q.path == name) {
-            let help = match compile::nearest(name, known.iter().map(|q| q.path.as_str())) {
-                Some(near) => format!("did you mean `{near}`?"),
-                None => "`names` shows what there is".into(),
-            };
-            return Err(Fault::Words(format!("there is no `{name}` here; {help}")));
+        let prefix = format!("{name}.");
+        if known.iter().any(|q| q.path == name) {
+            return Ok((self.explained_run(&what, name)?, Some(name.to_string())));
         }
-        let (mut loaded, experiment) = self.loaded(&what, "");
-        let changes = Changes { set: self.setup(&what).set.clone(), duration: Some(1.0), ..Changes::default() };
-        let mut explanation = compile::explain_run(&mut loaded, &project::Disk, &experiment, &changes)
-            .map_err(|errors| found(&loaded, &errors, name, None))?;
-        if whole {
-            let prefix = format!("{name}.");
+        if self.parts.iter().any(|part| part.name == name) || known.iter().any(|q| q.path.starts_with(&prefix)) {
+            let mut explanation = self.explained_run(&what, name)?;
             explanation.model = name.to_string();
             explanation.quantities.retain(|q| q.path.starts_with(&prefix));
             explanation.equations.retain(|(left, _)| left.contains(&prefix));
             explanation.states.retain(|state| state.path.starts_with(&prefix));
             return Ok((explanation, Some(String::new())));
         }
-        Ok((explanation, Some(name.to_string())))
+        let head = name.split(['.', '[']).next().unwrap_or(name);
+        let own = compile::load(TEXT, &self.text("", "").0, &project::Disk);
+        let texts = [&own].into_iter().chain(self.used.iter().rev().map(|used| &used.loaded));
+        for loaded in texts.clone() {
+            if let Lookup::Found(item, Item::Model(_)) = loaded.find(loaded.root(), Space::Type, head) {
+                let explanation = compile::explain_in(loaded, &project::Disk, head, item.file);
+                return explanation
+                    .map(|explanation| (explanation, None))
+                    .map_err(|errors| found(loaded, &errors, name, None));
+            }
+        }
+        if self.experiments().iter().any(|experiment| experiment == name) {
+            let what = self.experiment(name)?;
+            return Ok((self.explained_run(&what, name)?, Some(String::new())));
+        }
+        let experiments = self.experiments();
+        let quantities = known.iter().map(|q| q.path.as_str());
+        let visible = texts.flat_map(|loaded| loaded.visible(loaded.root(), Space::Type));
+        let names = quantities.chain(visible).chain(experiments.iter().map(String::as_str));
+        let help = match compile::nearest(name, names) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None if known.is_empty() && !experiments.is_empty() => {
+                format!("quantities of an experiment are known once it has been run, `run {}`", experiments[0])
+            }
+            None => "`names` shows what there is".into(),
+        };
+        Err(Fault::Words(format!("there is no quantity, part, model or experiment `{name}` here; {help}")))
+    }
+
+    fn explained_run(&self, what: &What, typed: &str) -> Result<Explanation, Fault> {
+        let (mut loaded, experiment) = self.loaded(what, "");
+        // Settings belong to what was run last, or to the instances.
+        let set = match &self.stage {
+            Some((staged, setup)) if staged == what => setup.set.clone(),
+            _ if *what == What::Session => self.bench.set.clone(),
+            _ => Vec::new(),
+        };
+        let changes = Changes { set, unjudged: true, ..Changes::default() };
+        compile::explain_run(&mut loaded, &project::Disk, &experiment, &changes)
+            .map_err(|errors| found(&loaded, &errors, typed, None))
+    }
+
+    /// That there is no model of this name, and what there is instead.
+    pub fn no_model(&self, name: &str) -> Fault {
+        let known = self.quantities().any(|q| q.path == name || q.path.starts_with(&format!("{name}.")));
+        Fault::Words(if self.experiments().iter().any(|experiment| experiment == name) {
+            format!("`{name}` is an experiment; `explain {name}` shows what it runs")
+        } else if known {
+            format!("`{name}` is no model; `explain {name}` says what it is")
+        } else {
+            let models = self.models();
+            match compile::nearest(name, models.iter().map(String::as_str)) {
+                Some(near) => format!("there is no model `{name}`; did you mean `{near}`?"),
+                None => format!("there is no model `{name}`; `names` shows what there is"),
+            }
+        })
     }
 
     /// The tree of a model that is visible, in the session or in a file in use.
@@ -204,6 +233,18 @@ impl Session {
             None => format!("there are {}", known.collect::<Vec<_>>().join(", ")),
         };
         Err(Fault::Words(format!("there is no experiment or instance `{name}`; {help}")))
+    }
+
+    /// What was run last besides the instances: its name, and its quantities that are no parameters.
+    pub fn staged(&self) -> Option<(String, Vec<String>)> {
+        let (what, setup) = self.stage.as_ref()?;
+        let name = match what {
+            What::Experiment(_, name) => name.clone(),
+            What::Typed(instance) => instance.clone(),
+            What::Session => return None,
+        };
+        let read = setup.known.iter().filter(|q| q.kind != "param");
+        Some((name, read.map(|q| q.path.clone()).collect()))
     }
 
     /// Names of all experiments.

@@ -209,6 +209,7 @@ impl Session {
             step: Some(h),
             duration: setup.duration,
             also: vec![format!("plot {}", paths.join(", "))],
+            unjudged: true,
             ..Changes::default()
         };
         let options = Options { changes, interpret: true };
@@ -304,6 +305,7 @@ impl Session {
             duration: setup.duration,
             vary: vec![vary.clone()],
             also: vec![format!("plot {shows}")],
+            unjudged: true,
             ..Changes::default()
         };
         let options = Options { changes, interpret: false };

@@ -237,23 +237,25 @@ impl Session {
         }
     }
 
-    /// Compiles an experiment with what has been done to it and further statements.
+    /// Compiles an experiment with what has been done to it and further statements. A question is interpreted, and the
+    /// experiment's own expectations are left out of it.
     fn compiled_in(
         &self,
         loaded: &mut Loaded,
         name: &str,
         setup: &Setup,
         also: &[String],
-        interpret: bool,
+        question: bool,
     ) -> Result<(Vec<Case>, Vec<Diagnostic>), Vec<Diagnostic>> {
         let changes = Changes {
             set: setup.set.clone(),
             also: setup.also.iter().chain(also).cloned().collect(),
             duration: setup.duration,
+            unjudged: question,
             ..Changes::default()
         };
         let mut warnings = Vec::new();
-        let options = Options { changes, interpret };
+        let options = Options { changes, interpret: question };
         let cases = compile::compile(loaded, &project::Disk, name, &options, &mut warnings, &mut |_| ())
             .map_err(|errors| if errors.is_empty() { loaded.diagnostics.clone() } else { errors })?;
         Ok((cases, warnings))
