@@ -15,6 +15,9 @@
 
 mod support;
 
+#[path = "lang/helps.rs"]
+mod helps;
+
 use std::collections::HashSet;
 use std::fmt::Write;
 use std::fs;

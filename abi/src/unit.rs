@@ -463,6 +463,10 @@ fn si_text(dimension: Dimension) -> String {
         ("N·m·s", [1, 2, -1, 0, 0]),
         ("V", [1, 2, -3, -1, 0]),
         ("Ohm", [1, 2, -3, -2, 0]),
+        ("1/N", [-1, -1, 2, 0, 0]),
+        ("1/N/m", [-1, -2, 2, 0, 0]),
+        ("m/N", [-1, 0, 2, 0, 0]),
+        ("m/N/s", [-1, 0, 1, 0, 0]),
     ];
     if let Some((text, _)) = NAMED.iter().find(|(_, exponents)| Dimension::of(*exponents) == dimension) {
         return (*text).into();

@@ -206,6 +206,20 @@ impl Checker<'_> {
         self.files.slice(self.system.span(id))
     }
 
+    /// `0.006 1/N·m`, which is (1/N)·m, where 1/(N·m) is needed: how it is read, and the number with the unit that fits.
+    fn left_to_right(&self, value: ExprId, wanted: &Term) -> Option<String> {
+        let (number, unit) = self.text(value).trim().split_once(' ')?;
+        let (above, below) = unit.trim().split_once('/')?;
+        let (first, rest) = below.split_once(['·', '*'])?;
+        let meant = format!("{above}/{}", below.replace(['·', '*'], "/"));
+        let wanted = self.resolved(wanted);
+        let fits = wanted.unknowns.is_empty() && Unit::parse(&meant).ok()?.dimension == wanted.base;
+        let unit = unit.trim();
+        fits.then(|| {
+            format!("a unit is read from left to right: `{unit}` is ({above}/{first})·{rest}; write `{number} {meant}`")
+        })
+    }
+
     // ---- quantities
 
     fn declare(&mut self) {
@@ -497,7 +511,10 @@ impl Checker<'_> {
         let message = format!("this is {}, {} is needed", self.described(found), self.described(wanted));
         let error = Diagnostic::error("E0101", message)
             .label(self.system.span(id), format!("{}, not {}", self.shown(found), self.shown(wanted)));
-        self.diagnostics.push(error);
+        self.diagnostics.push(match self.left_to_right(id, wanted) {
+            Some(help) => error.help(help),
+            None => error,
+        });
     }
 
     fn condition(&mut self, id: ExprId, what: &str) {
@@ -854,10 +871,22 @@ impl Checker<'_> {
                 let name = &self.system.instance(var.instance).model;
                 let expects = format!("expects {} in {}", var.name, self.shown(&wanted));
                 let rotary = self.system.instance(var.instance).rotary;
-                if (!rotary && needs.rotary() == has) || (rotary && has.rotary() == needs) {
+                let misread = self.left_to_right(value, &wanted);
+                if misread.is_none() && ((!rotary && needs.rotary() == has) || (rotary && has.rotary() == needs)) {
                     self.found.push(var.instance);
                 }
-                let error = if !rotary && needs.rotary() == has {
+                let error = if let Some(help) = misread {
+                    let message = format!(
+                        "`{}` of {name} is in {}, but gets {}",
+                        var.name,
+                        self.shown(&wanted),
+                        self.shown(&found)
+                    );
+                    Diagnostic::error("E0101", message)
+                        .label(self.system.span(value), self.shown(&found))
+                        .label(model, expects)
+                        .help(help)
+                } else if !rotary && needs.rotary() == has {
                     let message =
                         format!("{name} is written for straight motion, but `{}` gets {}", var.name, angular(has));
                     Diagnostic::error("E0108", message)
@@ -893,7 +922,8 @@ impl Checker<'_> {
                     Some((_, span)) => error.label(*span, "declared here"),
                     None => error.label(var.span, format!("{} by its other uses", self.shown(&wanted))),
                 };
-                if let Some(help) = self.factor(value, &found, &wanted, var.instance) {
+                let help = self.left_to_right(value, &wanted);
+                if let Some(help) = help.or_else(|| self.factor(value, &found, &wanted, var.instance)) {
                     error = error.help(help);
                 }
                 self.diagnostics.push(error);
@@ -927,7 +957,8 @@ impl Checker<'_> {
         let mut error = Diagnostic::error("E0101", message)
             .label(self.system.span(value), self.shown(&found))
             .label(*span, format!("needs {}", self.shown(&wanted)));
-        if let Some(help) = self.factor(value, &found, &wanted, var.instance) {
+        let help = self.left_to_right(value, &wanted);
+        if let Some(help) = help.or_else(|| self.factor(value, &found, &wanted, var.instance)) {
             error = error.help(help);
         }
         self.diagnostics.push(error);

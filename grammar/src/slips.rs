@@ -18,7 +18,19 @@ pub(crate) struct Stop {
 /// What is wrong with `piece`.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     let finders = [
-        character, head, operator, condition, habit, branch, unit, bare_unit, reserved, deeper, missing, neighbours,
+        unit_in_parentheses,
+        character,
+        head,
+        operator,
+        condition,
+        habit,
+        branch,
+        unit,
+        bare_unit,
+        reserved,
+        deeper,
+        missing,
+        neighbours,
         model_name,
     ];
     finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
@@ -295,7 +307,7 @@ fn deeper(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         Diagnostic::error("E0001", "an argument is a name of the model itself, not of its parts")
             .label(source.span(at - 1).to(source.span(last)), "")
             .help(format!(
-                "in an experiment write `sweep {path} = ...`;\nwhere `{part}` is a slot, give it another model: `{part} = Model({name} = ...)`"
+                "where `{part}` is a slot, give the model in it: `{part} = Model({name} = ...)`;\nelse set it from outside: `sweep {path} = ...` in an experiment, `--set {path}=...` for one run"
             )),
     )
 }
@@ -563,12 +575,21 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     if !compares {
         return None;
     }
-    let right = if at + 1 < piece.end { source.word(at + 1) } else { "..." };
-    Some(
-        Diagnostic::error("E0001", "a comparison is written `==`")
-            .label(source.span(at), "`=` defines")
-            .help(format!("write `{} == {right}`", operand_before(source, piece, at))),
-    )
+    let error = Diagnostic::error("E0001", "a comparison is written `==`").label(source.span(at), "`=` defines");
+    let measured = source.is_word(piece.start, "expect") && at + 1 < piece.end;
+    let right = match at + 1 < piece.end {
+        true if at + 2 < piece.end && source.kind(at + 2) == Some(TokenKind::Unit) => slice(source, at + 1, at + 2),
+        true => source.word(at + 1),
+        false => "...",
+    };
+    Some(error.help(match measured {
+        // Measures are real numbers: that two are equal to the last bit is hardly meant.
+        true => {
+            let left = slice(source, piece.start + 1, at - 1);
+            format!("a measure is compared with a tolerance: `expect {left} ~= {right} +- 1 %`")
+        }
+        false => format!("write `{} == {right}`", operand_before(source, piece, at)),
+    }))
 }
 
 /// `if` without `then` or `else`.
@@ -642,6 +663,13 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
         let help = format!("write it behind the comparison: `expect first(…) < 10 s {word} 9 s`");
         return Some(error.label(source.span(at), "").help(help));
     }
+    // `run M() for 1 s set k = 1 N/m`
+    if source.word(at) == "set" && source.kind(at + 1) == Some(TokenKind::Word) {
+        let name = source.word(at + 1);
+        return Some(Diagnostic::error("E0001", "there is no statement `set`").label(source.span(at), "").help(
+            format!("give `{name}` where the model is run, `run M({name} = ...)`, or in a `sweep {name} = ...`"),
+        ));
+    }
     if left == "inf" {
         let error = Diagnostic::error("E0111", "`inf` has no unit");
         return Some(error.label(source.span(at), "").help("leave the unit out: `inf` fits every quantity"));
@@ -656,6 +684,34 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
             .label(source.span(at), "")
             .help(format!("to multiply write `{left} * {right}`")),
     )
+}
+
+/// `1 1/(N·m)`, `[N/(m*s)]`: a unit is read from left to right and has no parentheses.
+fn unit_in_parentheses(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
+    if piece.start >= piece.end {
+        return None;
+    }
+    let (begin, end) = (source.marks[piece.start].token.start, source.marks[piece.end - 1].token.end);
+    let text = &source.text[begin..end];
+    let power = |atom: &str| atom.split('^').next().is_some_and(is_unit);
+    text.match_indices("/(").find_map(|(slash, _)| {
+        let sign = |c: char| c.is_alphanumeric() || matches!(c, '·' | '*' | '/' | '^' | '%' | '°');
+        let first =
+            text[..slash].rfind(|c| !sign(c)).map_or(0, |at| at + text[at..].chars().next().map_or(1, char::len_utf8));
+        let close = slash + text[slash..].find(')')?;
+        let (above, below) = (&text[first..slash], &text[slash + 2..close]);
+        let below: Vec<&str> = below.split(['·', '*']).map(str::trim).collect();
+        let units =
+            above.split(['·', '*', '/']).all(|atom| atom == "1" || power(atom)) && below.iter().all(|atom| power(atom));
+        let from = (piece.start..piece.end).find(|&mark| source.marks[mark].token.end > begin + first)?;
+        let to = (piece.start..piece.end).rfind(|&mark| source.marks[mark].token.start <= begin + close)?;
+        if !units || above.is_empty() || !(from.saturating_sub(1)..=to + 1).contains(&stop.at) {
+            return None;
+        }
+        let error =
+            Diagnostic::error("E0001", "a unit has no parentheses").label(source.span(from).to(source.span(to)), "");
+        Some(error.help(format!("it is read from left to right: write `{above}/{}`", below.join("/"))))
+    })
 }
 
 /// The unit of a declaration without its brackets: `input v m/s`.

@@ -139,6 +139,10 @@ impl<'a> Flattener<'a> {
             (None, None) => match declaration.kind {
                 // The argument that was meant is reported where it is misspelt.
                 DeclarationKind::Param | DeclarationKind::Input if self.misspelt(id, &name.text) => Definition::Missing,
+                // A model that does not fit its slot has been reported with the slot.
+                DeclarationKind::Param | DeclarationKind::Input if self.system.strangers.contains(&id) => {
+                    Definition::Missing
+                }
                 DeclarationKind::Param | DeclarationKind::Input if !self.tree(id).alone => {
                     let info = self.system.instance(id);
                     let model = self.tree(id).model;

@@ -8,6 +8,9 @@ fn kind_with_article(kind: DeclarationKind) -> String {
     format!("{} {word}", if word.starts_with(['i', 'o']) { "an" } else { "a" })
 }
 
+/// Quantities of a model that a message lists at most.
+const MOST_LISTED: usize = 12;
+
 impl<'a> Flattener<'a> {
     /// E0204
     pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
@@ -25,6 +28,7 @@ impl<'a> Flattener<'a> {
             _ => None,
         });
         let consts = self.loaded.visible(tree.file, Space::Const);
+        let file = tree.file;
         self.unknowns += 1;
         let near = match self.unknowns <= MOST_SUGGESTIONS {
             true => nearest(&name.text, all.chain(parts).chain(consts)),
@@ -36,6 +40,18 @@ impl<'a> Flattener<'a> {
                 None => error.help(format!("did you mean `{near}`?")),
             },
             None if name.text == "time" => error.help("time is `t`"),
+            // In a model of another file nothing can be declared from here.
+            None if name.span.file != file || self.loaded.files.get(file).library => {
+                let mut known: Vec<&str> = declarations(model).map(|d| d.name.text.as_str()).collect();
+                let more = known.len().saturating_sub(MOST_LISTED);
+                known.truncate(MOST_LISTED);
+                let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+                error.help(format!("{} has {}{more}", model.name.text, known.join(", ")))
+            }
+            None if Unit::parse(&name.text).is_ok() => error.help(format!(
+                "a unit stands right after its number, without parentheses: `2 N/{0}`; for a quantity of this name declare it, `param {0} = …`",
+                name.text
+            )),
             None => error.help(format!("declare it, for example `param {} = …` or `let {} = …`", name.text, name.text)),
         };
         self.report(error);

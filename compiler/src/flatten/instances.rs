@@ -441,10 +441,14 @@ impl<'a> Flattener<'a> {
                         replaced = true;
                     }
                 }
-                ArgValue::Expr(_) => {
+                ArgValue::Expr(expr) => {
+                    let word = self.loaded.files.slice(expr.span);
+                    let model = self.loaded.find(arg.env.file, Space::Type, word);
+                    let model = if matches!(model, Lookup::Found(_, Item::Model(_))) { word } else { "Model" };
+                    let between = if model == word { "" } else { "…" };
                     let error = Diagnostic::error("E0205", format!("`{}` is a part: it takes a model", part.name.text))
-                        .label(arg.span, "a value")
-                        .help(format!("write `{} = Model(…)`", part.name.text));
+                        .label(arg.span, if model == word { "a model is made by `()`" } else { "a value" })
+                        .help(format!("write `{} = {model}({between})`", part.name.text));
                     self.report(error);
                 }
             }
