@@ -41,6 +41,7 @@ pub mod remembered;
 pub mod proof;
 pub mod friction;
 pub mod stability;
+pub mod acting;
 pub mod lints;
 pub mod explain;
 pub mod unstable;
@@ -636,7 +637,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
 /// Most combinations of an experiment whose steps are looked at.
 const MOST_STEPPED: usize = 4;
 
-/// What is to be said of the fixed steps of an experiment, once for all combinations of its sweeps.
+/// What is to be said of the steps and ticks of an experiment, once for all combinations of its sweeps.
 fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
     use grammar::ast::ExperimentStatement as Statement;
     let run = experiment.body.iter().find_map(|statement| match statement {
@@ -647,15 +648,16 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
         Statement::Solver(solver) => Some(solver.method.span),
         _ => None,
     });
-    let (Some(run), Some(place)) = (run, solver) else { return Vec::new() };
-    let fixed = variants.iter().filter(|variant| {
-        variant.rig.is_none() && variant.experiment.solver.method != Method::Adaptive && !loaded.has_errors()
-    });
-    let said = fixed.take(MOST_STEPPED).flat_map(|variant| {
+    let Some(run) = run else { return Vec::new() };
+    let looked_at = variants.iter().filter(|variant| variant.rig.is_none() && !loaded.has_errors());
+    let said = looked_at.take(MOST_STEPPED).flat_map(|variant| {
         let abi::plan::Solver { method, step, .. } = variant.experiment.solver;
         let (system, types, program) = (&variant.system, &variant.types, &variant.program);
-        let fixed = unstable::Fixed { system, types, program, method, step, place, run, ends: &[], rig: false };
-        let mut found = unstable::check(&fixed, &loaded.files);
+        let mut found = acting::check(system, types, program, None, run);
+        if let Some(place) = solver.filter(|_| method != Method::Adaptive) {
+            let fixed = unstable::Fixed { system, types, program, method, step, place, run, ends: &[], rig: false };
+            found.extend(unstable::check(&fixed, &loaded.files));
+        }
         lints::silence(system, &mut found);
         found
     });

@@ -158,7 +158,8 @@ impl Fixed<'_> {
             .label(self.place, format!("steps throw it to and fro by {far}"))
             .label(var.span, "its rate jumps where this changes its sign")
             .help(
-                "a force that jumps needs a model that can hold: KFM, Karnopp or one with a bristle; or a smooth sign,\n\
+                "a force that jumps needs a contact that holds: `Sticking(law = ...)` keeps this law and rests exactly at\n\
+                 any step, KFM and Karnopp have laws of their own, LuGre a bristle; or take a smooth sign,\n\
                  `tanh(v / v0)`. To keep it: `allow chatter \"...\"`",
             )
     }

@@ -605,6 +605,8 @@ impl Cut {
             rig: true,
         };
         let mut found = crate::unstable::check(&fixed, files);
+        let (system, types) = (fixed.system, fixed.types);
+        found.extend(crate::acting::check(system, types, control, rig.plant.inertia, fixed.run));
         found.retain(|said| said.is_error() || !self.allowed(said));
         found
     }
