@@ -4,6 +4,7 @@
 
 mod chance;
 mod crossings;
+mod delay;
 mod estimate;
 mod invariance;
 mod methods;

@@ -83,13 +83,59 @@ struct Contact {
     damping: f64,
 }
 
-/// The greatest ω_n τ at which a spring and a damper emulated τ late are stable.
-///
-/// `zeta`: damping ratio B / (2 √(K J)). Source: the crossing of the imaginary axis of J s² + (B s + K) e^{−s τ}.
-#[allow(clippy::disallowed_methods, reason = "a warning's limit: shown with three digits, decides nothing that runs")]
-pub fn stable_up_to(zeta: f64) -> f64 {
-    let w = (2.0 * zeta * zeta + (4.0 * zeta.powi(4) + 1.0).sqrt()).sqrt();
-    (2.0 * zeta * w).atan() / w
+/// A contact that a program computes from the measured speed and a drive renders with a delay τ.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Emulated {
+    /// Natural frequency √(K/J), rad/s.
+    pub natural: f64,
+    /// Damping ratio B / (2 √(K J)).
+    pub damping_ratio: f64,
+    /// Period of the program, s.
+    pub period: f64,
+    /// Time constant of the drive, s.
+    pub lag: f64,
+}
+
+impl Emulated {
+    /// The total delay τ = T/2 + dead time + lag, s, from which on the contact is unstable.
+    ///
+    /// The program sums the speed over the coming period before it gives the force, so its spring is half a period ahead
+    /// of its damper. Source: the crossing of the imaginary axis of J s² (1 + s l) + (B s + K e^{s T/2}) e^{−s (τ − l)} for a
+    /// lag l; within 3 % of the limit of the sampled loop (`runtime::predict`).
+    #[allow(
+        clippy::disallowed_methods,
+        reason = "a warning's limit: shown with three digits, decides nothing that runs"
+    )]
+    pub fn limit(self) -> f64 {
+        let (zeta, lead, lag) =
+            (self.damping_ratio.max(0.0), 0.5 * self.period * self.natural, self.lag * self.natural);
+        // The lead is held at a quarter turn: beyond it the period does not resolve the spring at all.
+        let turn = |w: f64| (w * lead).min(std::f64::consts::FRAC_PI_2);
+        // w in units of the natural frequency; |w² (1 + jwl)| = |2 ζ j w + e^{jw lead}|.
+        let (mut low, mut high) = (0.0, 2.0 + 2.0 * zeta);
+        for _ in 0..60 {
+            let w = 0.5 * (low + high);
+            let size = 1.0 + 4.0 * zeta * zeta * w * w + 4.0 * zeta * w * turn(w).sin();
+            if w.powi(4) * (1.0 + w * w * lag * lag) < size { low = w } else { high = w }
+        }
+        let phase = (2.0 * zeta * low + turn(low).sin()).atan2(turn(low).cos());
+        (phase - (low * lag).atan()) / (low * self.natural) + self.lag
+    }
+
+    /// The greatest natural frequency that a delay allows, rad/s, and the damping ratio that it takes.
+    pub fn stiffest(period: f64, lag: f64, tau: f64) -> (f64, f64) {
+        let stable = |natural: f64, damping_ratio: f64| Emulated { natural, damping_ratio, period, lag }.limit() > tau;
+        let ratios = (5..=150).map(|k| f64::from(k) * 0.01);
+        let most = |ratio: f64| {
+            let (mut low, mut high) = (0.1 / tau, 3.0 / tau);
+            for _ in 0..40 {
+                let middle = 0.5 * (low + high);
+                if stable(middle, ratio) { low = middle } else { high = middle }
+            }
+            low
+        };
+        ratios.map(|ratio| (most(ratio), ratio)).fold((0.0, 0.0), |best, one| if one.0 > best.0 { one } else { best })
+    }
 }
 
 fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, found: &mut Vec<Diagnostic>) {
@@ -108,21 +154,24 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, fou
         }
         let natural = (contact.stiffness / inertia).sqrt();
         let zeta = 0.5 * contact.damping / (contact.stiffness * inertia).sqrt();
-        let limit = stable_up_to(zeta.max(0.0)) / natural;
+        let limit = Emulated { natural, damping_ratio: zeta, period, lag: node.lag }.limit();
         if tau < limit {
             continue;
         }
         let ms = |seconds: f64| three_digits(1e3 * seconds);
         let message = format!("`{}` emulates a contact that is too stiff for the delay of its loop", node.name);
-        let most = inertia * (0.74 / tau) * (0.74 / tau);
+        let (fastest, ratio) = Emulated::stiffest(period, node.lag, tau);
+        let most = inertia * fastest * fastest;
         let help = format!(
-            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms. At {} ms a stiffness up to {} N·m/rad can be \
-             rendered, best with a damping ratio of 0.64; or write `predict {}`",
+            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms, within 3 % (`fric predict` computes it from the \
+             compiled step). At {} ms a stiffness up to {} N·m/rad can be rendered, with a damping ratio of {}; or write \
+             `predict {}`",
             three_digits(contact.stiffness),
             three_digits(inertia),
             ms(limit),
             ms(tau),
             three_digits(most),
+            three_digits(ratio),
             node.name
         );
         let warning = Diagnostic::warning("W0801", message)

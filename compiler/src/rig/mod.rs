@@ -39,7 +39,7 @@ use nodes::{Description, Read, Speaks};
 use statements::{Expressions, Statements};
 use std::sync::Arc;
 
-pub use advice::linear;
+pub use advice::{Emulated, linear};
 pub use frames::{load as bus_load, of_dbc as dbc_messages};
 pub use step::{Discrete, StepDerivative};
 

@@ -1,0 +1,48 @@
+//! The delay at which `check` calls an emulated contact unstable (W0801) is the one at which `fric predict` does.
+
+use crate::chance::{Chance, seeds};
+use compiler::rig::Emulated;
+use runtime::predict::{Late, Loop, Shaft, Step};
+
+/// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m², stepped over the coming period with
+/// the newest speed: z' = z + T v, F = K z' + B v.
+fn sampled(contact: Emulated) -> Loop {
+    let Emulated { natural, damping_ratio, period, lag } = contact;
+    let (stiffness, damping) = (natural * natural, 2.0 * damping_ratio * natural);
+    let step = Step {
+        states: 1,
+        signals: 1,
+        commands: 1,
+        a: vec![1.0],
+        b: vec![period],
+        c: vec![-stiffness],
+        d: vec![-(stiffness * period + damping)],
+    };
+    Loop { period, step, shaft: Shaft::rigid(1.0), late: vec![Late { dead: 0.0, lag }] }
+}
+
+#[test]
+fn the_lint_and_predict_agree_on_the_largest_delay() {
+    let seeds = seeds(200);
+    println!("seeds {seeds:?}");
+    let (mut failed, mut compared, mut worst) = (Vec::new(), 0, 0.0f64);
+    for seed in seeds {
+        let mut chance = Chance::new(seed);
+        let period = chance.decades(0.25e-3, 4e-3);
+        let (natural, damping_ratio) = (chance.decades(0.03, 0.4) / period, chance.decades(0.05, 2.0));
+        let lag = chance.within(0.05, 0.4) * Emulated { natural, damping_ratio, period, lag: 0.0 }.limit();
+        let contact = Emulated { natural, damping_ratio, period, lag };
+        let lint = contact.limit();
+        // A contact that no dead time leaves stable has no limit to compare.
+        let Some(dead) = sampled(contact).limit(0).filter(|dead| *dead > 0.0) else { continue };
+        compared += 1;
+        let predict = 0.5 * period + lag + dead;
+        worst = worst.max((lint / predict - 1.0).abs());
+        if (lint - predict).abs() > 0.03 * predict {
+            failed.push(format!("seed {seed}, {contact:?}: lint {lint:e} s, predict {predict:e} s"));
+        }
+    }
+    println!("{compared} compared, worst {worst:.3}");
+    assert!(compared > 50, "{compared}");
+    assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
+}
