@@ -3,24 +3,29 @@
 //! Contacts, observers and controllers of the library, moved by a sine or held, against rk4 with a hundredth of the step.
 
 use crate::chance::{Chance, seeds};
-use crate::support::{Texts, checked};
+use crate::support::{Texts, checked, root, texts_below};
 use abi::Instance;
 use compiler::{Changes, Options};
+use std::borrow::Cow;
 
 /// What is run, and the quantity that is compared. `SPEED` is a sine of the speed, `FORCE` of the force, `PLACE` of a place.
+#[derive(Clone)]
 struct Bench {
-    run: &'static str,
+    run: Cow<'static, str>,
     quantity: &'static str,
     /// Linear and in one circle, or of single states; moved by constants only: `expo` is exact.
     exact: bool,
+    /// A force that jumps with the state, or comes close to it within a step: every method is off by where in a step the
+    /// jump falls, so that a single run says little. Such are judged together.
+    jumps: bool,
 }
 
 const fn bench(run: &'static str, quantity: &'static str) -> Bench {
-    Bench { run, quantity, exact: false }
+    Bench { run: Cow::Borrowed(run), quantity, exact: false, jumps: false }
 }
 
 const fn exact(run: &'static str, quantity: &'static str) -> Bench {
-    Bench { run, quantity, exact: true }
+    Bench { run: Cow::Borrowed(run), quantity, exact: true, jumps: false }
 }
 
 const BENCHES: &[Bench] = &[
@@ -50,39 +55,145 @@ const BENCHES: &[Bench] = &[
     bench("Axis(F_motor = FORCE)", "x"),
     bench("SpringBench(fr = LuGre())", "x"),
     bench("SpringBench(fr = KFMSmooth(v0 = 10 mm/s, vs = 30 mm/s))", "x"),
-    bench("SpeedBench(v = SPEED, fr = LuGre())", "F"),
-    bench("SpeedBench(v = SPEED, fr = LoadedLuGre())", "F"),
-    bench("SpeedBench(v = SPEED, fr = LuGreAsymmetric())", "F"),
-    bench("SpeedBench(v = SPEED, fr = LuGreCurve())", "F"),
-    bench("SpeedBench(v = SPEED, fr = Dahl())", "F"),
-    bench("SpeedBench(v = SPEED, fr = DahlPower())", "F"),
-    bench("SpeedBench(v = SPEED, fr = ElastoPlastic())", "F"),
-    bench("SpeedBench(v = SPEED, fr = BoucWen())", "F"),
-    bench("SpeedBench(v = SPEED, fr = BlimanSorine())", "F"),
-    bench("SpeedBench(v = SPEED, fr = BlimanSorine1())", "F"),
-    bench("SpeedBench(v = SPEED, fr = BristleMass())", "F"),
-    bench("SpeedBench(v = SPEED, fr = Gonthier())", "F"),
-    bench("SpeedBench(v = SPEED, fr = GMS())", "F"),
-    bench("SpeedBench(v = SPEED, fr = MaxwellSlip())", "F"),
-    bench("SpeedBench(v = SPEED, fr = LeuvenModified())", "F"),
-    bench("SpeedBench(v = SPEED, fr = ResetIntegrator())", "F"),
-    bench("SpeedBench(v = SPEED, fr = RateState())", "F"),
-    bench("SpeedBench(v = SPEED, fr = PositionDependent())", "F"),
+    bench("DriveTorqueSampled(u = FORCE, Ts = 1 ms)", "F"),
+    bench("Encoder(x = PLACE)", "y"),
+    bench("SampleHold(u = PLACE)", "y"),
+    bench("UnitDelay(u = PLACE)", "y"),
+    bench("PIDDiscrete(r = PLACE, y = 0 m)", "u"),
+    bench("CascadeDiscrete(r = PLACE, y = 0 m)", "u"),
+    bench("FeedForward(v_d = SPEED)", "u"),
+    bench("Dither(u_in = FORCE)", "u"),
+    bench("Knocker(u_in = FORCE)", "u"),
+    bench("StictionPush(e = PLACE, v = SPEED)", "u"),
+    bench("AdaptiveCoulomb(e = PLACE, de = SPEED, v_d = SPEED)", "u"),
+    Bench { run: Cow::Borrowed("Clutch(F1 = FORCE)"), quantity: "v1", exact: false, jumps: true },
+    bench("EndStops(x = PLACE, v = SPEED, low = -0.05 mm, high = 0.05 mm)", "F"),
+    bench("StoppedAxis(u = FORCE, low = -1 mm, high = 1 mm)", "x"),
+    bench("BandedBench(u = FORCE, v_start = 20 mm/s)", "x"),
+    bench("ObserverBench(u = FORCE, fr = LuGre())", "error"),
+    bench("Servo(r = PLACE)", "x"),
+    bench("Pull()", "x"),
+    bench("Hold()", "x"),
+    bench("TrackingServo(f = 5 Hz)", "x"),
+];
+/// Contacts of the library, each moved by a sine and under a mass that is thrown and pushed. Where the contact is held by what
+/// it knows of its mass, it is told.
+const CONTACTS: &[&str] = &[
+    "Ambrosio",
+    "Armstrong",
+    "Asymmetric",
+    "BengisuAkay",
+    "BittencourtGunnarsson",
+    "BlimanSorine",
+    "BlimanSorine1",
+    "BoPavelescu",
+    "BoucWen",
+    "BreakAwayTanh",
+    "BristleMass",
+    "Bristles",
+    "BrownMcPhee",
+    "Coulomb",
+    "CoulombViscous",
+    "Dahl",
+    "DahlPower",
+    "ElastoPlastic",
+    "GMS",
+    "GMS4",
+    "GearEfficiency",
+    "GearM1",
+    "GearM2",
+    "GearM3",
+    "GearM4",
+    "GearM5",
+    "GearM6",
+    "Gonthier",
+    "KFM",
+    "KFMClip",
+    "KFMDwell",
+    "KFMSmooth",
+    "Karnopp",
+    "LeuvenModified",
+    "LeuvenModified4",
+    "LoadedLuGre",
+    "LoadedStribeck",
+    "LuGre",
+    "LuGreAsymmetric",
+    "LuGreCurve",
+    "Makkar",
+    "MaxwellSlip",
+    "MaxwellSlip4",
+    "PointsFriction",
+    "PositionDependent",
+    "RateState",
+    "ResetIntegrator",
+    "Smoothed",
+    "Sticking",
+    "StribeckGauss",
+    "StribeckLorentz",
+    "TableFriction",
+    "Threlfall",
+    "Tustin",
+    "Viscous",
+    "ViscousPowers",
+];
+/// Parts of models above, which are stepped with them; and what has no step of its own.
+const WITHIN: &[&str] = &[
+    "AtanSign",
+    "BandedAxis",
+    "BristleElement",
+    "ClampSign",
+    "ExponentialAgeing",
+    "GMSElement",
+    "HyperbolicAgeing",
+    "KarnoppPublished",
+    "MaxwellElement",
+    "RootSign",
+    "SineProfile",
+    "TanhSign",
 ];
 const METHODS: [&str; 3] = ["expo", "implicit", "rk4"];
+/// How many times Euler's error a single run across a jump may have.
+const WORST: f64 = 10.0;
 const STEPS: [f64; 4] = [1e-4, 5e-4, 1e-3, 2e-3];
+/// Models with ticks of 1 ms.
+const SAMPLED: &[&str] = &[
+    "CascadeDiscrete",
+    "DriveTorqueSampled",
+    "Encoder",
+    "KFMClip",
+    "Knocker",
+    "PIDDiscrete",
+    "SampleHold",
+    "UnitDelay",
+];
+
+/// Every bench: those above, and two for each contact.
+fn benches() -> Vec<Bench> {
+    let of = |name: &&str| {
+        let moved = format!("SpeedBench(v = SPEED, fr = {name}())");
+        let thrown = format!("ForceBench(u = FORCE, v_start = 20 mm/s, fr = {name}())");
+        let slips = ["Bristles", "GMS", "GMS4"].contains(name);
+        [(moved, "F", slips), (thrown, "x", true)].map(|(run, quantity, jumps)| Bench {
+            run: run.into(),
+            quantity,
+            exact: false,
+            jumps,
+        })
+    };
+    BENCHES.iter().cloned().chain(CONTACTS.iter().flat_map(of)).collect()
+}
 
 /// What a seed decides.
-struct Case {
-    bench: &'static Bench,
+struct Case<'a> {
+    bench: &'a Bench,
     run: String,
     step: f64,
 }
 
-impl Case {
-    fn of(seed: u64, benches: &[&'static Bench]) -> Case {
+impl<'a> Case<'a> {
+    fn of(seed: u64, benches: &'a [Bench]) -> Case<'a> {
         let mut chance = Chance::new(seed);
-        let bench = benches[seed as usize % benches.len()];
+        let bench = &benches[seed as usize % benches.len()];
         let (frequency, size) = (chance.decades(1.0, 20.0), chance.decades(0.1, 10.0));
         let rate = chance.decades(5.0, 400.0);
         let run = bench
@@ -91,7 +202,10 @@ impl Case {
             .replace("FORCE", &format!("sine({size:.3} N, {frequency:.3} Hz)"))
             .replace("PLACE", &format!("sine({size:.3} mm, {frequency:.3} Hz)"))
             .replace("RATE", &format!("{rate:.3} 1/s"));
-        Case { bench, run, step: chance.of(&STEPS) }
+        // Ticks of 1 ms fall on whole steps.
+        let sampled = SAMPLED.iter().any(|name| run.contains(name));
+        let step = chance.of(if sampled { &STEPS[..3] } else { &STEPS });
+        Case { bench, run, step }
     }
 }
 
@@ -134,32 +248,56 @@ fn size(a: &[f64]) -> f64 {
     a.iter().fold(0.0, |most, a| a.abs().max(most))
 }
 
+/// The greatest errors of Euler's method and of the others, and the size of what is compared.
+fn errors(case: &Case) -> Result<(f64, [f64; 3], f64), String> {
+    let reference = course(case, "rk4", 100)?;
+    let error = |method: &str| course(case, method, 1).map(|course| distance(&course, &reference));
+    let mut all = [0.0; 3];
+    for (one, method) in all.iter_mut().zip(METHODS) {
+        *one = error(method)?;
+    }
+    Ok((error("euler")?, all, size(&reference)))
+}
+
 /// What is wrong with the methods of a case.
-fn judge(case: &Case, reference: &[f64]) -> Result<Vec<String>, String> {
-    let range = size(reference);
-    let euler = distance(&course(case, "euler", 1)?, reference);
+fn judge(euler: f64, all: &[f64; 3], range: f64) -> Vec<String> {
     let mut wrong = Vec::new();
-    for method in METHODS {
-        let error = distance(&course(case, method, 1)?, reference);
+    for (method, error) in METHODS.iter().zip(all) {
         // Where Euler's is beyond the stability of explicit methods, rk4 may be too.
-        let beyond = method == "rk4" && euler > range;
-        if !beyond && error > 1.02 * euler + 1e-7 * range {
+        let beyond = *method == "rk4" && euler > range;
+        if !beyond && *error > 1.02 * euler + 1e-7 * range {
             wrong.push(format!("{method} {error:.3e}, euler {euler:.3e} of {range:.3e}"));
         }
     }
-    Ok(wrong)
+    wrong
+}
+
+#[test]
+fn every_model_of_the_library_is_stepped() {
+    let all = benches();
+    let mut missing = Vec::new();
+    for (path, text) in texts_below(&root().join("stdlib-models")) {
+        for line in text.lines().filter_map(|line| line.strip_prefix("model ")) {
+            let name = line.split([' ', '{']).next().unwrap_or_default();
+            let stepped = all.iter().any(|bench| bench.run.split(['(', ' ']).any(|word| word == name));
+            if !stepped && !WITHIN.contains(&name) {
+                missing.push(format!("{name} of {}", path.display()));
+            }
+        }
+    }
+    assert!(missing.is_empty(), "stepped by no bench: {missing:?}");
 }
 
 #[test]
 fn no_method_loses_to_euler() {
-    let benches: Vec<&Bench> = BENCHES.iter().collect();
+    let benches: Vec<Bench> = benches().into_iter().filter(|bench| !bench.jumps).collect();
     let seeds = seeds(2 * benches.len() as u64);
     println!("seeds {seeds:?}");
     let mut failed = Vec::new();
     for seed in seeds {
         let case = Case::of(seed, &benches);
-        let words = match course(&case, "rk4", 100).and_then(|reference| judge(&case, &reference)) {
-            Ok(wrong) => wrong,
+        let words = match errors(&case) {
+            Ok((euler, all, range)) => judge(euler, &all, range),
             Err(words) => vec![words],
         };
         failed.extend(words.iter().map(|words| format!("seed {seed}, step {:e} s, {}: {words}", case.step, case.run)));
@@ -167,9 +305,49 @@ fn no_method_loses_to_euler() {
     assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
 }
 
+/// Over all contacts under a mass, the error of each method is on average below that of Euler's, and nowhere many times it.
+///
+/// Where Euler's error is above a quarter of the range, its step does not resolve the contact at all. `implicit` is not
+/// judged on BreakAwayTanh: its force falls so steeply with the speed that 1 = γ h λ can hold, λ the rate at which a
+/// disturbance grows; near that point the linear equations of a step are singular, and `run` says `undecided`.
+#[test]
+#[allow(clippy::disallowed_methods, reason = "a mean that is compared with 1")]
+fn under_a_mass_no_method_loses_to_euler_on_average() {
+    let benches: Vec<Bench> = benches().into_iter().filter(|bench| bench.jumps).collect();
+    let seeds = seeds(benches.len() as u64);
+    println!("seeds {seeds:?}");
+    let (mut failed, mut sums, mut counts) = (Vec::new(), [0.0; 3], [0; 3]);
+    for seed in seeds {
+        let case = Case::of(seed, &benches);
+        let (euler, all, range) = errors(&case).unwrap_or_else(|words| panic!("seed {seed}: {words}"));
+        if euler > 0.25 * range {
+            continue;
+        }
+        for (k, error) in all.iter().enumerate() {
+            if METHODS[k] == "implicit" && case.run.contains("BreakAwayTanh") {
+                continue;
+            }
+            let ratio = (error + 1e-6 * range) / (euler + 1e-6 * range);
+            sums[k] += ratio.ln();
+            counts[k] += 1;
+            if ratio > WORST && error > &(1e-3 * range) {
+                let (step, run) = (case.step, &case.run);
+                failed.push(format!(
+                    "seed {seed}, step {step:e} s, {run}: {} {error:.3e}, euler {euler:.3e}",
+                    METHODS[k]
+                ));
+            }
+        }
+    }
+    let means: Vec<f64> = sums.iter().zip(counts).map(|(sum, count)| (sum / f64::from(count)).exp()).collect();
+    println!("{counts:?} runs, mean error over Euler's: {METHODS:?} {means:.3?}");
+    assert!(means.iter().all(|mean| *mean < 1.0), "{METHODS:?} {means:?}");
+    assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
+}
+
 #[test]
 fn linear_circles_are_exact_with_expo() {
-    let benches: Vec<&Bench> = BENCHES.iter().filter(|bench| bench.exact).collect();
+    let benches: Vec<Bench> = BENCHES.iter().filter(|bench| bench.exact).cloned().collect();
     let seeds = seeds(6 * benches.len() as u64);
     println!("seeds {seeds:?}");
     for seed in seeds {
