@@ -212,6 +212,7 @@ const SEVERAL: &[&str] = &[
     "inf-true-and-false-cannot-be-declared",
     "mistakes-are-found-each-by-itself",
     "next-in-a-regime",
+    "start-value-of-an-output",
     "the-arcsine-of-what-can-be-larger-than-one",
     "the-wrong-number-of-arguments",
     "time-and-pi-cannot-be-declared",
