@@ -101,7 +101,7 @@ impl Emulated {
     ///
     /// The program sums the speed over the coming period before it gives the force, so its spring is half a period ahead
     /// of its damper. Source: the crossing of the imaginary axis of J s² (1 + s l) + (B s + K e^{s T/2}) e^{−s (τ − l)} for a
-    /// lag l; within 3 % of the limit of the sampled loop (`runtime::predict`).
+    /// lag l; within 4 % of the limit of the sampled loop (`runtime::predict`).
     #[allow(
         clippy::disallowed_methods,
         reason = "a warning's limit: shown with three digits, decides nothing that runs"
@@ -163,7 +163,7 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, fou
         let (fastest, ratio) = Emulated::stiffest(period, node.lag, tau);
         let most = inertia * fastest * fastest;
         let help = format!(
-            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms, within 3 % (`fric predict` computes it from the \
+            "the contact has {} N·m/rad on {} kg·m^2: stable up to {} ms, within 4 % (`fric predict` computes it from the \
              compiled step). At {} ms a stiffness up to {} N·m/rad can be rendered, with a damping ratio of {}; or write \
              `predict {}`",
             three_digits(contact.stiffness),
