@@ -332,7 +332,7 @@ impl Control {
         &self.supervisor
     }
 
-    /// The same, to arm it, reset it or narrow its limits between cycles.
+    /// The same, to arm it or narrow its limits between cycles.
     pub fn supervisor_mut(&mut self) -> &mut Supervisor {
         &mut self.supervisor
     }
