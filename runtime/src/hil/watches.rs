@@ -197,6 +197,23 @@ mod tests {
     use abi::rig::{Field, Format, Message, Within};
     use abi::unit::Unit;
 
+    /// Periods around what a step takes here, whatever else this computer does.
+    #[test]
+    fn a_computer_that_is_too_slow_is_refused() {
+        let (rig, control) = bench::rig();
+        let steps = 100;
+        let of = |period_ns: u64| Rig { period_ns, steps, ..rig.clone() };
+        let measured_ns = (step_time(&of(1_000_000), &control).0 * 1e9) as u64;
+        for seed in 0..20 {
+            let mut chance = crate::chance::Chance(seed);
+            let short = measured_ns / (4 + chance.below(40)) + 1;
+            let why = too_slow(&of(short), &control);
+            assert!(why.is_some_and(|why| why.contains("more than half of a period")), "{short} of {measured_ns} ns");
+            let long = measured_ns * (40 + chance.below(1000)) + 1_000_000;
+            assert_eq!(too_slow(&of(long), &control), None, "{long} of {measured_ns} ns");
+        }
+    }
+
     fn message(name: &str, unit: &str, id: u32, send: bool) -> Message {
         let unit = Unit::parse(unit).unwrap();
         let field = Field {
