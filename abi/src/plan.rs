@@ -138,6 +138,20 @@ pub enum MeasureKind {
     TimeOfLeast,
     /// When it is greatest.
     TimeOfGreatest,
+    /// Number of phases in which the condition holds; one that holds at the begin of the window counts.
+    Count,
+    /// How often the condition turns true, having been false.
+    CountRises,
+    /// How often the condition turns.
+    CountTurns,
+    /// For how long the condition holds, in all.
+    Duration,
+    /// Number of local maxima.
+    Peaks,
+    /// The local maximum of this number, from 1.
+    Peak(f64),
+    /// When it is.
+    TimeOfPeak(f64),
 }
 
 /// A function that the compiler hands over, so that every machine computes it alike: numbers in their order → number.

@@ -1154,6 +1154,11 @@ impl Reader<'_> {
                 let window = plan::Window { after: after.unwrap_or_else(open)?, before: before.unwrap_or_else(open)? };
                 if name == MeasureName::Time {
                     return match *self.system.node(value) {
+                        Node::Measure(MeasureName::Peak, of, Some(number), inner) if inner == Window::default() => {
+                            self.places.push((Place::Second(self.expect, measures.len()), number));
+                            let kind = MeasureKind::TimeOfPeak(self.number_of_peak(number)?);
+                            Some(self.measure(id, of, kind, window, measures))
+                        }
                         Node::Measure(MeasureName::Max, of, None, inner) if inner == Window::default() => {
                             Some(self.measure(id, of, MeasureKind::TimeOfGreatest, window, measures))
                         }
@@ -1161,9 +1166,11 @@ impl Reader<'_> {
                             Some(self.measure(id, of, MeasureKind::TimeOfLeast, window, measures))
                         }
                         _ => {
-                            let error =
-                                Diagnostic::error("E0901", "`time` is of an extremum: `time(max(x))`, `time(min(x))`")
-                                    .label(self.system.span(value), "happens at no one instant");
+                            let error = Diagnostic::error(
+                                "E0901",
+                                "`time` is of an extremum: `time(max(x))`, `time(min(x))`, `time(peak(x, 2))`",
+                            )
+                            .label(self.system.span(value), "happens at no one instant");
                             let help = "a window stands in `time` itself: `time(max(x) after 1 s)`; when a condition first holds is `first(x > 0)`";
                             self.diagnostics.push(error.help(help));
                             None
@@ -1184,6 +1191,16 @@ impl Reader<'_> {
                     MeasureName::Rises => MeasureKind::Rises,
                     MeasureName::Turns => MeasureKind::Turns,
                     MeasureName::Time => unreachable!("it is of a measure"),
+                    MeasureName::Count => MeasureKind::Count,
+                    MeasureName::CountRises => MeasureKind::CountRises,
+                    MeasureName::CountTurns => MeasureKind::CountTurns,
+                    MeasureName::Duration => MeasureKind::Duration,
+                    MeasureName::Peaks => MeasureKind::Peaks,
+                    MeasureName::Peak if moment.is_some() => return self.unknown_before(id),
+                    MeasureName::Peak => {
+                        let Node::Measure(_, _, Some(number), _) = *self.system.node(id) else { unreachable!() };
+                        MeasureKind::Peak(self.number_of_peak(number)?)
+                    }
                     MeasureName::At if moment.is_some() => MeasureKind::AtMoment(moment?),
                     MeasureName::At => MeasureKind::At(second.expect("`at` has two arguments")),
                     MeasureName::Settling => MeasureKind::Settling(second.expect("`settling` has two arguments")),
@@ -1294,6 +1311,19 @@ impl Reader<'_> {
         }
     }
 
+    /// Which peak is meant.
+    fn number_of_peak(&mut self, id: ExprId) -> Option<f64> {
+        let number = self.constant(id);
+        if is_number_of_peak(number) {
+            return Some(number);
+        }
+        let error = Diagnostic::error("E0901", "peaks have the numbers 1, 2, 3 and so on")
+            .label(self.system.span(id), if number.is_nan() { "not constant".to_string() } else { format!("{number}") })
+            .help("write `peak(x, 1)` for the first one; `peaks(x)` is how many there are");
+        self.diagnostics.push(error);
+        None
+    }
+
     fn unknown_before<T>(&mut self, id: ExprId) -> Option<T> {
         let error = Diagnostic::error("E0901", "this instant or window is not known before the run")
             .label(self.system.span(id), "follows from the run");
@@ -1329,8 +1359,13 @@ impl Reader<'_> {
     fn measure_unit(&self, name: MeasureName, whole: ExprId, value: ExprId) -> Unit {
         match name {
             MeasureName::Integral => Unit::si(self.dimension(whole)),
-            MeasureName::Crossings => Unit::none(),
-            MeasureName::Period
+            MeasureName::Crossings
+            | MeasureName::Count
+            | MeasureName::CountRises
+            | MeasureName::CountTurns
+            | MeasureName::Peaks => Unit::none(),
+            MeasureName::Duration
+            | MeasureName::Period
             | MeasureName::Settling
             | MeasureName::First
             | MeasureName::Rises
@@ -1342,6 +1377,7 @@ impl Reader<'_> {
             | MeasureName::Rms
             | MeasureName::Final
             | MeasureName::At
+            | MeasureName::Peak
             | MeasureName::PeakToPeak => self.own_unit(value),
         }
     }
@@ -1350,6 +1386,11 @@ impl Reader<'_> {
         let node = self.system.node(id);
         matches!(node, Node::Measure(..)) || node.operands().any(|operand| self.measured(operand))
     }
+}
+
+/// Whether a peak can have this number.
+pub fn is_number_of_peak(number: f64) -> bool {
+    number >= 1.0 && number.fract() == 0.0 && number < 1e9
 }
 
 /// Whether an expression depends on a quantity for which `of` is true.

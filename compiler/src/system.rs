@@ -398,6 +398,14 @@ pub enum MeasureName {
     Turns,
     /// `time(max(x))`
     Time,
+    Count,
+    /// `count(a rises b)`
+    CountRises,
+    /// `count(a crosses b)`
+    CountTurns,
+    Duration,
+    Peaks,
+    Peak,
 }
 
 /// Name, measure, number of arguments.
@@ -415,6 +423,10 @@ const MEASURES: &[(&str, MeasureName, usize)] = &[
     ("settling", MeasureName::Settling, 2),
     ("first", MeasureName::First, 1),
     ("time", MeasureName::Time, 1),
+    ("count", MeasureName::Count, 1),
+    ("duration", MeasureName::Duration, 1),
+    ("peaks", MeasureName::Peaks, 1),
+    ("peak", MeasureName::Peak, 2),
 ];
 
 impl MeasureName {

@@ -333,11 +333,16 @@ impl Checker<'_> {
                         self.mismatch(edge, &given, &Term::known(TIME));
                     }
                 }
-                let event = matches!(measure, MeasureName::First | MeasureName::Rises | MeasureName::Turns);
-                let Some(term) = (match (measure, self.kind(value).clone()) {
-                    (_, Kind::Boolean) | (MeasureName::First, _) => {
-                        if event {
-                            self.condition(value, "`first`");
+                let event = match measure {
+                    MeasureName::First | MeasureName::Rises | MeasureName::Turns => Some("`first`"),
+                    MeasureName::Count | MeasureName::CountRises | MeasureName::CountTurns => Some("`count`"),
+                    MeasureName::Duration => Some("`duration`"),
+                    _ => None,
+                };
+                let Some(term) = (match (event, self.kind(value).clone()) {
+                    (_, Kind::Boolean) | (Some(_), _) => {
+                        if let Some(event) = event {
+                            self.condition(value, event);
                         }
                         Some(Term::known(Dimension::NONE))
                     }
@@ -348,15 +353,24 @@ impl Checker<'_> {
                 if let Some(second) = second
                     && let Some(given) = self.real(second)
                 {
-                    let wanted = if measure == MeasureName::At { Term::known(TIME) } else { term.clone() };
+                    let wanted = match measure {
+                        MeasureName::At => Term::known(TIME),
+                        MeasureName::Peak => Term::known(Dimension::NONE),
+                        _ => term.clone(),
+                    };
                     if !self.unify(&given, &wanted) {
                         self.mismatch(second, &given, &wanted);
                     }
                 }
                 match measure {
                     MeasureName::Integral => Kind::Real(term.times(&Term::known(TIME), Ratio::ONE)),
-                    MeasureName::Crossings => number,
-                    MeasureName::Period
+                    MeasureName::Crossings
+                    | MeasureName::Count
+                    | MeasureName::CountRises
+                    | MeasureName::CountTurns
+                    | MeasureName::Peaks => number,
+                    MeasureName::Duration
+                    | MeasureName::Period
                     | MeasureName::Settling
                     | MeasureName::First
                     | MeasureName::Rises

@@ -5,7 +5,7 @@
 //! corners, declared ranges and whatever `require` demands. Only code is made once.
 
 use crate::backend::interp::run_once;
-use crate::experiment::{Place, Variant, depends};
+use crate::experiment::{Place, Variant, depends, is_number_of_peak};
 use crate::ir::Func;
 use crate::lower::formulas;
 use crate::reach::{greatest, least};
@@ -367,6 +367,10 @@ fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), Str
         Place::MeasureBefore(k, j) => experiment.expects[k].measures[j].window.before = Edge::At(number),
         Place::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
             MeasureKind::At(second) | MeasureKind::Settling(second) => *second = number,
+            MeasureKind::Peak(_) | MeasureKind::TimeOfPeak(_) if !is_number_of_peak(number) => {
+                return Err(format!("peaks have the numbers 1, 2, 3 and so on, not {number}"));
+            }
+            MeasureKind::Peak(second) | MeasureKind::TimeOfPeak(second) => *second = number,
             kind => unreachable!("{kind:?} has no second argument"),
         },
     }

@@ -12,6 +12,7 @@ pub mod queue;
 
 pub mod verdict;
 mod peak;
+mod hills;
 pub mod measure;
 pub mod record;
 

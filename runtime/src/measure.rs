@@ -6,6 +6,7 @@
 //! between two points. An adaptive run shows a point at each edge and gives the areas under its own course; of other runs
 //! the areas are those of the trapezoidal rule with the end corrections of Gregory, of order four where steps are even.
 
+use crate::hills::{Hills, Turn};
 use crate::peak::{Peak, Point};
 use crate::show;
 use crate::verdict::{self, Reading, Verdict};
@@ -109,6 +110,10 @@ impl Expectations {
                 Tally::Sum { given, .. } => *given = true,
                 Tally::Extremes { .. } | Tally::TimeOf { .. } | Tally::AtPeak { .. } => meter.located = true,
                 Tally::Crossings { lobes } => lobes.band = tol,
+                Tally::Peaks { hills, .. } => {
+                    hills.band = tol;
+                    meter.located = true;
+                }
                 _ => {}
             }
         }
@@ -231,6 +236,39 @@ enum Tally {
         band: f64,
         kept: Kept,
     },
+    Count {
+        of: Counted,
+        count: u64,
+        time: Option<f64>,
+    },
+    Duration {
+        sum: Sum,
+        gap: f64,
+    },
+    Peaks {
+        what: Hill,
+        hills: Hills,
+    },
+}
+
+/// What is counted of a condition.
+#[derive(Clone, Copy)]
+enum Counted {
+    /// Phases in which it holds.
+    Phases,
+    /// Changes from false to true.
+    Rises,
+    /// Changes.
+    Turns,
+}
+
+/// What is read of the peaks.
+#[derive(Clone, Copy)]
+enum Hill {
+    Number,
+    /// Of the peak of this number, from 1.
+    Height(f64),
+    Time(f64),
 }
 
 /// What a condition must have been before it counts as first.
@@ -262,6 +300,8 @@ impl Meter {
             let (sum, even) = (Sum::default(), Even::default());
             Tally::Sum { square, kind, sum, given: false, even }
         };
+        let count = |of| Tally::Count { of, count: 0, time: None };
+        let peaks = |what| Tally::Peaks { what, hills: Hills::default() };
         let tally = match measure.kind {
             MeasureKind::Min => extremes(Extreme::Min),
             MeasureKind::Max => extremes(Extreme::Max),
@@ -287,6 +327,13 @@ impl Meter {
             MeasureKind::TimeOfGreatest => Tally::TimeOf { peak: Peak::greatest() },
             MeasureKind::Period => Tally::Period { kept: Kept::default() },
             MeasureKind::Settling(band) => Tally::Settling { band, kept: Kept::default() },
+            MeasureKind::Count => count(Counted::Phases),
+            MeasureKind::CountRises => count(Counted::Rises),
+            MeasureKind::CountTurns => count(Counted::Turns),
+            MeasureKind::Duration => Tally::Duration { sum: Sum::default(), gap: 0.0 },
+            MeasureKind::Peaks => peaks(Hill::Number),
+            MeasureKind::Peak(number) => peaks(Hill::Height(number)),
+            MeasureKind::TimeOfPeak(number) => peaks(Hill::Time(number)),
         };
         let none = (f64::INFINITY, 0.0);
         // An edge that an event sets is out of reach until then.
@@ -343,14 +390,19 @@ impl Meter {
 
     fn demand(&self) -> Demand {
         let what = match &self.tally {
-            Tally::Extremes { .. } | Tally::TimeOf { .. } => Wants::Turns,
+            Tally::Extremes { .. } | Tally::TimeOf { .. } | Tally::Peaks { .. } => Wants::Turns,
             Tally::AtPeak { .. } => {
                 return Demand { slot: self.moment.unwrap_or(self.slot), what: Wants::Turns };
             }
             Tally::Sum { square: false, .. } => Wants::Area,
             Tally::Sum { square: true, .. } => Wants::Square,
             Tally::Crossings { .. } | Tally::Period { .. } | Tally::Settling { .. } => Wants::Points,
-            Tally::Final | Tally::At { .. } | Tally::First { .. } | Tally::AtMoment { .. } => Wants::Edges,
+            Tally::Final
+            | Tally::At { .. }
+            | Tally::First { .. }
+            | Tally::AtMoment { .. }
+            | Tally::Count { .. }
+            | Tally::Duration { .. } => Wants::Edges,
         };
         Demand { slot: self.slot, what }
     }
@@ -375,7 +427,10 @@ impl Meter {
 
     /// The value at an edge between two points. A condition keeps its value until the next point.
     fn between(&self, from: Point, to: Point, t: f64) -> f64 {
-        if matches!(self.tally, Tally::First { .. }) { from.1 } else { line(from, to, t) }
+        match self.tally {
+            Tally::First { .. } | Tally::Count { .. } | Tally::Duration { .. } => from.1,
+            _ => line(from, to, t),
+        }
     }
 
     fn count(&mut self, t: f64, v: f64) {
@@ -443,6 +498,27 @@ impl Meter {
                     *gap = if self.counted { t - previous.0 } else { 0.0 };
                 }
             }
+            Tally::Count { of, count, time } => {
+                let was = if self.counted { Some(previous.1 != 0.0) } else { None };
+                let one = match of {
+                    Counted::Phases => v != 0.0 && was != Some(true),
+                    Counted::Rises => v != 0.0 && was == Some(false),
+                    Counted::Turns => was.is_some_and(|was| was != (v != 0.0)),
+                };
+                if one {
+                    (*count, *time) = (*count + 1, Some(t));
+                }
+            }
+            Tally::Duration { sum, gap } => {
+                if self.counted && previous.1 != 0.0 {
+                    sum.add(t - previous.0);
+                }
+                if self.counted && (previous.1 != 0.0) != (v != 0.0) {
+                    // It turned somewhere since the point before.
+                    *gap += t - previous.0;
+                }
+            }
+            Tally::Peaks { hills, .. } => hills.push((t, v), KEPT_POINTS),
             Tally::Period { kept } | Tally::Settling { kept, .. } => kept.push((t, v)),
         }
         self.end = (t, v);
@@ -453,7 +529,7 @@ impl Meter {
     /// How far the reading may be off because only points were looked at, SI.
     fn resolution(&self) -> f64 {
         match &self.tally {
-            Tally::First { gap, .. } | Tally::AtMoment { gap, .. } => *gap,
+            Tally::First { gap, .. } | Tally::AtMoment { gap, .. } | Tally::Duration { gap, .. } => *gap,
             Tally::Extremes { .. }
             | Tally::Sum { .. }
             | Tally::Final
@@ -462,6 +538,8 @@ impl Meter {
             | Tally::AtPeak { .. }
             | Tally::TimeOf { .. }
             | Tally::Period { .. }
+            | Tally::Count { .. }
+            | Tally::Peaks { .. }
             | Tally::Settling { .. } => 0.0,
         }
     }
@@ -478,7 +556,17 @@ impl Meter {
             },
             Tally::AtPeak { near: (before, after), .. } => before.max(after.unwrap_or(0.0)),
             Tally::TimeOf { peak } => peak.gap(),
-            Tally::Sum { .. }
+            Tally::Peaks { what, hills } => {
+                let of = |number: f64| hills.peaks()?.get(number as usize - 1).map(Turn::seen);
+                match what {
+                    Hill::Number => 0.0,
+                    Hill::Height(number) => of(*number).map_or(0.0, |peak| peak.unseen(corners)),
+                    Hill::Time(number) => of(*number).map_or(0.0, |peak| peak.gap()),
+                }
+            }
+            Tally::Count { .. }
+            | Tally::Duration { .. }
+            | Tally::Sum { .. }
             | Tally::Final
             | Tally::At { .. }
             | Tally::Crossings { .. }
@@ -550,6 +638,25 @@ impl Meter {
             Tally::AtPeak { peak, found, .. } => Ok((*found, Some(peak.found().0))),
             Tally::TimeOf { peak } => Ok((peak.found().0, Some(peak.found().0))),
             Tally::First { time, .. } => Ok((*time, time.is_finite().then_some(*time))),
+            Tally::Count { count, time, .. } => Ok((*count as f64, *time)),
+            Tally::Duration { sum, .. } => Ok((sum.total(), None)),
+            Tally::Peaks { what, hills } => {
+                let peaks = hills.peaks().ok_or_else(too_many)?;
+                let of = |number: f64| {
+                    // A whole number from 1, as the plan promises.
+                    let words = match peaks.len() {
+                        0 => "there is no peak in the window".to_string(),
+                        1 => "there is one peak in the window".into(),
+                        n => format!("there are {n} peaks in the window"),
+                    };
+                    peaks.get(number as usize - 1).map(|turn| turn.at).ok_or(words)
+                };
+                match what {
+                    Hill::Number => Ok((peaks.len() as f64, peaks.last().map(|turn| turn.at.0))),
+                    Hill::Height(number) => of(*number).map(|(time, value)| (value, Some(time))),
+                    Hill::Time(number) => of(*number).map(|(time, _)| (time, Some(time))),
+                }
+            }
             Tally::Period { kept } => Ok((period(kept.whole()?)?, None)),
             Tally::Settling { band, kept } => {
                 let time = settling(kept.whole()?, last.1, *band).unwrap_or(first.0);
@@ -763,12 +870,16 @@ impl Kept {
 
     fn whole(&self) -> Result<&[Point], String> {
         if self.overflowed {
-            return Err(format!(
-                "more than {KEPT_POINTS} points lie in the window; narrow it with `after` and `before`, or take a larger step"
-            ));
+            return Err(too_many());
         }
         Ok(&self.points)
     }
+}
+
+fn too_many() -> String {
+    format!(
+        "more than {KEPT_POINTS} points lie in the window; narrow it with `after` and `before`, or take a larger step"
+    )
 }
 
 /// A compensated sum (Neumaier): ten million steps lose nothing that matters.
@@ -873,6 +984,42 @@ mod tests {
         assert_eq!(value(MeasureKind::First, (1.5, 3.0), &points), 2.0);
         assert_eq!(value(MeasureKind::First, (2.5, 3.0), &points), 2.5);
         assert_eq!(taken(MeasureKind::First, (0.0, 1.0), &points), Ok((f64::INFINITY, None)));
+    }
+
+    #[test]
+    fn phases_of_a_condition() {
+        // True from the start to 1, from 2 to 3 by way of an event, and from 4 on.
+        let points = [(0.0, 1.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (3.0, 1.0), (3.0, 0.0), (4.0, 1.0), (5.0, 1.0)];
+        assert_eq!(taken(MeasureKind::Count, WHOLE, &points), Ok((3.0, Some(4.0))));
+        assert_eq!(taken(MeasureKind::CountRises, WHOLE, &points), Ok((2.0, Some(4.0))));
+        assert_eq!(taken(MeasureKind::CountTurns, WHOLE, &points), Ok((4.0, Some(4.0))));
+        assert_eq!(value(MeasureKind::Duration, WHOLE, &points), 3.0);
+        // A window cuts phases: the one that holds at its begin counts, and its time from there on.
+        assert_eq!(value(MeasureKind::Count, (2.5, 4.5), &points), 2.0);
+        assert_eq!(value(MeasureKind::CountRises, (2.5, 4.5), &points), 1.0);
+        assert_eq!(value(MeasureKind::Duration, (2.5, 4.5), &points), 1.0);
+        assert_eq!(value(MeasureKind::Count, (1.2, 1.8), &points), 0.0);
+        assert_eq!(value(MeasureKind::Duration, (1.2, 1.8), &points), 0.0);
+        // Where it turned between two points is not known, where it turned at an event is.
+        let mut meter = Meter::new(&measure(MeasureKind::Duration), 0.0, f64::INFINITY);
+        points.iter().for_each(|(t, v)| meter.see(*t, *v));
+        assert_eq!(meter.resolution(), 2.0);
+    }
+
+    #[test]
+    fn peaks_of_a_decay() {
+        let points: Vec<Point> = (0..=4000)
+            .map(|n| {
+                let t = f64::from(n) * 1e-3;
+                (t, (-0.5 * t).exp() * (std::f64::consts::TAU * t).cos())
+            })
+            .collect();
+        assert_eq!(value(MeasureKind::Peaks, WHOLE, &points), 3.0);
+        let height = |n| value(MeasureKind::Peak(n), WHOLE, &points);
+        assert!((height(1.0) / height(3.0) - 1f64.exp()).abs() < 1e-5);
+        assert!((value(MeasureKind::TimeOfPeak(2.0), WHOLE, &points) - 1.987).abs() < 2e-3);
+        let reason = taken(MeasureKind::Peak(4.0), WHOLE, &points).unwrap_err();
+        assert_eq!(reason, "there are 3 peaks in the window");
     }
 
     /// One measure over points of a quantity and of what tells when.

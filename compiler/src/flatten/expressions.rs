@@ -65,14 +65,21 @@ impl<'a> Flattener<'a> {
     }
 
     /// `fr.dz/dt`, where `z` is a quantity of the part: outside a division, and meant as a derivative.
-    fn derivative_of_part(&mut self, part: InstanceId, name: &Name) -> bool {
+    fn derivative_of_part(&mut self, part: InstanceId, path: &ast::Path, name: &Name, env: &Env) -> bool {
         let state = name.text.strip_prefix('d').filter(|state| self.tree(part).names.contains_key(*state));
         let (Some(state), Some((along, place))) = (state, self.below(name)) else { return false };
         let model = &self.tree(part).model.name.text;
         let derivative = format!("{}/{along}", name.text);
         let error = Diagnostic::error("E0204", format!("`{derivative}` of {model} cannot be read from outside"))
             .label(name.span.to(place), "a derivative of a part")
-            .help(format!("give {model} an output, `output rate_of_{state} = {derivative}`, and read that"));
+            .help(match env.outside {
+                true => {
+                    let text = self.loaded.files.slice(path.span);
+                    let owner = text.strip_suffix(name.text.as_str()).unwrap_or_default();
+                    format!("write `slope({owner}{state})`")
+                }
+                false => format!("give {model} an output, `output rate_of_{state} = {derivative}`, and read that"),
+            });
         self.derivatives_read.push(place);
         self.report(error);
         true
@@ -371,7 +378,7 @@ impl<'a> Flattener<'a> {
             match self.tree(part).names.get(next.text.as_str()).cloned() {
                 Some(next) => (id, binding) = (part, next),
                 None => {
-                    if k + 2 < path.segments.len() || !self.derivative_of_part(part, next) {
+                    if k + 2 < path.segments.len() || !self.derivative_of_part(part, path, next, env) {
                         self.unknown(part, next);
                     }
                     return self.error(path.span);
@@ -439,7 +446,7 @@ impl<'a> Flattener<'a> {
                 let error =
                     Diagnostic::error("E0307", format!("there is no derivative `d{}/d{}` here", of.text, along.text))
                         .label(span, "not a state of this model")
-                        .help("to watch a derivative, give the model an output for it");
+                        .help("to watch the derivative of `x` in an experiment, write `slope(x)`");
                 self.report(error);
                 Node::Error
             }
@@ -459,10 +466,15 @@ impl<'a> Flattener<'a> {
         let value = match (&args[0].kind, measure) {
             (
                 ExprKind::Binary(op @ (BinaryOp::Rises | BinaryOp::Falls | BinaryOp::Crosses), _, a, b),
-                MeasureName::First,
+                MeasureName::First | MeasureName::Count,
             ) => {
                 let (a, b) = (self.expr(a, env), self.expr(b, env));
-                measure = if *op == BinaryOp::Crosses { MeasureName::Turns } else { MeasureName::Rises };
+                measure = match (measure, *op == BinaryOp::Crosses) {
+                    (MeasureName::Count, false) => MeasureName::CountRises,
+                    (MeasureName::Count, true) => MeasureName::CountTurns,
+                    (_, false) => MeasureName::Rises,
+                    (_, true) => MeasureName::Turns,
+                };
                 let op = if *op == BinaryOp::Falls { BinaryOp::LessEqual } else { BinaryOp::GreaterEqual };
                 self.system.push(Node::Binary(op, a, b), args[0].span)
             }
@@ -490,7 +502,11 @@ impl<'a> Flattener<'a> {
         {
             return folded;
         }
+        // Names that came later give way to a function of the text.
+        let late = ["count", "duration", "peaks", "peak", "slope"].contains(&function.text.as_str());
+        let own = late && matches!(self.loaded.find(env.file, Space::Function, &function.text), Lookup::Found(..));
         if env.outside
+            && !own
             && let Some((measure, wanted)) = MeasureName::named(&function.text)
             && args.len() == wanted
         {
@@ -502,6 +518,25 @@ impl<'a> Flattener<'a> {
                 .label(edge, "a part of a run");
             self.report(error.help("measures in `expect` have one: `expect max(x after 1 s) < 2 mm`"));
             return self.error(span);
+        }
+        if function.text == "slope" && !own {
+            return match args {
+                [_] if !env.outside => {
+                    let error = Diagnostic::error("E0901", "`slope` belongs in an experiment")
+                        .label(function.span, "follows equations that a model may not know of")
+                        .help("in a model the derivative of a state is written `dx/dt`");
+                    self.report(error);
+                    self.error(span)
+                }
+                [of] => {
+                    let of = self.expr(of, env);
+                    self.slope(of, span)
+                }
+                _ => {
+                    self.wrong_count(function, 1, args.len());
+                    self.error(span)
+                }
+            };
         }
         match self.loaded.find(env.file, Space::Function, &function.text) {
             Lookup::Found(item, Item::Function(f)) => return self.expand(item, f, function, args, span, env),

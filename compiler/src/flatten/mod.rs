@@ -7,6 +7,7 @@ mod equations;
 mod expressions;
 mod frame;
 mod instances;
+mod slopes;
 
 use crate::names::nearest;
 use crate::resolve::{ItemRef, Loaded, Lookup, RESERVED, Space, declared_twice, reserved};

@@ -1,0 +1,329 @@
+//! `slope(x)`: the derivative of an expression in time, as an expression, for experiments.
+//!
+//! In: an expression over the quantities of a flat system whose equations have been read. Out: its derivative by the rules
+//! of calculus, down to the rates of states; or what has none that is known. It is that between events: where a quantity
+//! jumps it has no derivative, so `sign`, `floor`, ticks and noise are refused rather than said to be 0.
+
+use super::*;
+
+/// Deepest chain of quantities and operations.
+const DEEPEST_CHAIN: usize = 400;
+
+/// The derivative; none if it is 0.
+type Slope = Option<ExprId>;
+
+/// What has no known derivative, and why.
+type Unknown = (Span, String);
+
+/// Derivatives found so far.
+#[derive(Default)]
+struct Known {
+    exprs: HashMap<ExprId, Slope>,
+    /// Operations and quantities that the present one is part of.
+    depth: usize,
+}
+
+impl<'a> Flattener<'a> {
+    /// The derivative of an expression, as an expression; or a report.
+    pub(super) fn slope(&mut self, of: ExprId, span: Span) -> ExprId {
+        let slope = self.rate(of, &mut Known::default()).map(|slope| match slope {
+            // Copied, so that it has the place of the call.
+            Some(slope) => self.system.push(self.system.node(slope).clone(), span),
+            None => self.system.push(zero(), span),
+        });
+        slope.unwrap_or_else(|(place, why)| {
+            let error = Diagnostic::error("E0307", "the derivative of this is not known").label(span, "asked for here");
+            let error = if place == span { error } else { error.label(place, &why) };
+            self.report(error.help(format!("{why}; `slope` follows equations down to the rates of states")));
+            self.error(span)
+        })
+    }
+
+    fn rate(&mut self, id: ExprId, known: &mut Known) -> Result<Slope, Unknown> {
+        if let Some(slope) = known.exprs.get(&id) {
+            return Ok(*slope);
+        }
+        if known.depth >= DEEPEST_CHAIN || self.full(self.system.span(id)) {
+            return Err((self.system.span(id), "it follows from too many quantities".into()));
+        }
+        known.depth += 1;
+        let slope = self.rate_of(id, known);
+        known.depth -= 1;
+        known.exprs.insert(id, slope.clone()?);
+        slope
+    }
+
+    fn rate_of(&mut self, id: ExprId, known: &mut Known) -> Result<Slope, Unknown> {
+        let span = self.system.span(id);
+        let unknown = |why: &str| Err((span, why.to_string()));
+        match self.system.node(id).clone() {
+            Node::Number { .. } | Node::Bool(_) => Ok(None),
+            Node::Hole | Node::Error => Ok(Some(id)),
+            Node::Time => Ok(Some(self.plain(1.0, span))),
+            Node::Var(var) => self.rate_of_var(var, span, known),
+            Node::Rate(var) => match self.system.var(var).definition {
+                Definition::Continuous { rate, .. } => self.rate(rate, known),
+                _ => Ok(Some(id)), // Reported with the units.
+            },
+            Node::PathRate(_) => unknown("a derivative along another quantity"),
+            Node::Negate(a) => {
+                let a = self.rate(a, known)?;
+                Ok(a.map(|a| self.system.push(Node::Negate(a), span)))
+            }
+            Node::Binary(op, a, b) => self.rate_of_binary(op, a, b, span, known),
+            Node::If(condition, a, b) => match (self.rate(a, known)?, self.rate(b, known)?) {
+                (None, None) => Ok(None),
+                (a, b) => {
+                    let [a, b] = [a, b].map(|slope| slope.unwrap_or_else(|| self.system.push(zero(), span)));
+                    Ok(Some(self.system.push(Node::If(condition, a, b), span)))
+                }
+            },
+            Node::Fits { value, .. } => self.rate(value, known),
+            Node::Call(builtin, args) => self.rate_of_call(id, builtin, &args, span, known),
+            Node::Table(_, x) => match self.rate(x, known)? {
+                None => Ok(None),
+                Some(_) => unknown("a table or a recording"),
+            },
+            Node::Not(_) | Node::InRegime(..) | Node::Crossing(_) => unknown("a condition is true or false"),
+            Node::Measure(..) => unknown("a measure is one number"),
+        }
+    }
+
+    fn rate_of_var(&mut self, var: VarId, span: Span, known: &mut Known) -> Result<Slope, Unknown> {
+        let declared = self.system.var(var);
+        let name = &declared.path;
+        match (&declared.definition, declared.kind) {
+            (_, VarKind::Param) => Ok(None),
+            (Definition::Value(value, _), _) => {
+                let value = *value;
+                self.rate(value, known)
+            }
+            (Definition::Continuous { .. }, _) => Ok(Some(self.system.push(Node::Rate(var), span))),
+            (Definition::Sampled { .. } | Definition::Held { .. }, _) => {
+                Err((span, format!("`{name}` changes at ticks only")))
+            }
+            (Definition::Free, _) => Err((span, format!("`{name}` comes from outside"))),
+            (Definition::Missing, _) => Ok(Some(self.error(span))),
+        }
+    }
+
+    fn rate_of_binary(
+        &mut self,
+        op: BinaryOp,
+        a: ExprId,
+        b: ExprId,
+        span: Span,
+        known: &mut Known,
+    ) -> Result<Slope, Unknown> {
+        let (da, db) = match op {
+            BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power => {
+                (self.rate(a, known)?, self.rate(b, known)?)
+            }
+            _ => return Err((span, "a condition is true or false".into())),
+        };
+        Ok(match (op, da, db) {
+            (_, None, None) => None,
+            (BinaryOp::Add, Some(slope), None) | (BinaryOp::Add, None, Some(slope)) => Some(slope),
+            (BinaryOp::Subtract, Some(slope), None) => Some(slope),
+            (BinaryOp::Subtract, None, Some(slope)) => Some(self.system.push(Node::Negate(slope), span)),
+            (BinaryOp::Multiply, ..) => {
+                let left = da.map(|da| self.operation(BinaryOp::Multiply, da, b, span));
+                let right = db.map(|db| self.operation(BinaryOp::Multiply, a, db, span));
+                self.sum(left, right, span)
+            }
+            // (a/b)′ = (a′ − (a/b) b′) / b
+            (BinaryOp::Divide, ..) => {
+                let ratio = self.operation(BinaryOp::Divide, a, b, span);
+                let less = db.map(|db| self.operation(BinaryOp::Multiply, ratio, db, span));
+                let less = less.map(|less| self.system.push(Node::Negate(less), span));
+                let above = self.sum(da, less, span);
+                above.map(|above| self.operation(BinaryOp::Divide, above, b, span))
+            }
+            (BinaryOp::Power, Some(da), None) => {
+                let below = match self.literal(b) {
+                    Some(exponent) => self.plain(exponent - 1.0, span),
+                    None => {
+                        let one = self.plain(1.0, span);
+                        self.operation(BinaryOp::Subtract, b, one, span)
+                    }
+                };
+                let power = self.operation(BinaryOp::Power, a, below, span);
+                let slope = self.operation(BinaryOp::Multiply, b, power, span);
+                Some(self.operation(BinaryOp::Multiply, slope, da, span))
+            }
+            (BinaryOp::Power, ..) => return Err((span, "an exponent that changes".into())),
+            (op, Some(da), Some(db)) => Some(self.operation(op, da, db, span)),
+            _ => unreachable!("{op:?} has been looked at"),
+        })
+    }
+
+    fn rate_of_call(
+        &mut self,
+        id: ExprId,
+        builtin: Builtin,
+        args: &[ExprId],
+        span: Span,
+        known: &mut Known,
+    ) -> Result<Slope, Unknown> {
+        let unknown = |why: &str| Err((span, why.to_string()));
+        // Signals move by themselves.
+        match builtin {
+            Builtin::Step | Builtin::Pulse | Builtin::Square => return unknown("this signal jumps"),
+            Builtin::Noise | Builtin::Random => return unknown("chance has no derivative"),
+            Builtin::Chirp => return unknown("a chirp"),
+            Builtin::Delay => return unknown("what is delayed"),
+            _ => {}
+        }
+        let mut slopes = Vec::new();
+        for arg in args {
+            slopes.push(self.rate(*arg, known)?);
+        }
+        let call = |f: &mut Self, builtin, args: &[ExprId]| f.system.push(Node::Call(builtin, args.into()), span);
+        use BinaryOp::{Add, Divide, LessEqual, Multiply, Power, Subtract};
+        match builtin {
+            Builtin::Ramp if slopes.iter().all(Option::is_none) => {
+                let time = self.system.push(Node::Time, span);
+                let before = self.operation(BinaryOp::Less, time, args[0], span);
+                let zero = self.system.push(zero(), span);
+                return Ok(Some(self.system.push(Node::If(before, zero, args[2]), span)));
+            }
+            Builtin::Sine if slopes.iter().all(Option::is_none) => {
+                let (time, turn) = (self.system.push(Node::Time, span), self.plain(std::f64::consts::TAU, span));
+                let rate = self.operation(Multiply, turn, args[1], span);
+                let phase = self.operation(Multiply, rate, time, span);
+                let cosine = call(self, Builtin::Cos, &[phase]);
+                let size = self.operation(Multiply, args[0], rate, span);
+                return Ok(Some(self.operation(Multiply, size, cosine, span)));
+            }
+            Builtin::Ramp | Builtin::Sine => return unknown("a signal whose own numbers change"),
+            _ => {}
+        }
+        if slopes.iter().all(Option::is_none) {
+            return Ok(None);
+        }
+        let two = self.plain(2.0, span);
+        let one = self.plain(1.0, span);
+        let square = |f: &mut Self, x: ExprId| f.operation(Power, x, two, span);
+        let choice = |f: &mut Self, at_most: ExprId, than: ExprId, a: Slope, b: Slope| {
+            let condition = f.operation(LessEqual, at_most, than, span);
+            let [a, b] = [a, b].map(|slope| slope.unwrap_or_else(|| f.system.push(zero(), span)));
+            f.system.push(Node::If(condition, a, b), span)
+        };
+        let x = args[0];
+        // Of functions of one argument: its slope, to be multiplied by that of the argument.
+        let factor = match builtin {
+            Builtin::Min => return Ok(Some(choice(self, args[0], args[1], slopes[0], slopes[1]))),
+            Builtin::Max => return Ok(Some(choice(self, args[0], args[1], slopes[1], slopes[0]))),
+            Builtin::Clamp => {
+                let upper = choice(self, args[2], x, slopes[2], slopes[0]);
+                return Ok(Some(choice(self, x, args[1], slopes[1], Some(upper))));
+            }
+            Builtin::Hypot | Builtin::Atan2 => {
+                let (y, x) = (args[0], args[1]);
+                let (dy, dx) = (slopes[0], slopes[1]);
+                let (left, right) = if builtin == Builtin::Hypot { (y, x) } else { (x, y) };
+                let left = dy.map(|dy| self.operation(Multiply, left, dy, span));
+                let right = dx.map(|dx| self.operation(Multiply, right, dx, span));
+                return Ok(match builtin {
+                    Builtin::Hypot => {
+                        let above = self.sum(left, right, span);
+                        above.map(|above| self.operation(Divide, above, id, span))
+                    }
+                    _ => {
+                        let right = right.map(|right| self.system.push(Node::Negate(right), span));
+                        let above = self.sum(left, right, span);
+                        let (xx, yy) = (square(self, x), square(self, y));
+                        let below = self.operation(Add, xx, yy, span);
+                        above.map(|above| self.operation(Divide, above, below, span))
+                    }
+                });
+            }
+            Builtin::Sign | Builtin::Floor => return unknown("this jumps"),
+            Builtin::Abs => call(self, Builtin::Sign, &[x]),
+            Builtin::Sqrt => {
+                let twice = self.operation(Multiply, two, id, span);
+                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, twice, span)));
+            }
+            Builtin::Exp => id,
+            Builtin::Expm1 => call(self, Builtin::Exp, &[x]),
+            Builtin::Log => return Ok(slopes[0].map(|slope| self.operation(Divide, slope, x, span))),
+            Builtin::Log1p => {
+                let below = self.operation(Add, one, x, span);
+                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, below, span)));
+            }
+            Builtin::Sin => call(self, Builtin::Cos, &[x]),
+            Builtin::Cos => {
+                let sine = call(self, Builtin::Sin, &[x]);
+                self.system.push(Node::Negate(sine), span)
+            }
+            Builtin::Tan => {
+                let squared = square(self, id);
+                self.operation(Add, one, squared, span)
+            }
+            Builtin::Asin | Builtin::Acos => {
+                let squared = square(self, x);
+                let inside = self.operation(Subtract, one, squared, span);
+                let below = call(self, Builtin::Sqrt, &[inside]);
+                let slope = slopes[0].map(|slope| self.operation(Divide, slope, below, span));
+                let negative = builtin == Builtin::Acos;
+                return Ok(slope.map(|s| if negative { self.system.push(Node::Negate(s), span) } else { s }));
+            }
+            Builtin::Atan => {
+                let squared = square(self, x);
+                let below = self.operation(Add, one, squared, span);
+                return Ok(slopes[0].map(|slope| self.operation(Divide, slope, below, span)));
+            }
+            Builtin::Sinh => call(self, Builtin::Cosh, &[x]),
+            Builtin::Cosh => call(self, Builtin::Sinh, &[x]),
+            Builtin::Tanh => {
+                let squared = square(self, id);
+                self.operation(Subtract, one, squared, span)
+            }
+            Builtin::Step
+            | Builtin::Ramp
+            | Builtin::Pulse
+            | Builtin::Sine
+            | Builtin::Square
+            | Builtin::Chirp
+            | Builtin::Noise
+            | Builtin::Random
+            | Builtin::Delay => unreachable!("signals have been looked at"),
+        };
+        Ok(slopes[0].map(|slope| self.operation(Multiply, factor, slope, span)))
+    }
+
+    fn operation(&mut self, op: BinaryOp, a: ExprId, b: ExprId, span: Span) -> ExprId {
+        self.system.push(Node::Binary(op, a, b), span)
+    }
+
+    fn sum(&mut self, a: Slope, b: Slope, span: Span) -> Slope {
+        match (a, b) {
+            (Some(a), Some(b)) => Some(self.operation(BinaryOp::Add, a, b, span)),
+            (a, b) => a.or(b),
+        }
+    }
+
+    fn plain(&mut self, value: f64, span: Span) -> ExprId {
+        self.system.push(Node::Number { value, dimension: Some(Dimension::NONE), angle: Angle::Silent }, span)
+    }
+
+    /// An exponent that is written as a number.
+    fn literal(&self, id: ExprId) -> Option<f64> {
+        match self.system.node(id) {
+            Node::Number { value, .. } => Some(*value),
+            Node::Negate(a) => self.literal(*a).map(|value| -value),
+            Node::Fits { value, .. } => self.literal(*value),
+            Node::Binary(op, a, b) => {
+                let (a, b) = (self.literal(*a)?, self.literal(*b)?);
+                match op {
+                    BinaryOp::Add => Some(a + b),
+                    BinaryOp::Subtract => Some(a - b),
+                    BinaryOp::Multiply => Some(a * b),
+                    BinaryOp::Divide => Some(a / b),
+                    _ => None,
+                }
+            }
+            _ => None,
+        }
+    }
+}
