@@ -195,6 +195,9 @@ pub struct Run {
     /// Write the data of one experiment to this file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     pub csv: Option<PathBuf>,
+    /// Rows of the CSV this far apart, such as 1ms, instead of one for each step
+    #[arg(long, value_name = "TIME", value_parser = positive_time)]
+    pub every: Option<f64>,
     /// Print one JSON object a line for each run instead of words and plots
     #[arg(long)]
     pub json: bool,

@@ -552,3 +552,31 @@ experiment fine {
     let (out, _) = folder.check(&["run", "decay.fric", "fine", "--no-error", "--digits", "12"], 0, "");
     assert!(out.contains("735.758882"), "{out}");
 }
+
+#[test]
+fn rows_of_a_csv_lie_on_a_grid() {
+    let folder = Folder::new("every").with("pull.fric", PULL);
+    let done = folder.run(&["run", "pull.fric", "holds", "--every", "0.1s", "--csv", "a.csv"]);
+    assert_eq!(done.status.code(), Some(0), "{done:?}");
+    let text = fs::read_to_string(folder.0.join("a.csv")).unwrap();
+    let times: Vec<&str> = text.lines().skip(1).map(|row| row.split(',').next().unwrap()).collect();
+    assert_eq!((times.len(), times[0], times[3], times[20]), (21, "0", "0.3", "2"), "{text}");
+    for (every, code, said) in [
+        ("0s", 2, "greater than 0"),
+        ("-1ms", 2, "greater than 0"),
+        ("1", 2, "needs its unit"),
+        ("1mm", 2, "a time is needed"),
+        ("nan s", 2, ""),
+        ("3s", 1, "too few in a run of 2 s"),
+        ("1.5ms", 1, "do not lie on steps of 0.001 s"),
+    ] {
+        let done = folder.run(&["run", "pull.fric", "holds", &format!("--every={every}"), "--csv", "b.csv"]);
+        let words = String::from_utf8_lossy(&done.stderr);
+        assert!(done.status.code() == Some(code) && words.contains(said), "{every}: {done:?}");
+        assert!(!folder.0.join("b.csv").exists(), "{every} leaves a file");
+    }
+    let done = folder.run(&["run", "pull.fric", "holds", "--solver", "adaptive", "--every", "100ns", "--csv", "b.csv"]);
+    assert!(String::from_utf8_lossy(&done.stderr).contains("20000001 rows are too many"), "{done:?}");
+    let done = folder.run(&["run", "pull.fric", "holds", "--every", "1ms", "--json"]);
+    assert_eq!(done.status.code(), Some(2), "{done:?}");
+}

@@ -30,6 +30,7 @@ pub mod lookahead;
 mod dry;
 
 pub mod engine;
+pub mod even;
 pub mod estimate;
 pub mod steady;
 pub mod lanes;

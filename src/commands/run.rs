@@ -9,6 +9,8 @@ use crate::results::{self, Ran};
 use crate::terminal::{Style, Terminal};
 use crate::{figure, project, report};
 use grammar::diagnostic::Diagnostic;
+use runtime::engine::Continue;
+use runtime::even;
 use runtime::record::csv;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -28,6 +30,11 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
             "--plot and --csv are for one experiment, and this runs {}: name one, or use --out DIR",
             names.join(", ")
         ));
+        return End::Misused;
+    }
+    let by_default = args.plot.is_none() && !args.json;
+    if args.every.is_some() && args.csv.is_none() && args.out.is_none() && !by_default {
+        terminal.error("--every is for the rows of a CSV file, and none is written: add --csv FILE or --out DIR");
         return End::Misused;
     }
     if let Err(diagnostics) = sound(&loaded, args.json || args.quiet, terminal, &mut watch) {
@@ -92,7 +99,7 @@ fn experiment(
     }
 
     if cases.iter().all(|case| case.experiment.plots.is_empty()) {
-        let asked = [(args.plot.is_some(), "--plot"), (args.csv.is_some(), "--csv")];
+        let asked = [(args.plot.is_some(), "--plot"), (args.csv.is_some(), "--csv"), (args.every.is_some(), "--every")];
         if let Some((_, option)) = asked.into_iter().find(|(asked, _)| *asked) {
             terminal.error(&format!(
                 "{}: {option} has nothing to write: `{name}` records nothing; add `plot` with what to record, such as `plot x, v`",
@@ -104,6 +111,15 @@ fn experiment(
             terminal.line("  nothing to write: the experiment has no `plot`");
         }
     }
+    let grids: Result<Vec<_>, _> =
+        args.every.iter().flat_map(|every| cases.iter().map(|case| even::instants(*every, &case.experiment))).collect();
+    let grids = match grids {
+        Ok(grids) => grids,
+        Err(why) => {
+            terminal.error(&format!("{}: --every: {why}", place(loaded, name)));
+            return End::Failed;
+        }
+    };
     let done = done(cases, stages, !talking, !args.trust.no_error);
     let crossed: Option<Vec<Crossed>> = match args.cross {
         true => cross(loaded, name, options, &done.cases, terminal),
@@ -113,7 +129,7 @@ fn experiment(
     let crossed = crossed.unwrap_or_default();
     let drawn = drawn(name, &done);
     // Files come first: when the reader of our words has gone, they are there all the same.
-    let written = write(args, name, &done, drawn.as_ref());
+    let written = write(args, name, &done, &grids, drawn.as_ref());
     for (k, (case, result)) in done.cases.iter().zip(&done.results).enumerate() {
         let ran = Ran {
             file: &file,
@@ -182,11 +198,13 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
     Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
 }
 
-/// Writes what was asked for; gives the paths, or the one that failed and why.
+/// Writes what was asked for; gives the paths, or the one that failed and why. `grids`: the instants of each case in s, if
+/// rows are to lie on a grid.
 fn write(
     args: &Run,
     name: &str,
     done: &Done,
+    grids: &[Vec<f64>],
     drawn: Option<&Figure>,
 ) -> Result<Vec<PathBuf>, (PathBuf, std::io::Error)> {
     let by_default = args.plot.is_none() && args.csv.is_none() && !args.json;
@@ -197,9 +215,14 @@ fn write(
             let png = path.extension().is_some_and(|extension| extension == "png");
             files.push((path, if png { plot::png(figure) } else { plot::svg(figure).into_bytes() }));
         }
-        for (label, recording) in figure::recorded(&done.cases, &done.results) {
+        for (k, (label, recording)) in figure::recorded(&done.cases, &done.results).into_iter().enumerate() {
             let mut bytes = Vec::new();
-            csv::write(recording, &mut bytes).expect("writing to memory does not fail");
+            let evenly = grids.get(k).map(|grid| {
+                let case = &done.cases[k];
+                // How the run ends has been said of the first one.
+                even::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
+            });
+            csv::write(evenly.as_ref().unwrap_or(recording), &mut bytes).expect("writing to memory does not fail");
             for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {
                 files.push((for_case(&path, label), bytes.clone()));
             }

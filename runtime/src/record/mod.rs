@@ -106,6 +106,15 @@ impl Recorder {
         Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last }
     }
 
+    /// A recording of these rows instead of points seen: times in s, ascending, and as many rows of values in SI as there
+    /// are, in the order of [`Recorder::slots`].
+    pub fn rows(self, times: &[f64], values: &[f64]) -> Recording {
+        let rows = times.iter().zip(values.chunks_exact(self.slots.len().max(1)));
+        let numbers: Vec<f64> = rows.flat_map(|(t, row)| std::iter::once(*t).chain(row.iter().copied())).collect();
+        let seen = (numbers.len() / (self.columns.len() + 1)) as u64;
+        Recording { columns: self.columns, numbers, seen }
+    }
+
     /// Whether there is nothing to record.
     pub fn is_empty(&self) -> bool {
         self.slots.is_empty()

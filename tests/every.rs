@@ -1,0 +1,81 @@
+//! Rows on an even grid lie on the course of the run: grids of other distances agree to the bit where they meet, measures
+//! at these instants agree, and rows of fixed steps are its steps. `FRIC_SEED`, `FRIC_RUNS` (default 40).
+
+mod support;
+
+use compiler::ir::random::Random;
+use compiler::{Case, Changes, Options};
+use runtime::engine::{Continue, run};
+use runtime::even;
+use support::Texts;
+
+fn compiled(text: &str) -> Case {
+    let mut loaded = compiler::load("a.fric", text, &Texts::default());
+    let options = Options { changes: Changes::default(), interpret: true };
+    let cases = compiler::compile(&mut loaded, &Texts::default(), "e", &options, &mut Vec::new(), &mut |_| ());
+    cases.unwrap_or_else(|found| panic!("{found:#?}\n{text}")).remove(0)
+}
+
+fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
+    let grid = even::instants(every, &case.experiment).unwrap_or_else(|why| panic!("{why}"));
+    let go_on = &mut |_| Continue::Continue(());
+    let (recording, result) = even::record(case.instance.clone(), &case.experiment, &grid, go_on);
+    result.unwrap_or_else(|failure| panic!("{failure}"));
+    recording.rows().map(<[f64]>::to_vec).collect()
+}
+
+#[test]
+fn rows_lie_on_the_course_of_the_run() {
+    let from =
+        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
+    let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 40));
+    let mut random = Random(seed);
+    let mut compared = 0;
+    for number in 0..runs {
+        let contact = ["KFM()", "Sticking()", "Karnopp()", "LuGre(vd = 10 mm/s)", "Dahl()", "GMS()"][random.below(6)];
+        let bench = match random.below(2) {
+            0 => format!("ForceBench(fr = {contact}, u = sine({} N, 0.7 Hz))", random.within(1.0, 3.0)),
+            _ => format!("SpringBench(fr = {contact}, k = {} N/m)", random.within(1.0, 20.0)),
+        };
+        let solver = ["adaptive", "adaptive tol 1e-9", "expo step 1 ms", "expo step 0.5 ms"][random.below(4)];
+        let every = [1e-3, 2e-3, 5e-3, 0.01, 0.02][random.below(5)];
+        let at: Vec<u64> = (0..3).map(|_| 1 + random.below((1.0 / every) as usize - 1) as u64).collect();
+        let expects: Vec<String> = at.iter().map(|k| format!("  expect at(x, {k} * {every} s) < 1 km\n")).collect();
+        let text = format!(
+            "import std.friction\nimport std.bench
+experiment e {{
+  run {bench} for 1 s
+  solver {solver}
+  plot x, v, F
+{}}}
+",
+            expects.concat()
+        );
+        let place = format!("seed {seed}, case {number}, every {every} s\n{text}");
+        let case = compiled(&text);
+        let fine = rows(&case, every);
+        assert_eq!(fine.len() as f64, (1.0 / every).round() + 1.0, "{place}");
+        assert!(fine.iter().enumerate().all(|(k, row)| (row[0] - k as f64 * every).abs() < 1e-12), "{place}");
+        for times in [2, 5] {
+            for (k, row) in rows(&case, every * times as f64).iter().enumerate() {
+                let same = row[1..].iter().zip(&fine[k * times][1..]).all(|(a, b)| a.to_bits() == b.to_bits());
+                assert!(same, "row {k} of a grid {times} times as coarse: {row:?} and {:?}, {place}", fine[k * times]);
+                compared += 1;
+            }
+        }
+        let outcome = run(case.instance.clone(), &case.experiment, &mut |_| Continue::Continue(())).unwrap();
+        for (k, verdict) in at.iter().zip(&outcome.verdicts) {
+            let (read, row) = (verdict.readings[0].value, fine[*k as usize][1]);
+            assert!((read - row).abs() <= 1e-12 * row.abs().max(1e-3), "row {k}: {row}, measured {read}, {place}");
+        }
+        if !solver.starts_with("adaptive") {
+            // Each is a row of the recording of all steps.
+            let all: Vec<Vec<f64>> = outcome.recording.rows().map(<[f64]>::to_vec).collect();
+            for row in &fine {
+                let step = all.iter().find(|step| (step[0] - row[0]).abs() < 1e-9);
+                assert!(step.is_none_or(|step| step[1..] == row[1..]), "{row:?} and {step:?}, {place}");
+            }
+        }
+    }
+    println!("seed {seed}: {runs} runs, {compared} rows met");
+}
