@@ -1008,7 +1008,7 @@ mod tests {
 
     #[test]
     fn peaks_of_a_decay() {
-        let points: Vec<Point> = (0..=4000)
+        let points: Vec<Point> = (0..=3500)
             .map(|n| {
                 let t = f64::from(n) * 1e-3;
                 (t, (-0.5 * t).exp() * (std::f64::consts::TAU * t).cos())
