@@ -124,10 +124,19 @@ pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
     }
 }
 
+/// What is not finite, or the quantity whose range was left at the same instant: results rest on ranges, so that is the cause.
 fn not_finite(instance: &Instance, slot: Slot) -> Stop {
+    let time = instance.get(Slot::TIME);
+    let left = instance.description().guards.iter().find_map(|guard| {
+        let (value, (low, high)) = (instance.get(guard.slot), guard.range);
+        (value.is_finite() && !(low..=high).contains(&value)).then_some((guard, value))
+    });
+    if let Some((guard, value)) = left {
+        return Stop { cause: Cause::Guard { guard: Box::new(guard.clone()), value }, time };
+    }
     let named = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
     let path = named.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone());
-    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time: instance.get(Slot::TIME) }
+    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time }
 }
 
 /// What a status that is not 0 means.
