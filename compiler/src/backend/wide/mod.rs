@@ -151,7 +151,7 @@ pub fn widest(func: &Func, layout: &Layout, pool_len: usize) -> Result<Lanes, Un
 /// If this processor does not have the width, or the width no instruction for an operation.
 ///
 /// # Panics
-/// If the function is not sound: a mistake of the passes before.
+/// As [`bytes`].
 pub fn compile(
     func: &Func,
     layout: &Layout,
@@ -159,28 +159,10 @@ pub fn compile(
     width: Width,
     vectors: usize,
 ) -> Result<Lanes, Unsupported> {
-    verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
     if !width.is_here() {
         return Err(Unsupported(format!("this processor lacks {}", width.name())));
     }
-    let own: &[Unary] = match width {
-        Width::Avx512 => &[Unary::Exp],
-        Width::Avx2 | Width::Avx | Width::Pairs => &[],
-    };
-    // Expanding works on the pool that every model begins with; what needs none may run with any.
-    let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
-    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
-    let func = expanded.as_ref().unwrap_or(func);
-    let (code, alignment, scratch) = match width.own() {
-        Some(own) => {
-            let (code, scratch) = generate(func, layout, own, vectors, elementary)?;
-            (code, 64, scratch)
-        }
-        None => {
-            let (bytes, scratch) = Coder::new(here()?).pairs(func, layout, vectors)?;
-            (bytes.code, bytes.alignment as u64, scratch)
-        }
-    };
+    let Bytes { code, alignment, scratch } = bytes(func, layout, pool_len, width, vectors)?;
     let executable = Executable::new(&code, alignment)?;
     // SAFETY: `address` is the beginning of code with the signature of `LanesEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, LanesEntry>(executable.address()) };
@@ -189,6 +171,51 @@ pub fn compile(
     // SAFETY: the entry lives as long as the memory; `verify` has checked that every slot lies in the layout and every
     // table in the pool, indices are held inside, and what the code needs beyond the block is `scratch`.
     Ok(unsafe { Lanes::new(entry, lanes, layout.size(), scratch, pool_len, name, Arc::new(executable)) })
+}
+
+/// The machine code of a step for many instances, before it is made executable.
+pub struct Bytes {
+    /// The instructions; they begin with the entry.
+    pub code: Vec<u8>,
+    /// Bytes to a multiple of which the entry must lie.
+    pub alignment: u64,
+    /// Doubles that the code uses after the blocks.
+    pub scratch: usize,
+}
+
+/// The instructions of [`compile`], for a processor that has the width; this one need not.
+///
+/// # Errors
+/// If the width has no instruction for an operation.
+///
+/// # Panics
+/// If the function is not sound: a mistake of the passes before.
+pub fn bytes(
+    func: &Func,
+    layout: &Layout,
+    pool_len: usize,
+    width: Width,
+    vectors: usize,
+) -> Result<Bytes, Unsupported> {
+    verify(func, layout, pool_len, Stage::Lowered).unwrap_or_else(|fault| panic!("{fault}"));
+    let own: &[Unary] = match width {
+        Width::Avx512 => &[Unary::Exp],
+        Width::Avx2 | Width::Avx | Width::Pairs => &[],
+    };
+    // Expanding works on the pool that every model begins with; what needs none may run with any.
+    let elementary = func.ops.iter().any(|op| matches!(op, Op::Unary(..) | Op::Binary(..)));
+    let expanded = elementary.then(|| math::expand_for_lanes(func, own));
+    let func = expanded.as_ref().unwrap_or(func);
+    match width.own() {
+        Some(own) => {
+            let (code, scratch) = generate(func, layout, own, vectors, elementary)?;
+            Ok(Bytes { code, alignment: 64, scratch })
+        }
+        None => {
+            let (bytes, scratch) = Coder::new(here()?).pairs(func, layout, vectors)?;
+            Ok(Bytes { code: bytes.code, alignment: bytes.alignment as u64, scratch })
+        }
+    }
 }
 
 /// The code, and the numbers it needs behind the block. `pooled`: the pool begins with the tables of the elementary functions.

@@ -1,0 +1,77 @@
+//! Hashes of everything that the back ends make of the library: what a change that only moves or renames must leave as it is.
+//!
+//! One line for each model and method: images for both processors, C, lanes of each width, as the first twelve digits of SHA-256.
+//! `cargo bench --bench frozen > before.txt`, and `diff` with the same after the change.
+
+#[path = "../src/project.rs"]
+#[allow(dead_code, unused_imports, reason = "the command uses more of it")]
+mod project;
+
+mod compile {
+    pub use compiler::Sources;
+}
+
+use abi::image::{Target, sha256};
+use abi::plan::Method;
+use compiler::backend::wide::{self, Width};
+use compiler::backend::{blob, c};
+use compiler::{Changes, Sources, load};
+
+/// The step of fixed methods, s.
+const STEP: f64 = 1e-3;
+
+fn main() {
+    for module in project::Disk.modules() {
+        for (name, text) in project::Disk.library(&module).into_iter().flatten() {
+            let loaded = load(&name, &text, &project::Disk);
+            let models: Vec<String> = loaded.models().iter().map(|model| model.name.text.clone()).collect();
+            for model in models {
+                for method in [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit, Method::Adaptive] {
+                    let hashes = match made(&name, &text, &model, method) {
+                        Ok(all) => all.iter().map(|bytes| short(bytes)).collect::<Vec<_>>().join(" "),
+                        Err(code) => code,
+                    };
+                    println!("{module} {model} {method:?} {hashes}");
+                }
+            }
+        }
+    }
+}
+
+/// What each back end makes of a model, or the code of the first mistake, as of a model with an open slot.
+fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u8>>, String> {
+    let mut loaded = load(name, text, &project::Disk);
+    let changes =
+        Changes { method: Some(method), step: (method != Method::Adaptive).then_some(STEP), ..Changes::default() };
+    let built = compiler::build(&mut loaded, &project::Disk, model, &changes, &mut Vec::new());
+    let mut built = built.map_err(|found| found.first().map_or_else(String::new, |first| first.code.to_string()))?;
+    built.program.size_rings(STEP);
+    let program = &built.program;
+    let (description, functions) = (&program.description, compiler::functions(program, method));
+    let mut all = Vec::new();
+    for target in Target::ALL {
+        let image = blob::image(&functions, description, &program.params, target, &[]);
+        all.push(image.map_err(|why| why.to_string())?.to_bytes());
+    }
+    all.push(c::source(&functions, description, &program.params).into_bytes());
+    let step = match method {
+        Method::Adaptive => compiler::code::of_lanes(program, method).map(|(_, func)| func),
+        _ => Some(compiler::code::step(program, method)),
+    };
+    for width in Width::ALL {
+        let lanes = step
+            .as_ref()
+            .map(|step| wide::bytes(step, &description.layout, description.pool.len(), width, width.vectors()));
+        all.push(match lanes {
+            Some(Ok(bytes)) => bytes.code,
+            Some(Err(why)) => why.to_string().into_bytes(),
+            None => Vec::new(),
+        });
+    }
+    Ok(all)
+}
+
+/// The beginning of a hash.
+fn short(bytes: &[u8]) -> String {
+    sha256(bytes).iter().take(6).map(|byte| format!("{byte:02x}")).collect()
+}
