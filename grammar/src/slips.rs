@@ -348,7 +348,7 @@ fn head(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
             );
         }
     }
-    if let Some(at) = (first..piece.end).find(|&at| source.is_symbol(at, ":=")) {
+    if let Some(at) = (first + 1..piece.end).find(|&at| source.is_symbol(at, ":=")) {
         return Some(
             Diagnostic::error("E0001", "an equation is written with `=`")
                 .label(source.span(at), "")
@@ -567,7 +567,8 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
 /// `=` where values are compared.
 fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
-    if at <= piece.start || at >= piece.end || !source.is_symbol(at, "=") {
+    // After the word that begins the statement there must be something to compare.
+    if at <= piece.start + 1 || at >= piece.end || !source.is_symbol(at, "=") {
         return None;
     }
     let compares = matches!(source.word(piece.start), "require" | "when" | "go" | "expect" | "stop")
