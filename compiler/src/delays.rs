@@ -5,7 +5,7 @@
 use crate::ir::Func;
 use crate::ir::build::Build;
 use crate::system::*;
-use crate::units::{literal, three_digits};
+use crate::units::three_digits;
 use abi::Slot;
 use abi::description::{Layout, Segment};
 use grammar::diagnostic::Diagnostic;
@@ -24,14 +24,14 @@ pub fn of(system: &System, node: ExprId) -> (ExprId, ExprId) {
 
 /// Least and greatest T in s, if they are known; the least is 0 if nothing else is said.
 pub fn range(system: &System, time: ExprId) -> Option<(f64, f64)> {
-    if let Some(time) = literal(system, time) {
+    if let Some(time) = system.literal(time) {
         return (time >= 0.0 && time.is_finite()).then_some((time, time));
     }
     match system.node(time) {
         Node::Fits { value, .. } => range(system, *value),
         Node::Var(id) if system.var(*id).kind == VarKind::Param => {
             let declared = system.var(*id).range;
-            let bound = |bound: Option<(ExprId, bool)>| bound.map(|(bound, _)| literal(system, bound));
+            let bound = |bound: Option<(ExprId, bool)>| bound.map(|(bound, _)| system.literal(bound));
             let (low, high) = (bound(declared.low)??, bound(declared.high)??);
             (low >= 0.0 && high.is_finite()).then_some((low, high))
         }

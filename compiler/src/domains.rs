@@ -7,7 +7,7 @@ use crate::interval::planted;
 use crate::reach::{Reach, whole};
 use crate::source::Files;
 use crate::system::*;
-use crate::units::{Types, literal};
+use crate::units::Types;
 use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
@@ -67,7 +67,7 @@ fn equalities(system: &System, types: &Types, files: &Files, diagnostics: &mut V
         let kind = dimension.describe();
         let kind = kind.strip_prefix("a ").or(kind.strip_prefix("an ")).unwrap_or(&kind).to_string();
         let other = if side == *a { *b } else { *a };
-        let zero = literal(system, other) == Some(0.0);
+        let zero = system.literal(other) == Some(0.0);
         let exactly = if zero { "exactly zero".to_string() } else { "exactly equal to another".into() };
         let name = files.slice(system.span(side));
         let mut error = Diagnostic::error("E0306", format!("a computed {kind} is practically never {exactly}"))
@@ -176,7 +176,7 @@ impl Visit {
     ) {
         let system = reach.system();
         let x = reach.interval(a);
-        match literal(system, b) {
+        match system.literal(b) {
             Some(n) if n.fract() == 0.0 && n >= 0.0 => {}
             Some(n) if n.fract() == 0.0 => {
                 let divisor = if whole(n) { x.power(n.abs() as u32) } else { x };
@@ -187,7 +187,7 @@ impl Visit {
             _ if x.is_not_negative() => {
                 let n = reach.interval(b);
                 if x.has_zero() && n.low < 0.0 && !n.is_empty() && !planted::is("zero has any power") {
-                    found.push(match literal(system, b) {
+                    found.push(match system.literal(b) {
                         Some(_) => division(reach, types, files, a),
                         None => {
                             let (base, power) = (files.slice(system.span(a)), files.slice(system.span(b)));

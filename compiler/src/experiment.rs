@@ -13,7 +13,7 @@ use crate::rig::{self, Prepared};
 use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns as columns_of;
-use crate::units::{self, Types, literal};
+use crate::units::{self, Types};
 use crate::{causality, checks, delays, starts};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
@@ -843,7 +843,7 @@ impl Reader<'_> {
     }
 
     fn constant(&self, expr: ExprId) -> f64 {
-        literal(self.system, expr).unwrap_or_else(|| evaluate(self.system, self.types, &[expr])[0])
+        self.system.literal(expr).unwrap_or_else(|| evaluate(self.system, self.types, &[expr])[0])
     }
 
     fn dimension(&self, expr: ExprId) -> Dimension {
@@ -1114,7 +1114,7 @@ impl Reader<'_> {
                 // A condition without a measure is its value at the end.
                 return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
             }
-            if let Some(value) = literal(self.system, id) {
+            if let Some(value) = self.system.literal(id) {
                 return Some(Formula::Number(value));
             }
             if self.varies(id) {

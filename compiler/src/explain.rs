@@ -402,7 +402,7 @@ fn rate_independent(system: &System) -> Option<bool> {
 }
 
 fn is_zero(system: &System, id: ExprId) -> bool {
-    crate::units::literal(system, id) == Some(0.0)
+    system.literal(id) == Some(0.0)
 }
 
 impl Stepped {

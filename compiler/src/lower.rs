@@ -1223,7 +1223,7 @@ impl<'a> Emit<'a> {
             Node::Binary(op, a, b) => {
                 let boolean = self.plan.types.boolean[a.0 as usize];
                 let exponent = match self.plan.system.node(b) {
-                    _ if op == BinaryOp::Power => crate::units::literal(self.plan.system, b),
+                    _ if op == BinaryOp::Power => self.plan.system.literal(b),
                     _ => None,
                 };
                 let (a, b) = match op {

@@ -11,7 +11,6 @@
 use crate::causality::rate_of;
 use crate::interval::{Interval, planted};
 use crate::system::*;
-use crate::units::literal;
 use abi::description::TINY;
 pub use abi::live::{greatest, least};
 use grammar::ast::BinaryOp;
@@ -246,7 +245,7 @@ impl<'a> Reach<'a> {
                     (BinaryOp::Greater, true) | (BinaryOp::LessEqual, false) => (b, a, true),
                     (BinaryOp::GreaterEqual, true) | (BinaryOp::Less, false) => (b, a, false),
                     (BinaryOp::NotEqual, true) | (BinaryOp::Equal, false) => {
-                        let zero = |id: ExprId| literal(self.system, id) == Some(0.0);
+                        let zero = |id: ExprId| self.system.literal(id) == Some(0.0);
                         return match (zero(a), zero(b)) {
                             (_, true) => self.constrain(a, Interval::NOT_ZERO, id, DEEPEST),
                             (true, _) => self.constrain(b, Interval::NOT_ZERO, id, DEEPEST),
@@ -287,12 +286,12 @@ impl<'a> Reach<'a> {
             Node::Binary(BinaryOp::Multiply, a, b) if self.same(a, b) => {
                 self.constrain(a, roots_of(inside, 2), id, deep)
             }
-            Node::Binary(BinaryOp::Power, a, b) => match literal(self.system, b) {
+            Node::Binary(BinaryOp::Power, a, b) => match self.system.literal(b) {
                 Some(n) if [2.0, 4.0, 6.0].contains(&n) => self.constrain(a, roots_of(inside, n as u32), id, deep),
                 _ => Interval::ALL,
             },
             Node::Binary(op @ (BinaryOp::Multiply | BinaryOp::Divide), a, b) => {
-                let factor = |id: ExprId| literal(self.system, id).filter(|factor| *factor != 0.0);
+                let factor = |id: ExprId| self.system.literal(id).filter(|factor| *factor != 0.0);
                 let (part, other) = match (factor(b), factor(a)) {
                     (Some(factor), _) if op == BinaryOp::Multiply => (a, inside.divide(Interval::point(factor))),
                     (Some(factor), _) => (a, inside.multiply(Interval::point(factor))),
@@ -387,7 +386,7 @@ impl<'a> Reach<'a> {
             Node::Negate(a) => self.is_rounded(*a),
             Node::Var(var) => self.meaning(*var).is_some_and(|value| self.is_rounded(value)),
             Node::Binary(BinaryOp::Multiply | BinaryOp::Divide, a, b) => {
-                literal(self.system, *a).is_none() && literal(self.system, *b).is_none()
+                self.system.literal(*a).is_none() && self.system.literal(*b).is_none()
             }
             Node::Binary(BinaryOp::Power, ..) => true,
             _ => false,
@@ -402,7 +401,7 @@ impl<'a> Reach<'a> {
                 let (factor, of) = self.scaled(a);
                 (-factor, of)
             }
-            Node::Binary(BinaryOp::Multiply, a, b) => match (literal(self.system, a), literal(self.system, b)) {
+            Node::Binary(BinaryOp::Multiply, a, b) => match (self.system.literal(a), self.system.literal(b)) {
                 (Some(number), _) => {
                     let (factor, of) = self.scaled(b);
                     (number * factor, of)
@@ -413,7 +412,7 @@ impl<'a> Reach<'a> {
                 }
                 _ => (1.0, id),
             },
-            Node::Binary(BinaryOp::Divide, a, b) => match literal(self.system, b) {
+            Node::Binary(BinaryOp::Divide, a, b) => match self.system.literal(b) {
                 Some(number) => {
                     let (factor, of) = self.scaled(a);
                     (factor / number, of)
@@ -556,7 +555,7 @@ impl<'a> Reach<'a> {
             }
             BinaryOp::Power => {
                 let x = self.interval(a);
-                match literal(self.system, b) {
+                match self.system.literal(b) {
                     Some(n) if whole(n) => {
                         let n = if n < 0.0 && planted::is("x^-n is 1/x^2") { -2.0 } else { n };
                         let power = x.power(n.abs() as u32);

@@ -564,7 +564,27 @@ impl System {
         }
     }
 
-    /// Who wrote the start value of a state: its own declaration, or whoever uses the model.
+    /// The value of a number as written, with its sign, or of a sum, product or quotient of such numbers.
+    pub fn literal(&self, id: ExprId) -> Option<f64> {
+        match self.node(id) {
+            Node::Number { value, .. } => Some(*value),
+            Node::Negate(a) => Some(-self.literal(*a)?),
+            Node::Fits { value, .. } => self.literal(*value),
+            Node::Binary(op, a, b) => {
+                let (a, b) = (self.literal(*a)?, self.literal(*b)?);
+                match op {
+                    BinaryOp::Add => Some(a + b),
+                    BinaryOp::Subtract => Some(a - b),
+                    BinaryOp::Multiply => Some(a * b),
+                    BinaryOp::Divide => Some(a / b),
+                    _ => None,
+                }
+            }
+            _ => None,
+        }
+    }
+
+    /// Who wrote the start value of a state: its own declaration, or the user of the model.
     pub fn start_origin(&self, state: VarId) -> Origin {
         self.starts.iter().find(|(of, _)| *of == state).map_or(Origin::Default, |(_, origin)| *origin)
     }

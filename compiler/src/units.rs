@@ -621,7 +621,7 @@ impl Checker<'_> {
 
     /// The value of a literal exponent.
     fn constant(&self, id: ExprId) -> Option<f64> {
-        literal(self.system, id)
+        self.system.literal(id)
     }
 
     fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Kind {
@@ -1108,26 +1108,6 @@ impl Checker<'_> {
             }
         }
         Types { nodes, boolean, units, boolean_vars }
-    }
-}
-
-/// The value of a number as written, with its sign.
-pub fn literal(system: &System, id: ExprId) -> Option<f64> {
-    match system.node(id) {
-        Node::Number { value, .. } => Some(*value),
-        Node::Negate(a) => Some(-literal(system, *a)?),
-        Node::Fits { value, .. } => literal(system, *value),
-        Node::Binary(op, a, b) => {
-            let (a, b) = (literal(system, *a)?, literal(system, *b)?);
-            match op {
-                BinaryOp::Add => Some(a + b),
-                BinaryOp::Subtract => Some(a - b),
-                BinaryOp::Multiply => Some(a * b),
-                BinaryOp::Divide => Some(a / b),
-                _ => None,
-            }
-        }
-        _ => None,
     }
 }
 

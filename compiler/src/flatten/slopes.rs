@@ -140,7 +140,7 @@ impl<'a> Flattener<'a> {
                 above.map(|above| self.operation(BinaryOp::Divide, above, b, span))
             }
             (BinaryOp::Power, Some(da), None) => {
-                let below = match self.literal(b) {
+                let below = match self.system.literal(b) {
                     Some(exponent) => self.plain(exponent - 1.0, span),
                     None => {
                         let one = self.plain(1.0, span);
@@ -305,25 +305,5 @@ impl<'a> Flattener<'a> {
 
     fn plain(&mut self, value: f64, span: Span) -> ExprId {
         self.system.push(Node::Number { value, dimension: Some(Dimension::NONE), angle: Angle::Silent }, span)
-    }
-
-    /// An exponent that is written as a number.
-    fn literal(&self, id: ExprId) -> Option<f64> {
-        match self.system.node(id) {
-            Node::Number { value, .. } => Some(*value),
-            Node::Negate(a) => self.literal(*a).map(|value| -value),
-            Node::Fits { value, .. } => self.literal(*value),
-            Node::Binary(op, a, b) => {
-                let (a, b) = (self.literal(*a)?, self.literal(*b)?);
-                match op {
-                    BinaryOp::Add => Some(a + b),
-                    BinaryOp::Subtract => Some(a - b),
-                    BinaryOp::Multiply => Some(a * b),
-                    BinaryOp::Divide => Some(a / b),
-                    _ => None,
-                }
-            }
-            _ => None,
-        }
     }
 }
