@@ -1,4 +1,4 @@
-//! Measures against what they are said to be, over drawn experiments with printed seeds: `slope` against the difference of
+//! Measures against their definitions, over drawn experiments with printed seeds: `slope` against the difference of
 //! the quantity, `count` and `duration` against a count over the recording. `FRIC_SEED`, `FRIC_RUNS` (default 60).
 
 mod support;

@@ -3,7 +3,7 @@
 //! In: what the model asks for, what was measured, what went wrong anywhere. Out: what is permitted, and whether the
 //! drives follow, stop quickly or are disabled. Knows neither buses nor models.
 //!
-//! It decides in the cycle in which it is told. A trip latches: nothing leads out of it. Limits can be narrowed
+//! It decides in the cycle that brings it the measurements. A trip latches: nothing leads out of it. Limits can be narrowed
 //! while running and never widened. It allocates nothing after [`Supervisor::new`] and holds no unsafe code.
 //!
 //! Software is not the safety function of a machine: the emergency stop acts by wire on the safe torque off of the

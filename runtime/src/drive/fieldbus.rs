@@ -841,7 +841,7 @@ impl Fieldbus {
                 bounds.angle = BY_HAND.max(bounds.angle);
             }
             let patience = match holder.and_then(|holder| drive_of(&self.nodes[holder])) {
-                // At the speed that it is told, three times as long as it takes.
+                // Three times as long as the turn takes at the commanded speed.
                 Some(holder) if holder.config().mode == Mode::Speed => PATIENCE + 3.0 * bounds.angle / turning(holder),
                 Some(_) => 2.0 * PATIENCE,
                 None => PATIENCE_BY_HAND,

@@ -113,7 +113,7 @@ impl Table {
 type Judged = (Vec<Verdict>, Vec<Solver>);
 
 impl Errors {
-    /// One more run, `number`, of these expectations.
+    /// Adds the errors of run `number` of the table, in the order of its expectations.
     fn take(&mut self, expects: &[Expect], number: u64, verdicts: &[Verdict], companions: Vec<Solver>) {
         self.ended += 1;
         if self.companions.is_empty() {
