@@ -98,7 +98,6 @@ pub enum Cause {
     /// Somebody else commands: the bus and the identifier of the frame.
     Foreign(usize, u32),
     /// More energy came back than a friction can hold.
-    Energy,
     /// The shaft is not as told, and the loop is stable only while its commands look ahead.
     Unpredictable,
     /// No cycle ended in time.
@@ -294,11 +293,14 @@ pub enum Protection {
     Patient,
     Recorded,
     Reused,
+    Unhurried,
+    Counted,
+    Energy,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 29] = [
+    pub const ALL: [(&'static str, Protection); 31] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -328,6 +330,8 @@ impl Protection {
         ("patient", Protection::Patient),
         ("recorded", Protection::Recorded),
         ("reused", Protection::Reused),
+        ("unhurried", Protection::Unhurried),
+        ("counted", Protection::Counted),
     ];
 }
 

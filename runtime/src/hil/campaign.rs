@@ -793,9 +793,9 @@ impl Stand {
     }
 }
 
-/// Protections that the fault space alone holds.
+/// Protections that generators alone hold.
 #[cfg(feature = "mutants")]
-const ELSEWHERE: [&str; 3] = ["patient", "recorded", "reused"];
+const ELSEWHERE: [&str; 5] = ["patient", "recorded", "reused", "unhurried", "counted"];
 
 /// Each protection taken away makes the tests above fail: so they would notice if it were broken.
 #[cfg(feature = "mutants")]

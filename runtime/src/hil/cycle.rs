@@ -367,6 +367,12 @@ impl Hil {
         &self.cycle
     }
 
+    /// The frames of the cycle before, as its log has them.
+    #[cfg(test)]
+    pub(super) fn last_frames(&self) -> &[u64] {
+        &self.wires.frames
+    }
+
     /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere; they are taken
     /// back when this rig is dropped.
     pub fn prepare_emergency(&mut self) {
@@ -645,7 +651,8 @@ impl Hil {
         if let Some((settings, head)) = self.log_wanted.take() {
             let head = head.with("settings", trace::settings_to_bytes(&bounds, &self.options.control));
             let head = head.with("drives", self.identities());
-            match Log::begin(settings, &head) {
+            let patient = settings.patient || !is_present(Protection::Unhurried);
+            match Log::begin(log::Settings { patient, ..settings }, &head) {
                 Ok(log) => self.log = Some(log),
                 Err(error) => return self.refuse(format!("the log cannot be written: {error}")),
             }
@@ -757,7 +764,7 @@ impl Hil {
             trace::write_state(self.k, control, &mut self.words);
             log.push(trace::STATE, &self.words);
         }
-        self.counts.log_dropped = log.dropped();
+        self.counts.log_dropped = if is_present(Protection::Counted) { log.dropped() } else { 0 };
     }
 
     /// Ends the run when it is over.

@@ -36,3 +36,6 @@ mod faults;
 
 #[cfg(test)]
 mod endings;
+
+#[cfg(test)]
+mod disks;

@@ -4,7 +4,8 @@
 //! [`blocks`]) with a head, messages and a tail. Knows nothing of what the words mean.
 //!
 //! A block is closed after a fixed number of messages of kind [`CYCLE`], not after a time: so two equal runs leave equal
-//! files. A full queue drops the message and counts it, and the next one that fits says how many are missing.
+//! files. A full queue drops the message and counts it, and the next one that fits says how many are missing. After an error
+//! of the file the thread goes on to empty the queue and counts what comes: each message is in the file, or is counted.
 //!
 //! The thread packs each block (differences, then deflate) and begins a new file where the last one has become long
 //! enough (see [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
@@ -12,11 +13,11 @@
 use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK_LONGEST};
 use super::claim::Claim;
 use super::packed;
-use super::parts::{self, Limits};
+use super::parts::{self, Disk, Limits};
 use crate::queue::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{self, BufReader};
+use std::io::{self, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -100,6 +101,20 @@ pub enum Sink {
     File(PathBuf, Limits),
     /// So many blocks are kept, and written to this file only if the run ends with a stop: a black box.
     BlackBox(PathBuf, usize),
+    /// The first, on a disk that may fail, with a queue of so many words.
+    #[cfg(test)]
+    On(Box<dyn Disk>, PathBuf, Limits, usize),
+}
+
+impl Sink {
+    /// Words that fit its queue.
+    fn queue(&self) -> usize {
+        match self {
+            Sink::File(..) | Sink::BlackBox(..) => QUEUE,
+            #[cfg(test)]
+            Sink::On(.., words) => *words,
+        }
+    }
 }
 
 /// How a log is kept.
@@ -119,7 +134,7 @@ pub struct Log {
     patient: bool,
     /// Messages dropped since the last that fitted.
     lost: u64,
-    /// All messages dropped.
+    /// All messages dropped since the queue was full.
     dropped: u64,
     thread: Option<JoinHandle<io::Result<()>>>,
 }
@@ -128,8 +143,8 @@ pub struct Log {
 struct Shared {
     /// Nothing more will come.
     over: AtomicBool,
-    /// The file no longer takes anything.
-    broken: AtomicBool,
+    /// Messages that came to the thread and will be in no file.
+    lost: AtomicU64,
     /// Bytes written.
     written: AtomicU64,
     /// Bytes that were free on the disk when it was last looked at.
@@ -143,7 +158,7 @@ struct Shared {
 /// What is left to say at the end.
 #[derive(Debug)]
 pub struct Summary {
-    /// Messages that were dropped because the queue was full.
+    /// Messages that are not in the files: the queue was full.
     pub dropped: u64,
     /// Bytes of all files.
     pub bytes: u64,
@@ -174,7 +189,7 @@ impl Log {
     /// # Errors
     /// Those of the file.
     pub fn begin(settings: Settings, head: &Sections) -> io::Result<Log> {
-        let (queue, end) = queue(QUEUE);
+        let (queue, end) = queue(settings.sink.queue());
         let shared = Arc::new(Shared::default());
         let mut carrier = Carrier::new(settings.sink, settings.cycles_per_block, end, shared.clone())?;
         carrier.keep_head(&head.bytes())?;
@@ -189,7 +204,8 @@ impl Log {
     pub fn push(&mut self, kind: u32, words: &[u64]) {
         assert!(words.len() < LONGEST, "a message of {} words", words.len());
         let needed = words.len() + 1 + if self.lost > 0 { 2 } else { 0 };
-        while self.patient && self.queue.free() < needed && !self.shared.broken.load(Ordering::Relaxed) {
+        // The thread empties the queue whatever its file does.
+        while self.patient && self.queue.free() < needed && !self.queue.is_abandoned() {
             std::thread::sleep(Duration::from_micros(100));
         }
         if self.queue.free() < needed {
@@ -211,18 +227,17 @@ impl Log {
         self.shared.free.load(Ordering::Relaxed)
     }
 
-    /// Messages dropped until now.
+    /// Messages that are in no file and will be in none, until now.
     pub fn dropped(&self) -> u64 {
-        self.dropped
+        self.dropped + self.shared.lost.load(Ordering::Relaxed)
     }
 
     /// Ends the log. `stopped`: a black box is written out.
     ///
     /// # Errors
-    /// What kept the file from being written.
+    /// What kept the file from being written, and how many messages it lacks.
     pub fn end(mut self, tail: &Sections, stopped: bool) -> io::Result<Summary> {
         let words = pack(&tail.bytes());
-        let dropped = self.dropped;
         self.patient = true;
         for piece in words.chunks(LONGEST / 2) {
             self.push(TAIL_PART, piece);
@@ -230,7 +245,9 @@ impl Log {
         self.push(TAIL_END, &[tail.bytes().len() as u64, u64::from(stopped)]);
         self.shared.over.store(true, Ordering::Release);
         let thread = self.thread.take().expect("a log ends once");
-        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+        let carried = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        let dropped = self.dropped();
+        carried.map_err(|error| io::Error::new(error.kind(), format!("{error}; {dropped} messages are not in it")))?;
         let [bytes, parts, removed] =
             [&self.shared.written, &self.shared.parts, &self.shared.removed].map(|count| count.load(Ordering::Relaxed));
         Ok(Summary { dropped, bytes, parts, removed })
@@ -250,6 +267,11 @@ impl Drop for Log {
 /// Kinds of messages that do not reach a file as such.
 const TAIL_PART: u32 = u32::MAX - 1;
 const TAIL_END: u32 = u32::MAX;
+
+/// Messages of the caller in this one: what the log itself has to say is none.
+fn records(words: &[u64]) -> u64 {
+    u64::from(![LOST, TAIL_PART, TAIL_END].contains(&((words[0] >> 32) as u32)))
+}
 
 fn word(kind: u32, length: usize) -> u64 {
     u64::from(kind) << 32 | length as u64
@@ -273,6 +295,8 @@ struct Carrier {
     cycles_per_block: u32,
     cycles: u32,
     block: Vec<u8>,
+    /// Messages in it.
+    held: u64,
     tail: Vec<u8>,
 }
 
@@ -285,7 +309,8 @@ enum Out {
 struct Parts {
     first: PathBuf,
     limits: Limits,
-    writer: BlockWriter<File>,
+    disk: Box<dyn Disk>,
+    writer: BlockWriter<Box<dyn Write + Send>>,
     /// Nobody else writes a log of this name.
     _claim: Option<Claim>,
     /// Number of the file being written, from 1.
@@ -296,21 +321,21 @@ struct Parts {
 }
 
 impl Parts {
-    fn begin(first: PathBuf, mut limits: Limits) -> io::Result<Parts> {
+    fn begin(disk: Box<dyn Disk>, first: PathBuf, mut limits: Limits) -> io::Result<Parts> {
         if let Some(keep) = limits.keep {
             limits.part = limits.part.min(keep / 4);
         }
         parts::make_folder_of(&first)?;
         let claim = Claim::on(&first)?;
-        let writer = BlockWriter::new(parts::create(&first, 1)?)?;
-        Ok(Parts { _claim: claim, first, limits, writer, number: 1, bytes: 0, head: Vec::new() })
+        let writer = BlockWriter::new(disk.create(&first, 1)?)?;
+        Ok(Parts { _claim: claim, first, limits, disk, writer, number: 1, bytes: 0, head: Vec::new() })
     }
 
     /// Begins the next file, with the head and the number of the part.
     fn next(&mut self) -> io::Result<()> {
         self.number += 1;
         self.bytes = 0;
-        self.writer = BlockWriter::new(parts::create(&self.first, self.number)?)?;
+        self.writer = BlockWriter::new(self.disk.create(&self.first, self.number)?)?;
         let part = format!("{} {:08x}", self.number, blocks::mark(&self.head));
         let head = Sections::read(&self.head).unwrap_or_default().with(PART, part);
         self.write(PACKED_HEAD, &packed::pack_bytes(&head.bytes()))?;
@@ -335,7 +360,7 @@ impl Parts {
 
     /// Bytes that are free on the disk; an error where a log must not take more.
     fn free(&self) -> io::Result<u64> {
-        let free = parts::free(&parts::path(&self.first, self.number))?;
+        let free = self.disk.free(&parts::path(&self.first, self.number))?;
         if free < self.limits.reserve {
             let (free, reserve) = (free / 1_000_000, self.limits.reserve / 1_000_000);
             let why = format!("the disk has {free} MB free, and the last {reserve} MB are left to others");
@@ -348,12 +373,14 @@ impl Parts {
 impl Carrier {
     fn new(sink: Sink, cycles_per_block: u32, queue: Receiver<u64>, shared: Arc<Shared>) -> io::Result<Carrier> {
         let out = match sink {
-            Sink::File(path, limits) => Out::File(Parts::begin(path, limits)?),
+            Sink::File(path, limits) => Out::File(Parts::begin(Box::new(parts::System), path, limits)?),
+            #[cfg(test)]
+            Sink::On(disk, path, limits, _) => Out::File(Parts::begin(disk, path, limits)?),
             Sink::BlackBox(path, most) => Out::Ring { path, head: Vec::new(), blocks: VecDeque::new(), most },
         };
         shared.parts.store(1, Ordering::Relaxed);
         let (block, tail) = (Vec::new(), Vec::new());
-        let carrier = Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, tail };
+        let carrier = Carrier { queue, shared, out, cycles_per_block, cycles: 0, block, held: 0, tail };
         carrier.make_room()?;
         carrier.look_at_disk()?;
         Ok(carrier)
@@ -373,9 +400,10 @@ impl Carrier {
         Ok(())
     }
 
-    /// Carries until all is over.
+    /// Carries until all is over; after an error it counts what comes.
     fn carry(mut self) -> io::Result<()> {
         let mut words = Vec::new();
+        let mut carried = Ok(());
         loop {
             let over = self.shared.over.load(Ordering::Acquire);
             while let Some(first) = self.queue.first() {
@@ -383,15 +411,28 @@ impl Carrier {
                 if !self.queue.take((first & 0xffff_ffff) as usize + 1, &mut words) {
                     break;
                 }
-                if let Err(error) = self.take(&words) {
-                    self.shared.broken.store(true, Ordering::Relaxed);
-                    return Err(error);
+                if carried.is_ok() {
+                    carried = self.take(&words);
+                } else {
+                    self.held += records(&words);
                 }
+                self.give_up(&carried);
+            }
+            if over && carried.is_ok() {
+                carried = self.close();
+                self.give_up(&carried);
             }
             if over {
-                return self.close();
+                return carried;
             }
             std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// After an error, what is held will never be written.
+    fn give_up(&mut self, carried: &io::Result<()>) {
+        if carried.is_err() {
+            self.shared.lost.fetch_add(std::mem::take(&mut self.held), Ordering::Relaxed);
         }
     }
 
@@ -409,11 +450,10 @@ impl Carrier {
                 }
             }
             _ => {
-                if let (STATE, Out::File(parts)) = (kind, &self.out)
-                    && parts.bytes >= parts.limits.part
-                {
-                    self.next_part()?;
-                }
+                let rolls = matches!(&self.out, Out::File(parts) if kind == STATE && parts.bytes >= parts.limits.part);
+                let rolled = if rolls { self.next_part() } else { Ok(()) };
+                self.held += records(words);
+                rolled?;
                 self.block.extend(words.iter().flat_map(|word| word.to_le_bytes()));
                 self.cycles += u32::from(kind == CYCLE);
                 if self.cycles >= self.cycles_per_block {
@@ -452,12 +492,15 @@ impl Carrier {
         match &mut self.out {
             Out::File(parts) => {
                 let added = parts.write(kind, &bytes)?;
+                // From here on they are in the file, whatever its disk says next.
+                self.held = if kind == PACKED { 0 } else { self.held };
                 self.shared.written.fetch_add(added, Ordering::Relaxed);
                 self.look_at_disk()?;
             }
             Out::Ring { head, blocks, most, .. } => match kind {
                 PACKED_HEAD => *head = bytes,
                 PACKED => {
+                    self.held = 0;
                     blocks.push_back(bytes);
                     if blocks.len() > *most {
                         blocks.pop_front();

@@ -8,7 +8,7 @@
 
 use super::claim::is_locked;
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -33,6 +33,32 @@ impl Default for Limits {
     /// Parts of 256 MB, all of them kept; 64 MB of the disk are left to others.
     fn default() -> Limits {
         Limits { part: 256_000_000, keep: None, reserve: 64_000_000 }
+    }
+}
+
+/// Where the files of a log lie.
+pub trait Disk: Send {
+    /// Opens part `number` of the log whose first part is `first`.
+    ///
+    /// # Errors
+    /// Those of the files.
+    fn create(&self, first: &Path, number: u32) -> io::Result<Box<dyn Write + Send>>;
+    /// Bytes that are free where this file lies.
+    ///
+    /// # Errors
+    /// Those of the system.
+    fn free(&self, path: &Path) -> io::Result<u64>;
+}
+
+/// The disk that the system knows.
+pub struct System;
+
+impl Disk for System {
+    fn create(&self, first: &Path, number: u32) -> io::Result<Box<dyn Write + Send>> {
+        Ok(Box::new(create(first, number)?))
+    }
+    fn free(&self, path: &Path) -> io::Result<u64> {
+        free(path)
     }
 }
 

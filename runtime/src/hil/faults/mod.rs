@@ -127,12 +127,17 @@ fn the_same_seed_gives_the_same_bits() {
     }
 }
 
-/// Protections of the process, not of a cycle: signal handlers, their stack and their table of frames. Random
-/// [`endings`](crate::hil::endings) of real processes hold them.
+/// Protections that generators of their own hold: what a process does that ends or stands still, what its disk does, what
+/// takes longer than a run of the fault space, and shafts and contacts that are not as told.
 #[cfg(feature = "mutants")]
-const OUTSIDE: [&str; 2] = ["table", "own-stack"];
+const OUTSIDE: [(&str, &str); 4] = [
+    ("table", "hil::endings"),
+    ("own-stack", "hil::endings"),
+    ("unhurried", "hil::disks"),
+    ("counted", "hil::disks"),
+];
 
-/// Each protection taken away makes the fault space, or the endings of processes, fail. `FRIC_ONLY=name` tries one alone.
+/// Each protection taken away makes its generator fail. `FRIC_ONLY=name` tries one alone.
 #[cfg(feature = "mutants")]
 #[test]
 fn mutants_are_caught_by_the_fault_space() {
@@ -141,9 +146,9 @@ fn mutants_are_caught_by_the_fault_space() {
     let mut missed = Vec::new();
     for name in all.filter(|name| only.as_deref().is_none_or(|only| only == *name)) {
         let mut test = std::process::Command::new(std::env::current_exe().unwrap());
-        let (generator, runs) = match OUTSIDE.contains(&name) {
-            true => ("hil::endings", "100"),
-            false => ("hil::faults::random_faults", "4000"),
+        let (generator, runs) = match OUTSIDE.iter().find(|(outside, _)| *outside == name) {
+            Some((_, generator)) => (*generator, "100"),
+            None => ("hil::faults::random_faults", "4000"),
         };
         test.args([generator, "--nocapture"]).env("FRIC_MUTANT", name).env("FRIC_RUNS", runs);
         let out = test.output().unwrap();

@@ -1,0 +1,398 @@
+//! Logs on disks that stall, fill up, fail and recover, while a rig runs.
+//!
+//! In: a seed. Out: whether cycles went on, whether each message is in the files or counted as missing, whether what is in them
+//! replays to the bit, and whether the end says so. The reference is what the test itself noted in each cycle. `FRIC_SEED=n`
+//! repeats one seed; `FRIC_RUNS=n` says how many there are.
+
+use super::campaign::quick;
+use super::control::Control;
+use super::cycle::{Command, End, Hil};
+use super::replay::Replay;
+use super::simulated::{Pace, World};
+use super::{bench, trace};
+use crate::chance::Chance;
+use crate::record::log::{CYCLE, LOST, Message, Reader, STATE, Sections, Settings, Sink};
+use crate::record::parts::{Disk, Limits, System};
+use std::io::{self, ErrorKind, Write};
+use std::path::Path;
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::Duration;
+
+/// Seeds in `cargo test`.
+const RUNS: u64 = 60;
+/// Wall-clock time without a cycle after which a cycle waits for the disk, which waits for it.
+const STUCK: Duration = Duration::from_secs(3);
+/// Writes after which the log's thread does the rest.
+const HEAD: u64 = 3;
+/// Cycles from one state to the next in a log.
+const STATE_EVERY: u64 = 1000;
+
+/// What a disk does from one of its writes on.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Ill {
+    /// It takes no byte before so many cycles have passed.
+    Stalls(u64),
+    /// It takes a part of each write only, or is interrupted: so many times.
+    Halting(u64),
+    /// So many writes fail, after some of their bytes.
+    Fails(u64),
+    /// It takes so many bytes more.
+    Full(u64),
+    /// Others have filled it, for so many looks.
+    Filled(u64),
+    /// So many new files cannot be opened.
+    Sealed(u64),
+}
+
+/// One run.
+#[derive(Clone, PartialEq, Debug)]
+struct Script {
+    seed: u64,
+    /// From which write on what happens, in order.
+    ills: Vec<(u64, Ill)>,
+    /// Words of the queue.
+    queue: usize,
+    cycles_per_block: u32,
+    /// Bytes of a file.
+    part: u64,
+    /// Cycles of the model until it is told to stop; the model gives no number instead.
+    cycles: u64,
+    fails: bool,
+}
+
+impl Script {
+    fn of(seed: u64) -> Script {
+        let mut chance = Chance(seed);
+        let ill = |chance: &mut Chance| match chance.below(8) {
+            0..=2 => Ill::Stalls(1 + chance.below(600)),
+            3 => Ill::Halting(1 + chance.below(20)),
+            4 => Ill::Fails(1 + chance.below(3)),
+            5 => Ill::Full(chance.below(20_000)),
+            6 => Ill::Filled(1 + chance.below(3)),
+            _ => Ill::Sealed(1 + chance.below(2)),
+        };
+        let mut ills: Vec<(u64, Ill)> = (0..[0, 1, 1, 2, 3][chance.below(5) as usize])
+            .map(|_| match (chance.below(60), ill(&mut chance)) {
+                // The head is written by the cycle itself, before a drive is enabled.
+                (at, stalls @ Ill::Stalls(_)) => (at + HEAD, stalls),
+                other => other,
+            })
+            .collect();
+        ills.sort_by_key(|(at, _)| *at);
+        Script {
+            seed,
+            ills,
+            queue: [600, 3_000, 20_000][chance.below(3) as usize],
+            cycles_per_block: [1, 10, 100][chance.below(3) as usize],
+            part: [4_000, 20_000, 1 << 40][chance.below(3) as usize],
+            cycles: 100 + chance.below(2400),
+            fails: chance.below(6) == 0,
+        }
+    }
+}
+
+/// What disk and test tell each other.
+#[derive(Default)]
+struct Shared {
+    /// Cycles that have passed; all of them once the run is over.
+    cycles: u64,
+    /// Writes until now.
+    writes: u64,
+    ills: Vec<(u64, Ill)>,
+    /// The disk has waited in vain for a cycle.
+    stuck: bool,
+}
+
+#[derive(Clone, Default)]
+struct Faulty(Arc<(Mutex<Shared>, Condvar)>);
+
+impl Faulty {
+    fn pass(&self, cycles: u64) {
+        let (shared, passed) = &*self.0;
+        let mut shared = shared.lock().unwrap();
+        shared.cycles = cycles;
+        drop(shared);
+        passed.notify_all();
+    }
+
+    /// What is wrong now, of this kind.
+    fn wrong(&self, is: impl Fn(Ill) -> bool, change: impl FnOnce(&mut Ill)) -> Option<Ill> {
+        let mut shared = self.0.0.lock().unwrap();
+        let writes = shared.writes;
+        let at = shared.ills.iter().position(|(from, ill)| *from <= writes && is(*ill))?;
+        let ill = shared.ills[at].1;
+        change(&mut shared.ills[at].1);
+        match shared.ills[at].1 {
+            Ill::Halting(0) | Ill::Fails(0) | Ill::Filled(0) | Ill::Sealed(0) => _ = shared.ills.remove(at),
+            _ => {}
+        }
+        Some(ill)
+    }
+
+    fn stall(&self) {
+        let Some(Ill::Stalls(cycles)) = self.wrong(|ill| matches!(ill, Ill::Stalls(_)), |_| ()) else { return };
+        let (shared, passed) = &*self.0;
+        let mut shared = shared.lock().unwrap();
+        let until = shared.cycles.saturating_add(cycles);
+        while shared.cycles < until {
+            let before = shared.cycles;
+            let (now, waited) = passed.wait_timeout(shared, STUCK).unwrap();
+            shared = now;
+            if waited.timed_out() && shared.cycles == before {
+                shared.stuck = true;
+                break;
+            }
+        }
+        let at = shared.ills.iter().position(|(_, ill)| *ill == Ill::Stalls(cycles)).expect("it is still there");
+        shared.ills.remove(at);
+    }
+}
+
+fn less(count: &mut u64) {
+    *count -= 1;
+}
+
+impl Disk for Faulty {
+    fn create(&self, first: &Path, number: u32) -> io::Result<Box<dyn Write + Send>> {
+        let sealed = |ill: &mut Ill| {
+            if let Ill::Sealed(count) = ill {
+                less(count)
+            }
+        };
+        if number > 1 && self.wrong(|ill| matches!(ill, Ill::Sealed(_)), sealed).is_some() {
+            return Err(ErrorKind::ReadOnlyFilesystem.into());
+        }
+        Ok(Box::new(Part { disk: self.clone(), file: System.create(first, number)? }))
+    }
+
+    fn free(&self, path: &Path) -> io::Result<u64> {
+        let filled = |ill: &mut Ill| {
+            if let Ill::Filled(count) = ill {
+                less(count)
+            }
+        };
+        let is_filled = self.wrong(|ill| matches!(ill, Ill::Filled(_)), filled).is_some();
+        if is_filled { Ok(0) } else { System.free(path).map(|_| u64::MAX) }
+    }
+}
+
+struct Part {
+    disk: Faulty,
+    file: Box<dyn Write + Send>,
+}
+
+impl Write for Part {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.disk.0.0.lock().unwrap().writes += 1;
+        self.disk.stall();
+        let mut room = bytes.len();
+        let full = |ill: &mut Ill| {
+            if let Ill::Full(left) = ill {
+                *left = left.saturating_sub(bytes.len() as u64)
+            }
+        };
+        if let Some(Ill::Full(left)) = self.disk.wrong(|ill| matches!(ill, Ill::Full(_)), full) {
+            room = room.min(left as usize);
+        }
+        if room == 0 && !bytes.is_empty() {
+            return Err(ErrorKind::StorageFull.into());
+        }
+        let fails = |ill: &mut Ill| {
+            if let Ill::Fails(count) = ill {
+                less(count)
+            }
+        };
+        if self.disk.wrong(|ill| matches!(ill, Ill::Fails(_)), fails).is_some() {
+            self.file.write_all(&bytes[..room / 2])?;
+            return Err(io::Error::other("the disk has failed"));
+        }
+        let halting = |ill: &mut Ill| {
+            if let Ill::Halting(count) = ill {
+                less(count)
+            }
+        };
+        if let Some(Ill::Halting(count)) = self.disk.wrong(|ill| matches!(ill, Ill::Halting(_)), halting) {
+            if count % 2 == 0 {
+                return Err(ErrorKind::Interrupted.into());
+            }
+            room = room.div_ceil(3);
+        }
+        self.file.write_all(&bytes[..room])?;
+        Ok(room)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
+}
+
+/// What became of a run's messages.
+#[derive(Clone, Copy, Debug, Default)]
+struct Fate {
+    written: u64,
+    dropped: u64,
+    broken: bool,
+    parts: u64,
+    skipped: u64,
+}
+
+/// Runs a script in simulated time.
+///
+/// # Errors
+/// What is not as promised.
+fn run(script: &Script) -> Result<Fate, String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.friclog");
+    let disk = Faulty::default();
+    disk.0.0.lock().unwrap().ills.clone_from(&script.ills);
+    let limits = Limits { part: script.part, ..Limits::default() };
+    let sink = Sink::On(Box::new(disk.clone()), path.clone(), limits, script.queue);
+    let settings = Settings { sink, cycles_per_block: script.cycles_per_block, patient: false };
+    let (rig, mut model, plant) = bench::pair();
+    if script.fails {
+        let slot = model.description().layout.params.slot(2);
+        model.set(slot, script.cycles as f64 * 1e-3);
+    }
+    let mut world = World::new(&rig, Some(plant), Pace::Fast, script.seed).unwrap();
+    let masters = world.masters();
+    let log = Some((settings, Sections::default().with("rig", "pair")));
+    let (mut hil, mut operator) = Hil::new(&rig, model.clone(), world.clock(), masters, quick(), log).unwrap();
+    let mut truth: Vec<Message> = Vec::new();
+    let mut words = Vec::new();
+    while hil.ended().is_none() {
+        hil.cycle();
+        disk.pass(hil.counts().all);
+        let Some(control) = hil.control() else { continue };
+        let mut note = |kind, write: &dyn Fn(&mut Vec<u64>)| {
+            words.clear();
+            write(&mut words);
+            truth.push(Message { kind, words: words.clone() });
+        };
+        note(CYCLE, &|words| hil.last().write(words));
+        note(trace::FRAMES, &|words| words.extend_from_slice(hil.last_frames()));
+        let k = hil.last().k + 1;
+        if k.is_multiple_of(STATE_EVERY) {
+            note(STATE, &|words| trace::write_state(k, control, words));
+        }
+        if hil.counts().cycles == script.cycles {
+            operator.push(Command::Stop);
+        }
+    }
+    disk.pass(u64::MAX);
+    let (counted, missed, end) = (hil.counts().log_dropped, hil.counts().missed, hil.ended().cloned());
+    let finished = hil.finish();
+    if disk.0.0.lock().unwrap().stuck {
+        return Err("a cycle waits for the disk".into());
+    }
+    if let Some(End::Refused(why)) = &end {
+        // Its head was not taken: that is said before anything moves.
+        let said = why.contains("the log cannot be written") && truth.is_empty();
+        return if said { Ok(Fate::default()) } else { Err(format!("refused: {why}")) };
+    }
+    if (end == Some(End::Asked)) == script.fails || missed > 0 {
+        return Err(format!("it ended with {end:?}, {missed} ticks missed"));
+    }
+
+    // The file against what was noted.
+    let mut reader = Reader::open(&path)?;
+    let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
+    let mut replay = Replay::new(&rig, Control::new(&rig, model, None, &bounds, options)?);
+    let (mut at, mut fate) = (0, Fate { broken: finished.is_err(), ..Fate::default() });
+    loop {
+        let message = match reader.message() {
+            Ok(Some(message)) => message,
+            Ok(None) => break,
+            Err(error) => return Err(format!("message {at}: {error}")),
+        };
+        replay.message(&message).map_err(|stopped| format!("message {at} does not replay: {stopped:?}"))?;
+        if message.kind == LOST {
+            at += message.words[0] as usize;
+            continue;
+        }
+        if truth.get(at) != Some(&message) {
+            return Err(format!("message {at} is of kind {}, and not what was handed over", message.kind));
+        }
+        (at, fate.written) = (at + 1, fate.written + 1);
+    }
+    fate.skipped = replay.found().skipped;
+    fate.dropped = truth.len() as u64 - fate.written;
+    let (told, dropped) = match &finished {
+        Ok(summary) => {
+            let summary = summary.as_ref().expect("there is a log");
+            fate.parts = summary.parts;
+            let tail = reader.tail().and_then(|tail| tail.text("counts")).unwrap_or_default();
+            let line = format!("log      {} messages dropped", fate.dropped);
+            if at != truth.len() || !tail.contains(&line) {
+                return Err(format!("{at} of {} messages, and its end says `{tail}`", truth.len()));
+            }
+            (counted, summary.dropped)
+        }
+        Err(error) => {
+            let said = error.to_string();
+            let number = said.strip_suffix(" messages are not in it").and_then(|said| said.rsplit("; ").next());
+            // What was handed over last may be under way when the cycle counts.
+            let number = number.and_then(|number| number.parse().ok()).ok_or(said)?;
+            (counted.max(number), number)
+        }
+    };
+    if (told, dropped) != (fate.dropped, fate.dropped) {
+        return Err(format!("{fate:?}, and {told} are counted, {dropped} told at the end"));
+    }
+    Ok(fate)
+}
+
+/// A script made smaller, as long as it fails.
+fn shrunk(script: &Script, why: String) -> (Script, String) {
+    let (mut best, mut how) = (script.clone(), why);
+    'again: loop {
+        let mut smaller: Vec<Script> = (0..best.ills.len())
+            .map(|at| {
+                let mut other = best.clone();
+                other.ills.remove(at);
+                other
+            })
+            .collect();
+        smaller.push(Script { part: 1 << 40, ..best.clone() });
+        smaller.push(Script { queue: 20_000, ..best.clone() });
+        smaller.push(Script { fails: false, ..best.clone() });
+        smaller.push(Script { cycles: best.cycles / 2, ..best.clone() });
+        for other in smaller.into_iter().filter(|other| *other != best && other.cycles > 50) {
+            if let Err(why) = run(&other) {
+                (best, how) = (other, why);
+                continue 'again;
+            }
+        }
+        return (best, how);
+    }
+}
+
+#[test]
+fn each_message_is_in_the_log_or_counted_whatever_its_disk_does() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
+    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let all = seeds.end - seeds.start;
+    let (mut dropped, mut broken, mut rolled, mut skipped) = (0, 0, 0, 0);
+    for seed in seeds {
+        let script = Script::of(seed);
+        match run(&script) {
+            Ok(fate) => {
+                dropped += u64::from(fate.dropped > 0 && !fate.broken);
+                broken += u64::from(fate.broken);
+                rolled += u64::from(fate.parts > 1);
+                skipped += u64::from(fate.skipped > 0);
+            }
+            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
+                println!("mutant caught with seed {seed}: {why}");
+                panic!("seed {seed}");
+            }
+            Err(why) => {
+                let (script, why) = shrunk(&script, why);
+                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
+            }
+        }
+    }
+    println!(
+        "{all} runs: {dropped} dropped some, {broken} broke, {rolled} went on in further files, {skipped} with gaps"
+    );
+    assert!(all < RUNS || [dropped, broken, rolled, skipped].iter().all(|count| *count > 0), "each kind comes");
+}
