@@ -98,6 +98,7 @@ pub enum Cause {
     /// Somebody else commands: the bus and the identifier of the frame.
     Foreign(usize, u32),
     /// More energy came back than a friction can hold.
+    Energy,
     /// The shaft is not as told, and the loop is stable only while its commands look ahead.
     Unpredictable,
     /// No cycle ended in time.
@@ -295,12 +296,13 @@ pub enum Protection {
     Reused,
     Unhurried,
     Counted,
+    Plain,
     Energy,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 31] = [
+    pub const ALL: [(&'static str, Protection); 33] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -332,6 +334,8 @@ impl Protection {
         ("reused", Protection::Reused),
         ("unhurried", Protection::Unhurried),
         ("counted", Protection::Counted),
+        ("plain", Protection::Plain),
+        ("energy", Protection::Energy),
     ];
 }
 

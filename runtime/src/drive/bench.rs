@@ -212,6 +212,12 @@ impl Bench {
         }
     }
 
+    /// What lies behind the drives.
+    #[cfg(test)]
+    pub fn plant(&self) -> Option<&Instance> {
+        self.plant.as_ref()
+    }
+
     /// Status of the plant's last step: 0, or the guard that was hit.
     pub fn status(&self) -> u64 {
         self.status

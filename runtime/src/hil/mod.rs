@@ -39,3 +39,6 @@ mod endings;
 
 #[cfg(test)]
 mod disks;
+
+#[cfg(test)]
+mod contacts;

@@ -1,0 +1,450 @@
+//! Contacts that a drive plays, on shafts that are as their inertia and torques say, or are not.
+//!
+//! In: a seed: a contact, a shaft, delays, and something that hits, holds or misleads the shaft. Out: whether the rig noticed in
+//! time that the shaft is not as told, and that the contact gives back more energy than it holds. The reference is the shaft of
+//! the simulation itself: its equations, which the test wrote, and the energy, which is a state beside them. `FRIC_SEED=n`
+//! repeats one seed; `FRIC_RUNS=n` says how many there are.
+
+use super::bench;
+use super::campaign::quick;
+use super::cycle::{End, Hil, look_ahead};
+use super::simulated::{Pace, World};
+use crate::chance::Chance;
+use crate::clock::Clock;
+use crate::drive::Step;
+use crate::drive::bench::Bench;
+use crate::drive::hooks::{Effect, Hook, Start};
+use crate::models::Model;
+use crate::safety::Cause;
+use abi::rig::{Kind, Rig, Signal, What};
+use abi::{Function, Instance};
+use std::collections::VecDeque;
+use std::f64::consts::TAU;
+
+/// Seeds in `cargo test`.
+const RUNS: u64 = 80;
+/// Steps of the shaft, ns.
+const STEP_NS: u64 = 100_000;
+const MS: u64 = 1_000_000;
+/// How long the model has the outputs, ns.
+const RUN_NS: u64 = 700 * MS;
+/// Time from which energies are summed, and in which they must be noticed, ns.
+const WINDOW_NS: u64 = 100 * MS;
+/// How much later or earlier a reversal may be told than it is, ns: a small torque is within one step for as long.
+const TOLD_NS: u64 = 30 * MS;
+/// How long a blow takes, s.
+const BLOW: f64 = 2e-4;
+/// Counts of the encoder in one tick that torques do not explain, from which on that must be noticed.
+const MANY: f64 = 20.0;
+/// Factor between the energy that must be noticed and that which must not stop a rig, around what docs/prediction.md says; and a
+/// part of the store for steps of torque and speed.
+const BAND: f64 = 1.6;
+const STEPS: f64 = 0.4;
+
+/// What happens to a shaft.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Event {
+    Nothing,
+    /// A blow changes its speed by so much, rad/s.
+    Blow(f64),
+    /// A brake that nobody told seizes it.
+    Seized,
+    /// Its encoder loses so many counts.
+    Lost(i64),
+}
+
+/// One run.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Script {
+    seed: u64,
+    /// Moment of inertia as it is and as the rig says, kg·m².
+    inertia: f64,
+    told: f64,
+    /// Friction of the bearings, which nobody tells, N·m·s/rad.
+    bearings: f64,
+    /// Stiffness of the contact at rest, N·m/rad; its break-away torque, N·m; its damping, N·m·s/rad.
+    stiffness: f64,
+    most: f64,
+    damping: f64,
+    /// Amplitude of the servo, N·m, and its frequency, Hz.
+    swing: f64,
+    hertz: f64,
+    /// Of the load, s.
+    delay: f64,
+    lag: f64,
+    predicts: bool,
+    needs_look: bool,
+    energy_stops: bool,
+    event: Event,
+    /// From arming to the event, ns.
+    after: u64,
+}
+
+impl Script {
+    fn of(seed: u64) -> Script {
+        let mut chance = Chance(seed);
+        let log = |chance: &mut Chance, low: f64, high: f64| low * (high / low).powf(chance.fraction());
+        let inertia = log(&mut chance, 0.004, 0.04);
+        let predicts = chance.below(3) > 0;
+        let told = inertia * if chance.below(4) == 0 { chance.between(0.6, 1.6) } else { chance.between(0.99, 1.01) };
+        let sign = |chance: &mut Chance| if chance.below(2) == 0 { 1.0 } else { -1.0 };
+        let event = match chance.below(6) {
+            0 | 1 => Event::Blow(sign(&mut chance) * log(&mut chance, 0.2, 6.0)),
+            2 => Event::Seized,
+            3 => Event::Lost((sign(&mut chance) * log(&mut chance, 5.0, 2_000.0)) as i64),
+            _ => Event::Nothing,
+        };
+        let most = chance.between(0.1, 0.6);
+        Script {
+            seed,
+            inertia,
+            told,
+            bearings: if chance.below(3) == 0 { chance.between(0.0, 0.02) } else { 0.0 },
+            stiffness: log(&mut chance, 5.0, 300.0),
+            most,
+            damping: [0.0, 0.02, 0.1][chance.below(3) as usize],
+            swing: most * chance.between(0.3, 2.5),
+            hertz: chance.between(0.5, 3.0),
+            delay: if predicts { chance.between(0.8e-3, 4e-3) } else { log(&mut chance, 0.8e-3, 60e-3) },
+            lag: chance.between(0.2e-3, 2e-3),
+            predicts,
+            needs_look: predicts && chance.below(2) == 0,
+            energy_stops: chance.below(2) == 0,
+            event,
+            after: 250 * MS + chance.below(3_000) * STEP_NS,
+        }
+    }
+
+    /// Rig, control program, plant program. `at`: time of the event, s.
+    fn build(&self, at: f64) -> (Rig, Instance, Instance) {
+        let Script { inertia, bearings, stiffness, most, damping, swing, hertz, event, .. } = *self;
+        let (mut rig, _, _) = bench::bristle();
+        let control = Model::new("Bristle")
+            .inputs(2)
+            .state("z", "rad")
+            .output("servo", "N·m")
+            .output("load", "N·m")
+            .output("v", "rad/s")
+            .body(Function::Derivatives, move |view| {
+                let v = view.u(0);
+                view.set_dx(0, v - stiffness * v.abs() * view.x(0) / most);
+            })
+            .body(Function::Outputs, move |view| {
+                view.set_y(0, swing * (TAU * hertz * view.t()).sin());
+                view.set_y(1, -stiffness * view.x(0) - damping * view.u(0));
+                view.set_y(2, view.u(0));
+            })
+            .build();
+        let plant = Model::new("Shaft")
+            .inputs(2)
+            .state("x", "rad")
+            .state("v", "rad/s")
+            .state("absorbed", "J")
+            .output("position", "rad")
+            .output("speed", "rad/s")
+            .body(Function::Derivatives, move |view| {
+                let v = view.x(1);
+                let other = match event {
+                    Event::Blow(by) if at <= view.t() && view.t() < at + BLOW => by * inertia / BLOW,
+                    Event::Seized if at <= view.t() => -v * inertia / 2e-3,
+                    _ => 0.0,
+                };
+                view.set_dx(0, v);
+                view.set_dx(1, (view.u(0) + view.u(1) - bearings * v + other) / inertia);
+                view.set_dx(2, -view.u(1) * v);
+            })
+            .body(Function::Outputs, |view| {
+                view.set_y(0, view.x(0));
+                view.set_y(1, view.x(1));
+            })
+            .build();
+        (rig.nodes[0].delay, rig.nodes[0].lag) = (self.delay, self.lag);
+        let (inside, outside) = (&control.description().layout, &plant.description().layout);
+        rig.inputs.iter_mut().enumerate().for_each(|(k, input)| input.slot = inside.inputs.slot(k));
+        rig.outputs.iter_mut().enumerate().for_each(|(k, output)| output.slot = inside.outputs.slot(k));
+        rig.record[0].slot = inside.outputs.slot(2);
+        // The servo first; position and speed at each drive.
+        rig.plant.applied.iter_mut().enumerate().for_each(|(k, (_, slot))| *slot = outside.inputs.slot(k));
+        rig.plant.seen.iter_mut().enumerate().for_each(|(k, (_, slot))| *slot = outside.outputs.slot(k % 2));
+        rig.predict = self.predicts.then_some(0);
+        rig.plant.inertia = Some(self.told);
+        (rig, control, plant)
+    }
+
+    /// The largest energy that the contact holds, J.
+    fn store(&self) -> f64 {
+        0.5 * self.most * self.most / self.stiffness
+    }
+}
+
+/// Energies of the true torque and speed, in units of the store, since the model got the outputs.
+#[derive(Default)]
+struct Energies {
+    /// Time, and what was given back in that tick.
+    back: VecDeque<(u64, f64)>,
+    /// When the other torque changed its sign.
+    reversals: VecDeque<u64>,
+    other: f64,
+    begun: Option<f64>,
+    absorbed: f64,
+    highest: f64,
+}
+
+impl Energies {
+    fn note(&mut self, now_ns: u64, absorbed: f64, other: f64) {
+        let absorbed = absorbed - *self.begun.get_or_insert(absorbed);
+        self.back.push_back((now_ns, (self.absorbed - absorbed).max(0.0)));
+        self.absorbed = absorbed;
+        self.highest = self.highest.max(absorbed);
+        // Within a step of the torque its sign is not told.
+        if other.abs() > 4e-3 {
+            if other * self.other < 0.0 {
+                self.reversals.push_back(now_ns);
+            }
+            self.other = other;
+        }
+        while self.back.front().is_some_and(|(at, _)| at + WINDOW_NS <= now_ns) {
+            self.back.pop_front();
+        }
+    }
+
+    fn returned(&self) -> f64 {
+        self.back.iter().map(|(_, back)| back).sum()
+    }
+
+    fn fall(&self) -> f64 {
+        self.highest - self.absorbed
+    }
+
+    /// What reversals of the last so many ns allow.
+    fn allowed(&self, now_ns: u64, ns: u64) -> f64 {
+        1.5 * self.reversals.iter().filter(|at| **at + ns > now_ns).count() as f64
+    }
+}
+
+/// What a run showed.
+#[derive(Clone, Copy, Debug, Default)]
+struct Shown {
+    warned: bool,
+    energy_stop: bool,
+    unpredicted: bool,
+    needed: bool,
+    quiet: bool,
+}
+
+/// Runs a script.
+///
+/// # Errors
+/// What is not as promised.
+fn run(script: &Script) -> Result<Shown, String> {
+    // The start takes the same time whatever happens later: a first one shows how long.
+    let armed_ns = {
+        let (mut hil, world, _) = started(&Script { event: Event::Nothing, ..*script }, f64::INFINITY);
+        while hil.ended().is_none() && hil.counts().cycles == 0 {
+            hil.cycle();
+        }
+        match hil.ended() {
+            Some(end) => return Err(format!("it did not start: {end:?}")),
+            None => world.simulation().now_ns() / STEP_NS * STEP_NS,
+        }
+    };
+    let event_ns = armed_ns + script.after;
+    let (mut hil, world, rig) = started(script, event_ns as f64 * 1e-9);
+    if let Event::Lost(counts) = script.event {
+        let (node, effect, start) = (0, Effect::EncoderLost(counts), Start::At(event_ns));
+        world.bench().hook(Hook { node, effect, start, lasts_ns: None });
+    }
+    let speed_slot = rig.inputs.iter().find(|input| input.signal == Signal { node: 0, what: What::Speed });
+    let speed_slot = speed_slot.expect("the contact reads the speed of its drive").slot;
+    let Kind::Cia402(load) = &rig.nodes[0].kind else { unreachable!("the load is a drive") };
+    let count = load.count;
+    let mut shown = Shown::default();
+    let mut energies = Energies::default();
+    let (mut unpredicted, mut warnings) = (0, VecDeque::from([(0u64, 0u64)]));
+    // Deadlines of what must be noticed.
+    let (mut must_look, mut must_warn, mut must_stop) = (None, None, None);
+    let mut speed = 0.0f64;
+    let mut before_event = None;
+    let period = rig.period_ns;
+    while world.simulation().now_ns() < armed_ns + RUN_NS && hil.ended().is_none() {
+        hil.cycle();
+        let now_ns = world.simulation().now_ns();
+        let Some(counts) = hil.counts().coupling.filter(|_| hil.counts().cycles > 0) else { continue };
+        let control = hil.control().expect("it counts");
+        let tripped = control.supervisor().cause();
+        let shaft = world.bench().shaft(0);
+        let (absorbed, other) = {
+            let bench = world.bench();
+            let plant = bench.plant().expect("it has a shaft");
+            (plant.get(plant.description().layout.states.slot(2)), bench.shaft(1).torque)
+        };
+
+        // The shaft.
+        let looked = counts.unpredicted > unpredicted;
+        if looked {
+            let (got, read) = (control.model().get(speed_slot), hil.seen()[0].speed.unwrap_or(f64::NAN));
+            if got.to_bits() != read.to_bits() && tripped.is_none() {
+                return Err(format!("at {now_ns} ns it does not look ahead, reads {read} and steps with {got} rad/s"));
+            }
+        }
+        unpredicted = counts.unpredicted;
+        let as_told = (script.told / script.inertia - 1.0).abs() <= 0.01 && script.bearings == 0.0;
+        if script.predicts && now_ns > event_ns && before_event.is_none() {
+            before_event = Some(unpredicted - u64::from(looked));
+            let by = match script.event {
+                Event::Nothing => 0.0,
+                Event::Blow(by) => by.abs() * period as f64 * 1e-9 / count,
+                // In the first tick it loses more than a third of its speed.
+                Event::Seized => 0.35 * speed.abs() * period as f64 * 1e-9 / count,
+                Event::Lost(counts) => counts.unsigned_abs() as f64,
+            };
+            if by > MANY && as_told && tripped.is_none() {
+                // The tick in which it happens, and three.
+                must_look = Some(now_ns + 4 * period);
+            }
+        }
+        speed = shaft.speed;
+        let noticed = before_event.is_some_and(|before| unpredicted > before);
+        if must_look.is_some_and(|until| now_ns >= until) {
+            must_look = None;
+            shown.unpredicted = true;
+            let stops = tripped.is_some();
+            if !(stops || noticed && !script.needs_look) {
+                return Err(format!("{:?}, and {unpredicted} cycles did not look ahead: {tripped:?}", script.event));
+            }
+        }
+        let untouched = script.event == Event::Nothing || now_ns < event_ns;
+        if untouched && as_told && unpredicted > 0 {
+            return Err(format!("at {now_ns} ns it does not look ahead, and the shaft is as told"));
+        }
+
+        // The energy.
+        let store = script.store();
+        energies.note(now_ns, absorbed / store, other);
+        let (returned, fall) = (energies.returned(), energies.fall());
+        let least = energies.allowed(now_ns, WINDOW_NS - TOLD_NS);
+        let most = energies.allowed(now_ns, WINDOW_NS + TOLD_NS);
+        warnings.push_back((now_ns, counts.warnings));
+        while warnings.front().is_some_and(|(at, _)| at + 2 * WINDOW_NS < now_ns) {
+            warnings.pop_front();
+        }
+        if tripped == Some(Cause::Energy) && !shown.energy_stop {
+            shown.energy_stop = true;
+            if !script.energy_stops {
+                return Err("energy stops it, and it was not asked to".into());
+            }
+            if returned + STEPS < (3.0 + least) / BAND && fall + STEPS < (1.0 + least) / BAND {
+                return Err(format!("it stops for energy: {returned:.2} came back, {fall:.2} fell"));
+            }
+        }
+        let drives = returned > BAND * (3.0 + most) + STEPS || fall > BAND * (1.0 + most) + STEPS;
+        if drives || returned > BAND * (0.5 + most) + STEPS {
+            must_warn = must_warn.or(Some((now_ns + WINDOW_NS, returned, fall)));
+        }
+        if drives && script.energy_stops {
+            must_stop = must_stop.or(Some((now_ns + WINDOW_NS, returned, fall)));
+        }
+        if let Some((_, returned, fall)) = must_warn.take_if(|(until, ..)| now_ns >= *until) {
+            shown.warned = true;
+            if warnings.front().is_none_or(|(_, before)| counts.warnings == *before) && tripped.is_none() {
+                return Err(format!("{returned:.2} came back, {fall:.2} fell, and it does not warn"));
+            }
+        }
+        if let Some((_, returned, fall)) = must_stop.filter(|(until, ..)| now_ns >= *until && tripped.is_none()) {
+            return Err(format!("{returned:.2} came back, {fall:.2} fell, and it goes on"));
+        }
+        if tripped.is_some() {
+            // What was due to be noticed has stopped it.
+            shown.unpredicted |= must_look.is_some();
+            shown.needed |= must_look.is_some() && tripped == Some(Cause::Unpredictable);
+            shown.warned |= must_warn.is_some();
+            break;
+        }
+    }
+    if let Some(End::Refused(why)) = hil.ended() {
+        return Err(format!("refused: {why}"));
+    }
+    shown.quiet = unpredicted == 0 && hil.counts().coupling.is_some_and(|counts| counts.warnings == 0);
+    Ok(shown)
+}
+
+/// The rig of a script, about to start.
+fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
+    let (rig, control, plant) = script.build(at);
+    let mut options = quick();
+    options.control.needs_look = script.needs_look;
+    options.control.energy_stops = script.energy_stops;
+    options.look = look_ahead(&rig, &plant).unwrap();
+    let bench = Bench::new(&rig, Some(plant), script.seed).unwrap().in_steps_of(STEP_NS);
+    let mut world = World::around(&rig, bench, Pace::Fast, script.seed).unwrap();
+    let masters = world.masters();
+    let (hil, _) = Hil::new(&rig, control, world.clock(), masters, options, None).unwrap();
+    assert!(hil.step() < Step::Armed);
+    (hil, world, rig)
+}
+
+/// A script made plainer, as long as it fails.
+fn shrunk(script: &Script, why: String) -> (Script, String) {
+    let (mut best, mut how) = (*script, why);
+    'again: loop {
+        let plainer: [fn(&mut Script); 8] = [
+            |script| script.event = Event::Nothing,
+            |script| script.told = script.inertia,
+            |script| script.bearings = 0.0,
+            |script| script.damping = 0.0,
+            |script| script.needs_look = false,
+            |script| script.energy_stops = false,
+            |script| script.predicts = false,
+            |script| (script.delay, script.lag) = (2e-3, 0.6e-3),
+        ];
+        for plain in plainer {
+            let mut other = best;
+            plain(&mut other);
+            if other != best
+                && let Err(why) = run(&other)
+            {
+                (best, how) = (other, why);
+                continue 'again;
+            }
+        }
+        return (best, how);
+    }
+}
+
+#[test]
+fn a_shaft_that_is_not_as_told_and_a_contact_that_drives_are_noticed_in_time() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
+    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let all = seeds.end - seeds.start;
+    let counts_only = number("FRIC_COUNT").is_some();
+    let (mut kinds, mut failed) = ([0; 5], Vec::new());
+    for seed in seeds {
+        let script = Script::of(seed);
+        match run(&script) {
+            Ok(Shown { warned, energy_stop, unpredicted, needed, quiet }) => {
+                let shown = [warned, energy_stop, unpredicted, needed, quiet];
+                kinds.iter_mut().zip(shown).for_each(|(count, shown)| *count += u64::from(shown));
+            }
+            Err(why) if counts_only => {
+                println!("seed {seed}: {why}\n  {script:?}");
+                failed.push(seed);
+            }
+            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
+                println!("mutant caught with seed {seed}: {why}");
+                panic!("seed {seed}");
+            }
+            Err(why) => {
+                let (script, why) = shrunk(&script, why);
+                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
+            }
+        }
+    }
+    let [warned, stopped, unpredicted, needed, quiet] = kinds;
+    println!(
+        "{all} runs: {warned} had to warn, {stopped} stopped for energy, {unpredicted} were not as told, {needed} of them \
+         could not go on, {quiet} were quiet; {} failed: {failed:?}",
+        failed.len()
+    );
+    assert!(failed.is_empty());
+    assert!(all < RUNS || kinds.iter().all(|count| *count > 3), "each kind comes: {kinds:?}");
+}
