@@ -298,11 +298,12 @@ pub enum Protection {
     Counted,
     Plain,
     Energy,
+    Loop,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 33] = [
+    pub const ALL: [(&'static str, Protection); 34] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -336,6 +337,7 @@ impl Protection {
         ("counted", Protection::Counted),
         ("plain", Protection::Plain),
         ("energy", Protection::Energy),
+        ("loop", Protection::Loop),
     ];
 }
 

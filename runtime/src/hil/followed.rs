@@ -144,7 +144,8 @@ impl Followed {
         let Some(told) = told else { return false };
         let follows = self.low - self.tolerance <= told && told <= self.high + self.tolerance;
         self.outside = if follows { 0 } else { self.outside.saturating_add(1) };
-        self.outside >= self.patience && is_present(Protection::Followed)
+        let watches = if self.early { Protection::Followed } else { Protection::Loop };
+        self.outside >= self.patience && is_present(Protection::Followed) && is_present(watches)
     }
 
     /// All that the next cycle depends on, as words: appended.

@@ -12,6 +12,7 @@ mod invariants;
 mod run;
 mod shrink;
 mod scripts;
+mod loops;
 
 use invariants::Violation;
 use rigs::Sort;
@@ -130,13 +131,14 @@ fn the_same_seed_gives_the_same_bits() {
 /// Protections that generators of their own hold: what a process does that ends or stands still, what its disk does, what
 /// takes longer than a run of the fault space, and shafts and contacts that are not as told.
 #[cfg(feature = "mutants")]
-const OUTSIDE: [(&str, &str); 6] = [
+const OUTSIDE: [(&str, &str); 7] = [
     ("table", "hil::endings"),
     ("own-stack", "hil::endings"),
     ("unhurried", "hil::disks"),
     ("counted", "hil::disks"),
     ("plain", "hil::contacts"),
     ("energy", "hil::contacts"),
+    ("loop", "hil::faults::loops"),
 ];
 
 /// Each protection taken away makes its generator fail. `FRIC_ONLY=name` tries one alone.

@@ -141,7 +141,7 @@ fn imitate(objects: &mut ObjectDictionary, only: Only) {
 }
 
 /// Drives that boot fast: their times are not what is looked at here.
-fn behaviour() -> Behaviour {
+pub fn behaviour() -> Behaviour {
     let times = Times { switch_on_ns: MS, enable_ns: 5 * MS, disable_ns: 2 * MS, start_ns: MS };
     Behaviour { boot_ns: 5 * MS, times, ..Behaviour::default() }
 }

@@ -1,0 +1,268 @@
+//! Drives that follow a speed or a position by themselves, watched for longer than the runs of the fault space.
+//!
+//! In: a seed: a drive, a command, and what keeps the shaft from following it. Out: whether a stop was under way within a second
+//! after no command of late explained the shaft any more, and none before. The reference is the true shaft, and the commands
+//! that were permitted. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` says how many there are.
+
+use super::rigs::{Made, PLAIN, Sort};
+use super::run::behaviour;
+use super::space::MS;
+use crate::can::sim::{Fault, Kind as Planting};
+use crate::chance::Chance;
+use crate::clock::Clock;
+use crate::drive::bench::Bench;
+use crate::drive::hooks::{Effect, Hook, Start};
+use crate::hil::campaign::quick;
+use crate::hil::cycle::{End, Hil};
+use crate::hil::simulated::{MASTER, Pace, World};
+use crate::safety::Cause;
+use abi::rig::Rig;
+use std::collections::VecDeque;
+
+/// Seeds in `cargo test`.
+const RUNS: u64 = 40;
+const STEP_NS: u64 = 200_000;
+/// From the fault to the end of a run, ns.
+const RUN_NS: u64 = 3_500 * MS;
+/// What a loop with a time constant of 0.1 s has done of a step after this time is all but a fiftieth, s.
+const SETTLES: f64 = 0.4;
+/// How long a shaft may be where no command explains it, ns; and some ticks for the way of its reading.
+const PATIENCE_NS: u64 = 1_000 * MS;
+const WAY_NS: u64 = 20 * MS;
+/// Part of half the range of a command that a shaft may be away, and a part that is left to steps and settling.
+const PART: f64 = 0.1;
+const MARGIN: f64 = 0.05;
+/// The node that follows.
+const SERVO: usize = 1;
+
+/// What is wrong.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Ill {
+    Nothing,
+    /// Its set-points come, and are always the same.
+    Stale,
+    /// They do not come, and it has no deadline for them.
+    Lost,
+    /// It gives so much of its torque.
+    Weak(f64),
+    /// It tells so many times its speed or its angle.
+    Tells(f64),
+}
+
+/// One run.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Script {
+    seed: u64,
+    rig: Made,
+    /// Of the servo, s.
+    delay: f64,
+    lag: f64,
+    ill: Ill,
+    /// From arming to the fault, ns.
+    after: u64,
+}
+
+impl Script {
+    fn of(seed: u64) -> Script {
+        let mut chance = Chance(seed);
+        let sort = if chance.below(2) == 0 { Sort::SpeedServo } else { Sort::PositionServo };
+        let ill = match chance.below(8) {
+            0..=2 => Ill::Stale,
+            3 | 4 => Ill::Lost,
+            5 => Ill::Weak(chance.between(0.0, 0.1)),
+            6 => Ill::Tells(chance.between(-1.5, 2.5)),
+            _ => Ill::Nothing,
+        };
+        let rig = Made {
+            sort,
+            swing: chance.between(0.3, 0.95),
+            hertz: 0.05 * 20f64.powf(chance.fraction()),
+            damping: 0.02,
+            eager: sort == Sort::SpeedServo && chance.below(4) == 0,
+            ..PLAIN
+        };
+        let (delay, lag) = (chance.between(0.8e-3, 10e-3), chance.between(0.3e-3, 2e-3));
+        Script { seed, rig, delay, lag, ill, after: (30 + chance.below(700)) * MS }
+    }
+
+    fn build(&self) -> (Rig, abi::Instance, abi::Instance) {
+        let (mut rig, control, plant) = self.rig.build();
+        (rig.nodes[SERVO].delay, rig.nodes[SERVO].lag) = (self.delay, self.lag);
+        (rig, control, plant)
+    }
+}
+
+/// Commands and what the shaft was, the newest last.
+struct Course {
+    commands: VecDeque<f64>,
+    /// Ticks of a command that may be under way, and of one that a slow loop may still follow.
+    way: usize,
+    slow: usize,
+}
+
+impl Course {
+    /// How far a value lies outside the commands of the last ticks.
+    fn outside(&self, ticks: usize, value: f64) -> f64 {
+        let last = self.commands.iter().rev().take(ticks);
+        let (low, high) = last.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), u| (low.min(*u), high.max(*u)));
+        (low - value).max(value - high).max(0.0)
+    }
+}
+
+/// Runs a script: from where no command explained the shaft to the stop, ns, if it had to stop; or nothing.
+///
+/// # Errors
+/// What is not as promised.
+fn run(script: &Script) -> Result<Option<u64>, String> {
+    let (rig, control, plant) = script.build();
+    let mut bench = Bench::with(&rig, Some(plant), script.seed, |_| behaviour())?.in_steps_of(STEP_NS);
+    if script.ill == Ill::Lost {
+        bench.drive(SERVO).unwrap().without_deadlines();
+    }
+    let mut world = World::around(&rig, bench, Pace::Fast, script.seed)?;
+    let masters = world.masters();
+    let (mut hil, _) = Hil::new(&rig, control, world.clock(), masters, quick(), None)?;
+    let mut origin = 0.0;
+    while hil.counts().cycles == 0 {
+        origin = world.bench().shaft(SERVO).position;
+        hil.cycle();
+        if let Some(end) = hil.ended() {
+            return Err(format!("it did not start: {end:?}"));
+        }
+    }
+    let ticks = |seconds: f64| (seconds * 1e9) as usize / rig.period_ns as usize + 4;
+    let (way, slow) = (ticks(script.delay), ticks(script.delay + SETTLES));
+    let mut course = Course { commands: VecDeque::from(vec![0.0; slow]), way, slow };
+    let half = 0.5 * (rig.outputs[SERVO].high - rig.outputs[SERVO].low);
+    let begun_ns = world.simulation().now_ns();
+    let fault_ns = begun_ns + script.after;
+    let (mut planted, mut astray_ns, mut near_ns) = (false, None, Some(begun_ns));
+    loop {
+        let now_ns = world.simulation().now_ns();
+        if now_ns >= fault_ns && !planted {
+            planted = true;
+            plant_fault(script, &world, now_ns);
+        }
+        hil.cycle();
+        let now_ns = world.simulation().now_ns();
+        let supervisor = hil.control().expect("it is armed").supervisor();
+        course.commands.pop_front();
+        course.commands.push_back(supervisor.permitted()[SERVO]);
+        let shaft = world.bench().shaft(SERVO);
+        let told = match script.ill {
+            Ill::Tells(factor) if planted => factor,
+            _ => 1.0,
+        };
+        let is = match script.rig.sort {
+            Sort::PositionServo => told * shaft.position - origin,
+            _ => told * shaft.speed,
+        };
+        if course.outside(course.way, is) > 0.9 * PART * half {
+            near_ns = None;
+        } else {
+            near_ns = near_ns.or(Some(now_ns));
+        }
+        match supervisor.cause() {
+            Some(cause) => {
+                if script.ill == Ill::Nothing || !planted {
+                    return Err(format!("it stops by {cause:?} without a fault"));
+                }
+                let near = near_ns.is_some_and(|since| now_ns - since > PATIENCE_NS);
+                if matches!(cause, Cause::NotFollowing(_)) && near {
+                    return Err(format!("it stops by {cause:?}, and the shaft is where it was told to be"));
+                }
+                return Ok(astray_ns.map(|since| now_ns - since));
+            }
+            None if matches!(hil.ended(), Some(End::Stopped(..) | End::Refused(_))) => {
+                return Err(format!("it ended with {:?}", hil.ended()));
+            }
+            None => {}
+        }
+        let away = course.outside(course.slow, is);
+        astray_ns = if away > (PART + MARGIN) * half { astray_ns.or(Some(now_ns)) } else { None };
+        if let Some(since) = astray_ns.filter(|since| now_ns - since > PATIENCE_NS + WAY_NS) {
+            let long = (now_ns - since) as f64 * 1e-6;
+            return Err(format!("for {long:.0} ms it is {is:.3}, {away:.3} from every command, and goes on"));
+        }
+        if now_ns > fault_ns + RUN_NS {
+            return Ok(None);
+        }
+    }
+}
+
+fn plant_fault(script: &Script, world: &World, now_ns: u64) {
+    let frame = |kind| world.bus(0).plant(MASTER, Fault::new(kind).id(0x204).from(now_ns));
+    let effect = |effect| world.bench().hook(Hook { node: SERVO, effect, start: Start::At(now_ns), lasts_ns: None });
+    match (script.ill, script.rig.sort) {
+        (Ill::Nothing, _) => {}
+        (Ill::Stale, _) => frame(Planting::Stale),
+        (Ill::Lost, _) => frame(Planting::Drop),
+        (Ill::Weak(part), _) => effect(Effect::TorqueScale(part)),
+        (Ill::Tells(factor), Sort::PositionServo) => effect(Effect::EncoderScale(factor)),
+        (Ill::Tells(factor), _) => effect(Effect::SpeedScale(factor)),
+    }
+}
+
+/// A script made plainer, as long as it fails.
+fn shrunk(script: &Script, why: String) -> (Script, String) {
+    let (mut best, mut how) = (*script, why);
+    'again: loop {
+        let plainer: [fn(&mut Script); 6] = [
+            |script| script.ill = Ill::Nothing,
+            |script| script.rig.eager = false,
+            |script| script.rig.swing = 0.8,
+            |script| script.rig.hertz = 0.2,
+            |script| (script.delay, script.lag) = (0.8e-3, 0.6e-3),
+            |script| script.after = 100 * MS,
+        ];
+        for plain in plainer {
+            let mut other = best;
+            plain(&mut other);
+            if other != best
+                && let Err(why) = run(&other)
+            {
+                (best, how) = (other, why);
+                continue 'again;
+            }
+        }
+        return (best, how);
+    }
+}
+
+#[test]
+fn a_speed_or_position_that_no_set_point_explains_stops_the_rig_within_a_second() {
+    let (first, runs) = match super::number("FRIC_SEED") {
+        Some(seed) => (seed, 1),
+        None => (super::number("FRIC_FIRST").unwrap_or(0), super::number("FRIC_RUNS").unwrap_or(RUNS)),
+    };
+    let counts_only = super::number("FRIC_COUNT").is_some();
+    let (mut stopped, mut longest_ns, mut failed) = (0, 0, Vec::new());
+    for seed in first..first + runs {
+        let script = Script::of(seed);
+        match run(&script) {
+            Ok(after) => {
+                stopped += u64::from(after.is_some_and(|after| after > PATIENCE_NS / 2));
+                longest_ns = longest_ns.max(after.unwrap_or(0));
+            }
+            Err(why) if counts_only => {
+                println!("seed {seed}: {why}\n  {script:?}");
+                failed.push(seed);
+            }
+            Err(why) if std::env::var_os("FRIC_MUTANT").is_some() => {
+                println!("mutant caught with seed {seed}: {why}");
+                panic!("seed {seed}");
+            }
+            Err(why) => {
+                let (script, why) = shrunk(&script, why);
+                panic!("FRIC_SEED={seed} repeats it: {why}\n{script:?}");
+            }
+        }
+    }
+    let longest = longest_ns as f64 * 1e-6;
+    println!(
+        "{runs} runs: {stopped} were found by this watch, after {longest:.0} ms at most; {} failed: {failed:?}",
+        failed.len()
+    );
+    assert!(failed.is_empty());
+    assert!(runs < RUNS || stopped > 5, "{stopped} of {runs} were found by this watch");
+}
