@@ -299,11 +299,13 @@ pub enum Protection {
     Plain,
     Energy,
     Loop,
+    Bites,
+    Hushed,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 34] = [
+    pub const ALL: [(&'static str, Protection); 36] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -338,6 +340,8 @@ impl Protection {
         ("plain", Protection::Plain),
         ("energy", Protection::Energy),
         ("loop", Protection::Loop),
+        ("bites", Protection::Bites),
+        ("hushed", Protection::Hushed),
     ];
 }
 

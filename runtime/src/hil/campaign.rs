@@ -795,7 +795,7 @@ impl Stand {
 
 /// Protections that generators alone hold.
 #[cfg(feature = "mutants")]
-const ELSEWHERE: [&str; 6] = ["patient", "recorded", "reused", "unhurried", "loop", "counted"];
+const ELSEWHERE: [&str; 8] = ["patient", "recorded", "reused", "unhurried", "loop", "bites", "hushed", "counted"];
 
 /// Each protection taken away makes the tests above fail: so they would notice if it were broken.
 #[cfg(feature = "mutants")]

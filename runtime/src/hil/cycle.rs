@@ -121,7 +121,7 @@ impl Wires {
     /// Hands a frame to a bus. After the watchdog has stopped the drives nothing leaves until the cycle stops them too.
     fn send(&mut self, bus: usize, frame: Frame) {
         let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten);
-        if bitten && !self.acknowledged {
+        if bitten && !self.acknowledged && is_present(Protection::Hushed) {
             return;
         }
         match self.buses[bus].send(frame) {

@@ -198,8 +198,10 @@ impl Watchdog {
                 match look(clock.now_ns(), beat_ns, awake, bitten_ns, patience_ns) {
                     Look::Bites => {
                         bitten_ns = beat_ns;
-                        watching.bitten.store(true, Ordering::Release);
-                        stop();
+                        if is_present(Protection::Bites) {
+                            watching.bitten.store(true, Ordering::Release);
+                            stop();
+                        }
                     }
                     Look::Waits(ns) => std::thread::park_timeout(Duration::from_nanos(ns)),
                 }

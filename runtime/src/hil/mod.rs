@@ -42,3 +42,6 @@ mod disks;
 
 #[cfg(test)]
 mod contacts;
+
+#[cfg(test)]
+mod stalls;

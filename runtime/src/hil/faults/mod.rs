@@ -131,7 +131,7 @@ fn the_same_seed_gives_the_same_bits() {
 /// Protections that generators of their own hold: what a process does that ends or stands still, what its disk does, what
 /// takes longer than a run of the fault space, and shafts and contacts that are not as told.
 #[cfg(feature = "mutants")]
-const OUTSIDE: [(&str, &str); 7] = [
+const OUTSIDE: [(&str, &str); 9] = [
     ("table", "hil::endings"),
     ("own-stack", "hil::endings"),
     ("unhurried", "hil::disks"),
@@ -139,6 +139,8 @@ const OUTSIDE: [(&str, &str); 7] = [
     ("plain", "hil::contacts"),
     ("energy", "hil::contacts"),
     ("loop", "hil::faults::loops"),
+    ("bites", "hil::stalls"),
+    ("hushed", "hil::stalls"),
 ];
 
 /// Each protection taken away makes its generator fail. `FRIC_ONLY=name` tries one alone.

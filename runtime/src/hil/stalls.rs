@@ -1,0 +1,326 @@
+//! Cycles that do not end in time, against the watchdog.
+//!
+//! In: a seed: a period, a watchdog, and a moment at which the cycle stands still for a time of the wall. Out: whether the
+//! watchdog acted in its time and never before, only while drives are enabled, and whether the cycle sent nothing but stops after
+//! it. The rig runs in simulated time, the stall and the watchdog's thread in that of the wall. The reference is what the test
+//! reads from the clock around each cycle, and how late its own sleeps end meanwhile. `FRIC_SEED=n` repeats one seed;
+//! `FRIC_RUNS=n` says how many there are.
+
+use super::bench;
+use super::campaign::quick;
+use super::cycle::{Command, End, Hil};
+use super::emergency::Watchdog;
+use super::simulated::{Pace, World};
+use crate::can::sim::{Port, Simulation};
+use crate::can::{Bus, Frame, Health, Received, Refused};
+use crate::chance::Chance;
+use crate::clock::{Clock, monotonic_ns};
+use crate::drive::Step;
+use crate::safety::Cause;
+use std::cell::RefCell;
+use std::rc::Rc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+/// Seeds in `cargo test`, and threads that share them: each sleeps most of its time.
+const RUNS: u64 = 36;
+const THREADS: usize = 4;
+const MS: u64 = 1_000_000;
+/// What a system takes to wake a thread at most, besides what it takes to wake the test's own, ns.
+const WAKES_NS: u64 = 20 * MS;
+
+/// Where in a cycle it stands still.
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Place {
+    /// After the sleep to its tick.
+    Tick,
+    /// After the wait for the answers.
+    Answers,
+    /// After the frame of this number.
+    Sent(u32),
+}
+
+/// One run.
+#[derive(Clone, Copy, PartialEq, Debug)]
+struct Script {
+    seed: u64,
+    /// Period of the rig, ns.
+    period_ns: u64,
+    /// Patience of the watchdog, ns of the wall.
+    watchdog_ns: u64,
+    /// The first cycle that may stand still, where, and for how long, ns of the wall.
+    cycle: u64,
+    place: Place,
+    stall_ns: u64,
+}
+
+impl Script {
+    fn of(seed: u64) -> Script {
+        let mut chance = Chance(seed);
+        let watchdog_ns = (10 + chance.below(50)) * MS;
+        let place = match chance.below(4) {
+            0 => Place::Tick,
+            1 => Place::Answers,
+            _ => Place::Sent(chance.below(4) as u32),
+        };
+        let short = chance.below(4) == 0;
+        let part = chance.between(0.1, 0.6);
+        let stall_ns =
+            if short { (watchdog_ns as f64 * part) as u64 } else { watchdog_ns + 50 * MS + chance.below(80) * MS };
+        Script {
+            seed,
+            period_ns: [MS, 2 * MS, 4 * MS][chance.below(3) as usize],
+            watchdog_ns,
+            cycle: 20 + chance.below(500),
+            place,
+            stall_ns,
+        }
+    }
+}
+
+/// What clock, bus and test know of a run.
+struct Plan {
+    script: Script,
+    cycle: u64,
+    sleeps: u32,
+    sends: u32,
+    /// When clock or bus were last used.
+    touched_ns: u64,
+    /// The cycle that stood still, begin and end of its stall, and how late a sleep ended meanwhile, ns.
+    stalled: Option<(u64, u64, u64, u64)>,
+    /// Frames with their times and cycles.
+    sent: Vec<(u64, u64, Frame)>,
+}
+
+impl Plan {
+    fn passes(&mut self, place: Place) {
+        self.touched_ns = monotonic_ns();
+        if self.cycle < self.script.cycle || place != self.script.place || self.stalled.is_some() {
+            return;
+        }
+        let (begin, mut late) = (monotonic_ns(), 0);
+        let mut now = begin;
+        while now < begin + self.script.stall_ns {
+            std::thread::sleep(Duration::from_millis(1));
+            let woken = monotonic_ns();
+            late = late.max((woken - now).saturating_sub(MS));
+            now = woken;
+        }
+        self.stalled = Some((self.cycle, begin, now, late));
+    }
+}
+
+type Shared = Rc<RefCell<Plan>>;
+
+/// Simulated time that may stand still.
+struct Late(Simulation, Shared);
+
+impl Clock for Late {
+    fn now_ns(&self) -> u64 {
+        self.0.now_ns()
+    }
+    fn sleep_until(&self, until_ns: u64) {
+        self.0.sleep_until(until_ns);
+        let mut plan = self.1.borrow_mut();
+        let place = if plan.sleeps == 0 { Place::Tick } else { Place::Answers };
+        plan.sleeps += 1;
+        plan.passes(place);
+    }
+}
+
+/// A bus whose sender may stand still.
+struct Slow(Port, Shared);
+
+impl Bus for Slow {
+    fn send(&mut self, frame: Frame) -> Result<(), Refused> {
+        let sent = self.0.send(frame);
+        let mut plan = self.1.borrow_mut();
+        let (cycle, place) = (plan.cycle, Place::Sent(plan.sends));
+        plan.sent.push((monotonic_ns(), cycle, frame));
+        plan.sends += 1;
+        plan.passes(place);
+        sent
+    }
+    fn receive(&mut self) -> Option<Received> {
+        self.0.receive()
+    }
+    fn wait(&mut self, until_ns: u64) -> bool {
+        self.0.wait(until_ns)
+    }
+    fn health(&self) -> Health {
+        self.0.health()
+    }
+}
+
+/// A cycle as the test saw it: when it last used clock or bus, and had ended; whether drives were enabled then.
+#[derive(Clone, Copy)]
+struct Seen {
+    touched_ns: u64,
+    end_ns: u64,
+    awake: bool,
+}
+
+/// What a run showed.
+#[derive(Clone, Copy, Debug, Default)]
+struct Shown {
+    /// How late after its time the watchdog acted, ns.
+    late_ns: Option<u64>,
+    /// It had to act; it stood still while no drive was enabled; it was in time.
+    had_to: bool,
+    asleep: bool,
+    in_time: bool,
+}
+
+/// Runs a script.
+///
+/// # Errors
+/// What is not as promised.
+fn run(script: &Script) -> Result<Shown, String> {
+    let (mut rig, model, plant) = bench::pair();
+    rig.nodes.iter_mut().for_each(|node| node.timeout_ns = 3 * script.period_ns);
+    (rig.period_ns, rig.watchdog_ns) = (script.period_ns, 5 * script.period_ns);
+    let world = World::new(&rig, Some(plant), Pace::Fast, script.seed).unwrap();
+    let plan = Rc::new(RefCell::new(Plan {
+        script: *script,
+        cycle: 0,
+        sleeps: 0,
+        sends: 0,
+        touched_ns: 0,
+        stalled: None,
+        sent: Vec::new(),
+    }));
+    let clock = Box::new(Late(world.simulation().clone(), plan.clone()));
+    let bus = Box::new(Slow(world.bus(0).port(super::simulated::MASTER), plan.clone()));
+    let (mut hil, mut operator) = Hil::new(&rig, model, clock, vec![bus], quick(), None).unwrap();
+    let bites = Arc::new(Mutex::new(Vec::new()));
+    let bitten = bites.clone();
+    let bite = move || bitten.lock().unwrap().push(monotonic_ns());
+    hil.watched_by(Watchdog::new(Duration::from_nanos(script.watchdog_ns), bite).unwrap());
+    let mut cycles: Vec<Seen> = Vec::new();
+    let mut cause = None;
+    while hil.ended().is_none() {
+        let mut now = plan.borrow_mut();
+        (now.cycle, now.sleeps, now.sends) = (cycles.len() as u64, 0, 0);
+        drop(now);
+        hil.cycle();
+        let (end_ns, touched_ns) = (monotonic_ns(), plan.borrow().touched_ns);
+        let awake = hil.step() > Step::AwaitEnable && hil.ended().is_none();
+        cycles.push(Seen { touched_ns, end_ns, awake });
+        cause = cause.or(hil.control().and_then(|control| control.supervisor().cause()));
+        if cycles.len() as u64 == 600 {
+            operator.push(Command::Stop);
+        }
+    }
+    let end = hil.ended().cloned();
+    drop(hil);
+    let bites = bites.lock().unwrap().clone();
+    let plan = plan.borrow();
+    let Some((at, begin_ns, over_ns, late_ns)) = plan.stalled else {
+        // It ended before.
+        return if bites.is_empty() { Ok(Shown::default()) } else { judge_early(&bites, &cycles, script) };
+    };
+    let mut shown = judge_early(&bites, &cycles, script)?;
+
+    let before = cycles[at as usize - 1];
+    let allowed_ns = WAKES_NS + 5 * late_ns;
+    let first = bites.first().copied();
+    let until_ns = before.end_ns + script.watchdog_ns + allowed_ns;
+    if before.awake && over_ns >= until_ns {
+        shown.had_to = true;
+        if first.is_none_or(|first| first > until_ns) {
+            let told = first.map(|first| first as i64 - before.end_ns as i64);
+            return Err(format!("the watchdog acted {told:?} ns after the last cycle, {allowed_ns} ns are allowed"));
+        }
+    }
+    shown.asleep = !before.awake && over_ns > begin_ns + script.watchdog_ns;
+    shown.in_time = bites.is_empty() && before.awake;
+    shown.late_ns = first.map(|first| first.saturating_sub(before.end_ns + script.watchdog_ns));
+    if let Some(first) = first {
+        // The first cycle that knows of it, or the one in which it stood still.
+        let during = begin_ns <= first && first <= over_ns;
+        let from_ns =
+            if during { over_ns } else { cycles.iter().map(|c| c.end_ns).find(|end| *end > first).unwrap_or(first) };
+        // SYNC goes on while drives stop, but not before the cycle has told them to.
+        let mut told = false;
+        for (_, cycle, frame) in plan.sent.iter().filter(|(at, ..)| *at > from_ns) {
+            let set_point = (0x200..0x280).contains(&frame.id());
+            let lets_go_on = set_point && frame.data()[0] & 0x0F == 0x0F || frame.id() == 0x080 && !told;
+            if lets_go_on {
+                return Err(format!("{frame} was sent in cycle {cycle}, after the watchdog had stopped the drives"));
+            }
+            told |= set_point;
+        }
+        if !matches!(end, Some(End::Stopped(..))) {
+            return Err(format!("the watchdog stopped the drives, and it ended with {end:?}"));
+        }
+    } else if cause == Some(Cause::Watchdog) || end != Some(End::Asked) {
+        return Err(format!("no watchdog has acted, and it ended with {end:?}"));
+    }
+    let mut bench = world.bench();
+    for node in 0..2 {
+        let state = bench.drive(node).unwrap().state();
+        if state.powered() {
+            return Err(format!("drive {node} is {state} at the end"));
+        }
+    }
+    Ok(shown)
+}
+
+/// It acts at its time or later, while drives are enabled.
+fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown, String> {
+    for bite in bites {
+        let last = cycles.iter().rev().find(|cycle| cycle.end_ns <= *bite);
+        let awake = last.is_some_and(|cycle| cycle.awake);
+        let due_ns = last.map_or(u64::MAX, |cycle| cycle.touched_ns + script.watchdog_ns);
+        if !awake || *bite < due_ns {
+            return Err(format!("the watchdog acted at {bite} ns, due at {due_ns}, drives enabled: {awake}"));
+        }
+    }
+    Ok(Shown::default())
+}
+
+#[test]
+fn a_cycle_that_does_not_end_is_stopped_by_the_watchdog_in_its_time_and_no_other() {
+    let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
+    let seeds = number("FRIC_SEED").map_or(0..number("FRIC_RUNS").unwrap_or(RUNS), |seed| seed..seed + 1);
+    let all = seeds.end - seeds.start;
+    let next = AtomicU64::new(seeds.start);
+    let found = Mutex::new(Vec::new());
+    std::thread::scope(|scope| {
+        for _ in 0..THREADS {
+            scope.spawn(|| {
+                loop {
+                    let seed = next.fetch_add(1, Ordering::Relaxed);
+                    if seed >= seeds.end {
+                        return;
+                    }
+                    found.lock().unwrap().push((seed, run(&Script::of(seed))));
+                }
+            });
+        }
+    });
+    let found = found.into_inner().unwrap();
+    let failed = found.iter().filter_map(|(seed, shown)| Some((seed, shown.as_ref().err()?)));
+    let failed: Vec<String> =
+        failed.map(|(seed, why)| format!("FRIC_SEED={seed} repeats it: {why}\n{:?}", Script::of(*seed))).collect();
+    if let Some(first) = failed.first() {
+        println!("mutant caught: {first}");
+    }
+    let shown: Vec<Shown> = found.iter().filter_map(|(_, shown)| shown.clone().ok()).collect();
+    let count = |is: fn(&Shown) -> bool| shown.iter().filter(|shown| is(shown)).count();
+    let kinds = [count(|shown| shown.had_to), count(|shown| shown.asleep), count(|shown| shown.in_time)];
+    let mut late: Vec<u64> = shown.iter().filter_map(|shown| shown.late_ns).collect();
+    late.sort_unstable();
+    let late = |part: usize| late.get(late.len() * part / 100).map(|ns| *ns as f64 * 1e-6);
+    println!(
+        "{all} runs: {} had to act, {} slept, {} were in time; late by {:?} ms, at most {:?}",
+        kinds[0],
+        kinds[1],
+        kinds[2],
+        late(50),
+        late(99)
+    );
+    assert!(failed.is_empty(), "{} of {all} are not as promised:\n{}", failed.len(), failed.join("\n"));
+    assert!(all < RUNS || kinds.iter().all(|count| *count > 0), "each kind comes: {kinds:?}");
+}
