@@ -301,11 +301,12 @@ pub enum Protection {
     Loop,
     Bites,
     Hushed,
+    Life,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 36] = [
+    pub const ALL: [(&'static str, Protection); 37] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -342,6 +343,7 @@ impl Protection {
         ("loop", Protection::Loop),
         ("bites", Protection::Bites),
         ("hushed", Protection::Hushed),
+        ("life", Protection::Life),
     ];
 }
 

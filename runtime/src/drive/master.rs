@@ -257,6 +257,7 @@ impl Drive {
 
     fn timeout_wanted_ms(&self) -> u32 {
         let wanted = self.setting.watchdog_ns.div_ceil(1_000_000) as u32;
+        let wanted = if is_present(Protection::Life) { wanted } else { 20 * wanted };
         wanted.clamp(self.profile.timeout_ms.0, self.profile.timeout_ms.1)
     }
 

@@ -795,7 +795,8 @@ impl Stand {
 
 /// Protections that generators alone hold.
 #[cfg(feature = "mutants")]
-const ELSEWHERE: [&str; 8] = ["patient", "recorded", "reused", "unhurried", "loop", "bites", "hushed", "counted"];
+const ELSEWHERE: [&str; 9] =
+    ["patient", "recorded", "reused", "unhurried", "loop", "bites", "hushed", "life", "counted"];
 
 /// Each protection taken away makes the tests above fail: so they would notice if it were broken.
 #[cfg(feature = "mutants")]

@@ -45,3 +45,6 @@ mod contacts;
 
 #[cfg(test)]
 mod stalls;
+
+#[cfg(test)]
+mod kills;

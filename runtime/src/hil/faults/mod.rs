@@ -131,7 +131,7 @@ fn the_same_seed_gives_the_same_bits() {
 /// Protections that generators of their own hold: what a process does that ends or stands still, what its disk does, what
 /// takes longer than a run of the fault space, and shafts and contacts that are not as told.
 #[cfg(feature = "mutants")]
-const OUTSIDE: [(&str, &str); 9] = [
+const OUTSIDE: [(&str, &str); 10] = [
     ("table", "hil::endings"),
     ("own-stack", "hil::endings"),
     ("unhurried", "hil::disks"),
@@ -141,6 +141,7 @@ const OUTSIDE: [(&str, &str); 9] = [
     ("loop", "hil::faults::loops"),
     ("bites", "hil::stalls"),
     ("hushed", "hil::stalls"),
+    ("life", "hil::kills"),
 ];
 
 /// Each protection taken away makes its generator fail. `FRIC_ONLY=name` tries one alone.
