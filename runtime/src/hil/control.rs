@@ -87,6 +87,8 @@ const TIMEOUT: u32 = 3;
 pub const PATIENT_NS: u64 = 60_000_000_000;
 /// How late a drive's speed may be behind its position at least, s.
 const SPEED_LATE: f64 = 2e-3;
+/// Ticks over which the angle that a shaft has turned is compared with its speed at their end.
+const GAP: u32 = 6;
 /// Torque that could act on a shaft beyond that of its drives, as a multiple of theirs.
 const SURPLUS: f64 = 4.0;
 
@@ -94,12 +96,47 @@ const SURPLUS: f64 = 4.0;
 struct Paired {
     speed: usize,
     position: usize,
-    /// Greatest credible difference between the speed told and that of the position, rad/s; infinite: not judged.
+    /// Greatest credible difference between position and speed in a tick, rad; infinite: not judged.
     most: f64,
-    /// Position and lateness of the tick before, where both came.
+    /// Position when both came last, and the ticks since then.
     before: Option<(f64, u32)>,
-    /// Ticks without a break in which they did not agree.
-    odd: u32,
+    run: Disagreement,
+}
+
+/// Cycles in a row in which position and speed disagree by more than is credible, in one direction.
+///
+/// When a drive read the shaft is not known exactly: SYNC waits for frames that are on the bus. But what counts was read in its own
+/// period. So the time between two readings, however many periods apart, is off by less than one period, and errors of several
+/// cycles cancel but for that.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+struct Disagreement {
+    cycles: u32,
+    ticks: u32,
+    /// What the position turned beyond the speed, rad.
+    angle: f64,
+    /// Greatest speed, rad/s.
+    fastest: f64,
+}
+
+impl Disagreement {
+    /// One cycle more: so many ticks, what the position turned beyond the speed, the speed, and what is credible in a tick, rad.
+    fn add(&mut self, ticks: u32, angle: f64, speed: f64, most: f64) {
+        if angle.abs() <= most * f64::from(ticks) {
+            return *self = Disagreement::default();
+        }
+        if self.cycles > 0 && angle.is_sign_negative() != self.angle.is_sign_negative() {
+            *self = Disagreement::default();
+        }
+        self.cycles = self.cycles.saturating_add(1);
+        self.ticks = self.ticks.saturating_add(ticks);
+        self.angle += angle;
+        self.fastest = self.fastest.max(speed.abs());
+    }
+
+    /// Whether it is more than what a period may have been off.
+    fn is_certain(&self, most: f64, period: f64) -> bool {
+        self.angle.abs() > most * f64::from(self.ticks) + self.fastest * period
+    }
 }
 
 /// What is not in the text of a rig.
@@ -271,7 +308,8 @@ impl Control {
             let refreshed = profile.is_some_and(|profile| profile.refresh_ns > 0);
             let late = profile.map_or(0.0, |profile| 2.0 * profile.speed_lag).max(SPEED_LATE);
             let most = own_acceleration * (period + late) + 4.0 * (drive.speed_unit + drive.count / period);
-            Some(Paired { speed, position, most, before: None, odd: 0 }).filter(|_| !refreshed)
+            Some(Paired { speed, position, most: most * period, before: None, run: Disagreement::default() })
+                .filter(|_| !refreshed)
         });
         let paired = paired.collect();
         let odd = if options.count_overruns { ODD.max(ticks(ODD_NS)) } else { ODD };
@@ -444,19 +482,25 @@ impl Control {
     fn compare(&mut self, told: &Told) {
         for pair in &mut self.paired {
             let [speed, position] = [pair.speed, pair.position].map(|at| &self.watched[at]);
-            let came = told.source == Source::Model && speed.since == Some(0) && position.since == Some(0);
-            let before = pair.before.take();
-            if !came {
+            if told.source != Source::Model {
+                (pair.before, pair.run) = (None, Disagreement::default());
                 continue;
             }
-            pair.before = Some((position.last, told.late_ns));
-            let Some((from, late_ns)) = before else { continue };
-            // Drives read the shaft when SYNC comes, as late as the cycle.
+            let since = |(from, ticks): (f64, u32)| (from, ticks.saturating_add(told.ticks));
+            let before = pair.before.map(since).filter(|(_, ticks)| *ticks <= GAP);
+            if (speed.since, position.since) != (Some(0), Some(0)) {
+                pair.before = before;
+                continue;
+            }
+            pair.before = Some((position.last, 0));
+            let Some((from, ticks)) = before else {
+                pair.run = Disagreement::default();
+                continue;
+            };
             let period = self.step * self.steps as f64;
-            let span = period * f64::from(told.ticks) + (f64::from(told.late_ns) - f64::from(late_ns)) * 1e-9;
-            let agrees = span < 0.5 * period || ((position.last - from) / span - speed.last).abs() <= pair.most;
-            pair.odd = if agrees { 0 } else { pair.odd + 1 };
-            if pair.odd >= self.odd {
+            let turned = position.last - from - speed.last * period * f64::from(ticks);
+            pair.run.add(ticks, turned, speed.last, pair.most);
+            if pair.run.cycles >= self.odd && pair.run.is_certain(pair.most, period) {
                 self.supervisor.trip(Cause::Implausible(pair.position));
             }
         }
@@ -584,8 +628,9 @@ impl Control {
             words.extend([watched.last.to_bits(), since, watched.odd.into(), watched.late.into()]);
         }
         for pair in &self.paired {
-            let (from, late_ns) = pair.before.unwrap_or_default();
-            words.extend([u64::from(pair.before.is_some()), from.to_bits(), late_ns.into(), pair.odd.into()]);
+            let ((from, ticks), run) = (pair.before.unwrap_or_default(), pair.run);
+            words.extend([u64::from(pair.before.is_some()), from.to_bits(), ticks.into()]);
+            words.extend([run.cycles.into(), run.ticks.into(), run.angle.to_bits(), run.fastest.to_bits()]);
         }
         self.followed.iter().for_each(|followed| followed.save(words));
         words.extend([u64::from(self.follows), self.behind.into()]);
@@ -612,7 +657,10 @@ impl Control {
             let known = words.next()? != 0;
             let before = (f64::from_bits(words.next()?), u32::try_from(words.next()?).ok()?);
             pair.before = known.then_some(before);
-            pair.odd = u32::try_from(words.next()?).ok()?;
+            pair.run.cycles = u32::try_from(words.next()?).ok()?;
+            pair.run.ticks = u32::try_from(words.next()?).ok()?;
+            pair.run.angle = f64::from_bits(words.next()?);
+            pair.run.fastest = f64::from_bits(words.next()?);
         }
         self.followed.iter_mut().try_for_each(|followed| followed.restore(&mut words))?;
         self.follows = words.next()? != 0;
@@ -761,6 +809,59 @@ mod tests {
             assert_eq!(way.control.supervisor().cause().map(|_| ()), cause, "cycle {cycle}");
         }
         assert!(matches!(way.control.supervisor().cause(), Some(Cause::Implausible(_))));
+    }
+
+    /// Greatest acceleration of a shaft, rad/s², its period, s, and what is credible in a tick, rad.
+    const SHAFT: (f64, f64, f64) = (333.0, 1e-3, 333.0 * (1e-3 + SPEED_LATE) * 1e-3);
+
+    /// A shaft that accelerates at random, read at any time of each period; ticks are missed. Its encoder stands still from a
+    /// cycle on; the cycle in which that is found, and the speeds read.
+    fn read_at_any_time(seed: u64, stands: usize) -> (Option<usize>, Vec<f64>) {
+        let (acceleration, period, most) = SHAFT;
+        let mut chance = crate::chance::Chance(seed);
+        let jitter = chance.fraction();
+        let (mut run, mut speeds) = (Disagreement::default(), Vec::new());
+        let (mut now, mut due, mut angle, mut speed) = (0.0, 0.0, 0.0, chance.between(-200.0, 200.0));
+        let mut told = angle;
+        for k in 0..400 {
+            let ticks = if chance.below(20) == 0 { 1 + chance.below(3) as u32 } else { 1 };
+            due += f64::from(ticks) * period;
+            let next = due + jitter * chance.fraction() * period;
+            let (span, change) = (next - now, acceleration * chance.between(-1.0, 1.0));
+            angle += (speed + 0.5 * change * span) * span;
+            speed += change * span;
+            now = next;
+            let before = told;
+            told = if k < stands { angle } else { told };
+            run.add(ticks, told - before - speed * period * f64::from(ticks), speed, most);
+            speeds.push(speed);
+            if k > 0 && run.cycles >= ODD && run.is_certain(most, period) {
+                return (Some(k), speeds);
+            }
+        }
+        (None, speeds)
+    }
+
+    #[test]
+    fn a_shaft_that_is_read_at_any_time_of_a_period_agrees_with_its_speed() {
+        for seed in 0..2000 {
+            assert_eq!(read_at_any_time(seed, usize::MAX).0, None, "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn an_encoder_that_stands_still_is_found_at_whatever_time_it_is_read() {
+        let (mut found, (.., most)) = (0, SHAFT);
+        for seed in 0..2000 {
+            let stands = 20 + seed as usize % 100;
+            let (cycle, speeds) = read_at_any_time(seed, stands);
+            // Two thirds of the speed are certain after three readings; the first may have come before it stood still.
+            let fast = speeds.iter().skip(stands).all(|speed| speed.abs() * SHAFT.1 > 2.0 * most);
+            let late = cycle.map(|cycle| cycle - stands);
+            assert!(!fast || late.is_some_and(|late| late <= 3), "seed {seed}: found after {late:?}");
+            found += u32::from(fast && cycle.is_some());
+        }
+        assert!(found > 1500, "{found}");
     }
 
     #[test]

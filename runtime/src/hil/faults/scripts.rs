@@ -98,3 +98,10 @@ fn set_points_that_are_wrong_from_the_start() {
     let fault = Fault { what: Frame(0, 0x203, Corrupted), phase: StartUp, after: 0, lasts: EVER };
     holds(&Script { seed: 10_000, tested: true, faults: vec![fault], ..Script::plain(Pair) });
 }
+
+/// Where drives wait for SYNC, that itself waits in each other tick for our heartbeat: the shaft is read a little late and a little
+/// early in turn. Position and speed seemed to disagree: found with seed 94031.
+#[test]
+fn a_shaft_that_is_read_late_and_early_in_turn() {
+    holds(&Script { rig: Made { swing: 0.9683128397509957, at_sync: true, ..PLAIN }, ..Script::plain(Pair) });
+}
