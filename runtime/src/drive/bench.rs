@@ -41,6 +41,8 @@ struct SimulatedDevice {
     due_ns: Vec<u64>,
     period_ns: Vec<u64>,
     lag: f64,
+    /// Message and field of signals that stay as they were made, whatever the plant gives.
+    stuck: Vec<(usize, usize)>,
 }
 
 #[derive(Clone)]
@@ -137,6 +139,7 @@ impl Bench {
                         due_ns: messages.iter().map(|message| if message.send { u64::MAX } else { 0 }).collect(),
                         period_ns: messages.iter().map(period).collect(),
                         lag: node.lag,
+                        stuck: Vec::with_capacity(messages.iter().map(|message| message.fields.len()).sum()),
                     })
                 }
             });
@@ -393,6 +396,7 @@ impl Bench {
         for link in &self.felt {
             if let (Body::Device(device), What::Field(message, field)) =
                 (&mut self.bodies[link.signal.node], link.signal.what)
+                && !device.stuck.contains(&(message, field))
             {
                 device.values[message][field] = plant.get(link.slot);
             }
@@ -410,7 +414,8 @@ impl SimulatedDevice {
         for (message, values) in self.messages.iter().zip(&mut self.values) {
             if message.send && message.id == frame.id() && message.extended == frame.is_extended() {
                 for (field, value) in values.iter_mut().enumerate() {
-                    *value = frames::read(message, field, frame.data()).unwrap_or(*value);
+                    let told = frames::read(message, field, frame.data());
+                    *value = told.filter(|told| told.is_finite()).unwrap_or(*value);
                 }
             }
         }
@@ -432,6 +437,10 @@ impl SimulatedDevice {
     fn afflict(&mut self, effect: Effect, on: bool, now_ns: u64) {
         if let Effect::Value(message, field, value) = effect {
             self.values[message][field] = if on { value } else { self.messages[message].fields[field].start };
+            self.stuck.retain(|stuck| *stuck != (message, field));
+            if on {
+                self.stuck.push((message, field));
+            }
             // A change is sent at once.
             self.due_ns[message] = self.due_ns[message].min(now_ns);
         }

@@ -91,7 +91,7 @@ impl Device {
                 tell(TroubleKind::Short(frame.id()));
             }
             for field in 0..message.fields.len() {
-                // A field that is not in this frame, or holds no number, keeps its value and grows old.
+                // A field that is not in this frame keeps its value and grows old.
                 if let Some(value) = frames::read(message, field, frame.data()) {
                     line.values[field] = Reading { value, stamp_ns, age: 0 };
                 }

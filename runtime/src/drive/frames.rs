@@ -43,8 +43,8 @@ fn present(message: &Message, field: usize, data: &[u8]) -> bool {
     false
 }
 
-/// The value of a field, SI; nothing if the frame is too short, if the field is not in it (multiplexing), or if what
-/// it holds is no number.
+/// The value of a field, SI; nothing if the frame is too short, or if the field is not in it (multiplexing). A float may be
+/// infinite or no number.
 pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
     if !present(message, field, data) {
         return None;
@@ -60,8 +60,7 @@ pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
         Format::Float32 => f32::from_bits(raw as u32).into(),
         Format::Float64 => f64::from_bits(raw),
     };
-    let value = number * field.scale + field.offset;
-    value.is_finite().then_some(value)
+    Some(number * field.scale + field.offset)
 }
 
 /// Puts a value, SI, into the data of a frame: rounded towards zero, so that what travels is never greater than what was
@@ -269,6 +268,13 @@ mod tests {
         assert_eq!(read(&two, 1, &[2, 7]), Some(7.0));
         assert_eq!(read(&two, 1, &[1, 7]), None);
         assert_eq!(read(&two, 1, &[2]), None);
-        assert_eq!(value(field(0, 32, false, Format::Float32), &f32::NAN.to_bits().to_le_bytes()), None);
+    }
+
+    /// What to make of it is decided where readings are judged, once.
+    #[test]
+    fn a_float_that_is_no_number_is_told_as_it_is() {
+        let told = |number: f32| value(field(0, 32, false, Format::Float32), &number.to_bits().to_le_bytes()).unwrap();
+        assert!(told(f32::NAN).is_nan());
+        assert_eq!([f32::INFINITY, f32::NEG_INFINITY].map(told), [f64::INFINITY, f64::NEG_INFINITY]);
     }
 }

@@ -65,9 +65,11 @@ struct Watched {
     /// Greatest credible change in one tick, SI; infinite: not judged.
     jump: f64,
     last: f64,
-    /// Ticks since `last` was taken; none: nothing was taken yet.
+    /// Ticks since `last` came; none: nothing was taken yet.
     since: Option<u32>,
-    /// Ticks without a break in which it was not credible.
+    /// Ticks since the newest reading came, taken or not; none: nothing came yet.
+    looked: Option<u32>,
+    /// Readings without a break that were not credible.
     odd: u32,
     /// It answers SYNC: what comes after the computing of its tick is not one movement with the rest. A device speaks when it
     /// likes.
@@ -76,7 +78,7 @@ struct Watched {
     late: u32,
 }
 
-/// Ticks in which a value that is not credible is replaced by the one before.
+/// Readings in a row that are not credible until the rig stops; the value before holds meanwhile.
 const ODD: u32 = 3;
 /// Where what is late is only counted, they are as many as take so long, ns: a simulated drive that waited for a processor
 /// answers many a SYNC at once, and what it tells then is not one movement at the pace of the rig.
@@ -285,7 +287,17 @@ impl Control {
                 _ => f64::INFINITY,
             };
             let answers = matches!(node.kind, Kind::Cia402(_));
-            watched.push(Watched { signal, timeout, jump, last: start, since: None, odd: 0, answers, late: 0 });
+            watched.push(Watched {
+                signal,
+                timeout,
+                jump,
+                last: start,
+                since: None,
+                looked: None,
+                odd: 0,
+                answers,
+                late: 0,
+            });
             watched.len() - 1
         };
         let inputs = rig.inputs.iter().map(|input| (watch(input.signal, input.start, input.needed), input.slot));
@@ -444,12 +456,14 @@ impl Control {
     /// Takes what was read, as far as it is credible; trips on what has been missing or odd for too long.
     fn read(&mut self, readings: &[Reading], ticks: u32, source: Source) {
         // The start-up counts positions anew as it goes: only what the model reads must be one movement.
-        let judged = source == Source::Model;
+        let judged = source == Source::Model && self.running;
         for (i, (watched, reading)) in self.watched.iter_mut().zip(readings).enumerate() {
             watched.since = watched.since.map(|since| since.saturating_add(ticks));
+            watched.looked = watched.looked.map(|looked| looked.saturating_add(ticks));
             watched.late = if reading.age == 0 { 0 } else { watched.late.saturating_add(1) };
-            let newer = watched.since.is_none_or(|since| reading.age < since) && reading.age != Reading::NEVER;
+            let newer = watched.looked.is_none_or(|looked| reading.age < looked) && reading.age != Reading::NEVER;
             if reading.age == 0 || !watched.answers && newer {
+                watched.looked = Some(reading.age);
                 let change = (reading.value - watched.last).abs();
                 let credible = match watched.since {
                     Some(since) if judged => change <= watched.jump * f64::from(since),
@@ -465,8 +479,12 @@ impl Control {
                 (watched.odd, watched.late) = (0, 0);
                 continue;
             }
-            // An answer that is late in each tick is never believed: it is as good as lost.
-            let missing = if watched.answers && is_present(Protection::Late) { watched.late } else { 0 };
+            // An answer that is late in each tick is never believed, and a device may tell no number: both are as good as lost.
+            let missing = match watched.answers {
+                true if is_present(Protection::Late) => watched.late,
+                true => 0,
+                false => watched.since.unwrap_or(0),
+            };
             let patience = |timeout| if is_present(Protection::Patient) { timeout } else { 1 };
             if watched.timeout.is_some_and(|timeout| reading.age.max(missing) >= patience(timeout)) {
                 self.supervisor.trip(Cause::Lost(i));
@@ -624,8 +642,8 @@ impl Control {
         words.extend(self.requests.iter().chain(&self.offsets).map(|x| x.to_bits()));
         words.extend([u64::from(self.blend.0), u64::from(self.running)]);
         for watched in &self.watched {
-            let since = watched.since.map_or(u64::MAX, u64::from);
-            words.extend([watched.last.to_bits(), since, watched.odd.into(), watched.late.into()]);
+            let [since, looked] = [watched.since, watched.looked].map(|age| age.map_or(u64::MAX, u64::from));
+            words.extend([watched.last.to_bits(), since, looked, watched.odd.into(), watched.late.into()]);
         }
         for pair in &self.paired {
             let ((from, ticks), run) = (pair.before.unwrap_or_default(), pair.run);
@@ -648,8 +666,10 @@ impl Control {
         self.running = words.next()? != 0;
         for watched in &mut self.watched {
             watched.last = f64::from_bits(words.next()?);
-            let since = words.next()?;
-            watched.since = if since == u64::MAX { None } else { Some(u32::try_from(since).ok()?) };
+            for age in [&mut watched.since, &mut watched.looked] {
+                let word = words.next()?;
+                *age = if word == u64::MAX { None } else { Some(u32::try_from(word).ok()?) };
+            }
             watched.odd = u32::try_from(words.next()?).ok()?;
             watched.late = u32::try_from(words.next()?).ok()?;
         }
@@ -675,6 +695,7 @@ impl Control {
 mod tests {
     use super::*;
     use crate::hil::bench;
+    use abi::rig::{Field, Format, Input, Message, Node};
 
     const FRESH: u32 = 0;
 
@@ -780,6 +801,79 @@ mod tests {
             }
             assert_eq!(way.control.supervisor().cause(), Some(Cause::Implausible(at)));
         }
+    }
+
+    /// A device of the rig that tells a float at its own pace, with some `timeout` or none, and its readings' place.
+    fn with_device(timeout_ns: u64) -> (Control, usize) {
+        let (mut rig, model) = bench::rig();
+        let field = Field {
+            name: "force".into(),
+            start_bit: 0,
+            bits: 32,
+            big_endian: false,
+            format: Format::Float32,
+            scale: 1.0,
+            offset: 0.0,
+            start: 0.0,
+            unit: abi::unit::Unit::parse("N").unwrap(),
+            multiplexed: None,
+        };
+        let (name, fields) = ("force".to_string(), vec![field]);
+        let message = Message { name, id: 0x1A0, extended: false, length: 4, send: false, period_ns: 0, fields };
+        let (kind, signal) = (Kind::Frames(vec![message]), Signal { node: 1, what: What::Field(0, 0) });
+        rig.nodes.push(Node { kind, moves: false, timeout_ns, ..bench::drive("sensor", 9) });
+        let input = rig.inputs[0];
+        rig.inputs.push(Input { signal, ..input });
+        let mut control = Control::new(&rig, model, None, &[], Options::default()).unwrap();
+        assert!(control.supervisor_mut().arm());
+        let at = control.signals().position(|other| other == signal).unwrap();
+        (control, at)
+    }
+
+    #[test]
+    fn what_a_device_tells_is_a_number_or_the_one_before_and_three_that_are_none_stop_the_rig() {
+        let mut stopped = [0; 2];
+        for seed in 0..500 {
+            let mut chance = crate::chance::Chance(seed);
+            let timeout = [0, 15, 40][chance.below(3) as usize];
+            let (mut control, at) = with_device(timeout * bench::PERIOD_NS);
+            let (every, wrong) = (1 + chance.below(12), chance.fraction());
+            // Since when it came, and since the last number; the numbers that were none since then.
+            let (mut newest, mut age, mut number, mut since, mut none) = (0.0, Reading::NEVER, 0.0, 0, 0);
+            for k in 0..200 {
+                (age, since) = (age.saturating_add(1), since + 1);
+                if k == 0 || chance.below(every) == 0 {
+                    let odd = k > 0 && chance.fraction() < wrong;
+                    newest =
+                        if odd { 1.0 / [0.0, -0.0, f64::NAN][chance.below(3) as usize] } else { chance.fraction() };
+                    // Some come after the computing of the tick before.
+                    age = if age > 1 { chance.below(2) as u32 } else { 0 };
+                    none = if odd { none + 1 } else { 0 };
+                    (number, since) = if odd { (number, since) } else { (newest, age) };
+                }
+                // The drive does what it was told.
+                let torque = control.supervisor().permitted()[0];
+                let value = |signal: Signal| if signal.what == What::Torque { torque } else { 0.0 };
+                let reading = |signal| Reading { value: value(signal), age: 0 };
+                let mut readings: Vec<Reading> = control.signals().map(reading).collect();
+                readings[at] = Reading { value: newest, age };
+                let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
+                control.cycle(&Told { ticks: 1, late_ns: 0, readings: &readings, source, wanted, causes, set: &[] });
+                assert_eq!(control.watched[at].last, number, "seed {seed}, cycle {k}");
+                let lost = timeout > 0 && u64::from(since) >= timeout;
+                let cause = match (lost, none >= ODD) {
+                    (true, _) => Some(Cause::Lost(at)),
+                    (false, true) => Some(Cause::Implausible(at)),
+                    (false, false) => None,
+                };
+                assert_eq!(control.supervisor().cause(), cause, "seed {seed}, cycle {k}: {none} are none");
+                stopped[usize::from(lost)] += u32::from(cause.is_some());
+                if cause.is_some() {
+                    break;
+                }
+            }
+        }
+        assert!(stopped.iter().all(|count| *count > 50), "{stopped:?}");
     }
 
     #[test]
