@@ -302,11 +302,18 @@ pub enum Protection {
     Bites,
     Hushed,
     Life,
+    Jump,
+    Odd,
+    Infinite,
+    Agree,
+    Foreign,
+    Overload,
+    Shown,
 }
 
 impl Protection {
     /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
-    pub const ALL: [(&'static str, Protection); 37] = [
+    pub const ALL: [(&'static str, Protection); 44] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
         ("slew", Protection::Slew),
@@ -344,6 +351,13 @@ impl Protection {
         ("bites", Protection::Bites),
         ("hushed", Protection::Hushed),
         ("life", Protection::Life),
+        ("jump", Protection::Jump),
+        ("odd", Protection::Odd),
+        ("infinite", Protection::Infinite),
+        ("agree", Protection::Agree),
+        ("foreign", Protection::Foreign),
+        ("overload", Protection::Overload),
+        ("shown", Protection::Shown),
     ];
 }
 

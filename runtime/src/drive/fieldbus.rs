@@ -448,7 +448,7 @@ impl Fieldbus {
                 self.note(Some(at), kind, stamp_ns);
             }
         }
-        if self.canopen[bus] && !owned && self.foreign(bus, frame) {
+        if self.canopen[bus] && !owned && self.foreign(bus, frame) && is_present(Protection::Foreign) {
             self.note(None, TroubleKind::ForeignMaster(frame.id()), stamp_ns);
         }
     }

@@ -614,7 +614,8 @@ impl Drive {
             }
             self.wraps = !whole;
         }
-        if self.goal == Goal::Enabled && self.state() == State::Enabled && !self.following() {
+        let follows = self.following() || !is_present(Protection::Shown);
+        if self.goal == Goal::Enabled && self.state() == State::Enabled && !follows {
             self.not_following = self.not_following.saturating_add(1);
             match self.mode_shown {
                 Some(shown) if shown != self.mode && self.not_following == 1 => tell(TroubleKind::Mode(shown)),

@@ -469,7 +469,8 @@ impl Control {
                     Some(since) if judged => change <= watched.jump * f64::from(since),
                     _ => true,
                 };
-                if credible && reading.value.is_finite() {
+                let number = reading.value.is_finite() || !is_present(Protection::Infinite);
+                if (credible || !is_present(Protection::Jump)) && number {
                     (watched.last, watched.since, watched.odd) = (reading.value, Some(reading.age), 0);
                 } else {
                     watched.odd += 1;
@@ -489,7 +490,7 @@ impl Control {
             if watched.timeout.is_some_and(|timeout| reading.age.max(missing) >= patience(timeout)) {
                 self.supervisor.trip(Cause::Lost(i));
             }
-            if watched.odd >= self.odd {
+            if watched.odd >= self.odd && is_present(Protection::Odd) {
                 self.supervisor.trip(Cause::Implausible(i));
             }
         }
@@ -518,7 +519,7 @@ impl Control {
             let period = self.step * self.steps as f64;
             let turned = position.last - from - speed.last * period * f64::from(ticks);
             pair.run.add(ticks, turned, speed.last, pair.most);
-            if pair.run.cycles >= self.odd && pair.run.is_certain(pair.most, period) {
+            if pair.run.cycles >= self.odd && pair.run.is_certain(pair.most, period) && is_present(Protection::Agree) {
                 self.supervisor.trip(Cause::Implausible(pair.position));
             }
         }

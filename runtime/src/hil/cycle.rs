@@ -525,7 +525,7 @@ impl Hil {
     /// What the nodes and buses have said against going on.
     fn gather(&mut self) {
         self.overload = if self.wires.lossy { self.overload + 1 } else { 0 };
-        if self.overload >= OVERLOAD {
+        if self.overload >= OVERLOAD && is_present(Protection::Overload) {
             self.wires.report(Cause::Overload(0));
         }
         if self.wires.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten) && !self.wires.acknowledged {

@@ -6,6 +6,7 @@
 
 use super::rigs::{FRAME_COMMAND, Made};
 use super::space::{Ill, MS, Script, What};
+use super::wire::{self, Told, Traffic};
 use crate::can::Frame;
 use crate::canopen::Object;
 use crate::clock::Clock;
@@ -31,6 +32,8 @@ const SLOW_FOLLOW_NS: u64 = 1_300 * MS;
 const BEYOND_NS: u64 = 10 * MS;
 /// Ticks for which a reading may be held, and some for its way.
 const SEEN: usize = 8;
+/// Cycles in a row in which frames may be lost: in the last one they have led to a stop.
+const LOSSY: u32 = 3;
 /// What a brake of the drive itself leaves.
 const BRAKE_NS: u64 = 5 * MS;
 /// A drive that keeps an old set-point gives it once it is enabled, until it has not followed for five ticks: these, the way
@@ -96,6 +99,20 @@ pub enum Broken {
     Needless,
     /// It never ends.
     Endless,
+    /// A reading is believed that is further off than the shaft can be.
+    Jump,
+    /// Such readings three times in a row, and no quick stop is under way.
+    Odd,
+    /// A reading is believed that is no number.
+    Infinite,
+    /// A drive's position turns otherwise than its speed says, and no quick stop is under way.
+    Agree,
+    /// A frame came that only another master sends, and no quick stop is under way.
+    Foreign,
+    /// Frames were lost in three cycles in a row, and no stop is under way.
+    Overload,
+    /// A drive shows that it does not follow, and no stop is under way.
+    Shown,
     /// Our own code has failed.
     Panic,
 }
@@ -176,6 +193,9 @@ pub struct Judge {
     lies: bool,
     /// Our end of a bus may be cut off for good.
     cut: bool,
+    told: Vec<Told>,
+    /// Cycles in a row in which a bus has said that frames were lost.
+    lossy: u32,
 }
 
 impl Judge {
@@ -194,7 +214,7 @@ impl Judge {
                 What::Down(_) | What::Babble(_) | What::Frozen(_) => true,
                 // Frames that fail again and again take their node off the bus.
                 What::Frame(_, _, Ill::Disturbed) => true,
-                What::Frame(..) | What::Node(..) | What::Foreign(..) => false,
+                What::Frame(..) | What::Node(..) | What::Foreign(..) | What::Overrun(..) | What::NoNumber(..) => false,
             };
             let keeps = |what: What| matches!(what, What::Node(at, Effect::IgnoresCommands) if at == node);
             let deaf = script.faults.iter().any(|f| silent(f.what) || mode.is_none() && unheard(f.what));
@@ -242,6 +262,8 @@ impl Judge {
             blind_ns: None,
             cut: script.faults.iter().any(|fault| cuts(fault.what)),
             lies: script.faults.iter().any(|fault| lies(fault.what)),
+            told: Told::all(rig, &script.rig),
+            lossy: 0,
         }
     }
 
@@ -263,14 +285,9 @@ impl Judge {
         self.tripped_ns
     }
 
-    /// One tick. `sent`: the frames of this cycle, with their bus.
-    pub fn tick(
-        &mut self,
-        hil: &Hil,
-        world: &World,
-        rig: &Rig,
-        sent: &[(usize, Frame, bool)],
-    ) -> Result<(), Violation> {
+    /// One tick, with the frames of its cycle.
+    pub fn tick(&mut self, hil: &Hil, world: &World, rig: &Rig, traffic: &Traffic) -> Result<(), Violation> {
+        let sent = &traffic.sent;
         let now_ns = world.simulation().now_ns();
         let at = |broken, text: String| Violation { broken, at_ns: now_ns, text };
         let (step, order) = (hil.step(), hil.order());
@@ -319,10 +336,38 @@ impl Judge {
                 watched.note(now_ns, permitted[i]);
             }
         }
+        self.judge_traffic(hil, rig, traffic, now_ns).map_err(|(broken, text)| at(broken, text))?;
         self.judge_drives(world, now_ns, step, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
         self.judge_shaft(world, now_ns, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
         self.judge_sight(hil, world, now_ns, moves && !stops).map_err(|(broken, text)| at(broken, text))?;
         self.judge_rest(world, now_ns)
+    }
+
+    /// What has come from the buses, and what is made of it.
+    fn judge_traffic(&mut self, hil: &Hil, rig: &Rig, traffic: &Traffic, now_ns: u64) -> Result<(), (Broken, String)> {
+        let quick = matches!(hil.order(), Order::QuickStop | Order::Disable);
+        let stops = self.tripped_ns.is_some();
+        let ended = matches!(hil.step(), Step::Refused | Step::Stopped) || hil.ended().is_some();
+        let foreign = traffic.came.iter().find(|(bus, frame, _)| wire::is_foreign(rig, *bus, frame));
+        if let Some((bus, frame, _)) = foreign
+            && !quick
+            && !ended
+        {
+            return Err((Broken::Foreign, format!("frame {:03X} came on bus {bus}", frame.id())));
+        }
+        self.lossy = if traffic.lost { self.lossy + 1 } else { 0 };
+        if self.lossy >= LOSSY && !stops && hil.step() > Step::AwaitEnable {
+            return Err((Broken::Overload, format!("frames were lost in {} cycles in a row", self.lossy)));
+        }
+        let time = (hil.last().ticks, rig.period_ns as f64 * 1e-9);
+        let seen = hil.seen();
+        for (told, seen) in self.told.iter_mut().zip(seen) {
+            told.take(rig, &traffic.came);
+            if let Some(cycles) = self.armed.filter(|_| self.tripped_ns.is_none_or(|since| since == now_ns)) {
+                told.judge(cycles == 0, *seen, time, (stops, quick))?;
+            }
+        }
+        Ok(())
     }
 
     /// What is believed of the shaft is what it did a moment ago.
@@ -529,7 +574,7 @@ fn cuts(what: What) -> bool {
     match what {
         What::Short(_) | What::Unplugged(_) | What::Alone(_) | What::Down(_) | What::Babble(_) => true,
         What::Frame(_, _, ill) => ill == Ill::Disturbed,
-        What::Node(..) | What::Foreign(..) | What::Frozen(_) => false,
+        What::Node(..) | What::Foreign(..) | What::Frozen(_) | What::Overrun(..) | What::NoNumber(..) => false,
     }
 }
 

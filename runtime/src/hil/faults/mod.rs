@@ -9,6 +9,7 @@ mod rigs;
 mod space;
 mod heap;
 mod invariants;
+mod wire;
 mod run;
 mod shrink;
 mod scripts;

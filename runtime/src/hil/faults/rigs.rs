@@ -14,7 +14,7 @@ use abi::{Function, Instance};
 use std::f64::consts::TAU;
 
 /// Moment of inertia of the shaft, kg·m².
-const INERTIA: f64 = 0.012;
+pub const INERTIA: f64 = 0.012;
 /// Friction of the shaft's bearings, N·m·s/rad.
 const BEARINGS: f64 = 0.01;
 /// More than 32 bits of counts, rad.
@@ -81,6 +81,8 @@ pub struct Made {
     pub far: bool,
     /// Time of the model at which it gives no number, s; 0: never.
     pub no_number: f64,
+    /// The drive described by frames tells its speed as a float.
+    pub float: bool,
 }
 
 /// The rig that stands for all others.
@@ -101,6 +103,7 @@ pub const PLAIN: Made = Made {
     safe: 0.0,
     far: false,
     no_number: 0.0,
+    float: false,
 };
 
 /// Parameters of the control program that a set changes: the second is always the first plus 1.
@@ -192,7 +195,7 @@ impl Made {
         let name = ["load", "servo"][at];
         let made = bench::drive(name, 3 + at as u8);
         let bus = if self.sort == Sort::TwoBuses { at } else { 0 };
-        let Some(mode) = mode else { return Node { bus, kind: described(), ..made } };
+        let Some(mode) = mode else { return Node { bus, kind: described(self.float), ..made } };
         let Kind::Cia402(drive) = made.kind else { unreachable!("a drive of the bench follows CiA 402") };
         let some = |value: f64| (value > 0.0).then_some(value);
         let kind = Kind::Cia402(Cia402 {
@@ -307,13 +310,14 @@ fn plant(torques: usize) -> Instance {
 }
 
 /// A drive that takes a torque and tells a speed, each in a frame.
-fn described() -> Kind {
+fn described(float: bool) -> Kind {
+    let format = |bits| if float && bits == 32 { Format::Float32 } else { Format::Signed };
     let field = |name: &str, bits, unit: &str| Field {
         name: name.into(),
         start_bit: 0,
         bits,
         big_endian: false,
-        format: Format::Signed,
+        format: format(bits),
         scale: 1e-3,
         offset: 0.0,
         start: 0.0,

@@ -5,13 +5,14 @@
 use super::invariants::{Broken, CLAMPED_NS, Judge, RAMP, STANDSTILL_NS, Violation};
 use super::rigs::TWINS;
 use super::space::{EVER, Fault, Ill, MS, Only, Phase, Script, What};
+use super::wire::{Tap, Traffic};
 use crate::can::sim::{Fault as Planted, Join, Kind as Planting, Port};
-use crate::can::{Bus, Frame, Health, Received, Refused};
+use crate::can::{Bus, Frame, Received};
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, ObjectDictionary};
 use crate::clock::Clock;
 use crate::drive::bench::Bench;
-use crate::drive::hooks::{Hook, Start};
+use crate::drive::hooks::{Effect, Hook, Start};
 use crate::drive::sign::SignTest;
 use crate::drive::simulated::Behaviour;
 use crate::drive::state::Times;
@@ -54,41 +55,13 @@ pub struct Passed {
     pub hash: u64,
 }
 
-/// Frames handed over in a cycle: the bus, the frame, and whether the bus took it.
-pub type Handed = Vec<(usize, Frame, bool)>;
-type Sent = Rc<RefCell<Handed>>;
-
-/// Our end of a bus, which remembers what it is given to send.
-struct Tap {
-    port: Port,
-    bus: usize,
-    sent: Sent,
-}
-
-impl Bus for Tap {
-    fn send(&mut self, frame: Frame) -> Result<(), Refused> {
-        let sent = self.port.send(frame);
-        self.sent.borrow_mut().push((self.bus, frame, sent.is_ok()));
-        sent
-    }
-    fn receive(&mut self) -> Option<Received> {
-        self.port.receive()
-    }
-    fn wait(&mut self, until_ns: u64) -> bool {
-        self.port.wait(until_ns)
-    }
-    fn health(&self) -> Health {
-        self.port.health()
-    }
-}
-
 /// A script under way.
 struct Run<'a> {
     script: &'a Script,
     rig: Rig,
     made: (abi::Instance, abi::Instance),
     world: World,
-    sent: Sent,
+    traffic: Rc<RefCell<Traffic>>,
     /// Listen on each bus, and never send.
     witnesses: Vec<Port>,
     /// Times from and until which no cycle comes, and for how long at a time, ns.
@@ -160,7 +133,7 @@ impl<'a> Run<'a> {
             rig,
             made: (control, plant),
             world,
-            sent: Rc::new(RefCell::new(Vec::with_capacity(1 << 10))),
+            traffic: Traffic::new(),
             frozen: Vec::new(),
             foreign: Vec::new(),
             down: Vec::new(),
@@ -192,7 +165,7 @@ impl<'a> Run<'a> {
     fn program(&mut self, again: bool) -> Result<(), Violation> {
         let buses = (0..self.rig.buses.len()).map(|bus| {
             let port = self.world.bus(bus).port(MASTER);
-            Box::new(Tap { port, bus, sent: self.sent.clone() }) as Box<dyn Bus>
+            Box::new(Tap { port, bus, traffic: self.traffic.clone() }) as Box<dyn Bus>
         });
         let (clock, buses) = (self.world.clock(), buses.collect());
         let made = Hil::new(&self.rig, self.made.0.clone(), clock, buses, options(self.script), None);
@@ -378,6 +351,16 @@ impl<'a> Run<'a> {
             What::Down(bus) => self.down.push((from, bus)),
             What::Foreign(bus, id) => self.foreign.push((from, bus, id)),
             What::Frozen(each) => self.frozen.push((from, from + fault.lasts.min(100 * MS), each)),
+            What::Overrun(bus, percent) => {
+                let planted = Planted::new(Planting::Overrun).chance(f64::from(percent) / 100.0);
+                self.world.bus(bus).plant(MASTER, planted.from(from).until(until));
+            }
+            What::NoNumber(node, which) => {
+                // 1/0 is infinite, and 0/0 no number.
+                let effect = Effect::Value(1, 0, f64::from(which) / 0.0);
+                let lasts_ns = (fault.lasts != EVER).then_some(fault.lasts);
+                self.world.bench().hook(Hook { node, effect, start: Start::At(from), lasts_ns });
+            }
         }
     }
 
@@ -411,7 +394,7 @@ impl<'a> Run<'a> {
             // A reset takes back what it says of itself.
             imitate(self.world.bench().drive(0).unwrap().objects(), self.script.only);
         }
-        self.sent.borrow_mut().clear();
+        self.traffic.borrow_mut().clear();
         let settled = program.hil.step() >= Step::Sync && program.hil.control().is_some();
         let asked = super::heap::asked();
         program.hil.cycle();
@@ -432,7 +415,7 @@ impl<'a> Run<'a> {
                 }
             }
         }
-        program.judge.tick(&program.hil, &self.world, &self.rig, &self.sent.borrow())?;
+        program.judge.tick(&program.hil, &self.world, &self.rig, &self.traffic.borrow())?;
         self.judge_permission(program)?;
         self.note(program);
         self.judge_sets(program)?;

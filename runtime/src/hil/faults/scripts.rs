@@ -105,3 +105,16 @@ fn set_points_that_are_wrong_from_the_start() {
 fn a_shaft_that_is_read_late_and_early_in_turn() {
     holds(&Script { rig: Made { swing: 0.9683128397509957, at_sync: true, ..PLAIN }, ..Script::plain(Pair) });
 }
+
+/// A device that tells no number kept the last one for ever where the rig names no time-out for it.
+#[test]
+fn a_speed_that_is_no_number() {
+    for which in [-1, 0, 1] {
+        let fault = Fault { what: NoNumber(1, which), phase: Moving, after: 0, lasts: EVER };
+        holds(&Script {
+            rig: Made { sort: FramesServo, float: true, ..PLAIN },
+            faults: vec![fault],
+            ..Script::plain(FramesServo)
+        });
+    }
+}

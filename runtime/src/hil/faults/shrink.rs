@@ -56,7 +56,7 @@ fn simpler(script: &Script) -> Vec<Script> {
     if fits(&script.faults, Sort::Pair) {
         all.extend(with(&|other| sort(other, Sort::Pair)));
     }
-    let plainer: [fn(&mut Made); 12] = [
+    let plainer: [fn(&mut Made); 13] = [
         |made| made.swing = PLAIN.swing,
         |made| made.hertz = PLAIN.hertz,
         |made| made.damping = PLAIN.damping,
@@ -69,6 +69,7 @@ fn simpler(script: &Script) -> Vec<Script> {
         |made| made.eager = PLAIN.eager,
         |made| (made.safe, made.far) = (PLAIN.safe, PLAIN.far),
         |made| made.no_number = PLAIN.no_number,
+        |made| made.float = PLAIN.float,
     ];
     for plain in plainer {
         all.extend(with(&|other| plain(&mut other.rig)));
@@ -93,7 +94,9 @@ fn fits(faults: &[Fault], sort: Sort) -> bool {
         | What::Alone(bus)
         | What::Down(bus)
         | What::Babble(bus)
-        | What::Foreign(bus, _) => bus == 0 || sort == Sort::TwoBuses,
+        | What::Foreign(bus, _)
+        | What::Overrun(bus, _) => bus == 0 || sort == Sort::TwoBuses,
+        What::NoNumber(..) => sort == Sort::FramesServo,
         What::Frozen(_) => true,
     })
 }

@@ -135,6 +135,10 @@ pub enum What {
     Foreign(usize, u32),
     /// No cycle for so long, ns, again and again as long as it lasts.
     Frozen(u64),
+    /// Our queue of a bus loses so many percent of what comes.
+    Overrun(usize, u8),
+    /// A node that is described by frames tells no number: −1, 1 infinite, 0 none at all.
+    NoNumber(usize, i8),
 }
 
 /// All frames of a rig by bus and identifier, those of each cycle first; the number of these comes second.
@@ -209,6 +213,14 @@ impl Script {
             _ => Only::Any,
         };
         let again = again || only == Only::OtherLater;
+        // Drawn last, so that the seeds before these faults came keep most of what they gave.
+        rig.float = rig.sort == Sort::FramesServo && chance.below(2) == 0;
+        let bus = if rig.sort == Sort::TwoBuses { chance.below(2) as usize } else { 0 };
+        match chance.below(16) {
+            0 => faults[0].what = What::Overrun(bus, pick(&mut chance, &[30, 50, 70, 100])),
+            1..8 if rig.float => faults[0].what = What::NoNumber(1, pick(&mut chance, &[-1, 0, 1])),
+            _ => {}
+        }
         Script { seed, rig, tested, again, sets, only, faults }
     }
 }
@@ -371,6 +383,9 @@ impl fmt::Display for Made {
         }
         if self.at_sync {
             parts.push("at_sync: true".into());
+        }
+        if self.float {
+            parts.push("float: true".into());
         }
         if parts.is_empty() {
             return f.write_str("PLAIN");
