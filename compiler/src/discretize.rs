@@ -97,6 +97,8 @@ fn place_in<'a>(ring: Segment, number: Real<'a>) -> Int<'a> {
 /// Guards that are put together before they meet others, so that many do not wait for each other one by one, and those of
 /// parts of one kind are computed alike.
 const TOGETHER: usize = 8;
+/// γ of a step by `implicit`.
+pub const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
 /// The status: 0, or the number of the first guard whose quantity is not finite or out of its range by more than 1e-6
 /// of the range's width or, of a range open on one side, of its bound.
@@ -720,7 +722,7 @@ impl<'a> Model<'a> {
         given[value.index()]
     }
 
-    /// Order 2, L-stable, whatever J is; one factorisation. γ = 1 − 1/√2, J = ∂f/∂x at (t, x).
+    /// Order 2, L-stable, whatever J is; one factorisation. γ = 1 − 1/√2 ([`GAMMA`]), J = ∂f/∂x at (t, x).
     ///
     ///   (I − γhJ) k1 = f(t, x),  (I − γhJ) k2 = f(t + h, x + h k1) − 2 k1,  x' = x + h (3 k1 + k2)/2
     ///
@@ -728,9 +730,8 @@ impl<'a> Model<'a> {
     /// Source: Verwer, Spee, Blom, Hundsdorfer, SIAM J. Sci. Comput. 20 (1999), eq. 3.2.
     fn implicit(&self) -> Vec<Real<'a>> {
         let h = self.h;
-        let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
         let (f, rows) = self.f_and_gradient(0.0, &self.x);
-        let matrix = Matrix::identity_less(gamma * h, &rows);
+        let matrix = Matrix::identity_less(GAMMA * h, &rows);
         let factors = matrix.factorise(1e-12);
         let k1 = factors.solve(&f);
         let f = self.f(1.0, &self.moved(h, &k1));

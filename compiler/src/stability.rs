@@ -36,6 +36,8 @@ const CHATTER: (usize, usize) = (256, 8);
 const RELAXING: (usize, f64) = (8, 2e-5);
 /// Greatest value in SI of a quantity whose range is open.
 pub const OPEN: f64 = 10.0;
+/// 10^(k/8) for k from 0 to 7: the points between two powers of ten.
+const EIGHTHS: [f64; 8] = [1.0, 1.3335, 1.7783, 2.3714, 3.1623, 4.2170, 5.6234, 7.4989];
 /// The power of ten up to which an end of the run is looked for.
 const FAR: i32 = 4;
 /// The longest step in s that is looked for.
@@ -78,6 +80,15 @@ pub struct Chatter {
     pub state: usize,
     /// How far in one step, SI.
     pub amplitude: f64,
+}
+
+/// Where the model itself grows so fast that the linear equations of a step by `implicit` are nearly singular.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Singular {
+    /// Slot of the quantity that was moved, and its value there, SI.
+    pub at: (Slot, f64),
+    /// The rate at which deviations grow there, in 1/s.
+    pub rate: f64,
 }
 
 /// A program at points of its ranges.
@@ -297,6 +308,41 @@ impl<'a> Bench<'a> {
         None
     }
 
+    /// The point at which the model itself grows fastest, where that is so fast that a step by `implicit` loses its way: its
+    /// equations (I − γhJ) k = f are singular where an eigenvalue of J is 1/(γh), and from three quarters of that on a step
+    /// makes of a deviation some three times what the model makes of it. It grows once, while the point is passed, so no run
+    /// from there goes ever farther, and [`Bench::unstable`] says nothing of it.
+    ///
+    /// Sought along each input and state by [`EIGHTHS`], for such a place is narrow: of a Stribeck curve, the speeds at which it falls.
+    pub fn singular(&self, h: f64) -> Option<Singular> {
+        let (limit, n) = (0.75 / (discretize::GAMMA * h), self.n);
+        let cost =
+            RELAXING.0 * self.relaxing.ops.len() + self.jacobian.ops.len() + self.outputs.ops.len() + 20 * n.pow(3);
+        let mut work = WORK / cost;
+        let mut worst: Option<Singular> = None;
+        for scan in self.scans() {
+            for value in scan.values.iter().flat_map(|value| EIGHTHS.map(|part| value * part)) {
+                let (low, high) = self.quantity(scan.slot).map_or((value, value), |quantity| quantity.range);
+                if !(low..=high).contains(&value) {
+                    continue;
+                }
+                let Some(left) = work.checked_sub(1) else { return worst };
+                work = left;
+                let block = self.at(&self.base, scan.slot, value);
+                if self.ended(&block) {
+                    continue;
+                }
+                let model = self.matrix(&self.jacobian, &self.relaxed_around(block, scan.slot), h);
+                let Some((growth, _)) = radius(&exponential(&model, n, h), n, exp(limit * h)) else { continue };
+                let rate = ln(growth) / h;
+                if rate.is_finite() && worst.as_ref().is_none_or(|worst| rate > worst.rate) {
+                    worst = Some(Singular { at: (scan.slot, value), rate });
+                }
+            }
+        }
+        worst
+    }
+
     /// The farthest value up to which a run has not ended.
     fn edge(&self, setting: &[f64], slot: Slot, reached: f64, scan: &Scan) -> f64 {
         let beyond = scan.values.iter().copied().filter(|x| x.signum() == reached.signum() && x.abs() > reached.abs());
@@ -322,6 +368,18 @@ impl<'a> Bench<'a> {
         block[Slot::STEP.index()] = RELAXING.1;
         for _ in 0..RELAXING.0 {
             run_once(&self.relaxing, &mut block, &self.program.description.pool);
+        }
+        let states = self.program.description.layout.states.range();
+        if block[states].iter().all(|x| x.is_finite()) { block } else { begin }
+    }
+
+    /// The same while one quantity keeps its value: else a mass slows down and leaves the speed that is asked of.
+    fn relaxed_around(&self, mut block: Vec<f64>, held: Slot) -> Vec<f64> {
+        let (begin, value) = (block.clone(), block[held.index()]);
+        block[Slot::STEP.index()] = RELAXING.1;
+        for _ in 0..RELAXING.0 {
+            run_once(&self.relaxing, &mut block, &self.program.description.pool);
+            block[held.index()] = value;
         }
         let states = self.program.description.layout.states.range();
         if block[states].iter().all(|x| x.is_finite()) { block } else { begin }

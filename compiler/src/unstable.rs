@@ -1,13 +1,15 @@
 //! Says that a fixed step is unstable, or that it chatters, in the words of the text.
 //!
 //! In: a system with its program, its method and its step. Out: E0702 where it happens inside of the ranges, W0704 where
-//! ranges are open, W0705. What is found, and how, is told in [`stability`](crate::stability).
+//! ranges are open or the model itself grows too fast for `implicit`, W0705. What is found, and how, is told in
+//! [`stability`](crate::stability).
 
+use crate::discretize;
 use crate::explain::{Own, states};
 use crate::program::Program;
 use crate::remembered::Remembered;
 use crate::source::Files;
-use crate::stability::{Along, Bench, Chatter, Unstable, ten_to};
+use crate::stability::{Along, Bench, Chatter, Singular, Unstable, ten_to};
 use crate::system::*;
 use crate::units::Types;
 use abi::Slot;
@@ -47,15 +49,26 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
     // What jumps to and fro is also thrown off: the jump is the cause.
     let look = || match bench.chatters(fixed.method, fixed.step) {
         Some(chatter) => Finding::Chatters(chatter),
-        None => bench.unstable(fixed.method, fixed.step).map_or(Finding::Nothing, |unstable| {
-            Finding::Unstable(unstable, fixed.method != Method::Implicit && stable(Method::Implicit))
-        }),
+        None => {
+            let unstable = bench.unstable(fixed.method, fixed.step);
+            // What is unstable inside of ranges is an error, which a warning does not replace.
+            let open = unstable.as_ref().is_none_or(|found| found.along.as_ref().is_some_and(|along| !along.closed));
+            let look = open && fixed.method == Method::Implicit;
+            match (look.then(|| bench.singular(fixed.step)).flatten(), unstable) {
+                (Some(singular), _) => Finding::Singular(singular),
+                (None, Some(unstable)) => {
+                    Finding::Unstable(unstable, fixed.method != Method::Implicit && stable(Method::Implicit))
+                }
+                (None, None) => Finding::Nothing,
+            }
+        }
     };
     static KNOWN: Remembered<Finding> = Remembered::new();
     let also: Vec<u64> =
         ends.iter().map(|slot| u64::from(slot.0)).chain([fixed.step.to_bits(), fixed.method as u64]).collect();
     match KNOWN.answer(fixed.program, &also, look) {
         Finding::Unstable(unstable, implicit) => vec![fixed.unstable(&unstable, implicit, files)],
+        Finding::Singular(singular) => vec![fixed.singular(&singular)],
         Finding::Chatters(chatter) => vec![fixed.chatters(&chatter)],
         Finding::Nothing => Vec::new(),
     }
@@ -65,6 +78,7 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
 enum Finding {
     /// And whether `implicit` is stable with this step.
     Unstable(Unstable, bool),
+    Singular(Singular),
     Chatters(Chatter),
     Nothing,
 }
@@ -148,6 +162,36 @@ impl Fixed<'_> {
         };
         let keep = if open { "\nTo keep it: `allow large-step \"...\"`" } else { "" };
         out.help(format!("{help}{keep}"))
+    }
+
+    fn singular(&self, singular: &Singular) -> Diagnostic {
+        let (slot, value) = singular.at;
+        let quantities = &self.program.description.quantities;
+        let moved = quantities.iter().find(|quantity| quantity.slot == slot).expect("it was moved");
+        let unit = self.system.var_ids().find(|id| self.system.var(*id).path == moved.path);
+        let unit = unit.map_or(&moved.unit, |id| &self.types.units[id.0 as usize]);
+        let (at, step) = (amount(value, unit), time(self.step));
+        let rate = two_digits(singular.rate);
+        // With γhλ at most a half, the equations of a step are far from singular.
+        let shorter = below(0.5 / (discretize::GAMMA * singular.rate));
+        let shorter = if self.rig {
+            format!("divide the period: `solver implicit step {shorter}`")
+        } else {
+            format!("write `step {shorter}`")
+        };
+        Diagnostic::warning("W0704", format!("implicit at {step} is a large step for this model"))
+            .label(self.run, format!("near {} = {at} the model itself grows at {rate} 1/s", moved.path))
+            .label(
+                self.place,
+                format!(
+                    "from {} 1/s on a step overshoots without limit",
+                    two_digits(1.0 / (discretize::GAMMA * self.step))
+                ),
+            )
+            .help(format!(
+                "{shorter}{}\nTo keep it: `allow large-step \"...\"`",
+                if self.rig { "" } else { ", or leave `solver` out: adaptive" }
+            ))
     }
 
     fn chatters(&self, chatter: &Chatter) -> Diagnostic {

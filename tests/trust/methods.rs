@@ -71,6 +71,25 @@ const BENCHES: &[Bench] = &[
     bench("StoppedAxis(u = FORCE, low = -1 mm, high = 1 mm)", "x"),
     bench("BandedBench(u = FORCE, v_start = 20 mm/s)", "x"),
     bench("ObserverBench(u = FORCE, fr = LuGre())", "error"),
+    // Observers of a mass that slides against a friction that is news to them, and stays above any speed at which it jumps.
+    bench(
+        "ObserverBench(u = FORCE, v_start = 3 m/s, fr = Coulomb(Fc = 2 N), obs = ExtendedStateObserver(v_start = 3 m/s, w = RATE))",
+        "F_hat",
+    ),
+    bench(
+        "ObserverBench(u = FORCE, v_start = 3 m/s, fr = Coulomb(Fc = 2 N), obs = DisturbanceObserver(T = 1 / RATE))",
+        "F_hat",
+    ),
+    bench(
+        "ObserverBench(u = FORCE, v_start = 3 m/s, fr = Coulomb(Fc = 2 N), obs = DisturbanceObserver2(T = 1 / RATE))",
+        "F_hat",
+    ),
+    bench("ObserverBench(u = FORCE, v_start = 3 m/s, fr = Coulomb(Fc = 2 N), obs = FriedlandPark())", "F_hat"),
+    bench("ObserverBench(u = FORCE, v_start = 3 m/s, obs = ExtendedStateObserver(v_start = 3 m/s, w = RATE))", "F_hat"),
+    // Controllers around a mass in a viscous fluid.
+    bench("Servo(r = PLACE, fr = Viscous())", "x"),
+    bench("Servo(r = PLACE, fr = Viscous(), pid = PIDSpeed())", "x"),
+    bench("Servo(r = PLACE, fr = Viscous(), pid = Cascade())", "x"),
     bench("Servo(r = PLACE)", "x"),
     bench("Pull()", "x"),
     bench("Hold()", "x"),
@@ -263,9 +282,13 @@ fn errors(case: &Case) -> Result<(f64, [f64; 3], f64), String> {
 fn judge(euler: f64, all: &[f64; 3], range: f64) -> Vec<String> {
     let mut wrong = Vec::new();
     for (method, error) in METHODS.iter().zip(all) {
-        // Where Euler's is beyond the stability of explicit methods, rk4 may be too.
-        let beyond = *method == "rk4" && euler > range;
-        if !beyond && *error > 1.02 * euler + 1e-7 * range {
+        // Where Euler's is beyond the stability of explicit methods, rk4 may be too. A run that was stopped has said so: `z` of
+        // LuGre left its range, `s` of BristleMass is no number. At σ0 |v| h/g > 2.8 such steps of rk4 throw the bristle off;
+        // Euler's do so from 2 on, but stay where a deflection in the steady state has exactly the rate 0, or where a tip that
+        // is thrown to and fro sticks in between.
+        let beyond = *method == "rk4" && (euler > range || error.is_infinite());
+        // Below 1e-15 in SI is rounding.
+        if !beyond && *error > 1.02 * euler + 1e-7 * range + 1e-15 {
             wrong.push(format!("{method} {error:.3e}, euler {euler:.3e} of {range:.3e}"));
         }
     }
@@ -288,6 +311,8 @@ fn every_model_of_the_library_is_stepped() {
     assert!(missing.is_empty(), "stepped by no bench: {missing:?}");
 }
 
+/// On the code before a joint exponential, `expo` fails in case 134 of seed 1 on: 2.6 N, 70 times Euler's error, for an
+/// extended-state observer of 376 1/s at 0.5 ms on a sliding mass.
 #[test]
 fn no_method_loses_to_euler() {
     let benches: Vec<Bench> = benches().into_iter().filter(|bench| !bench.jumps).collect();
@@ -327,7 +352,7 @@ fn under_a_mass_no_method_loses_to_euler_on_average() {
             if METHODS[k] == "implicit" && case.run.contains("BreakAwayTanh") {
                 continue;
             }
-            // A run that a range has stopped has said so: the explicit method may leave it where its step is too long.
+            // As above: the run says which range was left, and `check` up to which speed the step is stable (W0704).
             if METHODS[k] == "rk4" && error.is_infinite() {
                 println!("seed {seed}, step {:e} s, {}: rk4 leaves a range", case.step, case.run);
                 continue;
@@ -350,6 +375,7 @@ fn under_a_mass_no_method_loses_to_euler_on_average() {
     assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
 }
 
+/// Before states took the exponential of their matrix together, it failed in 14 of 36 cases, first with seed 2.
 #[test]
 fn linear_circles_are_exact_with_expo() {
     let benches: Vec<Bench> = BENCHES.iter().filter(|bench| bench.exact).cloned().collect();
@@ -367,4 +393,52 @@ fn linear_circles_are_exact_with_expo() {
             case.run
         );
     }
+}
+
+/// `check` warns of `implicit` where the model itself grows so fast that 1 = γ h λ can hold, and only there.
+///
+/// A mass on BreakAwayTanh, whose force falls from v_brk on; λ from its formula. Where the largest γ h λ is between 0.6 and
+/// 0.9 both answers are right. A point that is let go, as the other searches do, finds none of the narrow ones.
+#[test]
+#[allow(clippy::disallowed_methods, reason = "the force by its formula, compared with a tolerance")]
+fn check_warns_where_implicit_is_singular() {
+    let seeds = seeds(60);
+    println!("seeds {seeds:?}");
+    let (mut warned, mut quiet) = (0, 0);
+    for seed in seeds {
+        let mut chance = Chance::new(seed);
+        let (m, v_brk, h) = (chance.decades(0.01, 100.0), chance.decades(1e-5, 1e-2), chance.of(&STEPS));
+        let peak = chance.within(1.1, 3.0);
+        let force = |v: f64| {
+            let r = v / v_brk;
+            (0.5f64).exp() * (peak - 1.0) * (-0.5 * r * r).exp() * r + (10.0 * r).tanh() + 0.4 * v
+        };
+        let slope = |v: f64| (force(1.0001 * v) - force(0.9999 * v)) / (2e-4 * v);
+        let rate = (1..200).map(|k| -slope(0.03 * f64::from(k) * v_brk) / m).fold(0.0, f64::max);
+        let text = format!(
+            "import std.interfaces\nimport std.friction\nimport std.bench
+experiment it {{
+  run ForceBench(m = {m} kg, fr = BreakAwayTanh(Fs = {peak} N, v_brk = {v_brk} m/s)) for 1 s
+  solver implicit step {} us
+  expect max(x) > -1 km
+}}
+",
+            h * 1e6
+        );
+        let (_, found) = checked("implicit.fric", &text, &Texts::default());
+        let says = |diagnostic: &grammar::diagnostic::Diagnostic| {
+            diagnostic.code == "W0704"
+                && diagnostic.labels.iter().any(|label| label.text.contains("the model itself grows"))
+        };
+        let (said, near) = (found.iter().any(says), (1.0 - 0.5f64.sqrt()) * h * rate);
+        if near > 0.9 {
+            assert!(said, "seed {seed}: γ h λ = {near:.2}, and no word: {found:?}\n{text}");
+            warned += 1;
+        } else if near < 0.6 {
+            assert!(!said, "seed {seed}: γ h λ = {near:.2}: {found:?}\n{text}");
+            quiet += 1;
+        }
+    }
+    println!("{warned} warned, {quiet} not");
+    assert!(warned > 5 && quiet > 5, "{warned} warned, {quiet} not: nothing is tested");
 }
