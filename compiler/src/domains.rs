@@ -17,9 +17,32 @@ use std::collections::HashSet;
 pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     equalities(system, types, files, diagnostics);
     let mut reach = Reach::new(system);
-    let mut visit = Visit { seen: vec![HashSet::new()] };
+    let mut visit = Visit { seen: vec![HashSet::new()], constants: false };
     for root in roots(system) {
         visit.walk(&mut reach, root, types, files, diagnostics);
+    }
+}
+
+/// Reports what an experiment gives to the model it runs and what is certainly undefined: `u = chirp(…, 0 s)`. Only
+/// constants are judged: what depends on time need not reach during the run what it could reach later.
+pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, diagnostics: &mut Vec<Diagnostic>) {
+    let mut reach = Reach::new(system);
+    let mut visit = Visit { seen: vec![HashSet::new()], constants: true };
+    let written = |id: ExprId| {
+        let span = system.span(id);
+        span.file == run.file && run.start <= span.start && span.end <= run.end
+    };
+    for var in &system.vars {
+        match var.definition {
+            Definition::Value(value, Origin::Argument { .. }) if written(value) => {
+                visit.walk(&mut reach, value, types, files, diagnostics);
+            }
+            Definition::Value(value, Origin::Override) => visit.walk(&mut reach, value, types, files, diagnostics),
+            Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. } if written(initial) => {
+                visit.walk(&mut reach, initial, types, files, diagnostics);
+            }
+            _ => {}
+        }
     }
 }
 
@@ -99,6 +122,8 @@ fn computed(system: &System, id: ExprId) -> bool {
 // ---- divisions and domains
 
 struct Visit {
+    /// Whether only divisors and arguments that are constants are judged.
+    constants: bool,
     /// Nodes visited without facts, and under each of those that hold: their operands need no second look.
     seen: Vec<HashSet<ExprId>>,
 }
@@ -128,6 +153,16 @@ impl Visit {
                     self.walk(reach, operand, types, files, found);
                 }
             }
+        }
+        let judged = match system.node(id) {
+            Node::Binary(BinaryOp::Divide, _, x) | Node::Binary(BinaryOp::Power, x, _) => Some(*x),
+            Node::Call(Builtin::Chirp, args) => Some(args[3]),
+            Node::Call(Builtin::Noise, args) => Some(args[1]),
+            Node::Call(_, args) => args.first().copied(),
+            _ => None,
+        };
+        if self.constants && !judged.is_some_and(|x| reach.interval(x).is_point()) {
+            return;
         }
         match system.node(id) {
             Node::Binary(BinaryOp::Divide, _, b) if reach.interval(*b).has_zero() => {

@@ -14,7 +14,7 @@ use crate::source::Sources;
 use crate::system::*;
 use crate::tables::columns as columns_of;
 use crate::units::{self, Types};
-use crate::{causality, checks, delays, starts};
+use crate::{causality, checks, delays, domains, starts};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
@@ -603,6 +603,7 @@ fn variant(
             }
             if !diagnostics.iter().any(Diagnostic::is_error) {
                 checks::values(&system, &types, &loaded.files, &mut diagnostics);
+                domains::check_given(&system, &types, &loaded.files, parts.run.instance.span, &mut diagnostics);
             }
             (system, types, flat.observed, ports.unwrap_or_default(), None)
         }

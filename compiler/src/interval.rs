@@ -65,6 +65,11 @@ impl Interval {
         self.low > self.high
     }
 
+    /// Whether it is one number.
+    pub fn is_point(self) -> bool {
+        self.low == self.high
+    }
+
     /// Whether 0 can be reached.
     pub fn has_zero(self) -> bool {
         self.low <= 0.0 && self.high >= 0.0 && self.away == 0.0
