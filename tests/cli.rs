@@ -553,6 +553,39 @@ experiment fine {
     assert!(out.contains("735.758882"), "{out}");
 }
 
+/// A measure made of measures is shown in their unit, an integral of a power as an energy.
+#[test]
+fn measures_are_shown_in_their_own_units() {
+    let text = r#"
+model Pushed {
+  state  x [mm] = 0
+  output F [N]   = 2 N
+  output v [m/s] = 1 m/s
+  dx/dt = v
+}
+experiment it {
+  run  Pushed() for 1 s
+  show integral(F * v)
+  show 3 * integral(F * v) / 2
+  show integral(F * v) - integral(F * v)
+  show -final(x)
+  show final(x) + max(v) * 1 s
+  show integral(F)
+  show 2 * final(x) * final(F)
+}
+"#;
+    let folder = Folder::new("units").with("pushed.fric", text);
+    let (out, _) = folder.check(&["run", "pushed.fric", "--json", "--no-error"], 0, "");
+    let object: Value = serde_json::from_str(out.lines().next().unwrap()).unwrap();
+    let shown =
+        |k: usize| (object["shows"][k]["value"].as_f64().unwrap(), object["shows"][k]["unit"].as_str().unwrap());
+    let expected = [(2.0, "J"), (3.0, "J"), (0.0, "J"), (-1000.0, "mm"), (2.0, "m"), (2.0, "N·s"), (4.0, "N·m")];
+    for (k, (value, unit)) in expected.into_iter().enumerate() {
+        let found = shown(k);
+        assert!((found.0 - value).abs() < 1e-9 && found.1 == unit, "{k}: {found:?}, not {value} {unit}");
+    }
+}
+
 #[test]
 fn rows_of_a_csv_lie_on_a_grid() {
     let folder = Folder::new("every").with("pull.fric", PULL);

@@ -989,12 +989,27 @@ impl Reader<'_> {
         }
     }
 
-    /// The unit of a side of a comparison: that of the measure that it is, else SI.
+    /// The unit of a side of a comparison: that of the measure that it is made of, else SI.
     fn side_unit(&self, id: ExprId) -> Unit {
+        let boolean = self.types.boolean[id.0 as usize];
+        let otherwise = || if boolean { Unit::none() } else { Unit::si(self.dimension(id)) };
+        self.unit_of_measures(id).unwrap_or_else(otherwise)
+    }
+
+    /// The unit of a measure, of its multiples, and of sums of measures in one unit.
+    fn unit_of_measures(&self, id: ExprId) -> Option<Unit> {
+        let number =
+            |id: &ExprId| matches!(self.system.node(*id), Node::Number { .. }) && self.dimension(*id).is_none();
         match self.system.node(id) {
-            Node::Measure(name, value, ..) => self.measure_unit(*name, id, *value),
-            _ if self.types.boolean[id.0 as usize] => Unit::none(),
-            _ => Unit::si(self.dimension(id)),
+            Node::Measure(name, value, ..) => Some(self.measure_unit(*name, id, *value)),
+            Node::Negate(a) => self.unit_of_measures(*a),
+            Node::Call(Builtin::Abs, args) => self.unit_of_measures(args[0]),
+            Node::Binary(BinaryOp::Multiply, a, b) if number(a) => self.unit_of_measures(*b),
+            Node::Binary(BinaryOp::Multiply | BinaryOp::Divide, a, b) if number(b) => self.unit_of_measures(*a),
+            Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
+                self.unit_of_measures(*a).filter(|unit| self.unit_of_measures(*b).as_ref() == Some(unit))
+            }
+            _ => None,
         }
     }
 
@@ -1346,10 +1361,7 @@ impl Reader<'_> {
             let number = matches!(self.system.node(id), Node::Number { .. } | Node::Negate(_));
             Unit::parse(unit.trim()).ok().filter(|unit| number && !unit.text.is_empty() && unit.dimension == dimension)
         };
-        let measure = |id: ExprId| match self.system.node(id) {
-            Node::Measure(name, value, ..) => Some(self.measure_unit(*name, id, *value)),
-            _ => None,
-        };
+        let measure = |id: ExprId| self.unit_of_measures(id);
         let unit = written(right).or(written(left)).or(measure(left)).or(measure(right));
         let boolean = self.types.boolean[left.0 as usize];
         let unit = unit.unwrap_or_else(|| if boolean { Unit::none() } else { Unit::si(dimension) });
@@ -1359,6 +1371,10 @@ impl Reader<'_> {
     /// The unit in which a measure is shown.
     fn measure_unit(&self, name: MeasureName, whole: ExprId, value: ExprId) -> Unit {
         match name {
+            // An energy and no torque, which has the same dimension.
+            MeasureName::Integral if Unit::si(self.dimension(value)).text == "W" => {
+                Unit::parse("J").expect("the joule is known")
+            }
             MeasureName::Integral => Unit::si(self.dimension(whole)),
             MeasureName::Crossings
             | MeasureName::Count
