@@ -198,7 +198,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let bite = move || bitten.lock().unwrap().push(monotonic_ns());
     hil.watched_by(Watchdog::new(Duration::from_nanos(script.watchdog_ns), bite).unwrap());
     let mut cycles: Vec<Seen> = Vec::new();
-    let mut cause = None;
+    let (mut cause, mut asked_ns) = (None, u64::MAX);
     while hil.ended().is_none() {
         let mut now = plan.borrow_mut();
         (now.cycle, now.sleeps, now.sends) = (cycles.len() as u64, 0, 0);
@@ -209,6 +209,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         cycles.push(Seen { touched_ns, end_ns, awake });
         cause = cause.or(hil.control().and_then(|control| control.supervisor().cause()));
         if cycles.len() as u64 == 600 {
+            asked_ns = monotonic_ns();
             operator.push(Command::Stop);
         }
     }
@@ -235,23 +236,23 @@ fn run(script: &Script) -> Result<Shown, String> {
     }
     shown.asleep = !before.awake && over_ns > begin_ns + script.watchdog_ns;
     shown.in_time = bites.is_empty() && before.awake;
-    shown.late_ns = first.map(|first| first.saturating_sub(before.end_ns + script.watchdog_ns));
     if let Some(first) = first {
-        // The first cycle that knows of it, or the one in which it stood still.
+        // Where this computer paused by itself, a frame of that cycle may have been on its way.
         let during = begin_ns <= first && first <= over_ns;
-        let from_ns =
-            if during { over_ns } else { cycles.iter().map(|c| c.end_ns).find(|end| *end > first).unwrap_or(first) };
+        let known_ns = cycles.iter().map(|cycle| cycle.end_ns).find(|end_ns| *end_ns > first).unwrap_or(first);
+        let from_ns = if during { over_ns } else { known_ns };
+        shown.late_ns = during.then(|| first.saturating_sub(before.end_ns + script.watchdog_ns));
         // SYNC goes on while drives stop, but not before the cycle has told them to.
         let mut told = false;
-        for (_, cycle, frame) in plan.sent.iter().filter(|(at, ..)| *at > from_ns) {
+        for (at_ns, cycle, frame) in plan.sent.iter().filter(|(at_ns, ..)| *at_ns > first) {
             let set_point = (0x200..0x280).contains(&frame.id());
-            let lets_go_on = set_point && frame.data()[0] & 0x0F == 0x0F || frame.id() == 0x080 && !told;
-            if lets_go_on {
+            let enables = set_point && frame.data()[0] & 0x0F == 0x0F;
+            if *at_ns > from_ns && (enables || frame.id() == 0x080 && !told) {
                 return Err(format!("{frame} was sent in cycle {cycle}, after the watchdog had stopped the drives"));
             }
-            told |= set_point;
+            told |= set_point && !enables;
         }
-        if !matches!(end, Some(End::Stopped(..))) {
+        if !matches!(end, Some(End::Stopped(..))) && first < asked_ns {
             return Err(format!("the watchdog stopped the drives, and it ended with {end:?}"));
         }
     } else if cause == Some(Cause::Watchdog) || end != Some(End::Asked) {

@@ -132,6 +132,8 @@ pub struct Log {
     queue: Sender<u64>,
     shared: Arc<Shared>,
     patient: bool,
+    /// Only the last blocks are kept: older messages are in no file, and nobody misses them.
+    boxed: bool,
     /// Messages dropped since the last that fitted.
     lost: u64,
     /// All messages dropped since the queue was full.
@@ -190,11 +192,12 @@ impl Log {
     /// Those of the file.
     pub fn begin(settings: Settings, head: &Sections) -> io::Result<Log> {
         let (queue, end) = queue(settings.sink.queue());
+        let boxed = matches!(settings.sink, Sink::BlackBox(..));
         let shared = Arc::new(Shared::default());
         let mut carrier = Carrier::new(settings.sink, settings.cycles_per_block, end, shared.clone())?;
         carrier.keep_head(&head.bytes())?;
         let thread = std::thread::Builder::new().name("fric log".into()).spawn(move || carrier.carry())?;
-        Ok(Log { queue, shared, patient: settings.patient, lost: 0, dropped: 0, thread: Some(thread) })
+        Ok(Log { queue, shared, patient: settings.patient, boxed, lost: 0, dropped: 0, thread: Some(thread) })
     }
 
     /// Appends a message. Neither waits nor allocates, unless it is patient.
@@ -247,7 +250,10 @@ impl Log {
         let thread = self.thread.take().expect("a log ends once");
         let carried = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
         let dropped = self.dropped();
-        carried.map_err(|error| io::Error::new(error.kind(), format!("{error}; {dropped} messages are not in it")))?;
+        carried.map_err(|error| match self.boxed {
+            true => error,
+            false => io::Error::new(error.kind(), format!("{error}; {dropped} messages are not in it")),
+        })?;
         let [bytes, parts, removed] =
             [&self.shared.written, &self.shared.parts, &self.shared.removed].map(|count| count.load(Ordering::Relaxed));
         Ok(Summary { dropped, bytes, parts, removed })
@@ -726,7 +732,7 @@ mod tests {
     fn a_full_queue_drops_counts_and_says_so() {
         let (queue, mut end) = queue(16);
         let shared = Arc::new(Shared::default());
-        let mut log = Log { queue, shared, patient: false, lost: 0, dropped: 0, thread: None };
+        let mut log = Log { queue, shared, patient: false, boxed: false, lost: 0, dropped: 0, thread: None };
         for k in 0..6 {
             log.push(CYCLE, &[k, k, k]);
         }
