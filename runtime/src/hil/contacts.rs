@@ -36,8 +36,8 @@ const TOLD_NS: u64 = 30 * MS;
 const BLOW: f64 = 2e-4;
 /// Counts of the encoder in one tick that torques do not explain, from which on that must be noticed.
 const MANY: f64 = 20.0;
-/// Factor between the energy that must be noticed and that which must not stop a rig, around what docs/prediction.md says; and a
-/// part of the store for steps of torque and speed.
+/// Factor between the energy that must be noticed and that which must not stop a rig, around what docs/prediction.md says; and the
+/// part of the store that steps of torque and speed may make.
 const BAND: f64 = 1.6;
 const STEPS: f64 = 0.4;
 
@@ -180,8 +180,8 @@ impl Script {
 /// Energies of the true torque and speed, in units of the store, since the model got the outputs.
 #[derive(Default)]
 struct Energies {
-    /// Time, and what was given back in that tick.
-    back: VecDeque<(u64, f64)>,
+    /// Time, and what was absorbed in that tick.
+    ticks: VecDeque<(u64, f64)>,
     /// When the other torque changed its sign.
     reversals: VecDeque<u64>,
     other: f64,
@@ -193,7 +193,7 @@ struct Energies {
 impl Energies {
     fn note(&mut self, now_ns: u64, absorbed: f64, other: f64) {
         let absorbed = absorbed - *self.begun.get_or_insert(absorbed);
-        self.back.push_back((now_ns, (self.absorbed - absorbed).max(0.0)));
+        self.ticks.push_back((now_ns, absorbed - self.absorbed));
         self.absorbed = absorbed;
         self.highest = self.highest.max(absorbed);
         // Within a step of the torque its sign is not told.
@@ -203,13 +203,18 @@ impl Energies {
             }
             self.other = other;
         }
-        while self.back.front().is_some_and(|(at, _)| at + WINDOW_NS <= now_ns) {
-            self.back.pop_front();
+        while self.ticks.front().is_some_and(|(at, _)| at + WINDOW_NS <= now_ns) {
+            self.ticks.pop_front();
         }
     }
 
     fn returned(&self) -> f64 {
-        self.back.iter().map(|(_, back)| back).sum()
+        self.ticks.iter().map(|(_, work)| (-work).max(0.0)).sum()
+    }
+
+    /// How closely a rig can sum them that reads torque and speed once a tick: the greatest of one tick.
+    fn resolution(&self) -> f64 {
+        self.ticks.iter().map(|(_, work)| work.abs()).fold(STEPS, f64::max)
     }
 
     fn fall(&self) -> f64 {
@@ -321,7 +326,7 @@ fn run(script: &Script) -> Result<Shown, String> {
         // The energy.
         let store = script.store();
         energies.note(now_ns, absorbed / store, other);
-        let (returned, fall) = (energies.returned(), energies.fall());
+        let (returned, fall, coarse) = (energies.returned(), energies.fall(), energies.resolution());
         let least = energies.allowed(now_ns, WINDOW_NS - TOLD_NS);
         let most = energies.allowed(now_ns, WINDOW_NS + TOLD_NS);
         warnings.push_back((now_ns, counts.warnings));
@@ -333,12 +338,12 @@ fn run(script: &Script) -> Result<Shown, String> {
             if !script.energy_stops {
                 return Err("energy stops it, and it was not asked to".into());
             }
-            if returned + STEPS < (3.0 + least) / BAND && fall + STEPS < (1.0 + least) / BAND {
+            if returned + coarse < (3.0 + least) / BAND && fall + coarse < (1.0 + least) / BAND {
                 return Err(format!("it stops for energy: {returned:.2} came back, {fall:.2} fell"));
             }
         }
-        let drives = returned > BAND * (3.0 + most) + STEPS || fall > BAND * (1.0 + most) + STEPS;
-        if drives || returned > BAND * (0.5 + most) + STEPS {
+        let drives = returned > BAND * (3.0 + most) + coarse || fall > BAND * (1.0 + most) + coarse;
+        if drives || returned > BAND * (0.5 + most) + coarse {
             must_warn = must_warn.or(Some((now_ns + WINDOW_NS, returned, fall)));
         }
         if drives && script.energy_stops {
