@@ -13,6 +13,8 @@ pub mod queue;
 pub mod verdict;
 mod peak;
 mod hills;
+mod quadrature;
+mod crossing;
 pub mod measure;
 pub mod record;
 

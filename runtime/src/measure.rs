@@ -6,8 +6,10 @@
 //! between two points. An adaptive run shows a point at each edge and gives the areas under its own course; of other runs
 //! the areas are those of the trapezoidal rule with the end corrections of Gregory, of order four where steps are even.
 
+use crate::crossing::{Lobes, period, settling};
 use crate::hills::{Hills, Turn};
 use crate::peak::{Peak, Point};
+use crate::quadrature::{Even, Sum};
 use crate::show;
 use crate::verdict::{self, Reading, Verdict};
 use abi::Slot;
@@ -15,9 +17,6 @@ use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
 
 /// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. Beyond, the measure fails and says so.
 pub const KEPT_POINTS: usize = 1 << 25;
-
-/// Values below this, in SI, are rounding errors.
-const NOTHING: f64 = 1e-15;
 
 /// All expectations of an experiment, filled point by point.
 pub struct Expectations {
@@ -666,190 +665,10 @@ impl Meter {
     }
 }
 
-/// Parts of a course between two changes of sign, of which those that rise above rounding errors and errors of the run count.
-#[derive(Default)]
-struct Lobes {
-    /// A value smaller than this part of the largest one is as good as zero.
-    band: f64,
-    /// Largest value of the run so far, inside the window or not.
-    largest: f64,
-    /// For each lobe its first instant in s and the value farthest from zero. Those that cannot count are dropped.
-    kept: Vec<Point>,
-}
-
-impl Lobes {
-    fn push(&mut self, t: f64, v: f64) {
-        if v == 0.0 {
-            return;
-        }
-        match self.kept.last_mut().filter(|(_, peak)| (*peak > 0.0) == (v > 0.0)) {
-            Some((_, peak)) => *peak = if v.abs() > peak.abs() { v } else { *peak },
-            None => {
-                let least = self.least();
-                self.kept.pop_if(|(_, peak)| peak.abs() <= least);
-                // Of the same sign as the one before that: both are one.
-                match self.kept.last_mut().filter(|(_, peak)| (*peak > 0.0) == (v > 0.0)) {
-                    Some((_, peak)) => *peak = if v.abs() > peak.abs() { v } else { *peak },
-                    None => self.kept.push((t, v)),
-                }
-            }
-        }
-    }
-
-    /// What is no more than this counts for zero.
-    fn least(&self) -> f64 {
-        (self.band.max(1e-12) * self.largest).max(NOTHING)
-    }
-
-    /// How often the sign changes, and when it last did.
-    fn crossings(&self) -> (u64, Option<f64>) {
-        let least = self.least();
-        let (mut sign, mut count, mut time) = (0.0, 0, None);
-        for (t, peak) in self.kept.iter().filter(|(_, peak)| peak.abs() > least) {
-            if peak.signum() != sign {
-                if sign != 0.0 {
-                    (count, time) = (count + 1, Some(*t));
-                }
-                sign = peak.signum();
-            }
-        }
-        (count, time)
-    }
-}
-
-/// A run of points at even distances: its first and last values, for the end corrections of Gregory that raise the
-/// trapezoidal rule to order four,
-///
-///   h/12 (Δf_0 − ∇f_n) − h/24 (Δ²f_0 + ∇²f_n).
-#[derive(Default)]
-struct Even {
-    step: f64,
-    last: f64,
-    points: u64,
-    head: [f64; 3],
-    tail: [f64; 3],
-}
-
-impl Even {
-    /// One more point; gives the correction of a run that ends with the one before.
-    fn push(&mut self, t: f64, v: f64) -> Option<f64> {
-        let step = t - self.last;
-        let goes_on = match self.points {
-            0 => true,
-            1 => step > 0.0,
-            // Times are multiples of the step, each rounded.
-            _ => (step - self.step).abs() <= 1e-9 * self.step + 8.0 * f64::EPSILON * t.abs(),
-        };
-        let correction = if goes_on { None } else { Some(self.correction()) };
-        if !goes_on {
-            // The last point begins the next run, unless something jumps there.
-            let from = self.tail[2];
-            self.points = u64::from(step > 0.0);
-            self.head[0] = from;
-            self.tail = [from; 3];
-        }
-        if self.points == 1 {
-            self.step = step;
-        }
-        if self.points < 3 {
-            self.head[self.points as usize] = v;
-        }
-        self.tail = [self.tail[1], self.tail[2], v];
-        self.points += 1;
-        self.last = t;
-        correction
-    }
-
-    /// What the trapezoidal rule lacks over the run so far; nothing of fewer than five points.
-    fn correction(&self) -> f64 {
-        if self.points < 5 {
-            return 0.0;
-        }
-        let ([a, b, c], [x, y, z]) = (self.head, self.tail);
-        self.step / 12.0 * ((b - a) - (z - y)) - self.step / 24.0 * ((a - 2.0 * b + c) + (x - 2.0 * y + z))
-    }
-}
-
 /// The value at `t` on the line through two points at different times.
 fn line(from: Point, to: Point, t: f64) -> f64 {
     let part = (t - from.0) / (to.0 - from.0);
     from.1 + part * (to.1 - from.1)
-}
-
-/// Mean distance of upward crossings through the mean over time.
-fn period(points: &[Point]) -> Result<f64, String> {
-    let mut area = Sum::default();
-    for pair in points.windows(2) {
-        area.add(0.5 * (pair[0].1 + pair[1].1) * (pair[1].0 - pair[0].0));
-    }
-    let width = points[points.len() - 1].0 - points[0].0;
-    let mean = if width > 0.0 { area.total() / width } else { points[0].1 };
-    // Upward means from below to at or above; a value that only touches the mean from above does not cross.
-    let upward = (1..points.len()).filter(|&i| points[i - 1].1 < mean && mean <= points[i].1);
-    let mut crossings = upward.map(|i| crossing(&points[i.saturating_sub(2)..points.len().min(i + 2)], mean));
-    let (mut first, mut last, mut count) = (0.0, 0.0, 0);
-    for time in &mut crossings {
-        if count == 0 {
-            first = time;
-        }
-        last = time;
-        count += 1;
-    }
-    if count < 3 {
-        return Err(format!("three upward crossings through the mean are needed, there are {count}"));
-    }
-    Ok((last - first) / f64::from(count - 1))
-}
-
-/// When the cubic through four points passes `level` between the middle two; a line where there are not four, or two
-/// of them lie at one time. A line alone would be as coarse as the points.
-fn crossing(points: &[Point], level: f64) -> f64 {
-    let middle = points.windows(2).position(|pair| pair[0].1 < level && level <= pair[1].1).expect("one pair crosses");
-    let (from, to) = (points[middle], points[middle + 1]);
-    let part = (level - from.1) / (to.1 - from.1);
-    let straight = from.0 + part * (to.0 - from.0);
-    let &[p0, p1, p2, p3] = points else { return straight };
-    if !points.is_sorted_by(|a, b| a.0 < b.0) || middle != 1 {
-        return straight;
-    }
-    let over = |a: Point, b: Point, high: f64, low: f64| (high - low) / (b.0 - a.0);
-    let (d01, d12, d23) = (over(p0, p1, p1.1, p0.1), over(p1, p2, p2.1, p1.1), over(p2, p3, p3.1, p2.1));
-    let (d02, d13) = (over(p0, p2, d12, d01), over(p1, p3, d23, d12));
-    let d03 = over(p0, p3, d13, d02);
-    let height = |t: f64| p0.1 - level + (t - p0.0) * (d01 + (t - p1.0) * (d02 + (t - p2.0) * d03));
-    let (mut low, mut high, mut t) = (p1.0, p2.0, straight);
-    for _ in 0..60 {
-        let value = height(t);
-        if value == 0.0 {
-            break;
-        }
-        if value < 0.0 {
-            low = t
-        } else {
-            high = t
-        }
-        let slope =
-            d01 + (t - p1.0) * d02 + (t - p0.0) * (d02 + (2.0 * t - p1.0 - p2.0) * d03) + (t - p1.0) * (t - p2.0) * d03;
-        let newton = t - value / slope;
-        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        if next == t || high - low <= 4.0 * f64::EPSILON * high.abs() {
-            break;
-        }
-        t = next;
-    }
-    t
-}
-
-/// The last time the value leaves the band around `end`, or none if it never is outside.
-fn settling(points: &[Point], end: f64, band: f64) -> Option<f64> {
-    let outside = points.iter().rposition(|(_, v)| (v - end).abs() > band)?;
-    let (from, to) = (points[outside], *points.get(outside + 1)?);
-    if from.0 == to.0 {
-        return Some(from.0);
-    }
-    let edge = end + band.copysign(from.1 - end);
-    let part = (edge - from.1) / (to.1 - from.1);
-    Some(from.0 + part * (to.0 - from.0))
 }
 
 /// Points kept whole, up to the limit.
@@ -880,25 +699,6 @@ fn too_many() -> String {
     format!(
         "more than {KEPT_POINTS} points lie in the window; narrow it with `after` and `before`, or take a larger step"
     )
-}
-
-/// A compensated sum (Neumaier): ten million steps lose nothing that matters.
-#[derive(Default, Clone, Copy)]
-struct Sum {
-    sum: f64,
-    lost: f64,
-}
-
-impl Sum {
-    fn add(&mut self, term: f64) {
-        let sum = self.sum + term;
-        self.lost += if self.sum.abs() >= term.abs() { (self.sum - sum) + term } else { (term - sum) + self.sum };
-        self.sum = sum;
-    }
-
-    fn total(&self) -> f64 {
-        self.sum + self.lost
-    }
 }
 
 #[cfg(test)]
@@ -1092,12 +892,5 @@ mod tests {
         assert!(taken(MeasureKind::Mean, (2.0, 1.0), &points).is_err());
         let outside = taken(MeasureKind::At(4.0), WHOLE, &points).unwrap_err();
         assert_eq!(outside, "4 s lies outside the window from 0 s to 3 s");
-    }
-
-    #[test]
-    fn ten_million_points_lose_nothing() {
-        let mut sum = Sum::default();
-        (0..10_000_000).for_each(|_| sum.add(0.1));
-        assert_eq!(sum.total(), 1_000_000.0);
     }
 }

@@ -1,0 +1,88 @@
+//! Areas under a course that is seen at points.
+//!
+//! In: points in order of time. Out: the compensated sum of the trapezoidal rule, and its end corrections where points are evenly
+//! apart. Knows no windows.
+
+/// A run of points at even distances: its first and last values, for the end corrections of Gregory that raise the
+/// trapezoidal rule to order four,
+///
+///   h/12 (Δf_0 − ∇f_n) − h/24 (Δ²f_0 + ∇²f_n).
+#[derive(Default)]
+pub(crate) struct Even {
+    step: f64,
+    last: f64,
+    points: u64,
+    head: [f64; 3],
+    tail: [f64; 3],
+}
+
+impl Even {
+    /// One more point; gives the correction of a run that ends with the one before.
+    pub(crate) fn push(&mut self, t: f64, v: f64) -> Option<f64> {
+        let step = t - self.last;
+        let goes_on = match self.points {
+            0 => true,
+            1 => step > 0.0,
+            // Times are multiples of the step, each rounded.
+            _ => (step - self.step).abs() <= 1e-9 * self.step + 8.0 * f64::EPSILON * t.abs(),
+        };
+        let correction = if goes_on { None } else { Some(self.correction()) };
+        if !goes_on {
+            // The last point begins the next run, unless something jumps there.
+            let from = self.tail[2];
+            self.points = u64::from(step > 0.0);
+            self.head[0] = from;
+            self.tail = [from; 3];
+        }
+        if self.points == 1 {
+            self.step = step;
+        }
+        if self.points < 3 {
+            self.head[self.points as usize] = v;
+        }
+        self.tail = [self.tail[1], self.tail[2], v];
+        self.points += 1;
+        self.last = t;
+        correction
+    }
+
+    /// What the trapezoidal rule lacks over the run so far; nothing of fewer than five points.
+    pub(crate) fn correction(&self) -> f64 {
+        if self.points < 5 {
+            return 0.0;
+        }
+        let ([a, b, c], [x, y, z]) = (self.head, self.tail);
+        self.step / 12.0 * ((b - a) - (z - y)) - self.step / 24.0 * ((a - 2.0 * b + c) + (x - 2.0 * y + z))
+    }
+}
+
+/// A compensated sum (Neumaier): ten million steps lose nothing that matters.
+#[derive(Default, Clone, Copy)]
+pub(crate) struct Sum {
+    sum: f64,
+    lost: f64,
+}
+
+impl Sum {
+    pub(crate) fn add(&mut self, term: f64) {
+        let sum = self.sum + term;
+        self.lost += if self.sum.abs() >= term.abs() { (self.sum - sum) + term } else { (term - sum) + self.sum };
+        self.sum = sum;
+    }
+
+    pub(crate) fn total(&self) -> f64 {
+        self.sum + self.lost
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ten_million_points_lose_nothing() {
+        let mut sum = Sum::default();
+        (0..10_000_000).for_each(|_| sum.add(0.1));
+        assert_eq!(sum.total(), 1_000_000.0);
+    }
+}
