@@ -661,7 +661,7 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     if let word @ ("after" | "before") = source.word(at) {
         let error =
             Diagnostic::error("E0111", format!("`{word}` begins a window, which belongs to the whole expectation"));
-        let help = format!("write it behind the comparison: `expect first(…) < 10 s {word} 9 s`");
+        let help = format!("write it after the comparison: `expect first(…) < 10 s {word} 9 s`");
         return Some(error.label(source.span(at), "").help(help));
     }
     // `run M() for 1 s set k = 1 N/m`
