@@ -1098,7 +1098,7 @@ impl Reader<'_> {
         Some(plan::Expect { text, measures, condition, after, before })
     }
 
-    /// `expect max(x) after 5 s < 1 m`: the window stands before the comparison. The expectation as it should be.
+    /// `expect max(x) after 5 s < 1 m`: the window comes before the comparison. The expectation as it should be.
     fn window_first(&mut self, expect: &ast::Expect) -> Option<String> {
         let compares =
             |op| matches!(op, BinaryOp::Less | BinaryOp::LessEqual | BinaryOp::Greater | BinaryOp::GreaterEqual);
@@ -1113,7 +1113,7 @@ impl Reader<'_> {
         let edge = edge.span;
         self.diagnostics.retain(|d| d.span().start < edge.start || d.span().end > edge.end);
         let [value, time, limit] = [expect.value.span, time.span, limit.span].map(|span| self.loaded.files.slice(span));
-        Some(format!("the window stands behind the comparison: `expect {value} {} {limit} {word} {time}`", op.text()))
+        Some(format!("the window comes after the comparison: `expect {value} {} {limit} {word} {time}`", op.text()))
     }
 
     /// Arithmetic over measures. The slot of a measure is the number of what it measures among the wanted ones.
