@@ -77,8 +77,40 @@ pub(super) struct Summary {
     kept: Vec<Vec<f64>>,
     every: u64,
     rows: u64,
-    /// How runs ended that did not end well, and how many did so.
-    ended: Vec<(String, u64)>,
+    /// How runs ended that did not end well.
+    ended: Vec<Ended>,
+}
+
+/// Runs that ended for the same reason.
+struct Ended {
+    /// The reason without its numbers.
+    kind: String,
+    runs: u64,
+    /// Number of the first of them, and its reason in full.
+    run: String,
+    first: String,
+}
+
+/// A reason without numbers and their units, for these differ from run to run. What is in backticks is a name and stays.
+fn kind(status: &str) -> String {
+    let mut kept = Vec::new();
+    for (k, part) in status.split('`').enumerate() {
+        let mut words = part.split_whitespace();
+        if k % 2 == 1 {
+            kept.push(part);
+            continue;
+        }
+        while let Some(word) = words.next() {
+            let bare = word.trim_start_matches(['-', '+', '.']);
+            if bare == "inf" || bare.starts_with(|c: char| c.is_ascii_digit()) {
+                // Its unit, or the dots of a range.
+                words.next();
+            } else {
+                kept.push(word);
+            }
+        }
+    }
+    kept.join(" ")
 }
 
 /// One column.
@@ -141,11 +173,13 @@ impl Summary {
         self.rows += 1;
         let status = record.get(record.len() - 1).unwrap_or_default();
         if status != "ok" {
-            // Instants and values differ from run to run: what comes before the first number tells the kinds apart.
-            let kind = status.split(|c: char| c.is_ascii_digit()).next().unwrap_or(status).trim_end().to_string();
-            match self.ended.iter().position(|(known, _)| *known == kind) {
-                Some(at) => self.ended[at].1 += 1,
-                None if self.ended.len() < 20 => self.ended.push((kind, 1)),
+            let kind = kind(status);
+            match self.ended.iter().position(|ended| ended.kind == kind) {
+                Some(at) => self.ended[at].runs += 1,
+                None if self.ended.len() < 20 => {
+                    let (run, first) = (record.get(0).unwrap_or_default().into(), status.into());
+                    self.ended.push(Ended { kind, runs: 1, run, first });
+                }
                 None => {}
             }
         }
@@ -188,9 +222,25 @@ impl Summary {
                 significant(share, 4)
             );
         }
-        for (kind, number) in &self.ended {
-            out += &format!("  {} run{}: {kind}\n", count(*number), if *number == 1 { "" } else { "s" });
+        for Ended { kind: _, runs, run, first } in &self.ended {
+            out += &match runs {
+                1 => format!("  run {run}: {first}\n"),
+                _ => format!("  {} runs such as {run}: {first}\n", count(*runs)),
+            };
         }
         out
     }
+}
+
+#[test]
+fn reasons_that_differ_in_numbers_are_of_one_kind() {
+    let same = [
+        "`F2` left its range 0 .. 10 m: it is 10.1 m at 901 ms",
+        "`F2` left its range -2.5 .. 10 m: it is 1e3 m at 1.5 s",
+        "`F2` left its range -inf .. 7 mm: it is -0.5 mm at 0 s",
+    ];
+    assert!(same.iter().all(|status| kind(status) == "F2 left its range it is at"), "{:?}", same.map(kind));
+    assert_eq!(kind("`2x` is infinite at 0.9 s"), "2x is infinite at");
+    assert_ne!(kind("`F2` is infinite at 1 s"), kind("`F3` is infinite at 1 s"));
+    assert_ne!(kind("`F2` is infinite at 1 s"), kind("`F2` is not a number at 1 s"));
 }
