@@ -285,8 +285,8 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     )
 }
 
-/// How much work the runs were, and what their errors were found with in how many s besides.
-pub fn work(outcomes: &[&Outcome], wall: f64, judging: f64) -> String {
+/// How much work the runs of an experiment were, and what their errors were found with in how many s besides.
+pub fn work(experiment: &Experiment, outcomes: &[&Outcome], wall: f64, judging: f64) -> String {
     let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
     let simulated: f64 = outcomes.iter().map(|outcome| outcome.time).sum();
     let speed = match simulated / wall {
@@ -297,15 +297,26 @@ pub fn work(outcomes: &[&Outcome], wall: f64, judging: f64) -> String {
     let errors = match estimate.map(|estimate| estimate.companions.as_slice()) {
         None | Some([]) => String::new(),
         Some(all) => {
-            let (kind, one): (_, fn(&Solver) -> String) = match all[0].method {
-                Method::Adaptive => ("errors by tol", |finer| significant(finer.tol, 3)),
-                _ => ("discretisation by steps of", |finer| duration(finer.step)),
-            };
-            let all: Vec<String> = all.iter().map(one).collect();
-            format!("; {kind} {} in {}", all.join(" and "), duration(judging))
+            let kind = if experiment.solver.method == Method::Adaptive { "errors" } else { "discretisation" };
+            format!("; {kind} by {} in {}", finer(experiment, all), duration(judging))
         }
     };
     format!("  ran {} steps in {}{speed}{errors}\n", count(steps), duration(wall))
+}
+
+/// The companions of a run in words: `tol 1e-7 and 1e-8`.
+pub fn finer(experiment: &Experiment, companions: &[Solver]) -> String {
+    let adaptive = |finer: &&Solver| finer.method == Method::Adaptive;
+    let joined = |all: Vec<String>| all.join(" and ");
+    let tols = joined(companions.iter().filter(adaptive).map(|finer| significant(finer.tol, 3)).collect());
+    let steps = companions.iter().filter(|finer| !adaptive(finer)).map(|finer| duration(finer.step));
+    let steps = joined(steps.collect());
+    let kind = if experiment.solver.method == Method::Adaptive { "tol" } else { "adaptive runs, tol" };
+    match (tols.is_empty(), steps.is_empty()) {
+        (false, true) => format!("{kind} {tols}"),
+        (true, _) => format!("steps of {steps}"),
+        (false, false) => format!("{kind} {tols}, and steps of {steps}"),
+    }
 }
 
 #[cfg(test)]

@@ -526,7 +526,7 @@ experiment fine {
     let folder = Folder::new("undecided").with("decay.fric", text);
     // By ten steps x is 0.349 m, in truth 0.368 m.
     let (out, _) = folder.check(&["run", "decay.fric", "coarse"], 1, "undecided: the error");
-    assert!(out.contains("discretisation by steps of 50 ms and 25 ms"), "{out}");
+    assert!(out.contains("discretisation by adaptive runs, tol 1e-8 and 1e-10, and steps of 50 ms and 25 ms"), "{out}");
     folder.check(&["run", "decay.fric", "coarse", "--no-error"], 0, "348.678 mm, margin");
     folder.check(&["test", "decay.fric"], 1, "1 passed, 1 failed");
     folder.check(&["test", "decay.fric", "--no-error"], 0, "2 passed, 0 failed");
@@ -537,7 +537,8 @@ experiment fine {
     let (value, error) = (expect["value"].as_f64().unwrap(), expect["error"].as_f64().unwrap());
     let truth = 367.879_441_171_442_3;
     assert!((value - truth).abs() < 1.5 * error && error < 3.0 * (value - truth).abs(), "{value} {error}");
-    assert_eq!(objects[0]["errors"]["companions"], serde_json::json!(["euler step 50 ms", "euler step 25 ms"]));
+    let companions = ["adaptive tol 1e-8", "adaptive tol 1e-10", "euler step 50 ms", "euler step 25 ms"];
+    assert_eq!(objects[0]["errors"]["companions"], serde_json::json!(companions));
     // What decides does.
     let decides = objects[0]["errors"]["decides"].as_str().map(|s| s.replace("euler step ", "").replace(' ', ""));
     if let Some(step) = decides {

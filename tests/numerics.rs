@@ -447,7 +447,10 @@ fn a_sweep_says_how_far_a_sample_of_its_runs_may_be_off() {
     let one = errors_in(&sweep(grid, &["--threads", "1", "--out", "one.csv"]));
     let three = errors_in(&sweep(grid, &["--threads", "3", "--out", "three.csv"]));
     assert_eq!(one, three);
-    assert!(one.starts_with("  errors of 10 of 31 runs, discretisation by steps of 10 ms and 5 ms\n"), "{one}");
+    assert!(
+        one.starts_with("  errors of 10 of 31 runs, discretisation by adaptive runs, tol 1e-8 and 1e-10\n"),
+        "{one}"
+    );
     // The table itself is the same without, and nothing is said then.
     let without = sweep(grid, &["--no-error", "--out", "without.csv"]);
     assert!(!without.contains("error") && read("one.csv") == read("without.csv"), "{without}");

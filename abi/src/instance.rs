@@ -14,6 +14,8 @@ pub struct Instance {
     size: usize,
     /// Whether that was prepared since a parameter or the length of the step changed.
     is_prepared: bool,
+    /// The same program for adaptive runs, where this one has fixed steps and there is such.
+    adaptive: Option<Arc<Instance>>,
 }
 
 impl Instance {
@@ -24,7 +26,27 @@ impl Instance {
         let size = description.layout.size();
         let mut numbers = vec![0.0; size + prepared];
         numbers[description.layout.params.range()].copy_from_slice(params);
-        Instance { description, code, numbers, size, is_prepared: false }
+        Instance { description, code, numbers, size, is_prepared: false, adaptive: None }
+    }
+
+    /// The same with its program as an adaptive run needs it: what fixed steps are judged by.
+    ///
+    /// # Panics
+    /// If that has other parameters or inputs.
+    pub fn with_adaptive(self, adaptive: Arc<Instance>) -> Instance {
+        let segments = |one: &Instance| (one.description.layout.params, one.description.layout.inputs);
+        assert!(segments(&self) == segments(&adaptive), "{} is another program", adaptive.description.name);
+        Instance { adaptive: Some(adaptive), ..self }
+    }
+
+    /// The same program for adaptive runs, with the parameters and inputs of this one; none where there is no such.
+    pub fn adaptive(&self) -> Option<Instance> {
+        let mut adaptive = Instance::clone(self.adaptive.as_deref()?);
+        let layout = &self.description.layout;
+        for range in [layout.params.range(), layout.inputs.range()] {
+            adaptive.block_mut()[range.clone()].copy_from_slice(&self.block()[range]);
+        }
+        Some(adaptive)
     }
 
     /// What it is.

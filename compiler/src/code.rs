@@ -114,11 +114,15 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
     match target::here() {
         // What may be too large for machine code is made at once, so that it is told at once.
-        Ok(_) if !interpret && size <= LARGE => {
-            (Code::Interpreted(Arc::new(Late::new(program.clone(), method))), Vec::new())
-        }
+        Ok(_) if !interpret && size <= LARGE => (on_demand(program, method, false), Vec::new()),
         _ => code(&functions(program, method), &program.description, interpret),
     }
+}
+
+/// As [`late`], of any size: for runs that are made at most on request. Where there can be no machine code it is interpreted.
+pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
+    let interpret = interpret || target::here().is_err();
+    Code::Interpreted(Arc::new(Late { program: program.clone(), method, interpret, made: Default::default() }))
 }
 
 /// Operations of a program, before elementary functions are expanded, that surely become machine code.
@@ -132,6 +136,8 @@ const PAYS: u64 = 200;
 struct Late {
     program: Program,
     method: Method,
+    /// Whether none becomes machine code.
+    interpret: bool,
     made: [Made; Function::ALL.len()],
 }
 
@@ -147,10 +153,6 @@ struct Made {
 }
 
 impl Late {
-    fn new(program: Program, method: Method) -> Late {
-        Late { program, method, made: Default::default() }
-    }
-
     /// The function as arithmetic.
     fn func(&self, which: Function) -> Option<&(Function, Func)> {
         let make = || Some((which, function(&self.program, self.method, which)?));
@@ -170,7 +172,8 @@ impl Interpret for Late {
         let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
         let compiled = || self.make(which, make);
         let pays = || made.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > PAYS;
-        if (made.machine.get().is_some() || pays())
+        if !self.interpret
+            && (made.machine.get().is_some() || pays())
             && let Some(machine) = made.machine.get_or_init(compiled)
         {
             return machine.call(which, block, pool, count);

@@ -78,6 +78,8 @@ pub struct Variant {
     pub types: Types,
     /// The program.
     pub program: crate::program::Program,
+    /// Of an experiment with fixed steps, the same for adaptive runs, where these are possible.
+    pub adaptive: Option<crate::program::Program>,
     /// What to run.
     pub experiment: plan::Experiment,
     /// Numbers of the plan that follow from expressions.
@@ -690,7 +692,8 @@ fn variant(
     let lowered = lower(&system, &types, &wanted);
     let description = &lowered.program.description;
     let states = description.layout.states.len as usize;
-    if cut.is_none() && solver.method == Method::Adaptive && states > MOST_DENSE && description.coupling.is_empty() {
+    let is_too_dense = states > MOST_DENSE && description.coupling.is_empty();
+    if cut.is_none() && solver.method == Method::Adaptive && is_too_dense {
         let message =
             format!("{states} states, of which each depends on many others, are too many for an adaptive run");
         let error = Diagnostic::error("E0902", message).label(parts.run.span, "with so many states");
@@ -700,17 +703,21 @@ fn variant(
     }
     let mut rig = cut.map(|cut| cut.with_plant(&lowered, own));
     let Lowered { mut program, observed: slots } = lowered;
+    program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
+    for root in &mut program.description.roots {
+        root.text = surface_text(loaded, &root.text);
+    }
+    let mut adaptive = None;
     match &mut rig {
         Some((rig, plant)) => {
             program.size_rings(rig.period_ns as f64 * 1e-9 / f64::from(rig.steps));
             plant.size_rings(solver.step);
         }
-        None if solver.method != Method::Adaptive => program.size_rings(solver.step),
+        None if solver.method != Method::Adaptive => {
+            adaptive = (!is_too_dense).then(|| program.clone());
+            program.size_rings(solver.step);
+        }
         None => {}
-    }
-    program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
-    for root in &mut program.description.roots {
-        root.text = surface_text(loaded, &root.text);
     }
     let series = |at: usize| plan::Series {
         label: wanted[at].text.clone(),
@@ -762,7 +769,7 @@ fn variant(
     });
     let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
     let ports = (inputs.collect(), outputs.collect());
-    Ok(Variant { label, system, types, program, experiment, places, ports, rig })
+    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig })
 }
 
 /// The rig that an experiment runs, with its descriptions; none if it runs a model.

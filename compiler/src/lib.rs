@@ -132,7 +132,11 @@ pub fn varying(
         let (code, notes) = code(&functions, &coded.description, options.interpret);
         let alone = options.interpret || variant.experiment.bench.is_some();
         let lanes = if alone { None } else { code::lanes(&coded, variant.experiment.solver.method) };
-        vary::Varying::new(variant, paths, &loaded.files, code, lanes, notes)
+        let adaptive = variant.adaptive.as_ref().map(|program| {
+            let code = code::on_demand(program, Method::Adaptive, options.interpret);
+            Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
+        });
+        vary::Varying::new(variant, paths, &loaded.files, vary::Runnable { code, lanes, adaptive, notes })
     };
     Ok(variants.into_iter().map(one).collect())
 }
@@ -325,6 +329,8 @@ struct Made {
     program: program::Program,
     method: Method,
     code: Code,
+    /// Code of the same for adaptive runs, if that is another one.
+    adaptive: Option<Code>,
     notes: Vec<String>,
 }
 
@@ -352,24 +358,25 @@ impl Made {
 
 /// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
-    let experiment::Variant { label, mut program, mut experiment, mut rig, .. } = variant;
+    let experiment::Variant { label, mut program, adaptive, mut experiment, mut rig, .. } = variant;
     let stepped = rig.as_mut().map_or(&mut program, |(_, plant)| plant);
     if experiment.solver.method != Method::Adaptive && !stepped.description.delays.is_empty() {
         stepped.size_rings_for_companions(experiment.solver.step);
     }
     let method = rig.as_ref().map_or(experiment.solver.method, |(rig, _)| rig.method);
     let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
-    let (code, notes) = match made {
-        Some(made) if made.fits(&program, method) => (made.code.clone(), made.notes.clone()),
-        _ => {
-            let (code, notes) = code::late(&program, method, interpret);
-            *made = Some(Made { program, method, code: code.clone(), notes: notes.clone() });
-            (code, notes)
-        }
-    };
-    let instance = Instance::new(description, code, &params);
+    if !made.as_ref().is_some_and(|made| made.fits(&program, method)) {
+        let (code, notes) = code::late(&program, method, interpret);
+        let adaptive = adaptive.as_ref().map(|program| code::on_demand(program, Method::Adaptive, interpret));
+        *made = Some(Made { program, method, code, adaptive, notes });
+    }
+    let Made { code, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
+    let mut instance = Instance::new(description, code.clone(), &params);
+    if let Some((program, code)) = adaptive.zip(adaptive_code.clone()) {
+        instance = instance.with_adaptive(Arc::new(Instance::new(Arc::new(program.description), code, &params)));
+    }
     experiment.bench = rig.map(|(rig, plant)| Box::new(bench(rig, &plant, experiment.solver.method, interpret)));
-    Case { label, instance, experiment, notes }
+    Case { label, instance, experiment, notes: notes.clone() }
 }
 
 /// The surroundings of a dry run.

@@ -36,6 +36,7 @@ pub struct Varying {
     params: Vec<f64>,
     code: Code,
     lanes: Option<Lanes>,
+    adaptive: Option<Arc<Instance>>,
     formulas: Func,
     size: usize,
     /// What the values of the formulas are for, in their order.
@@ -65,6 +66,18 @@ enum Use {
     Period,
 }
 
+/// What was compiled of an experiment.
+pub struct Runnable {
+    /// Its code.
+    pub code: Code,
+    /// The same for many runs at once, if there is such.
+    pub lanes: Option<Lanes>,
+    /// Of fixed steps the same program for adaptive runs, if there is such.
+    pub adaptive: Option<Arc<Instance>>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
 /// What a run needs.
 pub struct Fitted {
     /// With its parameters.
@@ -75,14 +88,8 @@ pub struct Fitted {
 
 impl Varying {
     /// From what was read, and its code.
-    pub fn new(
-        variant: Variant,
-        vary: &[String],
-        files: &Files,
-        code: Code,
-        lanes: Option<Lanes>,
-        notes: Vec<String>,
-    ) -> Varying {
+    pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
+        let Runnable { code, lanes, adaptive, notes } = runnable;
         let Variant { label, system, types, program, mut experiment, places, .. } = variant;
         let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
         let (mut exprs, mut uses) = (Vec::new(), Vec::new());
@@ -159,6 +166,7 @@ impl Varying {
             params: program.params,
             code,
             lanes,
+            adaptive,
             formulas,
             size,
             uses,
@@ -190,6 +198,9 @@ impl Varying {
     /// What the values break, in words.
     pub fn fit(&self, values: &[(Slot, f64)]) -> Result<Fitted, String> {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
+        if let Some(adaptive) = &self.adaptive {
+            instance = instance.with_adaptive(adaptive.clone());
+        }
         for (slot, value) in values {
             instance.set(*slot, *value);
         }
@@ -271,6 +282,7 @@ impl Varying {
         }
         if let Some(description) = description {
             let block = instance.block()[self.description.layout.params.range()].to_vec();
+            // The adaptive program would watch other ranges.
             instance = Instance::new(Arc::new(description), self.code.clone(), &block);
         }
         Ok(Fitted { instance, experiment })

@@ -2,24 +2,38 @@
 //!
 //! In: an instance as it was before its run, the plan, and the outcome. Out: the same outcome whose readings and margins carry
 //! their numerical error, whose verdicts are open where that error may turn them over, and an [`Estimate`] of how it was
-//! found: companion runs of the same code at a tenth and a hundredth of the tolerance, or with a half and a quarter of the
-//! step. The run itself is over by then: nothing here can change its bits.
+//! found, by companion runs. The run itself is over by then: nothing here can change its bits.
 //!
-//! The error of a number is the width that all results span, at least; of fixed steps it is extrapolated to the step 0
-//! besides (Richardson) with the order that three runs show, at least 1 and at most that of the method. Two companions
-//! rather than one since two results may agree by accident. Points that all runs share are no accident: what an extreme may
-//! reach between those of the finest run is added, and the end of an experiment lies within a step of each companion.
+//! An adaptive run has companions at a tenth and a hundredth of its tolerance. A run with fixed steps is compared with two
+//! adaptive runs of the same program, which share no points with it, locate events and extremes, and have an error control of
+//! their own. The error of a number is the width that all three results span. Two companions rather than one since two
+//! results may agree by accident. A method that is exact for a model is more accurate than those: where that leaves a verdict
+//! open, finer steps besides say how accurate it is.
+//!
+//! Where a program has no adaptive run, or one that costs too much, companions have a half and a quarter of the step. Their
+//! results are extrapolated to the step 0 besides (Richardson) with the order that three runs show, at least 1 and at most
+//! that of the method. Points that all of these runs share are no accident: what an extreme may reach between those of the
+//! finest run is added, and the end of an experiment lies within a step of each companion.
 
 use crate::engine::{self, Cause, Continue, Estimate, Outcome};
 use crate::verdict::{Reading, Runs, Verdict, judged};
-use abi::plan::{Experiment, Method, Solver};
+use abi::plan::{Experiment, Method, PARTS, Solver};
 use abi::{Description, Instance};
+use std::ops::Range;
 
 /// Tolerances of companions, as parts of that of the run.
 const TOLERANCES: [f64; 2] = [0.1, 0.01];
 
 /// No companion has a smaller tolerance: below, rounding is all there is.
 const LEAST_TOL: f64 = 1e-13;
+
+/// Tolerances of the adaptive runs that fixed steps are compared with, and how many times finer their longest step is: where that
+/// alone decides all steps, two runs with the same one agree whatever their tolerance.
+const REFERENCES: [(f64, f64); 2] = [(1e-8, 1.0), (1e-10, 4.0)];
+
+/// Such a run may look at its caller so often for each thousand fixed steps, and so often besides. It does so every few dozen steps.
+const LOOKS_PER_STEP: f64 = 2e-3;
+const LOOKS: f64 = 400.0;
 
 /// Steps of companions, as parts of that of the run. Powers of two: whatever divides into steps still does.
 const STEPS: [f64; 2] = [0.5, 0.25];
@@ -34,10 +48,10 @@ pub fn judge(
     outcome: &mut Outcome,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) {
-    let Some(mut ladder) = climbed(instance, experiment, outcome, watch) else { return };
+    let Some(mut companions) = accompanied(instance, experiment, outcome, watch) else { return };
     let failed = outcome.estimate.as_ref().is_some_and(|estimate| estimate.failed.is_some());
     if !failed && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
-        let decides = ladder.decides(&outcome.verdicts, outcome.work.steps, watch);
+        let decides = companions.decides(&outcome.verdicts, outcome.work.steps, watch);
         outcome.estimate.get_or_insert_default().decides = decides;
     }
 }
@@ -50,41 +64,52 @@ pub fn errors(
     outcome: &mut Outcome,
     watch: &mut dyn FnMut(f64) -> Continue,
 ) {
-    climbed(instance, experiment, outcome, watch);
+    accompanied(instance, experiment, outcome, watch);
 }
 
 /// Puts the errors into the outcome and gives the runs that they follow from; none where it stays as it was.
-fn climbed<'a>(
+fn accompanied<'a>(
     instance: &'a Instance,
     experiment: &Experiment,
     outcome: &mut Outcome,
     watch: &mut dyn FnMut(f64) -> Continue,
-) -> Option<Ladder<'a>> {
+) -> Option<Companions<'a>> {
     if experiment.expects.is_empty() {
         return None;
     }
     let bare = Experiment { plots: Vec::new(), ..experiment.clone() };
-    let mut ladder = Ladder { instance, bare, runs: Vec::new() };
-    ladder.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
-    for solver in companions(&experiment.solver) {
-        if !ladder.run(solver, watch) {
-            return None;
+    let adaptive = instance.adaptive().filter(|_| experiment.solver.method != Method::Adaptive);
+    let mut companions = Companions { instance, adaptive, bare, runs: Vec::new(), stepped: Vec::new() };
+    companions.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
+    let mut judged = None;
+    if companions.refer(outcome.work.steps, watch)? {
+        let verdicts = companions.verdicts(0, 1..companions.runs.len());
+        if verdicts.iter().all(|verdict| verdict.decided) {
+            judged = Some(verdicts);
+        } else {
+            let referred = companions.runs.len();
+            companions.run_all(finer(&experiment.solver), watch)?;
+            companions.stepped = companions.runs.split_off(referred);
         }
+    } else {
+        companions.adaptive = None;
+        companions.run_all(finer(&experiment.solver), watch)?;
     }
+    outcome.verdicts = judged.unwrap_or_else(|| companions.verdicts(0, 1..companions.runs.len()));
     let mut estimate = Estimate::default();
-    let finer = &ladder.runs[1..];
-    estimate.failed = finer.iter().find_map(|(solver, run)| Some((*solver, run.as_ref().err()?.clone())));
-    estimate.companions = finer.iter().filter(|(_, run)| run.is_ok()).map(|(solver, _)| *solver).collect();
-    outcome.verdicts = ladder.verdicts(0);
+    let finer = || companions.runs[1..].iter();
+    estimate.failed = finer().find_map(|(solver, run)| Some((*solver, run.as_ref().err()?.clone())));
+    let all = finer().chain(&companions.stepped).filter(|(_, run)| run.is_ok());
+    estimate.companions = all.map(|(solver, _)| *solver).collect();
     if experiment.stepped && experiment.solver.method != Method::Adaptive {
         outcome.verdicts.iter_mut().for_each(|verdict| verdict.decided = true);
     }
     outcome.estimate = Some(estimate);
-    Some(ladder)
+    Some(companions)
 }
 
-/// The solvers of the companions of a run, finer and finer; coarser ones where none can be finer.
-fn companions(solver: &Solver) -> Vec<Solver> {
+/// The solvers of the companions of a run by the same method, finer and finer; coarser ones where none can be finer.
+fn finer(solver: &Solver) -> Vec<Solver> {
     match solver.method {
         Method::Adaptive => {
             let finer = |part: f64| Solver { tol: part * solver.tol, parts: 2.0 * solver.parts, ..*solver };
@@ -98,17 +123,53 @@ fn companions(solver: &Solver) -> Vec<Solver> {
     }
 }
 
-/// Runs of one experiment by one method, finer and finer.
-struct Ladder<'a> {
+/// A run: its solver, and its verdicts or why it did not come to its end.
+type Run = (Solver, Result<Vec<Verdict>, String>);
+
+/// Runs of one experiment.
+struct Companions<'a> {
     instance: &'a Instance,
+    /// The same program for adaptive runs, if the experiment has fixed steps and is compared with such.
+    adaptive: Option<Instance>,
     /// Without plots.
     bare: Experiment,
-    /// The verdicts of each, or why it did not come to its end.
-    runs: Vec<(Solver, Result<Vec<Verdict>, String>)>,
+    /// The run itself, then its companions, finer and finer.
+    runs: Vec<Run>,
+    /// Runs with finer steps beside those, if any.
+    stepped: Vec<Run>,
 }
 
-impl Ladder<'_> {
-    /// Makes one more run, which must be finer than the last; false if the caller ended it.
+impl Companions<'_> {
+    /// Makes the adaptive runs that fixed steps, so many, are compared with; false if that cannot be, none if the caller ended it.
+    fn refer(&mut self, steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<bool> {
+        let Some(instance) = &self.adaptive else { return Some(false) };
+        let most = LOOKS + LOOKS_PER_STEP * steps as f64;
+        let mut found = Vec::new();
+        for (tol, finer) in REFERENCES {
+            let solver = Solver { method: Method::Adaptive, step: 0.0, tol, parts: finer * PARTS };
+            let (mut looks, mut stopped) = (0.0, false);
+            let mut within = |fraction: f64| {
+                looks += 1.0;
+                stopped = watch(fraction).is_break();
+                if stopped || looks > most { Continue::Break(()) } else { Continue::Continue(()) }
+            };
+            let ended = engine::run(instance.clone(), &Experiment { solver, ..self.bare.clone() }, &mut within);
+            if stopped {
+                return None;
+            }
+            let Ok(outcome) = ended else { return Some(false) };
+            found.push((solver, Ok(outcome.verdicts)));
+        }
+        self.runs.extend(found);
+        Some(true)
+    }
+
+    /// Makes these runs; none if the caller ended one.
+    fn run_all(&mut self, solvers: Vec<Solver>, watch: &mut dyn FnMut(f64) -> Continue) -> Option<()> {
+        solvers.into_iter().all(|solver| self.run(solver, watch)).then_some(())
+    }
+
+    /// Makes one more run; false if the caller ended it.
     fn run(&mut self, solver: Solver, watch: &mut dyn FnMut(f64) -> Continue) -> bool {
         let plant = self.bare.bench.as_ref().map(|bench| &bench.plant);
         let stepped = plant.unwrap_or(self.instance).description();
@@ -128,12 +189,18 @@ impl Ladder<'_> {
         going
     }
 
-    /// The verdicts of a run, judged by those after it.
-    fn verdicts(&self, of: usize) -> Vec<Verdict> {
+    /// The verdicts of a run, judged by finer ones.
+    fn verdicts(&self, of: usize, finer: Range<usize>) -> Vec<Verdict> {
         let (solver, Ok(own)) = &self.runs[of] else { return Vec::new() };
-        let finer = &self.runs[of + 1..];
+        let finer = &self.runs[finer];
         let failed = finer.iter().any(|(_, run)| run.is_err());
-        let error = |values: &[f64]| Some(if failed { f64::INFINITY } else { error(solver.method, values) });
+        let error = |values: &[f64]| {
+            Some(match self.adaptive.is_some() {
+                _ if failed => f64::INFINITY,
+                true => compared(solver.method, values),
+                false => error(solver.method, values),
+            })
+        };
         let judge = |(k, expect): (usize, &abi::plan::Expect)| {
             let own = &own[k];
             if own.problem.is_some() {
@@ -141,6 +208,10 @@ impl Ladder<'_> {
             }
             let mut readings: Vec<&[Reading]> = vec![&own.readings];
             let mut doubt = false;
+            let stepped = self.stepped.iter().filter(|_| of == 0);
+            let stepped = stepped.map(|(_, run)| run.as_ref().ok().map(|verdicts| &verdicts[k]));
+            let stepped: Option<Vec<&Verdict>> = stepped.map(|one| one.filter(|one| one.problem.is_none())).collect();
+            readings.extend(stepped.iter().flatten().map(|verdict| verdict.readings.as_slice()));
             for (_, run) in finer {
                 match run.as_ref().map(|verdicts| &verdicts[k]) {
                     Ok(verdict) if verdict.problem.is_none() => readings.push(&verdict.readings),
@@ -159,20 +230,24 @@ impl Ladder<'_> {
     /// steps.
     fn decides(&mut self, open: &[Verdict], steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<Solver> {
         let decided = |verdicts: &[Verdict]| !verdicts.is_empty() && verdicts.iter().all(|verdict| verdict.decided);
-        // The companions are judged by those after them.
-        for of in 1..self.runs.len() - 1 {
-            if decided(&self.verdicts(of)) {
-                return Some(self.runs[of].0);
+        let (own, references) = (self.runs[0].0, 1..self.runs.len());
+        let adaptive = own.method == Method::Adaptive;
+        if self.adaptive.is_none() {
+            // The companions are judged by those after them.
+            for of in 1..self.runs.len() - 1 {
+                if decided(&self.verdicts(of, of + 1..self.runs.len())) {
+                    return Some(self.runs[of].0);
+                }
             }
         }
-        // Then as the order of the method foretells; less than a factor of 4 is no news.
+        // Then as the order of the method foretells; less than a factor of 4 is no news of companions that were tried.
         let excess = open.iter().filter(|verdict| !verdict.decided).filter_map(|verdict| {
             let margin = verdict.margin.as_ref()?;
             Some(margin.error? / margin.amount.abs())
         });
-        let excess = excess.fold(4.0, f64::max);
-        let own = self.runs[0].0;
-        for safety in [4.0, 64.0] {
+        let excess = excess.fold(if self.adaptive.is_some() { 1.0 } else { 4.0 }, f64::max);
+        let safeties: &[f64] = if self.adaptive.is_some() { &[1.0, 4.0, 64.0] } else { &[4.0, 64.0] };
+        for safety in safeties {
             let solver = match own.method {
                 Method::Adaptive => {
                     let tol = power_of_ten_below(own.tol / (safety * excess));
@@ -189,20 +264,23 @@ impl Ladder<'_> {
                     Solver { step: part * own.step, ..own }
                 }
             };
-            let work = match own.method {
-                Method::Adaptive => power_of_fifth(own.tol / solver.tol),
-                Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => own.step / solver.step,
-            };
-            if work > MOST_WORK || work * steps as f64 > 2e7 || solver.method == Method::Adaptive && solver.tol < 1e-12
-            {
+            let work = if adaptive { power_of_fifth(own.tol / solver.tol) } else { own.step / solver.step };
+            if work > MOST_WORK || work * steps as f64 > 2e7 || adaptive && solver.tol < 1e-12 {
                 return None;
             }
-            let finer = Solver { step: 0.5 * solver.step, tol: 0.1 * solver.tol, ..solver };
             let at = self.runs.len();
-            if !(self.run(solver, watch) && self.run(finer, watch)) {
+            if !self.run(solver, watch) {
                 return None;
             }
-            if decided(&self.verdicts(at)) {
+            let judges = if self.adaptive.is_some() {
+                references.clone()
+            } else {
+                if !self.run(Solver { step: 0.5 * solver.step, tol: 0.1 * solver.tol, ..solver }, watch) {
+                    return None;
+                }
+                at + 1..at + 2
+            };
+            if decided(&self.verdicts(at, judges)) {
                 return Some(solver);
             }
         }
@@ -254,6 +332,17 @@ fn error(method: Method, values: &[f64]) -> f64 {
         }
         (_, _) => 0.0,
     }
+}
+
+/// The error of the first of these results of fixed steps: of the run, of finer steps if there are such, and of two adaptive runs.
+/// Where it is as near to the second adaptive run as the first one is, they are not more accurate, and finer steps tell more.
+fn compared(method: Method, values: &[f64]) -> f64 {
+    let [own, stepped @ .., first, second] = values else { return f64::INFINITY };
+    let span = error(Method::Adaptive, &[*own, *first, *second]);
+    if stepped.is_empty() || (own - second).abs() > (first - second).abs() {
+        return span;
+    }
+    error(method, &values[..values.len() - 2]).min(span)
 }
 
 /// The order of a fixed method.

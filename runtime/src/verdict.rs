@@ -100,9 +100,12 @@ pub fn judged(expect: &Expect, runs: &Runs) -> Verdict {
         let values: Vec<f64> = runs.readings.iter().map(|readings| readings[k].value).collect();
         // Points that several runs have in common are no news of the course between them: that is as wide open as in the
         // finest of the runs.
-        let beyond = finest[k].unseen + distance(reading.value, finest[k].value);
+        let moved = distance(reading.value, finest[k].value);
+        let beyond = if finest[k].unseen > 0.0 { finest[k].unseen + moved } else { 0.0 };
+        // The instant of an event lies as far from that of the finest run as the two say, if that one has located it.
+        let resolution = reading.resolution.min(finest[k].resolution + moved);
         let rounding = if reading.scale <= NOTHING { reading.value.abs() } else { 0.0 };
-        reading.error = (runs.error)(&values).map(|error| error.max(reading.resolution).max(beyond).max(rounding));
+        reading.error = (runs.error)(&values).map(|error| error.max(resolution).max(beyond).max(rounding));
     }
     if let Formula::Shown(unit, value) = &expect.condition {
         return shown(expect, runs, readings, unit, value);
@@ -276,11 +279,13 @@ impl Evaluation<'_> {
         let error = of(|side| side.0)?.max(of(|side| side.1)?);
         // What a denser look could change in each measure, through the formula.
         let readings = self.runs.readings;
-        let coarse = opened(formula, readings[0], |reading| reading.resolution);
         let finest = readings[readings.len() - 1];
         let ((own, own_width), (fine, fine_width)) = (all[0], all[all.len() - 1]);
         let moved = distance(own, fine).max(distance(own_width, fine_width));
-        let unseen = moved + opened(formula, finest, |reading| reading.unseen);
+        let resolution = |readings| opened(formula, readings, |reading| reading.resolution);
+        let coarse = resolution(readings[0]).min(resolution(finest) + moved);
+        let unseen = opened(formula, finest, |reading| reading.unseen);
+        let unseen = if unseen > 0.0 { unseen + moved } else { 0.0 };
         Some(error.max(coarse).max(unseen))
     }
 }

@@ -251,8 +251,8 @@ fn for_case(path: &Path, label: &str) -> PathBuf {
 /// Work, plot and verdicts in full.
 fn tell(done: &Done, drawn: Option<&Figure>, digits: Option<u8>, terminal: &mut Terminal) {
     let outcomes: Vec<_> = done.results.iter().filter_map(|result| result.as_ref().ok()).collect();
-    if !outcomes.is_empty() {
-        terminal.print(&results::work(&outcomes, done.wall, done.judging));
+    if let Some(case) = done.cases.first().filter(|_| !outcomes.is_empty()) {
+        terminal.print(&results::work(&case.experiment, &outcomes, done.wall, done.judging));
     }
     let mut notes: Vec<&String> = outcomes.iter().flat_map(|outcome| &outcome.notes).collect();
     notes.dedup();

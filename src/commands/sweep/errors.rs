@@ -6,9 +6,10 @@
 
 use super::{Table, extremes};
 use crate::compile::Fitted;
-use crate::value::{count, duration, significant};
+use crate::results;
+use crate::value::{count, significant};
 use crate::vary::Dice;
-use abi::plan::{Expect, Formula, Method, Solver};
+use abi::plan::{Expect, Experiment, Formula, Method, Solver};
 use abi::unit::Unit;
 use runtime::engine::{self, Continue};
 use runtime::estimate;
@@ -37,6 +38,8 @@ pub(super) struct Errors {
     sampled: u64,
     ended: u64,
     total: u64,
+    /// The experiment of the first case.
+    experiment: Experiment,
     /// Solvers of the companions.
     companions: Vec<Solver>,
     /// For each measure its text, its unit, and the largest error; none where it could be taken in no run.
@@ -63,6 +66,7 @@ impl Table {
             sampled: numbers.len() as u64,
             ended: 0,
             total: range.end - range.start,
+            experiment: self.cases[0].experiment.clone(),
             companions: Vec::new(),
             measures: measures.map(|measure| (measure.text.clone(), measure.unit.clone(), None)).collect(),
             verdicts: 0,
@@ -146,15 +150,12 @@ impl Errors {
         if self.sampled == 0 {
             return "  errors: none of the runs sampled of the whole table lies in this shard\n".into();
         }
-        let by = match self.companions.first().map(|finer| finer.method) {
-            None => String::new(),
-            Some(Method::Adaptive) => {
-                let all: Vec<String> = self.companions.iter().map(|finer| significant(finer.tol, 3)).collect();
-                format!(", by tol {}", all.join(" and "))
-            }
-            Some(_) => {
-                let all: Vec<String> = self.companions.iter().map(|finer| duration(finer.step)).collect();
-                format!(", discretisation by steps of {}", all.join(" and "))
+        let adaptive = self.experiment.solver.method == Method::Adaptive;
+        let by = match self.companions.as_slice() {
+            [] => String::new(),
+            all => {
+                let kind = if adaptive { "" } else { "discretisation " };
+                format!(", {kind}by {}", results::finer(&self.experiment, all))
             }
         };
         let lost = match self.sampled - self.ended {
@@ -178,7 +179,6 @@ impl Errors {
         }
         if let Some((text, number)) = self.open.first() {
             let (open, all) = (count(self.open.len() as u64), count(self.verdicts));
-            let adaptive = self.companions.first().is_some_and(|finer| finer.method == Method::Adaptive);
             let remedy = if adaptive { "--tol" } else { "--step" };
             out += &format!(
                 "    {open} of {all} verdicts undecided, first {text} (run {number}): give a smaller {remedy}\n"
