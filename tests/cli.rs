@@ -554,6 +554,39 @@ experiment fine {
     assert!(out.contains("735.758882"), "{out}");
 }
 
+/// Numbers without a unit that a sweep varies: how many parts there are is compiled in, and a state starts from one.
+#[test]
+fn a_sweep_varies_plain_numbers() {
+    let text = r#"
+model One { output b [1] = 1 }
+model Many {
+  param  n = 3  in 1 .. 10
+  param  follows = 2 * n
+  state  x [1] = n
+  part   q[i in 1 .. n] = One()
+  dx/dt  = -x / 1 s
+  output o [1] = sum(q.b)
+  output p [1] = x + follows
+}
+experiment it {
+  run    Many() for 10 ms
+  expect final(o) > 0
+  expect at(p, 0 s) > 0
+}
+"#;
+    let folder = Folder::new("plain").with("many.fric", text);
+    let (_, said) = folder.check(&["sweep", "many.fric", "it", "--vary", "n = 2, 5", "--out", "a.csv"], 1, "");
+    assert!(said.contains("decides how many parts"), "{said}");
+    for (vary, found) in [("x = 4, 5", ["10", "11"]), ("follows = 1, 2", ["4", "5"])] {
+        folder.check(&["sweep", "many.fric", "it", "--vary", vary, "--out", "b.csv", "-q"], 0, "");
+        let table = fs::read_to_string(folder.0.join("b.csv")).unwrap();
+        let rows: Vec<&str> = table.lines().skip(1).collect();
+        for (row, found) in rows.iter().zip(found) {
+            assert!(row.contains(&format!(",{found},true,ok")), "{vary}: {table}");
+        }
+    }
+}
+
 /// A measure made of measures is shown in their unit, an integral of a power as an energy.
 #[test]
 fn measures_are_shown_in_their_own_units() {

@@ -88,7 +88,10 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
     {
         return Some(cases);
     }
-    let shown = |vary: &Vary| format!("{}={} {}", vary.path, vary.unit.from_si(vary.typical()), vary.unit);
+    let shown = |vary: &Vary| {
+        let unit = Some(vary.unit.to_string()).filter(|unit| unit != "1").unwrap_or_default();
+        format!("{}={} {unit}", vary.path, vary.unit.from_si(vary.typical()))
+    };
     options.changes.set.extend(missing.into_iter().map(shown));
     match compile::varying(loaded, &project::Disk, name, &options, &mut Vec::new()) {
         Ok(cases) => Some(cases),
