@@ -24,6 +24,8 @@ fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
     recording.rows().map(<[f64]>::to_vec).collect()
 }
 
+/// Mutants tried by hand: rows of fixed steps come one step late (red in case 0 of seed 1), rows of adaptive runs are the end of
+/// the step in place of a point of its polynomial (case 2).
 #[test]
 fn rows_lie_on_the_course_of_the_run() {
     let from =

@@ -3,9 +3,11 @@
 
 mod support;
 
+use abi::description::Kind;
 use abi::plan::Method;
+use compiler::ir::random::Random;
 use compiler::vary::{Fitted, Varying};
-use compiler::{Changes, Options};
+use compiler::{Case, Changes, Options};
 use runtime::engine::{self, Continue, Failure, Outcome};
 use runtime::lanes::{self, Next};
 use support::Texts;
@@ -41,6 +43,7 @@ experiment last    { run Pull() for 10 s  expect final(x) > 0 m }
 experiment measured { run Pull() for 10 s  expect max(v) > 0 m/s  expect mean(power) > 0 W after 2 s }
 experiment regimes { run Pull(fr = Karnopp()) for 10 s  expect max(x) > 0 m }
 experiment narrow  { run Pull(fr = Karnopp(Dv = 1 um/s, Fv = 0 N·s/m)) for 20 s  expect final(x) > 0 m }
+experiment held    { run Pull(fr = KFM()) for 10 s  expect final(x) > 0 m }
 experiment sampled { run Sampled() for 2 s  expect final(x) > -10 m }
 "#;
 
@@ -60,8 +63,15 @@ fn go_on(_: f64) -> Continue {
 
 /// `runs` runs with values from `low` on; returns how many failed.
 fn compare(varying: &Varying, path: &str, runs: usize, low: f64, by: f64) -> usize {
+    let values: Vec<f64> = (0..runs).map(|k| low + by * k as f64).collect();
+    in_lanes_and_alone(varying, path, &values).iter().filter(|outcome| outcome.is_err()).count()
+}
+
+/// A run with each of these values, in SI: together in lanes, and each alone with the same result to the bit.
+fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Result<Outcome, Failure>> {
+    let runs = values.len();
     let slot = varying.param(path).expect("it is a parameter").slot;
-    let fitted = |k: usize| varying.fit(&[(slot, low + by * k as f64)]).expect("the values fit");
+    let fitted = |k: usize| varying.fit(&[(slot, values[k])]).expect("the values fit");
     let lanes = varying.lanes().expect("this processor has lanes, and so has the model");
     let mut found: Vec<Option<Result<Outcome, Failure>>> = vec![None; runs];
     let mut left = 0..runs;
@@ -78,15 +88,76 @@ fn compare(varying: &Varying, path: &str, runs: usize, low: f64, by: f64) -> usi
         })
     };
     lanes::run(lanes, &mut next, &mut |k: usize, outcome| found[k] = Some(outcome), &mut go_on);
-    let mut failed = 0;
+    let mut all = Vec::with_capacity(runs);
     for (k, found) in found.into_iter().enumerate() {
         let found = found.unwrap_or_else(|| panic!("run {k} came to nothing"));
         let Fitted { instance, experiment } = fitted(k);
         let alone = engine::run(instance, &experiment, &mut go_on);
-        failed += usize::from(alone.is_err());
-        assert_eq!(found, alone, "run {k} of `{}`", varying.label);
+        assert_eq!(found, alone, "run {k} of `{}`, {path} = {}", varying.label, values[k]);
+        all.push(found);
     }
-    failed
+    all
+}
+
+/// A start value that changes from lane to lane is one given with `--set`, to the bit: states of all kinds, all methods.
+///
+/// Mutants tried by hand, each red with seed 1: every run of a sweep starts where the first one does (`fit`); the start value as
+/// written stays although it is varied; sampled states cannot be varied (`starts::open`).
+#[test]
+fn start_values_share_their_lanes() {
+    let from =
+        |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
+    let (seed, draws) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 16));
+    if !has_lanes() {
+        return;
+    }
+    let mut random = Random(seed);
+    let mut apart = 0;
+    for draw in 0..draws {
+        let experiment = ["last", "measured", "regimes", "held", "sampled"][random.below(5)];
+        let method = Method::ALL[random.below(Method::ALL.len())];
+        let solver = match method {
+            Method::Adaptive => None,
+            Method::Euler | Method::Rk4 => Some((method, 1e-4)),
+            Method::Expo | Method::Implicit => Some((method, [1e-3, 5e-4][random.below(2)])),
+        };
+        let (method, step) = solver.unzip();
+        let plain = Changes { method, step, ..Changes::default() };
+        let case = compiled(experiment, plain.clone());
+        let description = case.instance.description().clone();
+        let is_state = |kind| matches!(kind, Kind::State | Kind::SampledState);
+        let states: Vec<_> = description.quantities.iter().filter(|q| is_state(q.kind) && !q.boolean).collect();
+        let state = states[random.below(states.len())];
+        let (low, high) = state.range;
+        let size = if (high - low).is_finite() { 0.4 * (high - low) } else { 0.3 };
+        let unit = if state.unit.text == "1" { "" } else { &state.unit.text };
+        let numbers: Vec<f64> = (0..20).map(|_| state.unit.from_si(size * random.within(-1.0, 1.0))).collect();
+        let values: Vec<f64> = numbers.iter().map(|number| state.unit.to_si(*number)).collect();
+        let place = format!("seed {seed}, draw {draw}: {experiment}, {} by {solver:?}", state.path);
+        println!("{place}");
+        let outcomes = in_lanes_and_alone(&varying(experiment, &state.path, solver), &state.path, &values);
+        let last = |outcome: &Result<Outcome, Failure>| match outcome {
+            Ok(outcome) => Ok(outcome.finals.iter().map(|last| last.value.to_bits()).collect::<Vec<u64>>()),
+            Err(failure) => Err(failure.to_string()),
+        };
+        for (k, found) in outcomes.iter().enumerate().step_by(7) {
+            let set = vec![format!("{}={:e} {unit}", state.path, numbers[k])];
+            let case = compiled(experiment, Changes { set, ..plain.clone() });
+            let by_set = engine::run(case.instance, &case.experiment, &mut go_on);
+            assert_eq!(last(found), last(&by_set), "{place}, start {} {unit}", numbers[k]);
+        }
+        apart += u64::from(last(&outcomes[0]) != last(&outcomes[7]));
+    }
+    println!("seed {seed}: {draws} drawn, {apart} with other ends");
+    assert!(apart * 2 > draws, "{apart} of {draws} start values matter: nothing is tested");
+}
+
+/// The only case of an experiment.
+fn compiled(experiment: &str, changes: Changes) -> Case {
+    let mut loaded = compiler::load("lanes.fric", TEXT, &Texts::default());
+    let options = Options { changes, interpret: false };
+    let cases = compiler::compile(&mut loaded, &Texts::default(), experiment, &options, &mut Vec::new(), &mut |_| ());
+    cases.unwrap_or_else(|found| panic!("{experiment}: {found:?}")).remove(0)
 }
 
 #[test]
