@@ -22,6 +22,7 @@ fn text(seed: u64) -> String {
     text + &format!("experiment it {{ run M() for 1 s  solver {method} step 1 ms  plot n, level, more }}\n")
 }
 
+/// When the whole condition was triggered by its edge once more, 31 of these 40 cases failed, the first with seed 2.
 #[test]
 fn an_event_happens_at_every_crossing() {
     for seed in seeds(40) {
