@@ -329,7 +329,12 @@ fn bus_fault(chance: &mut Chance, sort: Sort) -> What {
         2 => What::Alone(bus),
         3 => What::Down(bus),
         4 => What::Babble(bus),
-        5 => What::Foreign(bus, pick(chance, &[0x080, 0x000, 0x603, 0x203, 0x77E])),
+        5 => {
+            // To the drive of this bus: set-points of each number, a request for an object.
+            let node = 3 + bus as u32;
+            let to_drive = [0x200, 0x300, 0x400, 0x500, 0x600].map(|base| base + node);
+            What::Foreign(bus, pick(chance, &[&[0x080, 0x000, 0x77E][..], &to_drive].concat()))
+        }
         _ => {
             let most = pick(chance, &[2, 3, 12]);
             What::Frozen(chance.below(most) * MS + chance.below(1000) * 1000)

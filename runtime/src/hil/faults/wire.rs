@@ -97,7 +97,7 @@ pub fn is_foreign(rig: &Rig, bus: usize, frame: &Frame) -> bool {
         // Network management, SYNC.
         0x000 | 0x080 if node == 0 => true,
         // Set-points, requests for objects.
-        0x200 | 0x600 => named(node),
+        0x200 | 0x300 | 0x400 | 0x500 | 0x600 => named(node),
         // A heartbeat.
         0x700 => !named(node),
         _ => false,
