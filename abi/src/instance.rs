@@ -246,7 +246,7 @@ impl Instance {
 mod tests {
     use super::*;
     use crate::description::Layout;
-    use crate::table::{Entry, Interpret, Prepared};
+    use crate::table::{Interpret, Prepared};
 
     /// Counts many steps, one not, and knows no time.
     struct Counts;
@@ -304,7 +304,6 @@ mod tests {
             Machine::new([None; Function::ALL.len()], 6, 0, Arc::new(())).with_prepared(Prepared {
                 prepare: Some(prepare),
                 step,
-                told: None,
                 len: 1,
             })
         };
@@ -320,41 +319,5 @@ mod tests {
         assert_eq!(after(&|instance| instance.set(Slot::STEP, 0.5)), (24.0, 3.0, 6));
         assert_eq!(after(&|instance| instance.block_mut()[param.index()] = 4.0), (32.0, 4.0, 6));
         assert_eq!(after(&|instance| *instance = instance.clone()), (40.0, 4.0, 6), "a copy has it too");
-    }
-
-    unsafe extern "C" fn refused(block: *mut f64, _: *const f64, _: u64) -> u64 {
-        // SAFETY: as above.
-        unsafe { *block.add(5) = 1.0 };
-        (-f64::NAN).to_bits()
-    }
-
-    unsafe extern "C" fn failed(block: *mut f64, _: *const f64, count: u64) -> u64 {
-        // SAFETY: as above.
-        unsafe { *block.add(4) += 2.0 };
-        count + 2
-    }
-
-    unsafe extern "C" fn told(block: *mut f64, _: *const f64, _: u64) -> u64 {
-        // SAFETY: as above.
-        unsafe { *block.add(5) as u64 + 6 }
-    }
-
-    #[test]
-    fn of_a_prepared_step_that_gives_back_nan_what_it_left_tells_or_the_other_makes_it_again() {
-        let layout = Layout::new([1, 0, 1, 1, 0, 0, 0, 0, 0, 0]);
-        let state = layout.states.slot(0);
-        let description = Arc::new(Description { layout, ..Description::default() });
-        let mut entries = [None; Function::ALL.len()];
-        entries[Function::Step as usize] = Some(failed as Entry);
-        // SAFETY: they access the block.
-        let instance = |told| unsafe {
-            let prepared = Prepared { prepare: None, step: refused, told, len: 0 };
-            let machine = Machine::new(entries, 6, 0, Arc::new(())).with_prepared(prepared);
-            Instance::new(description.clone(), Code::Machine(machine), &[1.0])
-        };
-        let mut made_again = instance(None);
-        assert_eq!((made_again.advance(1), made_again.get(state)), (3, 2.0));
-        let mut asked = instance(Some(told as Entry));
-        assert_eq!((asked.advance(1), asked.get(state)), (7, 0.0));
     }
 }

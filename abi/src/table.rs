@@ -86,11 +86,8 @@ pub struct Prepared {
     /// Writes these numbers, whatever the count; none if there are none.
     pub prepare: Option<Entry>,
     /// One step, on a block whose numbers were written since a parameter or the length of the step changed; the count is 1. It
-    /// gives back the status, or the bits of a NaN, which are no status, if `told` is to find it out.
+    /// returns the status.
     pub step: Entry,
-    /// Gives the status of a step that has given back NaN, from the block that it has left, and changes nothing. If there is none,
-    /// the [`Entry`] for any number of steps is to make the step again: what that reads is as it was.
-    pub told: Option<Entry>,
     /// How many they are.
     pub len: usize,
 }
@@ -195,20 +192,14 @@ impl Machine {
     /// One fixed step on a block with the numbers of [`Prepared`] behind it, which are written before unless they are `there`;
     /// none if the code has no such step.
     pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], there: bool) -> Option<u64> {
-        let Prepared { prepare, step, told, len } = self.prepared?;
+        let Prepared { prepare, step, len } = self.prepared?;
         self.check(block, pool, len);
         if let Some(prepare) = prepare.filter(|_| !there) {
             // SAFETY: `with_prepared` was promised that it accesses only the lengths just checked.
             unsafe { prepare(block.as_mut_ptr(), pool.as_ptr(), 1) };
         }
         // SAFETY: as above.
-        let status = unsafe { step(block.as_mut_ptr(), pool.as_ptr(), 1) };
-        Some(match told {
-            _ if !f64::from_bits(status).is_nan() => status,
-            // SAFETY: as above.
-            Some(told) => unsafe { told(block.as_mut_ptr(), pool.as_ptr(), 1) },
-            None => self.call(Function::Step, block, pool, 1),
-        })
+        Some(unsafe { step(block.as_mut_ptr(), pool.as_ptr(), 1) })
     }
 
     fn check(&self, block: &[f64], pool: &[f64], more: usize) {

@@ -6,7 +6,6 @@ use abi::image::Target;
 use abi::lanes::Batch;
 use abi::table::{Code, Function, Interpret};
 use abi::{Description, Slot};
-use compiler::backend::target::{self, Coder};
 use compiler::backend::wide::{self, Width};
 use compiler::backend::{blob, c, jit};
 use std::fs;
@@ -20,8 +19,6 @@ pub struct Agreed {
     pub results: Vec<Result>,
     /// The widths of lanes that took part; none where there are no lanes for it.
     pub lanes: Vec<&'static str>,
-    /// Whether a single step is in our own instructions.
-    pub own: bool,
 }
 
 /// Runs cases on every back end, C at this level of optimisation (long lines take gcc long); panics at the first
@@ -43,13 +40,11 @@ pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
         }
         agreed
     });
-    expected.into_iter().zip(agreed).map(|(results, (lanes, own))| Agreed { results, lanes, own }).collect()
+    expected.into_iter().zip(agreed).map(|(results, lanes)| Agreed { results, lanes }).collect()
 }
 
-/// What needs no other program: lanes, machine code in memory, an image. The widths of lanes that took part in each case, and
-/// whether single steps are in our own instructions.
-fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<(Vec<&'static str>, bool)> {
-    let coder = Coder::new(target::here().expect("tests run where code is made for"));
+/// What needs no other program: lanes, machine code in memory, an image. The widths of lanes that took part in each case.
+fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'static str>> {
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");
     let one = |(case, expected): (&Case, &Vec<Result>)| {
@@ -67,9 +62,7 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<(Vec<&'sta
                 true
             })
         };
-        let step = case.functions.iter().find(|(function, _)| *function == Function::Step);
-        let own = step.is_some_and(|(_, func)| coder.has_own_single(func));
-        (widths.iter().filter(took_part).map(|width| width.name()).collect(), own)
+        widths.iter().filter(took_part).map(|width| width.name()).collect()
     };
     cases.iter().zip(expected).map(one).collect()
 }

@@ -101,14 +101,6 @@ fn seeds_of_operations_agree() {
     assert!(seen.group("operation").len() >= 16, "operations of every kind");
     assert!(seen.count("runs stopped") * 20 > seen.count("runs"));
     assert!(seen.count("value/NaN") * 4 < seen.count("values"));
-    own_single_steps(&seen);
-}
-
-/// Of enough programs a single step is in our own instructions, where there are such.
-#[track_caller]
-fn own_single_steps(seen: &Distribution) {
-    let (own, programs) = (seen.count("single steps of our own"), seen.count("programs"));
-    assert!(own * 10 >= programs || !cfg!(target_arch = "x86_64"), "{own} of {programs} programs");
 }
 
 #[test]
@@ -148,7 +140,6 @@ fn seeds_of_changed_texts_agree() {
     assert!(seen.count("seeds kept") * 3 >= seen.count("seeds"), "enough of what is changed still checks");
     assert!(seen.group("of").len() >= 30, "of many texts");
     assert!(seen.group("mutation").len() >= 8, "changed in every way");
-    own_single_steps(&seen);
     assert!(seen.count("programs with distinct results") * 10 >= programs * 9);
 }
 

@@ -59,7 +59,6 @@ impl Distribution {
         for width in &agreed.lanes {
             self.add(&format!("lanes/{width}"), 1);
         }
-        self.add("single steps of our own", usize::from(agreed.own));
         for (function, func) in &case.functions {
             self.add(&format!("function/{}", function.name()), 1);
             self.add(&format!("length/{:06}", func.ops.len()), 1);
@@ -117,7 +116,6 @@ impl Distribution {
         line("programs with", shares("with", programs));
         line("elementary functions, of programs", shares("elementary", programs));
         line("lanes, of programs", or_none(shares("lanes", programs)));
-        line("single steps in our own instructions", share(self.count("single steps of our own"), programs));
         line(
             "functions",
             self.group("function").iter().map(|(name, n)| format!("{n} {name}")).collect::<Vec<_>>().join(", "),

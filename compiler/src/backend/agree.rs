@@ -5,7 +5,7 @@ use super::copies::asked_by_many;
 use super::cut::{Lengths, cut};
 use super::interp::Interpreter;
 use super::jit::{compile, compile_prepared, cut_at};
-use super::target::{self, Coder, with};
+use super::target::{Coder, with};
 use super::wide::{self, Width};
 use crate::ir::build::Build;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
@@ -413,9 +413,6 @@ fn parameters_read_in_pairs_agree() {
         build.store(layout.outputs.slot(slot), output);
     }
     let funcs = [(Function::Step, build.finish())];
-    let here = target::here().expect("there is machine code");
-    let own = Coder::new(here).has_own_single(&funcs[0].1);
-    assert_eq!(own, cfg!(all(target_arch = "x86_64", unix)));
     let code = compile_prepared(&funcs, &layout, 0).unwrap().0;
     let len = code.prepared().expect("a single step has code of its own").len;
     assert_eq!(len, 1, "a ratio of parameters");
@@ -710,15 +707,12 @@ fn springs(number: u32) -> (Func, Layout) {
     (build.finish(), layout)
 }
 
-/// Whatever number stands where a regime does, −0 and none of its own too: with one automaton in our own instructions, with
-/// four in copies for the direction.
+/// Whatever number stands where a regime does, −0 and none of its own too: of one automaton, and of four in copies for the direction.
 #[test]
 fn any_number_of_a_regime_agrees() {
     let numbers = [0.0, -0.0, 1.0, 2.0, 7.0, f64::NAN];
     for count in [1, 4] {
         let (func, layout) = springs(count);
-        let here = target::here().expect("there is machine code");
-        assert_eq!(Coder::new(here).has_own_single(&func), count == 1 && cfg!(all(target_arch = "x86_64", unix)));
         assert_eq!(asked_by_many(&func).is_some(), count > 1);
         let mut blocks = Vec::new();
         for v in [-0.7, -0.0, 0.0, 0.7, f64::NAN, f64::INFINITY] {

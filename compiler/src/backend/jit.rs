@@ -102,8 +102,7 @@ fn generate(
             Some(prepared) => {
                 let id = define(&prepared.bytes)?;
                 let prepare = prepared.prepare.as_ref().map(&mut define).transpose()?;
-                let told = prepared.told.as_ref().map(&mut define).transpose()?;
-                single = Some((id, prepare, told, prepared.len));
+                single = Some((id, prepare, prepared.len));
                 (id, prepared.many, prepared.bytes.code.len())
             }
             None => {
@@ -123,10 +122,9 @@ fn generate(
     };
     let mut entries = [None; Function::ALL.len()];
     ids.into_iter().for_each(|(function, id, at)| entries[function as usize] = Some(entry(id, at)));
-    let prepared = single.map(|(step, prepare, told, len)| Prepared {
+    let prepared = single.map(|(step, prepare, len)| Prepared {
         prepare: prepare.map(|id| entry(id, 0)),
         step: entry(step, 0),
-        told: told.map(|id| entry(id, 0)),
         len,
     });
     Ok((entries, prepared, memory, stats))

@@ -10,19 +10,6 @@ use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
 use std::collections::HashMap;
 
-/// For how many iterations code of one is called.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub enum Called {
-    /// Any number: all counts but one it leaves to others.
-    Any,
-    /// One.
-    One,
-    /// One, which is made again where NaN is given back: see [`Prepared`](abi::table::Prepared).
-    OneOrAgain,
-    /// One, of which what it has left tells the status where NaN is given back.
-    OneOrTold,
-}
-
 /// A function in two parts.
 pub struct Halves {
     /// Writes the numbers, each to a slot behind the block.

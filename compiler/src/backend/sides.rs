@@ -15,8 +15,6 @@ pub struct Sides {
     pub of_choice: HashMap<Value, [usize; 2]>,
     /// Choices that stand behind each other and ask the same are taken apart together: those of the first of them.
     pub together: HashMap<Value, Vec<Value>>,
-    /// What each side costs, those within it too.
-    pub costs: Vec<u32>,
 }
 
 /// Operations, by their cost, from which on a side is long.
@@ -124,8 +122,7 @@ impl Sides {
         for value in list {
             members[kept(side_of[value].unwrap_or(0))].push(*value);
         }
-        let costs = sides.into_iter().map(|side| side.cost).collect();
-        Sides { members, of_choice, together, costs }
+        Sides { members, of_choice, together }
     }
 }
 

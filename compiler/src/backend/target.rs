@@ -5,19 +5,17 @@
 
 use super::clif::{self, Facts};
 use super::cut::{Lengths, cut};
-use super::listing::listing;
 use super::pieces;
-use super::prepared::{Called, Halves};
-use super::told::told;
+use super::prepared::Halves;
 use super::unsupported::Unsupported;
-use super::wide::{pairs, single};
+use super::wide::pairs;
 use crate::ir::Func;
 use crate::ir::build::prune;
 use abi::image::{Feature, Target};
 use abi::{Layout, Slot};
 use cranelift_codegen::binemit::Reloc;
 use cranelift_codegen::ir::{self as cranelift, ExternalName};
-use cranelift_codegen::isa::{self, CallConv, OwnedTargetIsa, TargetIsa};
+use cranelift_codegen::isa::{self, OwnedTargetIsa, TargetIsa};
 use cranelift_codegen::settings::{Configurable, Flags, builder};
 use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelocTarget};
 use cranelift_frontend::FunctionBuilderContext;
@@ -29,8 +27,6 @@ pub struct Coder<'a> {
     context: Context,
     builder: FunctionBuilderContext,
     lengths: Lengths,
-    /// Whether the processor has AVX-512 F and DQ.
-    avx512: bool,
 }
 
 /// Code of a function, and the power of two at a multiple of which it must begin.
@@ -49,8 +45,6 @@ pub struct PreparedBytes {
     pub many: usize,
     /// What prepares, if there is anything to.
     pub prepare: Option<Bytes>,
-    /// What tells the status of an iteration that has given back NaN, if it is not to be made again.
-    pub told: Option<Bytes>,
     /// How many numbers lie behind the block.
     pub len: usize,
 }
@@ -60,32 +54,12 @@ struct Parts {
     all: Bytes,
     /// At which byte what makes any number of iterations begins.
     many: usize,
-    /// Whether what makes one is in our own instructions.
-    is_own: bool,
-}
-
-/// What makes one iteration.
-struct Single {
-    func: Func,
-    /// How blocks are laid out, where parameters and what is behind a block are written seldom.
-    layout: Option<Layout>,
-    /// What an iteration reads of which nothing is prepared.
-    read: Vec<Slot>,
-    called: Called,
 }
 
 impl<'a> Coder<'a> {
     /// For this processor or target.
     pub fn new(isa: &'a OwnedTargetIsa) -> Coder<'a> {
-        Coder {
-            isa: &**isa,
-            context: Context::new(),
-            builder: FunctionBuilderContext::new(),
-            lengths: Lengths::USUAL,
-            avx512: ["has_avx512f", "has_avx512dq"]
-                .iter()
-                .all(|name| isa.isa_flags().iter().any(|flag| flag.name == *name && flag.as_bool() == Some(true))),
-        }
+        Coder { isa: &**isa, context: Context::new(), builder: FunctionBuilderContext::new(), lengths: Lengths::USUAL }
     }
 
     /// Other lengths of functions and pieces than the usual.
@@ -98,7 +72,8 @@ impl<'a> Coder<'a> {
     /// # Panics
     /// If the code calls anything but its own pieces: a mistake of `clif`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
-        Ok(self.parts(func, self.asking(func))?.all)
+        let single = self.single(func);
+        Ok(self.parts(func, single.as_ref(), true)?.all)
     }
 
     /// The code of a function on blocks of this layout whose single iterations find prepared what hangs on parameters and
@@ -107,15 +82,9 @@ impl<'a> Coder<'a> {
         let Some(single) = self.single(func) else { return Ok(None) };
         let Halves { prepare, step } = Halves::of(&single, layout);
         let len = prepare.stores.len();
-        let layout = Some(layout.clone());
-        let told = if single::may_be(&step) { told(&single) } else { None };
-        let called = if told.is_some() { Called::OneOrTold } else { Called::OneOrAgain };
-        let of_one = Single { func: step, layout, read: single.loads(), called };
-        let Parts { all: bytes, many, is_own } = self.parts(func, Some(of_one))?;
-        let prepare = if len > 0 { Some(self.once(prepare)?) } else { None };
-        // What is not in our own instructions always gives the status.
-        let told = told.filter(|_| is_own).map(|told| self.plain(&told, None)).transpose()?;
-        Ok(Some(PreparedBytes { bytes, many, prepare, told, len }))
+        let Parts { all: bytes, many } = self.parts(func, Some(&step), false)?;
+        let prepare = if len > 0 { Some(self.plain(&prepare, None)?) } else { None };
+        Ok(Some(PreparedBytes { bytes, many, prepare, len }))
     }
 
     /// The code of a function for any number of iterations, in one piece, as Cranelift makes it.
@@ -125,30 +94,13 @@ impl<'a> Coder<'a> {
         self.bytes(func)
     }
 
-    /// The code of a function that is called for one iteration only.
-    fn once(&mut self, func: Func) -> Result<Bytes, Unsupported> {
-        let single = Single { read: func.loads(), func, layout: None, called: Called::One };
-        if let Some(own) = self.own(&single) {
-            return Ok(Bytes { code: own.code, alignment: 64 });
-        }
-        self.plain(&single.func, None)
-    }
-
-    /// All parts of the code of a function.
-    fn parts(&mut self, func: &Func, single: Option<Single>) -> Result<Parts, Unsupported> {
+    /// All parts of the code of a function: of one iteration, if that has code of its own, and of any number. If it `asks`, that
+    /// of one iteration leaves all other counts to the other.
+    fn parts(&mut self, func: &Func, single: Option<&Func>, asks: bool) -> Result<Parts, Unsupported> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        let several = single.is_some();
-        let (own, single) = self.own_or_not(single);
-        let is_own = own.is_some();
-        if let Some(own) = own {
-            begins.push(0);
-            let to_others = own.to_others.into_iter();
-            calls.extend(to_others.map(|at| (at, Call { kind: Reloc::X86CallPCRel4, piece: 0, addend: -4 })));
-            all = Bytes { code: own.code, alignment: 64 };
-        }
-        self.each_part(func, single.as_ref(), several, |_, isa, context| {
+        self.each_part(func, single, asks, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -169,7 +121,7 @@ impl<'a> Coder<'a> {
             // What calls lies first.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
-        Ok(Parts { all, many: if several { begins[1] } else { 0 }, is_own })
+        Ok(Parts { all, many: if single.is_some() { begins[1] } else { 0 } })
     }
 
     /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are
@@ -195,12 +147,8 @@ impl<'a> Coder<'a> {
 
     /// The function as Cranelift's own IR.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let single = self.asking(func);
-        let several = single.is_some();
-        let (own, single) = self.own_or_not(single);
-        let mut text =
-            if own.is_some() { title("one iteration is not Cranelift's: see the assembly") } else { String::new() };
-        self.each_part(func, single.as_ref(), several, |what, _, context| {
+        let (single, mut text) = (self.single(func), String::new());
+        self.each_part(func, single.as_ref(), true, |what, _, context| {
             text += &what;
             text += &context.func.display().to_string();
             Ok(())
@@ -208,17 +156,10 @@ impl<'a> Coder<'a> {
         Ok(text)
     }
 
-    /// The function as assembly; what Cranelift makes as Cranelift writes it.
+    /// The function as assembly, as Cranelift writes it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
-        let mut text = String::new();
-        let single = self.asking(func);
-        let several = single.is_some();
-        let (own, single) = self.own_or_not(single);
-        if let Some(own) = &own {
-            text += &title(ONE);
-            text += &listing(&own.code, own.len, &own.to_others);
-        }
-        self.each_part(func, single.as_ref(), several, |what, isa, context| {
+        let (single, mut text) = (self.single(func), String::new());
+        self.each_part(func, single.as_ref(), true, |what, isa, context| {
             context.set_disasm(true);
             let compiled = context.compile(isa, &mut Default::default());
             text += &what;
@@ -228,58 +169,28 @@ impl<'a> Coder<'a> {
         Ok(text)
     }
 
-    /// Whether a single iteration of a function is in our own instructions.
-    pub fn has_own_single(&self, func: &Func) -> bool {
-        self.own_or_not(self.asking(func)).0.is_some()
-    }
-
-    /// What makes a single iteration of a function and leaves all other counts to others, if that has code of its own.
-    fn asking(&self, func: &Func) -> Option<Single> {
-        self.single(func).map(|func| Single { read: func.loads(), func, layout: None, called: Called::Any })
-    }
-
-    /// A single iteration in our own instructions, or what is left to Cranelift.
-    fn own_or_not(&self, single: Option<Single>) -> (Option<single::Single>, Option<Single>) {
-        match single.as_ref().and_then(|single| self.own(single)) {
-            Some(own) => (Some(own), None),
-            None => (None, single),
-        }
-    }
-
     /// What makes a single iteration of a function, if that has code of its own.
     fn single(&self, func: &Func) -> Option<Func> {
         (func.ops.len() <= self.lengths.whole && clif::has_single(func)).then(|| uncounted(func))
     }
 
-    /// A single iteration in our own instructions, where there are such.
-    fn own(&self, single: &Single) -> Option<single::Single> {
-        let ours = self.isa.name() == "x64" && self.isa.default_call_conv() == CallConv::SystemV;
-        let rests = |slot: Slot| {
-            single.layout.as_ref().is_some_and(|layout| layout.params.contains(slot) || slot.index() >= layout.size())
-        };
-        if !ours {
-            return None;
-        }
-        single::single(&single.func, single.called, &single.read, self.avx512, rests).ok()
-    }
-
-    /// Gives the function as Cranelift's own: whole, behind the single iteration that is left to it, or cut: then the loop
-    /// first and the pieces in their order. Of `several` parts each has a line that says what it is.
+    /// Gives the function as Cranelift's own: whole, after its single iteration if there is one, or cut: then the loop first and
+    /// the pieces in their order. Of several parts each has a line that says what it is.
     fn each_part(
         &mut self,
         func: &Func,
-        single: Option<&Single>,
-        several: bool,
+        single: Option<&Func>,
+        asks: bool,
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
-        let Coder { isa, context, builder, lengths, .. } = self;
+        let Coder { isa, context, builder, lengths } = self;
         if func.ops.len() <= lengths.whole {
             if let Some(single) = single {
                 context.clear();
-                clif::emit_single(&single.func, single.called == Called::Any, &mut context.func, builder, *isa);
+                clif::emit_single(single, asks, &mut context.func, builder, *isa);
                 part(title(ONE), *isa, context)?;
             }
-            let several = if several { title("any number of iterations") } else { String::new() };
+            let several = if single.is_some() { title("any number of iterations") } else { String::new() };
             context.clear();
             clif::emit(func, None, &mut context.func, builder, *isa);
             return part(several, *isa, context);

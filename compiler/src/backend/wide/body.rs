@@ -5,10 +5,9 @@
 //! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
 //! registers are free.
 
-use super::encode::{Assembler, Base, Instruction, OF_SIZE, Place, Vectors, ZEROING, instructions as i};
-use super::select::{Direction, Node, Nodes, Predicate, Signs, What};
+use super::encode::{Assembler, Base, Instruction, Place, Vectors, ZEROING, instructions as i};
+use super::select::{Direction, Node, Nodes, Signs, What};
 use crate::math;
-use abi::Slot;
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -27,17 +26,6 @@ pub fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize
 
 /// One vector of a node; what is the same in every vector has but the first.
 type Copy = usize;
-
-/// What a line leaves in registers.
-#[derive(Clone, Default)]
-pub struct Held {
-    vector_of: Vec<Option<Copy>>,
-}
-
-/// By so many operations what is loaded into a register of its own comes before what reads it, where it is told so.
-const AHEAD: usize = 4;
-/// Registers that must be free for that, one of them for what is loaded.
-const FREE: usize = 4;
 
 /// A straight line being written.
 pub struct Body<'a> {
@@ -63,14 +51,6 @@ pub struct Body<'a> {
     locked: Vec<(bool, u8)>,
     /// The place in the order, and the vector.
     now: (usize, usize),
-    /// What r10 holds, of single numbers.
-    index: Option<Node>,
-    /// Whether constants of single numbers are made, not read; 0 always is.
-    makes: bool,
-    /// What has been loaded into a register of its own, and for which place in the order.
-    loads: Vec<(usize, Node)>,
-    /// The same of another writing of the line, to be loaded sooner.
-    sooner: Vec<(usize, Node)>,
 }
 
 impl<'a> Body<'a> {
@@ -108,35 +88,7 @@ impl<'a> Body<'a> {
             mask_of: vec![None; 8],
             locked: Vec::new(),
             now: (0, 0),
-            index: None,
-            makes: false,
-            loads: Vec::new(),
-            sooner: Vec::new(),
         }
-    }
-
-    /// What lies in which registers.
-    pub fn held(&self) -> Held {
-        Held { vector_of: self.vector_of.clone() }
-    }
-
-    /// Begins where another line of single numbers has ended; of what that holds only what this one reads.
-    pub fn resume(&mut self, held: &Held) {
-        for (register, copy) in (0..).zip(&held.vector_of) {
-            if let Some(copy) = copy.filter(|copy| self.uses.contains_key(&Node(*copy as u32))) {
-                self.own(copy, false, register);
-            }
-        }
-    }
-
-    /// Makes constants of single numbers instead of reading them.
-    pub fn make_constants(&mut self) {
-        self.makes = true;
-    }
-
-    /// Keeps a node for the question at the end, which reads it; before those that are kept to the end.
-    pub fn keep_asked(&mut self, node: Node) {
-        self.uses.entry(node).or_default().push(self.order.len());
     }
 
     /// Keeps a node to the end.
@@ -155,7 +107,6 @@ impl<'a> Body<'a> {
         let order = self.order;
         for (at, node) in order.iter().enumerate() {
             let homes = stores(*node);
-            self.load_ahead(at);
             for k in 0..self.vectors {
                 self.now = (at, k);
                 self.node(*node);
@@ -183,31 +134,6 @@ impl<'a> Body<'a> {
         }
     }
 
-    /// What was loaded into registers of its own while the line was written, and for which place in the order.
-    pub fn loads(self) -> Vec<(usize, Node)> {
-        self.loads
-    }
-
-    /// Loads some of what the line reads sooner: what another writing of it has loaded.
-    pub fn load_sooner(&mut self, loads: Vec<(usize, Node)>) {
-        self.sooner = loads;
-    }
-
-    /// Before a place in the order: what is to be loaded sooner than it is read.
-    fn load_ahead(&mut self, at: usize) {
-        self.now = (at, 0);
-        let soon = self.sooner.iter().filter(|(place, _)| (at + 1..=at + AHEAD).contains(place));
-        for node in soon.map(|(_, node)| *node).collect::<Vec<Node>>() {
-            let copy = self.copy(node);
-            let free = self.vector_of.iter().filter(|owner| owner.is_none()).count();
-            if free >= FREE && self.is_in_memory(copy) && !self.register.contains_key(&copy) {
-                let place = self.memory(node);
-                self.loaded(node, place);
-                self.locked.clear();
-            }
-        }
-    }
-
     /// A jump that is taken if a mask has a lane; its target is open. It ends the line.
     pub fn test(&mut self, mask: Node) -> usize {
         self.now = (self.order.len(), 0);
@@ -219,7 +145,7 @@ impl<'a> Body<'a> {
                     let more = self.in_register(mask);
                     self.code.mask(i::MASK_OR, all, all, Place::Register(more));
                 }
-                Vectors::One | Vectors::Avx | Vectors::Avx2 => {
+                Vectors::Avx | Vectors::Avx2 => {
                     let more = self.place(mask);
                     self.code.vector(i::OR, all, all, more, None);
                 }
@@ -228,109 +154,13 @@ impl<'a> Body<'a> {
         }
         match self.width {
             Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
-            Vectors::One | Vectors::Avx | Vectors::Avx2 => {
-                // To r10.
-                self.index = None;
+            Vectors::Avx | Vectors::Avx2 => {
                 let l = u8::from(self.width == Vectors::Avx2);
                 self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
-                match self.width {
-                    Vectors::One => self.code.plain(&[0x41, 0xf6, 0xc2, 1]), // test r10b, 1
-                    _ => self.code.plain(&[0x45, 0x85, 0xd2]),               // test r10d, r10d
-                }
+                self.code.plain(&[0x45, 0x85, 0xd2]); // test r10d, r10d
             }
         }
         self.code.jump(&[0x0f, 0x85])
-    }
-
-    /// Jumps that are taken if a comparison of two numbers that are kept holds; their target is open. [`Predicate::Equal`] and
-    /// what is less or greater are no such questions.
-    pub fn ask(&mut self, predicate: Predicate, a: Node, b: Node) -> Vec<usize> {
-        self.now = (self.order.len(), 0);
-        // The flags are those of what is less and what is greater: what is less is asked the other way round.
-        let (first, last, predicate) = match predicate {
-            Predicate::Less | Predicate::LessEqual | Predicate::NotLess | Predicate::NotLessEqual => {
-                (b, a, predicate.turned())
-            }
-            _ => (a, b, predicate),
-        };
-        let opcodes: &[u8] = match predicate {
-            Predicate::Greater => &[0x87],         // ja
-            Predicate::GreaterEqual => &[0x83],    // jae
-            Predicate::NotGreater => &[0x86],      // jbe
-            Predicate::NotGreaterEqual => &[0x82], // jb
-            Predicate::NotEqual => &[0x85, 0x8a],  // jne, jp
-            _ => unreachable!("it is no such question"),
-        };
-        self.lock([first, last].into_iter());
-        let first = self.in_register(first);
-        let last = self.place(last);
-        self.code.vector(i::COMPARE_FIRST, first, 0, last, None);
-        self.locked.clear();
-        opcodes.iter().map(|opcode| self.code.jump(&[0x0f, *opcode])).collect()
-    }
-
-    /// A jump that is taken if a number that is kept, +0 or NaN, is NaN; its target is open. Where it is not, rax is 0.
-    pub fn unless_zero(&mut self, number: Node) -> usize {
-        self.bits(number);
-        self.code.plain(&[0x48, 0x85, 0xc0]); // test rax, rax
-        self.code.jump(&[0x0f, 0x85]) // jne
-    }
-
-    /// A jump that is taken if a number that is kept, not below 0 or NaN, is not at most one of these bits; its target is open.
-    pub fn unless_at_most(&mut self, number: Node, bits: u64) -> usize {
-        self.bits(number);
-        self.code.compare_bits(bits);
-        self.code.jump(&[0x0f, 0x87]) // ja
-    }
-
-    /// Brings the bits of a number or mask that is kept to rax.
-    pub fn bits(&mut self, number: Node) {
-        self.now = (self.order.len(), 0);
-        let register = self.in_register(number);
-        self.bits_of(register);
-    }
-
-    fn bits_of(&mut self, register: u8) {
-        let high = (!register >> 3 & 1) << 7;
-        self.code.plain(&[0xc4, 0x61 | high, 0xf9, 0x7e, 0xc0 | (register & 7) << 3]); // vmovq rax, register
-        self.locked.clear();
-    }
-
-    /// Brings 0 to rax, or all ones, which are a NaN, if a comparison of two numbers that are kept holds.
-    pub fn answer(&mut self, predicate: Predicate, a: Node, b: Node) {
-        self.now = (self.order.len(), 0);
-        self.lock([a, b].into_iter());
-        let first = self.in_register(a);
-        let last = self.place(b);
-        self.answered(predicate, first, last);
-    }
-
-    /// The same if a number that is kept, not below 0 or NaN, is not at most one of these bits.
-    pub fn answer_at_most(&mut self, number: Node, bits: u64) {
-        self.now = (self.order.len(), 0);
-        let first = self.in_register(number);
-        self.answered(Predicate::NotLessEqual, first, Place::Constant(bits));
-    }
-
-    fn answered(&mut self, predicate: Predicate, first: u8, last: Place) {
-        let to = self.take(false);
-        self.code.vector(i::COMPARE, to, first, last, Some(predicate as u8));
-        self.bits_of(to);
-    }
-
-    /// Stores what is kept, some of it into rings, of which the first slot and the index are given; it ends the line.
-    pub fn store_kept(&mut self, stores: &[(Node, Home)], writes: &[(Slot, Node, Node)]) {
-        self.now = (self.order.len(), 0);
-        for (base, index, value) in writes {
-            let register = self.in_register(*value);
-            self.bring_index(*index);
-            self.code.at_index(i::STORE_FIRST, register, Base::Block, 8 * base.0 as i32);
-            self.locked.clear();
-        }
-        let registers: Vec<u8> = stores.iter().map(|(node, _)| self.in_register(*node)).collect();
-        for ((node, home), register) in stores.iter().zip(registers) {
-            self.store(*node, register, self.at_home(*home, 0));
-        }
     }
 
     fn copy(&self, node: Node) -> Copy {
@@ -385,12 +215,6 @@ impl<'a> Body<'a> {
             return Place::Register(register);
         }
         let place = self.memory(node);
-        if let (Place::Constant(bits), Vectors::One) = (place, self.width)
-            && self.is_made(bits)
-            && (bits == 0 || self.is_room_until(usize::MAX))
-        {
-            return Place::Register(self.loaded(node, place));
-        }
         if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
             return place;
         }
@@ -407,27 +231,12 @@ impl<'a> Body<'a> {
         register
     }
 
-    /// The same for an instruction: one of whole vectors does not read a single number from memory.
-    fn place_for(&mut self, instruction: Instruction, node: Node) -> Place {
-        match self.place(node) {
-            Place::Memory(..) if self.width == Vectors::One && instruction.of_one().is_none() => {
-                Place::Register(self.in_register(node))
-            }
-            place => place,
-        }
-    }
-
     /// Whether a vector register is free, or holds what lies in memory too and is read later.
     fn is_room_until(&self, next: usize) -> bool {
         (0..self.vector_of.len()).any(|register| {
             let later = |copy: Copy| self.is_in_memory(copy) && self.next_use(copy).is_none_or(|other| other > next);
             !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
         })
-    }
-
-    /// Whether a constant of single numbers is made, not read.
-    fn is_made(&self, bits: u64) -> bool {
-        bits == 0 || self.makes
     }
 
     /// Whether a copy can be read from memory.
@@ -458,14 +267,11 @@ impl<'a> Body<'a> {
     }
 
     fn load(&mut self, node: Node, register: u8, place: Place) {
-        self.loads.push((self.now.0, node));
         match place {
             _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
-            Place::Constant(bits) if self.width == Vectors::One && self.is_made(bits) => self.code.make(register, bits),
             Place::Constant(_) if self.width == Vectors::Avx512 => {
                 self.code.vector(i::BROADCAST, register, 0, place, None);
             }
-            place if self.nodes.of_two.contains(&node) => self.code.vector(i::LOAD_TWO, register, 0, place, None),
             place => self.code.vector(i::LOAD, register, 0, place, None),
         }
     }
@@ -580,17 +386,12 @@ impl<'a> Body<'a> {
         }
         self.lock(what.operands());
         match what {
-            What::Load(_) | What::Number(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
+            What::Load(_) | What::Constant(_) | What::Row(..) => unreachable!("they lie in memory"),
             What::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
             What::One(instruction, immediate, a) => {
                 let last = self.place(a);
-                // Beside a single number stands what stood beside the operand: nothing else is waited for.
-                let beside = match last {
-                    Place::Register(register) if self.width == Vectors::One => register,
-                    _ => 0,
-                };
                 let to = self.result(node);
-                self.code.vector(instruction, to, beside, last, immediate);
+                self.code.vector(instruction, to, 0, last, immediate);
             }
             What::Fma { signs, a, b, c } => self.fma(node, signs, a, b, c),
             What::Shift(direction, a, n) => {
@@ -623,7 +424,7 @@ impl<'a> Body<'a> {
                 // a < b is b > a.
                 let instruction = if predicate == 0 { i::INT_EQUAL } else { i::INT_GREATER };
                 let first = self.in_register(b);
-                let last = self.place_for(instruction, a);
+                let last = self.place(a);
                 let to = self.result(node);
                 self.code.vector(instruction, to, first, last, None);
             }
@@ -662,11 +463,11 @@ impl<'a> Body<'a> {
             What::Select(when, a, b) => {
                 let mask = self.in_register(when);
                 let other = self.in_register(b);
-                let chosen = self.place_for(i::BLEND_BY_SIGN, a);
+                let chosen = self.place(a);
                 let to = self.result(node);
                 match self.width {
                     Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Vectors::One | Vectors::Avx | Vectors::Avx2 => {
+                    Vectors::Avx | Vectors::Avx2 => {
                         self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4))
                     }
                 }
@@ -689,11 +490,6 @@ impl<'a> Body<'a> {
                 self.code.gather(to, from, mask, 8 * base as i32);
                 self.release(index);
             }
-            What::Ring { base, index } => {
-                self.bring_index(index);
-                let to = self.result(node);
-                self.code.at_index(i::LOAD_FIRST, to, Base::Block, 8 * base.0 as i32);
-            }
             What::Gather { index, .. } => {
                 // All tables that are read at the same place, at once.
                 let same = |other: &&Node| matches!(self.what(**other), What::Gather { index: at, .. } if at == index);
@@ -701,15 +497,6 @@ impl<'a> Body<'a> {
                 self.look_up(&all, index);
                 self.release(index);
             }
-        }
-    }
-
-    /// Brings an index to where addresses are made, if it is not there.
-    fn bring_index(&mut self, index: Node) {
-        if self.index != Some(index) {
-            let from = self.in_register(index);
-            self.code.index(from);
-            self.index = Some(index);
         }
     }
 
@@ -754,7 +541,7 @@ impl<'a> Body<'a> {
     }
 
     fn two(&mut self, node: Node, instruction: Instruction, exchange: bool, a: Node, b: Node) {
-        let (first, last) = match (self.place_for(instruction, a), self.place_for(instruction, b)) {
+        let (first, last) = match (self.place(a), self.place(b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
             _ if a == b => {
@@ -771,7 +558,7 @@ impl<'a> Body<'a> {
             }
             return self.code.vector(instruction, to, first, last, Some(0));
         }
-        self.code.vector(instruction, to, first, last, (instruction == i::SIZE).then_some(OF_SIZE));
+        self.code.vector(instruction, to, first, last, None);
     }
 
     /// One of three operands is overwritten, one may lie in memory.

@@ -1,5 +1,4 @@
-//! Vector instructions of x86-64 as bytes: VEX with one number, 128 and 256 bits, EVEX with 512 bits and, of one
-//! instruction, with one number.
+//! Vector instructions of x86-64 as bytes: VEX with 128 and 256 bits, EVEX with 512 bits.
 //!
 //! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
 //! is reached relative to the instruction. Knows nothing of programs.
@@ -10,8 +9,6 @@ use std::collections::HashMap;
 /// Which vectors.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Vectors {
-    /// One lane of 64 bits in 16 registers: AVX and FMA.
-    One,
     /// Two lanes of 64 bits in 16 registers: AVX and FMA.
     Avx,
     /// Four lanes of 64 bits in 16 registers: AVX2 and FMA.
@@ -24,7 +21,6 @@ impl Vectors {
     /// Lanes of a vector.
     pub fn lanes(self) -> usize {
         match self {
-            Vectors::One => 1,
             Vectors::Avx => 2,
             Vectors::Avx2 => 4,
             Vectors::Avx512 => 8,
@@ -39,7 +35,7 @@ impl Vectors {
     /// Vector registers.
     pub fn registers(self) -> u8 {
         match self {
-            Vectors::One | Vectors::Avx | Vectors::Avx2 => 16,
+            Vectors::Avx | Vectors::Avx2 => 16,
             Vectors::Avx512 => 32,
         }
     }
@@ -77,31 +73,6 @@ pub enum Place {
 /// of the VEX form, opcode.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
-
-impl Instruction {
-    /// The same of the first number alone, which it leaves the others of its second operand beside; none if there is only the
-    /// one of whole vectors.
-    pub fn of_one(self) -> Option<Instruction> {
-        use instructions as i;
-        let Instruction(_, map, w, opcode) = self;
-        let fused = map == 2 && (0x98..=0xbf).contains(&opcode);
-        match self {
-            i::ADD | i::MUL | i::SUB | i::MIN | i::DIV | i::MAX | i::SQRT | i::COMPARE => {
-                Some(Instruction(3, map, w, opcode))
-            }
-            i::ROUND => Some(Instruction(1, map, w, 0x0b)),
-            i::BY_KIND => Some(Instruction(1, map, w, 0x55)),
-            i::SIZE => Some(Instruction(1, map, w, 0x51)),
-            i::LOAD => Some(i::LOAD_FIRST),
-            i::STORE => Some(i::STORE_FIRST),
-            _ if fused => Some(Instruction(1, map, w, opcode | 1)),
-            _ => None,
-        }
-    }
-}
-
-/// The less of two numbers, without its sign.
-pub const OF_SIZE: u8 = 8;
 
 #[rustfmt::skip]
 #[allow(missing_docs)]
@@ -142,16 +113,9 @@ pub mod instructions {
     /// Of each two lanes the first, or the second: v's, then rm's.
     pub const FIRST_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x14);
     pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
-    /// The same as [`LOAD`], of a single number the next one too.
-    pub const LOAD_TWO: Instruction = Instruction(1, 1, [1, 1], 0x10);
     /// Of one number, from memory.
     pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
-    pub const STORE_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x11);
-    /// Sets the flags as of integers without a sign; of NaN as of less and equal.
-    pub const COMPARE_FIRST: Instruction = Instruction(1, 1, [0, 0], 0x2e);
     pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
-    /// Of numbers of 32 bits.
-    pub const INT_EQUAL_HALVES: Instruction = Instruction(1, 1, [0, 0], 0x76);
     pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
     pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
     pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
@@ -159,8 +123,6 @@ pub mod instructions {
     pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
     /// By what kind of number v is, as the bits of rm say for each kind. The immediate is 0: no exceptions.
     pub const BY_KIND: Instruction = Instruction(1, 3, [1, 0], 0x54);
-    /// Of v and rm, which are the same, less the sign: the immediate is [`OF_SIZE`](super::OF_SIZE).
-    pub const SIZE: Instruction = Instruction(1, 3, [1, 0], 0x50);
     /// v · 2^⌊rm⌋
     pub const SCALE: Instruction = Instruction(1, 2, [1, 0], 0x2c);
     /// From the two vectors d and rm, d first, by the low bits of v.
@@ -231,17 +193,6 @@ impl Assembler {
                 self.evex(what, reg, second, last, mask);
                 self.operand(reg, last, immediate, self.width.bytes());
             }
-            Vectors::One if matches!(what, instructions::BY_KIND | instructions::SIZE) => {
-                self.evex(what.of_one().expect("there is one of it"), reg, second, last, mask);
-                self.operand(reg, last, immediate, 8);
-            }
-            // From one register to another it moves all.
-            Vectors::One => {
-                let copies = what == instructions::LOAD && matches!(last, Place::Register(_));
-                let what = what.of_one().filter(|_| !copies).unwrap_or(what);
-                self.vex(what, reg, second, last, 0);
-                self.operand(reg, last, immediate, 1);
-            }
             Vectors::Avx | Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
                 self.vex(what, reg, second, last, u8::from(self.width == Vectors::Avx2));
@@ -301,16 +252,6 @@ impl Assembler {
         self.vector(instructions::SECOND_OF_TWO, second, half, Place::Register(second), None);
     }
 
-    /// The first number of a vector register, an integer, to r10.
-    pub fn index(&mut self, from: u8) {
-        self.bytes.extend([0xc4, 0x41 | (!from >> 3 & 1) << 7, 0xf9, 0x7e, 0xc2 | (from & 7) << 3]);
-    }
-
-    /// Loads or stores one number, so many bytes behind a base, whose place in eights r10 holds.
-    pub fn at_index(&mut self, what: Instruction, register: u8, base: Base, distance: i32) {
-        self.entry(what, register, 0, 0, (base as u8, 8, distance));
-    }
-
     /// A number of a vector in memory, to r10.
     fn number(&mut self, (base, offset): (Base, i32), lane: usize) {
         self.bytes.extend([0x4c | base as u8 >> 3, 0x8b]);
@@ -349,7 +290,6 @@ impl Assembler {
         let (x, b, broadcast) = match last {
             Place::Register(register) => (bit(register, 4), bit(register, 3), 0),
             Place::Memory(base, _) => (1, bit(base as u8, 3), 0),
-            // Of one number there is nothing to be broadcast.
             Place::Constant(_) => {
                 (1, 1, u8::from(self.width == Vectors::Avx512 && opcode != instructions::BROADCAST.3))
             }
@@ -449,56 +389,6 @@ impl Assembler {
         self.bytes.extend(bytes);
     }
 
-    /// Makes a constant of single numbers without reading it: from ones, or by way of r11.
-    pub fn make(&mut self, register: u8, bits: u64) {
-        let own = Place::Register(register);
-        if bits == 0 {
-            return self.vector(instructions::XOR, register, register, own, None);
-        }
-        let (left, right) = (bits.trailing_zeros(), bits.leading_zeros());
-        if left + bits.count_ones() + right == 64 {
-            self.vector(instructions::INT_EQUAL_HALVES, register, register, own, None);
-            // /6: left, /2: right.
-            for (digit, by) in [(6, if left > 0 { left + right } else { 0 }), (2, right)] {
-                if by > 0 {
-                    self.vector(instructions::SHIFT, digit, register, own, Some(by as u8));
-                }
-            }
-            return;
-        }
-        self.plain(&[0x49, 0xbb]); // mov r11, bits
-        self.plain(&bits.to_le_bytes());
-        self.plain(&[0xc4, 0x41 | (!register >> 3 & 1) << 7, 0xf9, 0x6e, 0xc3 | (register & 7) << 3]); // vmovq register, r11
-    }
-
-    /// A number of the block, to rax.
-    pub fn bring_number(&mut self, offset: i32) {
-        self.plain(&[0x48, 0x8b]); // mov rax, [block + offset]
-        self.operand(0, Place::Memory(Base::Block, offset), None, 1);
-    }
-
-    /// A jump that is taken if rax is not +0; its target is open.
-    pub fn unless_clear(&mut self) -> usize {
-        self.plain(&[0x48, 0x85, 0xc0]); // test rax, rax
-        self.jump(&[0x0f, 0x85]) // jne
-    }
-
-    /// A jump that is taken if rax is not this number, which is no NaN; its target is open. Of 0 rax does not keep the sign.
-    pub fn unless_number(&mut self, bits: u64) -> usize {
-        if f64::from_bits(bits) == 0.0 {
-            self.plain(&[0x48, 0x01, 0xc0]); // add rax, rax: the sign goes
-        } else {
-            self.compare_bits(bits);
-        }
-        self.jump(&[0x0f, 0x85]) // jne
-    }
-
-    /// Compares rax with these bits.
-    pub fn compare_bits(&mut self, bits: u64) {
-        self.plain(&[0x48, 0x3b]); // cmp rax, [constant]
-        self.operand(0, Place::Constant(bits), None, 1);
-    }
-
     /// Where the next instruction begins.
     pub fn here(&self) -> usize {
         self.bytes.len()
@@ -522,8 +412,7 @@ impl Assembler {
         // EVEX spreads one number over the lanes as it reads it.
         let copies = match self.width {
             Vectors::Avx512 => 1,
-            // Some instructions read two.
-            width => width.lanes().max(2),
+            width => width.lanes(),
         };
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
         let begin = self.bytes.len();
@@ -628,31 +517,6 @@ mod tests {
         // mov r10, [rdi+0x100]; vmovapd xmm3, [r11+r10*8+0x40]; mov r10, [rdi+0x108]; vmovapd xmm4, [r11+r10*8+0x40];
         // vunpcklpd xmm9, xmm3, xmm4; vunpckhpd xmm4, xmm3, xmm4
         check(Vectors::Avx, |c| c.look_up_two([9, 4], (Base::Block, 0x100), 0x40, 3), &look_up_two);
-        // vmovq r10, xmm9; vmovsd xmm12, [rdi+r10*8+0x40]; vmovsd [rdi+r10*8+0x140], xmm1
-        let index = [
-            [0xc4, 0x41, 0xf9, 0x7e, 0xca].as_slice(),
-            &[0xc4, 0x21, 0x7b, 0x10, 0x64, 0xd7, 0x40],
-            &[0xc4, 0xa1, 0x7b, 0x11, 0x8c, 0xd7, 0x40, 1, 0, 0],
-        ];
-        let by_index = |c: &mut Assembler| {
-            c.index(9);
-            c.at_index(LOAD_FIRST, 12, Base::Block, 0x40);
-            c.at_index(STORE_FIRST, 1, Base::Block, 0x140);
-        };
-        check(Vectors::One, by_index, &index.concat());
-        // vpcmpeqd xmm9, xmm9, xmm9; vpsllq xmm9, xmm9, 54; vpsrlq xmm9, xmm9, 2
-        let one = [
-            [0xc4, 0x41, 0x31, 0x76, 0xc9].as_slice(),
-            &[0xc4, 0xc1, 0x31, 0x73, 0xf1, 0x36],
-            &[0xc4, 0xc1, 0x31, 0x73, 0xd1, 0x02],
-        ];
-        check(Vectors::One, |c| c.make(9, 1f64.to_bits()), &one.concat());
-        // vpcmpeqd xmm3, xmm3, xmm3; vpsllq xmm3, xmm3, 63 and vpsrlq xmm3, xmm3, 1
-        check(Vectors::One, |c| c.make(3, 1 << 63), &[0xc5, 0xe1, 0x76, 0xdb, 0xc5, 0xe1, 0x73, 0xf3, 0x3f]);
-        check(Vectors::One, |c| c.make(3, !(1 << 63)), &[0xc5, 0xe1, 0x76, 0xdb, 0xc5, 0xe1, 0x73, 0xd3, 0x01]);
-        // mov r11, 0x3ff8000000000001; vmovq xmm12, r11
-        let other = [0x49, 0xbb, 1, 0, 0, 0, 0, 0, 0xf8, 0x3f, 0xc4, 0x41, 0xf9, 0x6e, 0xe3];
-        check(Vectors::One, |c| c.make(12, 0x3ff8_0000_0000_0001), &other);
         // vgatherqpd zmm17{k2}, [rsi+zmm26*8+0x200]
         check(Vectors::Avx512, |c| c.gather(17, 26, 2, 0x200), &[0x62, 0xa2, 0xfd, 0x42, 0x93, 0x8c, 0xd6, 0, 2, 0, 0]);
         // vrndscalepd zmm3, zmm20, 9

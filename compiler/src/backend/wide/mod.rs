@@ -20,7 +20,6 @@ mod encode;
 mod select;
 mod order;
 pub(super) mod pairs;
-pub(super) mod single;
 
 use super::memory::Executable;
 use super::target::{Coder, here};
@@ -111,9 +110,7 @@ impl Vectors {
     #[cfg(all(target_arch = "x86_64", unix))]
     fn are_here(self) -> bool {
         match self {
-            Vectors::One | Vectors::Avx => {
-                std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma")
-            }
+            Vectors::Avx => std::arch::is_x86_feature_detected!("avx") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx2 => std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma"),
             Vectors::Avx512 => {
                 std::arch::is_x86_feature_detected!("avx512f") && std::arch::is_x86_feature_detected!("avx512dq")

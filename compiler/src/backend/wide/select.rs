@@ -6,10 +6,10 @@
 
 use super::encode::{Instruction, Vectors, instructions as i};
 use crate::backend::unsupported::Unsupported;
-use crate::ir::{Func, Op, Type, Unary, Value, Write, is_not_positive, sign_of, verify};
+use crate::ir::{Func, Op, Type, Unary, Value, is_not_positive, sign_of, verify};
 use crate::math::{self, exponential, tables};
 use abi::Slot;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 /// The node of this number.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
@@ -68,13 +68,6 @@ impl Predicate {
             Predicate::GreaterEqual => Predicate::NotGreaterEqual,
             Predicate::Greater => Predicate::NotGreater,
         }
-    }
-
-    /// Whether it asks which of two is less.
-    pub fn is_of_order(self) -> bool {
-        let of_equality =
-            [Predicate::Equal, Predicate::NotEqual, Predicate::LessOrGreater, Predicate::NotLessOrGreater];
-        !of_equality.contains(&self)
     }
 
     /// The same with its operands exchanged.
@@ -138,13 +131,6 @@ pub enum What {
         len: u32,
         index: Node,
     },
-    /// An entry of the ring that begins at this slot, at an index that lies inside. One lane only.
-    Ring {
-        base: Slot,
-        index: Node,
-    },
-    /// A number of the pool. One lane only.
-    Number(u32),
     /// Half a table: the same in every vector. AVX-512 only.
     Row(Sixteen, bool),
     /// Entries of sixteen, in two rows, by the low four bits of an integer. AVX-512 only.
@@ -187,12 +173,10 @@ impl What {
     /// Operands from left to right.
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
-            What::Load(_) | What::Number(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
-            What::One(_, _, a)
-            | What::Shift(_, a, _)
-            | What::MaskNot(a)
-            | What::Gather { index: a, .. }
-            | What::Ring { index: a, .. } => [Some(a), None, None],
+            What::Load(_) | What::Constant(_) | What::Row(..) | What::Mask(_) => [None; 3],
+            What::One(_, _, a) | What::Shift(_, a, _) | What::MaskNot(a) | What::Gather { index: a, .. } => {
+                [Some(a), None, None]
+            }
             What::Two(_, _, a, b)
             | What::Compare(_, a, b)
             | What::CompareInt(_, a, b)
@@ -208,14 +192,9 @@ impl What {
         all.into_iter().flatten()
     }
 
-    /// Whether it occupies the one part of a processor that divides.
-    pub fn divides(self) -> bool {
-        matches!(self, What::Two(i::DIV, ..) | What::One(i::SQRT, ..))
-    }
-
     /// Whether it lies in memory from the beginning.
     pub fn is_leaf(self) -> bool {
-        matches!(self, What::Load(_) | What::Number(_)) || self.is_shared()
+        matches!(self, What::Load(_)) || self.is_shared()
     }
 
     /// Whether it is the same in every vector, and lies in memory from the beginning.
@@ -242,8 +221,6 @@ impl What {
             | What::Select(..)
             | What::Scale(..)
             | What::Gather { .. }
-            | What::Ring { .. }
-            | What::Number(_)
             | What::Row(..)
             | What::Permute(..) => false,
         }
@@ -261,37 +238,6 @@ pub struct Nodes {
     pub failed: Option<Node>,
     /// Whether the pool begins with the tables of the elementary functions.
     pub pooled: bool,
-    /// Loads that bring the number of the next slot along, for who takes it from there.
-    pub of_two: HashSet<Node>,
-}
-
-impl Nodes {
-    /// These and all that they need.
-    pub fn needed(&self, roots: impl Iterator<Item = Node>) -> HashSet<Node> {
-        let (mut open, mut needed): (Vec<Node>, _) = (roots.collect(), HashSet::new());
-        while let Some(node) = open.pop() {
-            if needed.insert(node) {
-                open.extend(self.nodes[node.index()].operands());
-            }
-        }
-        needed
-    }
-
-    /// Reads slots side by side two at a time, of those that may be and that are read on the same `ways`: the nodes of each.
-    pub fn load_pairs(&mut self, may: impl Fn(Slot) -> bool, ways: &[HashSet<Node>]) {
-        let slot = |what: &What| if let What::Load(slot) = what { Some(*slot).filter(|slot| may(*slot)) } else { None };
-        let loads = (0..).zip(&self.nodes).filter_map(|(number, what)| Some((slot(what)?, Node(number))));
-        let mut loads: Vec<(Slot, Node)> = loads.collect();
-        loads.sort_unstable();
-        let mut loads = loads.into_iter().peekable();
-        while let Some((slot, first)) = loads.next() {
-            let together = |second| ways.iter().all(|way| way.contains(&first) == way.contains(&second));
-            if let Some((_, second)) = loads.next_if(|(next, second)| next.0 == slot.0 + 1 && together(*second)) {
-                self.nodes[second.index()] = What::Two(i::SECOND_OF_TWO, true, first, first);
-                self.of_two.insert(first);
-            }
-        }
-    }
 }
 
 /// The bit of a real's sign.
@@ -305,7 +251,7 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
     }
-    let mut selection = Selection::new(width, width == Vectors::Avx512);
+    let mut selection = Selection::new(width);
     let of = selection.operations(func, &func.live())?;
     let at = |value: Value| of[value.index()];
     let failed = func.status.map(|status| match func.failure() {
@@ -322,38 +268,11 @@ pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupp
         }
     });
     let stores = func.stores.iter().map(|(slot, value)| (*slot, at(*value))).collect();
-    let of_two = HashSet::new();
-    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled, of_two })
-}
-
-/// Operations as nodes, with nothing stored.
-pub struct Operations {
-    /// The nodes.
-    pub nodes: Nodes,
-    /// Of each operation that is wanted.
-    pub of: Vec<Node>,
-    /// Of each write to a ring its index, held inside.
-    pub indices: Vec<Node>,
-}
-
-/// The wanted operations of a function and what writes to rings need, whose operands are wanted, in one lane. `avx512`:
-/// whether there are the instructions of AVX-512 F and DQ.
-///
-/// # Errors
-/// As [`select`].
-pub fn operations(func: &Func, avx512: bool, wanted: &[bool], writes: &[Write]) -> Result<Operations, Unsupported> {
-    let mut selection = Selection::new(Vectors::One, avx512);
-    let of = selection.operations(func, wanted)?;
-    let indices = writes.iter().map(|write| selection.inside(func, write.index, write.len, &of)).collect();
-    let (nodes, of_two) = (selection.nodes, HashSet::new());
-    let nodes = Nodes { stores: Vec::new(), status: None, failed: None, nodes, pooled: false, of_two };
-    Ok(Operations { nodes, of, indices })
+    Ok(Nodes { stores, status: func.status.map(at), failed, nodes: selection.nodes, pooled })
 }
 
 struct Selection {
     width: Vectors,
-    /// Whether there are the instructions of AVX-512 F and DQ.
-    avx512: bool,
     nodes: Vec<What>,
     known: HashMap<What, Node>,
 }
@@ -363,8 +282,8 @@ struct Selection {
 const SIGN_BY_KIND: u64 = 0xa9a9_a122;
 
 impl Selection {
-    fn new(width: Vectors, avx512: bool) -> Selection {
-        Selection { width, avx512, nodes: Vec::new(), known: HashMap::new() }
+    fn new(width: Vectors) -> Selection {
+        Selection { width, nodes: Vec::new(), known: HashMap::new() }
     }
 
     fn operations(&mut self, func: &Func, wanted: &[bool]) -> Result<Vec<Node>, Unsupported> {
@@ -403,8 +322,8 @@ impl Selection {
     fn choose(&mut self, when: Node, a: Node, b: Node) -> What {
         let zero = What::Constant(0);
         match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
-            (Vectors::One | Vectors::Avx | Vectors::Avx2, a, _) if a == zero => What::Two(i::AND_NOT, false, when, b),
-            (Vectors::One | Vectors::Avx | Vectors::Avx2, _, b) if b == zero => What::Two(i::AND, true, when, a),
+            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => What::Two(i::AND_NOT, false, when, b),
+            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => What::Two(i::AND, true, when, a),
             _ => What::Select(when, a, b),
         }
     }
@@ -426,20 +345,9 @@ impl Selection {
             // Without mask registers a mask is a vector of all ones or zeros a lane.
             Op::Bool(truth) => What::Constant(if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => What::Load(slot),
-            Op::Pool { base, len, index }
-                if self.width == Vectors::One
-                    && let Op::Int(index) = func.op(index) =>
-            {
-                What::Number(base + (index as u64).min(u64::from(len) - 1) as u32)
-            }
-            Op::Pool { .. } if self.width == Vectors::One => return Err(self.missing("table")),
             Op::Pool { base, len, index } => {
                 let index = self.inside(func, index, len, of);
                 What::Gather { base, len, index }
-            }
-            Op::Ring { base, len, index } if self.width == Vectors::One => {
-                let index = self.inside(func, index, len, of);
-                What::Ring { base, index }
             }
             Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
             Op::Add(a, b) => What::Two(i::ADD, true, at(a), at(b)),
@@ -447,8 +355,6 @@ impl Selection {
             Op::Mul(a, b) => What::Two(i::MUL, true, at(a), at(b)),
             Op::Div(a, b) => What::Two(i::DIV, false, at(a), at(b)),
             Op::Neg(a) => What::Two(i::XOR, true, at(a), self.constant(SIGN)),
-            // Single numbers wait for what they read, as a constant is, sooner than for what is done to them.
-            Op::Abs(a) if !wide && self.avx512 => What::Two(i::SIZE, true, at(a), at(a)),
             Op::Abs(a) => What::Two(i::AND, true, at(a), self.constant(!SIGN)),
             Op::Sqrt(a) => What::One(i::SQRT, None, at(a)),
             Op::Fma(a, b, c) => {
@@ -528,7 +434,7 @@ impl Selection {
 
     /// ±1 with the sign of x, unless x is neither above nor below 0.
     fn sign(&mut self, x: Node) -> Node {
-        if self.avx512 {
+        if self.width == Vectors::Avx512 {
             let kinds = self.constant(SIGN_BY_KIND);
             return self.add(What::Two(i::BY_KIND, false, x, kinds));
         }
