@@ -102,7 +102,7 @@ fn library() {
         let found = compiler::check_models(loaded, &NoSources);
         assert!(found.iter().all(|found| !found.is_error()), "{found:?}");
     };
-    let built = |mut loaded: compiler::Loaded, work: &dyn Fn(&compiler::program::Program)| {
+    let built = |mut loaded: compiler::Loaded, work: &dyn Fn(&compiler::ir::program::Program)| {
         for model in &names {
             let (changes, mut warnings) = (Changes::default(), Vec::new());
             // A model with an open slot cannot be run on its own.
@@ -116,8 +116,8 @@ fn library() {
         black_box(read());
     });
     timed("read and checked, from the text to values", 15, &|| checked(&read()));
-    let first_step = |program: &compiler::program::Program| {
-        let (code, _) = compiler::code::late(program, Method::Expo, false);
+    let first_step = |program: &compiler::ir::program::Program| {
+        let (code, _) = compiler::codegen::tiering::late(program, Method::Expo, false);
         let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
         instance.start(1e-3);
         instance.advance(1);
@@ -131,7 +131,7 @@ fn library() {
         let loaded = read();
         checked(&loaded);
         built(loaded, &|program| {
-            let step = compiler::math::expand(&compiler::code::step(program, Method::Expo));
+            let step = compiler::math::expand(&compiler::codegen::tiering::step(program, Method::Expo));
             black_box(compiler::code(&[(Function::Step, step)], &program.description, false));
         });
     });
@@ -220,7 +220,8 @@ fn elements() {
         let (changes, mut warnings) = (Changes::default(), Vec::new());
         let built = compiler::build(&mut loaded, &project::Disk, "Surface", &changes, &mut warnings);
         let program = built.map_err(|found| format!("{found:?}")).expect("it compiles").program;
-        let step = [(Function::Step, compiler::math::expand(&compiler::code::step(&program, Method::Expo)))];
+        let step =
+            [(Function::Step, compiler::math::expand(&compiler::codegen::tiering::step(&program, Method::Expo)))];
         let (mut compiled, mut stepped, mut alone) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..if n < 1_000 { 9 } else { 3 } {
             let begin = processor_time();

@@ -13,8 +13,8 @@ mod compile {
 
 use abi::image::{Target, sha256};
 use abi::plan::Method;
-use compiler::backend::wide::{self, Width};
-use compiler::backend::{blob, c};
+use compiler::codegen::lanes::{self, Width};
+use compiler::codegen::{c, image};
 use compiler::{Changes, Sources, load};
 
 /// The step of fixed methods, s.
@@ -50,18 +50,18 @@ fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u
     let (description, functions) = (&program.description, compiler::functions(program, method));
     let mut all = Vec::new();
     for target in Target::ALL {
-        let image = blob::image(&functions, description, &program.params, target, &[]);
+        let image = image::image(&functions, description, &program.params, target, &[]);
         all.push(image.map_err(|why| why.to_string())?.to_bytes());
     }
     all.push(c::source(&functions, description, &program.params).into_bytes());
     let step = match method {
-        Method::Adaptive => compiler::code::of_lanes(program, method).map(|(_, func)| func),
-        _ => Some(compiler::code::step(program, method)),
+        Method::Adaptive => compiler::codegen::tiering::of_lanes(program, method).map(|(_, func)| func),
+        _ => Some(compiler::codegen::tiering::step(program, method)),
     };
     for width in Width::ALL {
         let lanes = step
             .as_ref()
-            .map(|step| wide::bytes(step, &description.layout, description.pool.len(), width, width.vectors()));
+            .map(|step| lanes::bytes(step, &description.layout, description.pool.len(), width, width.vectors()));
         all.push(match lanes {
             Some(Ok(bytes)) => bytes.code,
             Some(Err(why)) => why.to_string().into_bytes(),

@@ -8,17 +8,17 @@ use abi::lanes::Batch;
 use abi::plan::Method;
 use abi::unit::Unit;
 use abi::{Code, Description, Function, Layout, Slot};
-use compiler::backend::interp::Interpreter;
-use compiler::backend::jit::compile;
-use compiler::backend::wide::{self, Width};
-use compiler::discretize::step;
+use compiler::codegen::jit::compile;
+use compiler::codegen::lanes::{self, Width};
 use compiler::ir::Unary;
 use compiler::ir::build::Build;
 use compiler::ir::expr::{Real, Shared};
+use compiler::ir::interpret::Interpreter;
+use compiler::ir::program::Program;
 use compiler::math::{POOL, expand};
+use compiler::numerics::fixed_step::step;
 use compiler::opt::contract::contract;
-use compiler::opt::regroup::regroup;
-use compiler::program::Program;
+use compiler::opt::reassociate::reassociate;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -82,7 +82,7 @@ fn main() {
         };
         let [as_written, plain, watched] = [(false, false), (true, false), (true, true)].map(|(regrouped, watched)| {
             let func = step(&servo(watched), method);
-            let func = if regrouped { contract(&regroup(&func, false), &layout) } else { func };
+            let func = if regrouped { contract(&reassociate(&func, false), &layout) } else { func };
             let funcs = [(Function::Step, expand(&func))];
             let begun = Instant::now();
             let (machine, stats) = compile(&funcs, &layout, POOL.len()).expect("this processor can");
@@ -166,12 +166,12 @@ fn lanes(method: Method, name: &str, hand: Hand) {
     println!("{name}, many instances with their own parameters, on one core:");
     let program = servo(true);
     let layout = &program.description.layout;
-    let func = contract(&regroup(&step(&program, method), program.balanced), layout);
+    let func = contract(&reassociate(&step(&program, method), program.balanced), layout);
     let mut codes = Vec::new();
     for width in Width::ALL.into_iter().filter(|width| width.is_here()) {
         for vectors in [1, 2, 3, 4, 5, 6, 8] {
             let begun = Instant::now();
-            let lanes = wide::compile(&func, layout, POOL.len(), width, vectors).expect("this processor can");
+            let lanes = lanes::compile(&func, layout, POOL.len(), width, vectors).expect("this processor can");
             codes.push((format!("{} compiled in {:.2} ms", lanes.name(), ms(begun)), lanes));
         }
     }

@@ -4,7 +4,7 @@
 //! usage and not a failed run.
 
 use crate::compile::{Changes, Emit};
-use crate::value;
+use crate::quantity;
 use crate::vary::{self, Vary};
 use abi::image::{Feature, Target};
 use abi::plan::Method;
@@ -876,7 +876,7 @@ fn feature(text: &str) -> Result<Feature, String> {
 }
 
 fn positive_time(text: &str) -> Result<f64, String> {
-    let (value, unit) = value::parse(text)?;
+    let (value, unit) = quantity::parse(text)?;
     let second = Unit::parse("s").expect("the second is known").dimension;
     match unit.dimension {
         dimension if dimension == second => {}
@@ -896,7 +896,7 @@ fn looked_at(text: &str) -> Result<LookedAt, String> {
 
 /// 1 Hz to 20 kHz.
 fn frequency(text: &str) -> Result<f64, String> {
-    let (value, unit) = value::parse(text)?;
+    let (value, unit) = quantity::parse(text)?;
     let hertz = Unit::parse("Hz").expect("the hertz is known").dimension;
     if unit.dimension != hertz {
         return Err("a frequency is needed, for example 1kHz".into());

@@ -6,22 +6,22 @@ use abi::lanes::Lanes;
 pub use abi::plan::Method;
 use abi::unit::Unit;
 use abi::{Description, Function, Slot};
-pub use compiler::alone::Alone;
-use compiler::backend::target::{self, Coder};
-use compiler::backend::unsupported::Unsupported;
-use compiler::backend::wide;
-use compiler::backend::{blob, c, jit};
-pub use compiler::explain::{Explanation, Listed, StepCost};
-pub use compiler::friction::Verdict;
-pub use compiler::linearise::{Linear, Matrices, Ports};
-pub use compiler::names::nearest;
-use compiler::opt::regroup;
-pub use compiler::resolve::{Lookup, Space};
+pub use compiler::analysis::dissipation::Verdict;
+pub use compiler::analysis::explain::{Explanation, Listed, StepCost};
+pub use compiler::analysis::linearise::{Linear, Matrices, Ports};
+pub use compiler::analysis::step_stability::LONGEST as LONGEST_STEP;
+pub use compiler::analysis::step_stability_report::two_digits_time;
+pub use compiler::codegen::elementary::Alone;
+use compiler::codegen::lanes;
+use compiler::codegen::target::{self, FunctionCompiler};
+use compiler::codegen::unsupported::Unsupported;
+use compiler::codegen::{c, image, jit};
+pub use compiler::experiment::vary::{Fitted, Varying};
+pub use compiler::frontend::names::nearest;
+pub use compiler::frontend::resolve::{Lookup, Space};
+pub use compiler::frontend::system::LINTS;
+use compiler::opt::reassociate;
 pub use compiler::rig::{StepDerivative, bus_load, dbc_messages, linear as linear_of};
-pub use compiler::stability::LONGEST as LONGEST_STEP;
-pub use compiler::system::LINTS;
-pub use compiler::unstable::two_digits_time;
-pub use compiler::vary::{Fitted, Varying};
 pub use compiler::{
     Built, Case, Changes, Loaded, Options, Ready, SourceFile, Sources, build, check, check_models, compile,
     dissipation, explain, explain_in, explain_run, linear, load, quantities, rig, stepping, varying,
@@ -79,7 +79,7 @@ pub fn emit(
                 }
                 None => target::here().map_err(told)?,
             };
-            let mut coder = Coder::new(isa);
+            let mut coder = FunctionCompiler::new(isa);
             let mut listings = vec![places(description, method, size_of::<f64>())];
             if emit == Emit::Asm {
                 listings[0] += "; What is Cranelift's as it has that before it joins blocks and places constants.\n";
@@ -95,7 +95,7 @@ pub fn emit(
                 return Err(format!("no code is made for {}: choose a --target", std::env::consts::ARCH));
             };
             let more = usable(made_for, features)?;
-            let image = blob::image(&functions, description, &built.program.params, made_for, more).map_err(told)?;
+            let image = image::image(&functions, description, &built.program.params, made_for, more).map_err(told)?;
             return Ok(image.to_bytes());
         }
     };
@@ -167,11 +167,11 @@ pub struct StepCode {
 pub fn step_code(built: &Built, method: Method) -> StepCode {
     let description = &built.program.description;
     let (layout, pool) = (&description.layout, description.pool.len());
-    let step = compiler::code::step(&built.program, method);
+    let step = compiler::codegen::tiering::step(&built.program, method);
     let func = compiler::math::expand(&step);
-    let (operations, critical_path) = (func.ops.len(), regroup::critical_path(&func));
+    let (operations, critical_path) = (func.ops.len(), reassociate::critical_path(&func));
     let bytes = jit::compile(&[(Function::Step, func)], layout, pool).map_or(0, |(_, stats)| stats.functions[0].2);
-    let lanes = wide::widest(&step, layout, pool).map_err(|why| why.to_string());
+    let lanes = lanes::widest(&step, layout, pool).map_err(|why| why.to_string());
     StepCode { operations, bytes, critical_path, lanes }
 }
 
@@ -259,8 +259,8 @@ pub fn packed_rig(
         found.extend(errors);
         None
     })?;
-    let image = |program: &compiler::program::Program, functions: &[_]| {
-        blob::image(functions, &program.description, &program.params, processor, more)
+    let image = |program: &compiler::ir::program::Program, functions: &[_]| {
+        image::image(functions, &program.description, &program.params, processor, more)
             .map(|image| image.to_bytes())
             .map_err(|why| Some(why.to_string()))
     };

@@ -122,7 +122,7 @@ fn inside(expr: &Expr, least: u8) -> String {
 pub fn expression(expr: &Expr) -> String {
     match &expr.kind {
         ExprKind::Number { value, unit } => {
-            let number = crate::value::significant(*value, 15);
+            let number = crate::quantity::significant(*value, 15);
             match unit {
                 Some(unit) => format!("{number} {}", unit_text(&unit.text)),
                 None => number,

@@ -5,28 +5,29 @@
 
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
 
-mod args;
-mod characterise;
-mod commands;
 mod compile;
-mod diagram;
+mod quantity;
+mod vary;
+mod args;
 mod equations;
+mod plot;
+mod report;
+mod characterise;
+mod diagram;
 mod figure;
-mod kept;
+mod interrupt;
+mod loop_stability;
 mod matrices;
 mod parquet;
-mod plot;
 mod project;
-mod remote;
 mod repl;
-mod report;
-mod results;
-mod sign;
-mod stability;
 mod terminal;
+mod results;
+mod signing;
+mod source_snapshot;
+mod ssh;
 mod unfinished;
-mod value;
-mod vary;
+mod commands;
 
 use clap::Parser;
 use commands::End;

@@ -1,14 +1,14 @@
 //! What became of a run, in words and as JSON.
 
 use crate::compile::Stages;
+use crate::quantity::{count, duration, show, significant, uncertain};
 use crate::terminal::{Style, Terminal};
-use crate::value::{count, duration, show, significant, uncertain};
 use abi::plan::{Experiment, Method, Solver};
 use abi::unit::Unit;
 use abi::{Description, Instance};
 use runtime::engine::{Estimate, Failure, Outcome};
 use runtime::record::Recording;
-use runtime::verdict::{Margin, Reading, Verdict};
+use runtime::run::verdict::{Margin, Reading, Verdict};
 use serde_json::{Value, json};
 
 /// One run and all that is told of it.
@@ -242,7 +242,7 @@ fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> 
     }
     let distance = if verdict.holds { format!("margin {amount}") } else { format!("misses by {amount}") };
     let time = match margin.time {
-        Some(time) if !verdict.holds => format!(", at {}", runtime::show::time(time)),
+        Some(time) if !verdict.holds => format!(", at {}", runtime::format::time(time)),
         Some(_) | None => String::new(),
     };
     format!("{value}, {distance}{time}")

@@ -4,7 +4,7 @@
 //! its number alone. Random numbers are drawn by counter, so that a run has the same ones on every machine, in any order.
 
 use crate::compile::Alone;
-use crate::value;
+use crate::quantity;
 use abi::unit::Unit;
 
 /// Most values of a grid.
@@ -68,7 +68,7 @@ fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
     // Twelve digits in the unit as written: without the noise of a sum.
     let value = |k: usize| {
         let shown: f64 = format!("{:.11e}", unit.from_si(first + k as f64 * step)).parse().unwrap_or(f64::NAN);
-        value::si(shown, &unit)
+        quantity::si(shown, &unit)
     };
     Ok((unit.clone(), How::Values((0..count as usize).map(value).collect())))
 }
@@ -89,7 +89,7 @@ fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
             _ => Err("uniform goes from a smaller to a larger value".into()),
         },
         "lognormal" => {
-            let ((median, unit), (spread, plain)) = (value::parse(first)?, value::parse(second)?);
+            let ((median, unit), (spread, plain)) = (quantity::parse(first)?, quantity::parse(second)?);
             if !plain.text.is_empty() || spread < 0.0 {
                 return Err("the spread of a lognormal distribution is a number such as 0.2: about 20 %".into());
             }
@@ -104,7 +104,7 @@ fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
 
 /// Values of one kind; the unit is that of the first.
 fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
-    let read: Vec<(f64, Unit)> = texts.iter().map(|text| value::parse(text)).collect::<Result<_, _>>()?;
+    let read: Vec<(f64, Unit)> = texts.iter().map(|text| quantity::parse(text)).collect::<Result<_, _>>()?;
     let unit = read[0].1.clone();
     for ((_, other), text) in read.iter().zip(texts) {
         if other.dimension != unit.dimension {

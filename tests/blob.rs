@@ -6,9 +6,9 @@ mod support;
 use abi::Instance;
 use abi::image::{Image, Refusal, Target};
 use abi::plan::Method;
-use compiler::backend::blob::image;
+use compiler::codegen::image::image;
 use compiler::{Changes, experiment, functions};
-use runtime::blob::{Model, load};
+use runtime::image::{Model, load};
 use support::Texts;
 
 const SERVO: &str = "import std.interfaces

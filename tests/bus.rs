@@ -3,7 +3,7 @@
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Client;
 use runtime::can::{Bus, Frame, Options, Received};
-use runtime::clock::{Clock, Monotonic};
+use runtime::realtime::clock::{Clock, Monotonic};
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};

@@ -5,8 +5,8 @@ mod support;
 
 use compiler::ir::random::Random;
 use compiler::{Case, Changes, Options};
+use runtime::engine::even_grid;
 use runtime::engine::{Continue, run};
-use runtime::even;
 use support::Texts;
 
 fn compiled(text: &str) -> Case {
@@ -17,9 +17,9 @@ fn compiled(text: &str) -> Case {
 }
 
 fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
-    let grid = even::instants(every, &case.experiment).unwrap_or_else(|why| panic!("{why}"));
+    let grid = even_grid::instants(every, &case.experiment).unwrap_or_else(|why| panic!("{why}"));
     let go_on = &mut |_| Continue::Continue(());
-    let (recording, result) = even::record(case.instance.clone(), &case.experiment, &grid, go_on);
+    let (recording, result) = even_grid::record(case.instance.clone(), &case.experiment, &grid, go_on);
     result.unwrap_or_else(|failure| panic!("{failure}"));
     recording.rows().map(<[f64]>::to_vec).collect()
 }

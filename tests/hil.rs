@@ -93,7 +93,7 @@ fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Ve
     let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
     let mut options =
         HilOptions { arms_itself: true, duration_ns: Some((seconds * 1e9) as u64), ..HilOptions::default() };
-    options.start.sign_test = runtime::drive::sign::SignTest::Skip;
+    options.start.sign_test = runtime::drive::polarity_check::SignTest::Skip;
     let masters = world.masters();
     let (mut hil, _) = Hil::new(&ready.rig, ready.control, world.clock(), masters, options, None).unwrap();
     let mut rows = Vec::new();
@@ -208,7 +208,7 @@ fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
         HilOptions { arms_itself: true, duration_ns: Some(20_000_000_000), look, ..HilOptions::default() };
     options.control.ramp_ns = 1;
     // The push of the sign test would leave the block somewhere else.
-    options.start.sign_test = runtime::drive::sign::SignTest::Skip;
+    options.start.sign_test = runtime::drive::polarity_check::SignTest::Skip;
     let masters = world.masters();
     let (mut hil, _) = Hil::new(&made.rig, made.control, world.clock(), masters, options, None).unwrap();
     let (mut course, mut slips, mut fast) = (Vec::new(), 0, false);
@@ -544,7 +544,7 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
 fn a_set_is_refused_where_a_start_and_a_package_would_be() {
     let folder = folder("hil-set-stability");
     let number = |name: &str, plain| std::env::var(name).ok().and_then(|text| text.parse().ok()).unwrap_or(plain);
-    let mut chance = runtime::chance::Chance(number("FRIC_SEED", 22));
+    let mut chance = runtime::rng::Chance(number("FRIC_SEED", 22));
     let stiffnesses: Vec<String> =
         (0..number("FRIC_RUNS", 4)).map(|_| format!("{:.1} N·m/rad", 10f64.powf(chance.between(2.5, 3.5)))).collect();
     let mut child = under_way(&folder, "log");

@@ -7,9 +7,9 @@ mod support;
 use abi::plan::Method;
 use abi::table::Interpret;
 use abi::{Function, Slot};
-use compiler::backend::interp::Interpreter;
+use compiler::ir::interpret::Interpreter;
+use compiler::ir::program::Program;
 use compiler::ir::random::Random;
-use compiler::program::Program;
 use support::Texts;
 
 const POINTS: usize = 6;

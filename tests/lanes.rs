@@ -5,11 +5,11 @@ mod support;
 
 use abi::description::Kind;
 use abi::plan::Method;
+use compiler::experiment::vary::{Fitted, Varying};
 use compiler::ir::random::Random;
-use compiler::vary::{Fitted, Varying};
 use compiler::{Case, Changes, Options};
+use runtime::engine::lanes::{self, Next};
 use runtime::engine::{self, Continue, Failure, Outcome};
-use runtime::lanes::{self, Next};
 use support::Texts;
 
 const TEXT: &str = r#"
@@ -203,7 +203,7 @@ fn a_run_that_fails_leaves_the_others_alone() {
 }
 
 fn has_lanes() -> bool {
-    let here = compiler::backend::wide::Width::here().is_some();
+    let here = compiler::codegen::lanes::Width::here().is_some();
     if !here {
         println!("SKIPPED: this processor has no lanes: each run is alone");
     }

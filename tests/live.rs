@@ -7,8 +7,8 @@ mod support;
 use abi::description::Slot;
 use abi::live::Place;
 use compiler::{Changes, NoSources, Options, Ready};
-use runtime::chance::Chance;
 use runtime::hil::live::{Judge, Objection, TOLD};
+use runtime::rng::Chance;
 
 /// A rig whose friction has random parameters, of which some follow from others.
 fn text(chance: &mut Chance) -> String {

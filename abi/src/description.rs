@@ -75,7 +75,7 @@ pub struct Layout {
     pub jacobian: Segment,
     /// For each sampled block: is it due (1) or not (0), read by `Tick`.
     pub due: Segment,
-    /// One adaptive step that is tried: see [`Trial`](crate::trial::Trial). Empty where `Rosenbrock` is not there.
+    /// One adaptive step that is tried: see [`Trial`](crate::rosenbrock::layout::Trial). Empty where `Rosenbrock` is not there.
     pub trial: Segment,
     /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
     pub rings: Segment,

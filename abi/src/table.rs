@@ -25,7 +25,7 @@ pub enum Function {
     /// One fixed step with all that belongs to it: states, count, time where the model reads it, ticks, transitions, outputs,
     /// guards.
     Step,
-    /// Up to `count` adaptive steps, tried and as far as possible settled: see [`trial`](crate::trial).
+    /// Up to `count` adaptive steps, tried and as far as possible settled: see [`trial`](crate::rosenbrock::layout).
     Rosenbrock,
 }
 

@@ -13,10 +13,10 @@ use abi::Slot;
 use abi::lanes::Lanes;
 use abi::plan::{Experiment, Method};
 use clock::processor_time;
-use compiler::backend::wide::Width;
+use compiler::codegen::lanes::Width;
 use compiler::{Case, Changes, NoSources, Options};
+use runtime::engine::lanes::{self, Next};
 use runtime::engine::{self, Continue, Failure, Outcome};
-use runtime::lanes::{self, Next};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -195,7 +195,7 @@ fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
     let widths = Width::ALL.into_iter().filter(|width| width.is_here());
     let kinds = widths.flat_map(|width| [1, 2, 3].map(|vectors| (width, vectors)));
     let codes: Vec<Lanes> = kinds
-        .filter_map(|(width, vectors)| compiler::code::lanes_of(&program, Method::Adaptive, width, vectors))
+        .filter_map(|(width, vectors)| compiler::codegen::tiering::lanes_of(&program, Method::Adaptive, width, vectors))
         .collect();
     for (tol_ours, tol_c) in tolerances {
         let run = |k: usize| {

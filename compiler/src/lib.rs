@@ -4,58 +4,25 @@
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
-pub mod components;
 pub mod ir;
 pub mod math;
 pub mod opt;
-pub mod program;
-pub mod derive;
-pub mod impulse;
-pub mod questions;
-pub mod coupled;
-pub mod elimination;
-pub mod discretize;
-pub mod rosenbrock;
-pub mod backend;
-pub mod code;
-pub mod alone;
+pub mod numerics;
+pub mod codegen;
 
-pub mod names;
-pub mod source;
-pub mod resolve;
-pub mod system;
-pub mod columns;
-pub mod tables;
-pub mod flatten;
-pub mod units;
-pub mod delays;
-pub mod causality;
-pub mod interval;
-pub mod reach;
-pub mod lookup;
+pub mod frontend;
+pub mod ranges;
 pub mod lower;
-pub mod checks;
-pub mod starts;
-pub mod domains;
-pub mod remembered;
-pub mod proof;
-pub mod friction;
-pub mod stability;
-pub mod acting;
-pub mod lints;
-pub mod explain;
-pub mod unstable;
-pub mod linearise;
+pub mod analysis;
 pub mod rig;
 pub mod experiment;
-pub mod vary;
 #[cfg(test)]
 mod soundness;
 
-pub use code::{code, functions};
+pub use crate::codegen::tiering::{code, functions};
+pub use crate::frontend::resolve::{ExperimentInfo, Loaded, load};
+pub use crate::frontend::source::{Files, NoSources, SourceFile, Sources};
 pub use experiment::Changes;
-pub use resolve::{ExperimentInfo, Loaded, load};
-pub use source::{Files, NoSources, SourceFile, Sources};
 
 use abi::plan::Method;
 use abi::table::Code;
@@ -117,26 +84,32 @@ pub fn varying(
     experiment: &str,
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<Vec<vary::Varying>, Vec<Diagnostic>> {
+) -> Result<Vec<experiment::vary::Varying>, Vec<Diagnostic>> {
     let variants = experiment::read(loaded, sources, experiment, &options.changes, warnings, &mut |_| ())?;
-    let varied = |variant: &experiment::Variant| starts::params(&variant.system, &options.changes.vary);
-    if let Some(error) = variants.iter().find_map(|variant| vary::built_in(variant, &varied(variant))) {
+    let varied =
+        |variant: &experiment::Variant| experiment::start_values::params(&variant.system, &options.changes.vary);
+    if let Some(error) = variants.iter().find_map(|variant| experiment::vary::built_in(variant, &varied(variant))) {
         return Err(vec![error]);
     }
     let one = |variant: experiment::Variant| {
         let paths = &varied(&variant);
         // What is described keeps its ranges; the code of a fixed step loses those that change.
         let mut coded = variant.program.clone();
-        coded.description.guards = vary::in_code(&variant, paths);
+        coded.description.guards = experiment::vary::in_code(&variant, paths);
         let functions = functions(&coded, variant.experiment.solver.method);
         let (code, notes) = code(&functions, &coded.description, options.interpret);
         let alone = options.interpret || variant.experiment.bench.is_some();
-        let lanes = if alone { None } else { code::lanes(&coded, variant.experiment.solver.method) };
+        let lanes = if alone { None } else { codegen::tiering::lanes(&coded, variant.experiment.solver.method) };
         let adaptive = variant.adaptive.as_ref().map(|program| {
-            let code = code::on_demand(program, Method::Adaptive, options.interpret);
+            let code = codegen::tiering::on_demand(program, Method::Adaptive, options.interpret);
             Arc::new(Instance::new(Arc::new(program.description.clone()), code, &program.params))
         });
-        vary::Varying::new(variant, paths, &loaded.files, vary::Runnable { code, lanes, adaptive, notes })
+        experiment::vary::Varying::new(
+            variant,
+            paths,
+            &loaded.files,
+            experiment::vary::Runnable { code, lanes, adaptive, notes },
+        )
     };
     Ok(variants.into_iter().map(one).collect())
 }
@@ -144,7 +117,7 @@ pub fn varying(
 /// A model or an experiment as one program, for what is made of it beside a run.
 pub struct Built {
     /// The program.
-    pub program: program::Program,
+    pub program: ir::program::Program,
     /// How an experiment is stepped; none for a model on its own.
     pub solver: Option<abi::plan::Solver>,
 }
@@ -170,9 +143,9 @@ pub fn build(
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
     let step = changes.step.filter(|_| changes.method != Some(Method::Adaptive));
     let (system, types, ()) = sound(loaded, sources, (&model, file), overrides, warnings, |system, diagnostics| {
-        delays::check(system, diagnostics);
+        frontend::delays::check(system, diagnostics);
         if let Some(step) = step {
-            delays::fits(system, step, None, diagnostics);
+            frontend::delays::fits(system, step, None, diagnostics);
         }
     })?;
     let mut program = lower::lower(&system, &types, &[]).program;
@@ -193,11 +166,11 @@ pub fn linear(
     name: &str,
     options: &Options,
     warnings: &mut Vec<Diagnostic>,
-) -> Result<linearise::Linear, Vec<Diagnostic>> {
+) -> Result<analysis::linearise::Linear, Vec<Diagnostic>> {
     let root = loaded.root();
     let Some((model, file)) = model_of(loaded, name) else {
         let variant = first(loaded, sources, name, &options.changes, warnings)?;
-        if let Some(error) = delays::linear(&variant.system) {
+        if let Some(error) = frontend::delays::linear(&variant.system) {
             return Err(vec![error]);
         }
         let mut functions = functions(&variant.program, variant.experiment.solver.method);
@@ -208,15 +181,15 @@ pub fn linear(
         let instance = Instance::new(Arc::new(variant.program.description.clone()), code, &variant.program.params);
         let params = options.changes.ports.as_ref().map_or(&[][..], |ports| &ports.params);
         let experiment = Some(variant.experiment);
-        return Ok(linearise::Linear::new(&variant.program, instance, experiment, &variant.ports, params));
+        return Ok(analysis::linearise::Linear::new(&variant.program, instance, experiment, &variant.ports, params));
     };
     let given = experiment::overrides(loaded, &options.changes, warnings);
     let overrides = given.iter().map(|change| change.override_in(root)).collect();
     let ports = options.changes.ports.clone().unwrap_or_default();
     let (system, types, opened) =
         sound(loaded, sources, (&model, file), overrides, warnings, |system, diagnostics| {
-            diagnostics.extend(delays::linear(system));
-            linearise::open(system, &ports, diagnostics)
+            diagnostics.extend(frontend::delays::linear(system));
+            analysis::linearise::open(system, &ports, diagnostics)
         })?;
     let wanted: Vec<lower::Wanted> = opened
         .outputs
@@ -230,7 +203,7 @@ pub fn linear(
     let slots = (inputs.collect(), outputs.collect());
     let (code, _) = code(&functions(&program, Method::Adaptive), &program.description, true);
     let instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
-    Ok(linearise::Linear::new(&program, instance, None, &slots, &ports.params))
+    Ok(analysis::linearise::Linear::new(&program, instance, None, &slots, &ports.params))
 }
 
 /// A rig, ready to run.
@@ -242,15 +215,15 @@ pub struct Ready {
     /// The crossed-out part: its own `Step`, by `expo`.
     pub plant: Instance,
     /// The control program before it was compiled: for derivatives of its step.
-    pub program: program::Program,
+    pub program: ir::program::Program,
     /// The plant program before it was compiled.
-    pub plant_program: program::Program,
+    pub plant_program: ir::program::Program,
     /// Which parameters may change while it runs, and what must hold of them.
     pub live: abi::live::Live,
     /// What computes the numbers of that from a block of parameters.
     pub judge: Instance,
     /// The same before it was compiled.
-    pub judge_program: program::Program,
+    pub judge_program: ir::program::Program,
     /// What the user should know: a processor without what machine code needs.
     pub notes: Vec<String>,
 }
@@ -268,7 +241,7 @@ pub fn rig(
 ) -> Result<Ready, Vec<Diagnostic>> {
     let lowered = lowered_rig(loaded, sources, name, options, warnings)?;
     let rig::Lowered { rig, control, plant, live, judge } = lowered;
-    let make = |program: &program::Program, functions: &[(Function, ir::Func)]| {
+    let make = |program: &ir::program::Program, functions: &[(Function, ir::Func)]| {
         let (code, notes) = code(functions, &program.description, options.interpret);
         (Instance::new(Arc::new(program.description.clone()), code, &program.params), notes)
     };
@@ -289,7 +262,7 @@ pub fn rig(
 }
 
 /// The one function of a judge.
-pub fn judging(judge: &program::Program) -> Vec<(Function, ir::Func)> {
+pub fn judging(judge: &ir::program::Program) -> Vec<(Function, ir::Func)> {
     vec![(Function::Outputs, math::expand(&judge.outputs))]
 }
 
@@ -326,7 +299,7 @@ fn lowered_rig(
 
 /// Code of the last case, and what it was made from.
 struct Made {
-    program: program::Program,
+    program: ir::program::Program,
     method: Method,
     code: Code,
     /// Code of the same for adaptive runs, if that is another one.
@@ -336,8 +309,8 @@ struct Made {
 
 impl Made {
     /// Whether the code of a program is the same: it differs in the values of parameters at most.
-    fn fits(&self, program: &program::Program, method: Method) -> bool {
-        let program::Program {
+    fn fits(&self, program: &ir::program::Program, method: Method) -> bool {
+        let ir::program::Program {
             description,
             params: _,
             start,
@@ -366,8 +339,9 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) 
     let method = rig.as_ref().map_or(experiment.solver.method, |(rig, _)| rig.method);
     let (description, params) = (Arc::new(program.description.clone()), program.params.clone());
     if !made.as_ref().is_some_and(|made| made.fits(&program, method)) {
-        let (code, notes) = code::late(&program, method, interpret);
-        let adaptive = adaptive.as_ref().map(|program| code::on_demand(program, Method::Adaptive, interpret));
+        let (code, notes) = codegen::tiering::late(&program, method, interpret);
+        let adaptive =
+            adaptive.as_ref().map(|program| codegen::tiering::on_demand(program, Method::Adaptive, interpret));
         *made = Some(Made { program, method, code, adaptive, notes });
     }
     let Made { code, adaptive: adaptive_code, notes, .. } = made.as_ref().expect("it was just made");
@@ -380,8 +354,8 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) 
 }
 
 /// The surroundings of a dry run.
-fn bench(rig: abi::rig::Rig, plant: &program::Program, method: Method, interpret: bool) -> abi::rig::Bench {
-    let (code, _) = code::late(plant, method, interpret);
+fn bench(rig: abi::rig::Rig, plant: &ir::program::Program, method: Method, interpret: bool) -> abi::rig::Bench {
+    let (code, _) = codegen::tiering::late(plant, method, interpret);
     abi::rig::Bench { rig, plant: Instance::new(Arc::new(plant.description.clone()), code, &plant.params) }
 }
 
@@ -392,10 +366,10 @@ pub fn dissipation(
     sources: &dyn Sources,
     instance: &grammar::ast::Instance,
     file: FileId,
-) -> Option<friction::Verdict> {
+) -> Option<analysis::dissipation::Verdict> {
     use grammar::ast;
-    let resolve::Lookup::Found(item, Item::Model(model)) =
-        loaded.find(file, resolve::Space::Type, &instance.model.text)
+    let frontend::resolve::Lookup::Found(item, Item::Model(model)) =
+        loaded.find(file, frontend::resolve::Space::Type, &instance.model.text)
     else {
         return None;
     };
@@ -406,23 +380,27 @@ pub fn dissipation(
     let paths: Vec<ast::Path> = instance.args.iter().map(path).collect();
     let given = paths.iter().zip(&instance.args).map(|(path, bind)| {
         let value = match &bind.value {
-            ast::BindValue::Expr(expr) => flatten::OverrideValue::Expr(expr),
-            ast::BindValue::Instance(instance) => flatten::OverrideValue::Instance(instance),
+            ast::BindValue::Expr(expr) => frontend::flatten::OverrideValue::Expr(expr),
+            ast::BindValue::Instance(instance) => frontend::flatten::OverrideValue::Instance(instance),
         };
-        flatten::Override { path, value, file }
+        frontend::flatten::Override { path, value, file }
     });
     let (system, types, diagnostics) = alone(loaded, sources, model, item.file, given.collect());
     if diagnostics.iter().any(Diagnostic::is_error) {
         return None;
     }
-    friction::dissipation(&system, &types)
+    analysis::dissipation::dissipation(&system, &types)
 }
 
 /// Explains a model of a loaded text, on its own.
 ///
 /// # Errors
 /// Everything that is wrong with it.
-pub fn explain(loaded: &Loaded, sources: &dyn Sources, model: &str) -> Result<explain::Explanation, Vec<Diagnostic>> {
+pub fn explain(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    model: &str,
+) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
     let root = loaded.root();
     match loaded.models().into_iter().any(|candidate| candidate.name.text == model) {
         true => explain_in(loaded, sources, model, root),
@@ -439,14 +417,16 @@ pub fn explain_in(
     sources: &dyn Sources,
     model: &str,
     file: FileId,
-) -> Result<explain::Explanation, Vec<Diagnostic>> {
-    let resolve::Lookup::Found(item, Item::Model(model)) = loaded.find(file, resolve::Space::Type, model) else {
+) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
+    let frontend::resolve::Lookup::Found(item, Item::Model(model)) =
+        loaded.find(file, frontend::resolve::Space::Type, model)
+    else {
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
     let (system, types, diagnostics) = alone(loaded, sources, model, item.file, Vec::new());
     match diagnostics.iter().any(Diagnostic::is_error) {
         true => Err(once(diagnostics)),
-        false => Ok(explain::explain(&system, &types, &loaded.files)),
+        false => Ok(analysis::explain::explain(&system, &types, &loaded.files)),
     }
 }
 
@@ -466,8 +446,8 @@ pub fn stepping(
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
     let (system, types, mut diagnostics) = alone(loaded, sources, model, loaded.root(), Vec::new());
-    delays::check(&system, &mut diagnostics);
-    delays::fits(&system, step, None, &mut diagnostics);
+    frontend::delays::check(&system, &mut diagnostics);
+    frontend::delays::fits(&system, step, None, &mut diagnostics);
     if diagnostics.iter().any(Diagnostic::is_error) {
         return Err(once(diagnostics));
     }
@@ -488,9 +468,9 @@ pub fn quantities(
     sources: &dyn Sources,
     experiment: &str,
     changes: &Changes,
-) -> Result<Vec<explain::Listed>, Vec<Diagnostic>> {
+) -> Result<Vec<analysis::explain::Listed>, Vec<Diagnostic>> {
     let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
-    Ok(explain::quantities(&variant.system, &variant.types, &loaded.files))
+    Ok(analysis::explain::quantities(&variant.system, &variant.types, &loaded.files))
 }
 
 /// Explains what an experiment runs, with these changes.
@@ -502,9 +482,9 @@ pub fn explain_run(
     sources: &dyn Sources,
     experiment: &str,
     changes: &Changes,
-) -> Result<explain::Explanation, Vec<Diagnostic>> {
+) -> Result<analysis::explain::Explanation, Vec<Diagnostic>> {
     let variant = first(loaded, sources, experiment, changes, &mut Vec::new())?;
-    Ok(explain::explain(&variant.system, &variant.types, &loaded.files))
+    Ok(analysis::explain::explain(&variant.system, &variant.types, &loaded.files))
 }
 
 /// The first combination of an experiment's sweeps.
@@ -532,13 +512,13 @@ fn sound<T>(
     loaded: &Loaded,
     sources: &dyn Sources,
     (model, file): (&grammar::ast::Model, FileId),
-    overrides: Vec<flatten::Override>,
+    overrides: Vec<frontend::flatten::Override>,
     warnings: &mut Vec<Diagnostic>,
-    open: impl FnOnce(&mut system::System, &mut Vec<Diagnostic>) -> T,
-) -> Result<(system::System, units::Types, T), Vec<Diagnostic>> {
+    open: impl FnOnce(&mut frontend::system::System, &mut Vec<Diagnostic>) -> T,
+) -> Result<(frontend::system::System, frontend::units::Types, T), Vec<Diagnostic>> {
     let (system, types, mut diagnostics, opened) = opened(loaded, sources, model, file, overrides, open);
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
     }
     diagnostics.extend(std::mem::take(warnings));
     if diagnostics.iter().any(Diagnostic::is_error) {
@@ -554,8 +534,8 @@ fn alone(
     sources: &dyn Sources,
     model: &grammar::ast::Model,
     file: FileId,
-    overrides: Vec<flatten::Override>,
-) -> (system::System, units::Types, Vec<Diagnostic>) {
+    overrides: Vec<frontend::flatten::Override>,
+) -> (frontend::system::System, frontend::units::Types, Vec<Diagnostic>) {
     let (system, types, diagnostics, ()) = opened(loaded, sources, model, file, overrides, |_, _| ());
     (system, types, diagnostics)
 }
@@ -566,21 +546,22 @@ fn opened<T>(
     sources: &dyn Sources,
     model: &grammar::ast::Model,
     file: FileId,
-    overrides: Vec<flatten::Override>,
-    open: impl FnOnce(&mut system::System, &mut Vec<Diagnostic>) -> T,
-) -> (system::System, units::Types, Vec<Diagnostic>, T) {
-    let request = flatten::Request {
-        instance: flatten::Instance::Alone(model, file),
+    overrides: Vec<frontend::flatten::Override>,
+    open: impl FnOnce(&mut frontend::system::System, &mut Vec<Diagnostic>) -> T,
+) -> (frontend::system::System, frontend::units::Types, Vec<Diagnostic>, T) {
+    let request = frontend::flatten::Request {
+        instance: frontend::flatten::Instance::Alone(model, file),
         overrides,
         observed: Vec::new(),
         data: Vec::new(),
         frame: None,
     };
-    let flatten::Flat { mut system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
+    let frontend::flatten::Flat { mut system, mut diagnostics, .. } =
+        frontend::flatten::flatten(loaded, sources, &request);
     let opened = open(&mut system, &mut diagnostics);
-    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    let types = frontend::units::check(&system, &loaded.files, &mut diagnostics);
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        causality::check(&system, &loaded.files, &mut diagnostics);
+        frontend::causality::check(&system, &loaded.files, &mut diagnostics);
     }
     (system, types, diagnostics, opened)
 }
@@ -614,9 +595,9 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
             // What calls a function that grows beyond all bounds does so too, each time anew.
             Item::Function(_) if all.iter().any(|d| d.message.ends_with(GROWS)) => {}
             Item::Function(_) | Item::Const(_) | Item::Table(_) => {
-                let flat = flatten::flatten_item(loaded, sources, root, item);
+                let flat = frontend::flatten::flatten_item(loaded, sources, root, item);
                 let mut diagnostics = flat.diagnostics;
-                units::check(&flat.system, &loaded.files, &mut diagnostics);
+                frontend::units::check(&flat.system, &loaded.files, &mut diagnostics);
                 all.extend(diagnostics);
             }
             Item::Fit(fit) => {
@@ -660,12 +641,22 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
     let said = looked_at.take(MOST_STEPPED).flat_map(|variant| {
         let abi::plan::Solver { method, step, .. } = variant.experiment.solver;
         let (system, types, program) = (&variant.system, &variant.types, &variant.program);
-        let mut found = acting::check(system, types, program, None, run);
+        let mut found = analysis::acting_mass::check(system, types, program, None, run);
         if let Some(place) = solver.filter(|_| method != Method::Adaptive) {
-            let fixed = unstable::Fixed { system, types, program, method, step, place, run, ends: &[], rig: false };
-            found.extend(unstable::check(&fixed, &loaded.files));
+            let fixed = analysis::step_stability_report::Fixed {
+                system,
+                types,
+                program,
+                method,
+                step,
+                place,
+                run,
+                ends: &[],
+                rig: false,
+            };
+            found.extend(analysis::step_stability_report::check(&fixed, &loaded.files));
         }
-        lints::silence(system, &mut found);
+        analysis::lints::silence(system, &mut found);
         found
     });
     let mut said: Vec<Diagnostic> = said.collect();
@@ -675,7 +666,7 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
     });
     let allowed: Vec<&str> = allows.collect();
     said.retain(|diagnostic| {
-        let lint = system::LINTS.iter().find(|(_, code)| *code == diagnostic.code);
+        let lint = frontend::system::LINTS.iter().find(|(_, code)| *code == diagnostic.code);
         diagnostic.is_error() || lint.is_none_or(|(name, _)| !allowed.contains(name))
     });
     let mut codes = std::collections::HashSet::new();
@@ -697,20 +688,20 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     let whole = !loaded.has_errors();
     let (system, types, mut diagnostics) = alone(loaded, sources, model, file, Vec::new());
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
         if whole {
-            domains::check(&system, &types, &loaded.files, &mut diagnostics);
+            analysis::domains::check(&system, &types, &loaded.files, &mut diagnostics);
         }
     }
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
-        diagnostics.extend(lints::check(&system, &types, &loaded.files, physics));
+        diagnostics.extend(analysis::lints::check(&system, &types, &loaded.files, physics));
     }
     diagnostics.extend(with_defaults(loaded, sources, model));
     if loaded.misread(model.span) {
         // What could not be read is missing elsewhere: say the cause.
         diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
     }
-    lints::silence(&system, &mut diagnostics);
+    analysis::lints::silence(&system, &mut diagnostics);
     diagnostics
 }
 
@@ -724,22 +715,22 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
     if !given {
         return Vec::new();
     }
-    let request = flatten::Request {
-        instance: flatten::Instance::WithDefaults(model, loaded.root()),
+    let request = frontend::flatten::Request {
+        instance: frontend::flatten::Instance::WithDefaults(model, loaded.root()),
         overrides: Vec::new(),
         observed: Vec::new(),
         data: Vec::new(),
         frame: None,
     };
-    let flatten::Flat { system, mut diagnostics, .. } = flatten::flatten(loaded, sources, &request);
-    let types = units::check(&system, &loaded.files, &mut diagnostics);
+    let frontend::flatten::Flat { system, mut diagnostics, .. } = frontend::flatten::flatten(loaded, sources, &request);
+    let types = frontend::units::check(&system, &loaded.files, &mut diagnostics);
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        causality::check(&system, &loaded.files, &mut diagnostics);
+        frontend::causality::check(&system, &loaded.files, &mut diagnostics);
     }
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
         if !loaded.has_errors() {
-            domains::check(&system, &types, &loaded.files, &mut diagnostics);
+            analysis::domains::check(&system, &types, &loaded.files, &mut diagnostics);
         }
     }
     diagnostics.retain(Diagnostic::is_error);
@@ -758,7 +749,7 @@ fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::
     let model = Model { name, body: ports.into_iter().filter_map(port).collect(), doc, span };
     let (system, types, mut diagnostics) = alone(loaded, sources, &model, loaded.root(), Vec::new());
     if !diagnostics.iter().any(Diagnostic::is_error) {
-        checks::values(&system, &types, &loaded.files, &mut diagnostics);
+        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
         diagnostics.extend(with_defaults(loaded, sources, &model));
     }
     diagnostics.retain(Diagnostic::is_error);

@@ -5,9 +5,9 @@
 //! interpreter, whose output must be finite, and by an evaluator of its own, which sees each divisor. Not judged: results
 //! too large for a double, and instants at which a range that is watched is left. `FRIC_SEED`, `FRIC_RUNS` (default 600).
 
-use crate::interval::planted;
 use crate::ir::random::Random;
-use crate::reach::HUGE;
+use crate::ranges::interval::planted;
+use crate::ranges::reach::HUGE;
 use abi::description::TINY;
 use std::fmt::Write;
 use std::rc::Rc;
@@ -388,8 +388,8 @@ fn compare(op: &str, a: f64, b: f64) -> bool {
 
 /// A number of a range: often an edge.
 fn sample(random: &mut Random, (low, high): Bounds) -> f64 {
-    let least = low.map_or(-HUGE, |(low, strict)| crate::reach::least(low, strict));
-    let most = high.map_or(HUGE, |(high, strict)| crate::reach::greatest(high, strict));
+    let least = low.map_or(-HUGE, |(low, strict)| crate::ranges::reach::least(low, strict));
+    let most = high.map_or(HUGE, |(high, strict)| crate::ranges::reach::greatest(high, strict));
     let edges = [
         least,
         most,
@@ -479,7 +479,7 @@ fn wrong(text: &Text, seed: u64) -> (Option<String>, bool) {
                 block[*slot] = numbers[k];
             }
         }
-        crate::backend::interp::run_once(&outputs, &mut block, &description.pool);
+        crate::ir::interpret::run_once(&outputs, &mut block, &description.pool);
         let left = description.guards.iter().any(|guard| {
             let x = block[guard.slot.0 as usize];
             guard.path != "o" && !(x >= guard.range.0 && x <= guard.range.1)
@@ -644,7 +644,7 @@ fn elementary_functions_keep_their_limits() {
         let n = random.within(0.0, 3.0);
         let mut block = [0.0; 11];
         (block[0], block[1]) = (x, n);
-        crate::backend::interp::run_once(&func, &mut block, crate::math::pool());
+        crate::ir::interpret::run_once(&func, &mut block, crate::math::pool());
         let [exp, tanh, sin, cos, cosh, expm1, atan, sinh, power] = block[2..] else { unreachable!() };
         assert!(if x <= 0.0 { (0.0..=1.0).contains(&exp) } else { exp >= 1.0 }, "exp({x:e}) = {exp:e}");
         assert!(tanh.abs() <= 1.0, "tanh({x:e}) = {tanh:e}");

@@ -1,6 +1,6 @@
 //! Whether this computer can keep time: what a cycle needs, what it gets, and what to change.
 
-use runtime::realtime::{self, Wishes};
+use runtime::realtime::threads::{self, Wishes};
 use std::fs;
 
 /// One line for each thing that is looked at.
@@ -16,7 +16,7 @@ pub fn doctor() -> String {
         "a kernel with full preemption",
         "install one (Debian: linux-image-rt-amd64), or expect late cycles under load",
     );
-    let core = realtime::isolated_core();
+    let core = threads::isolated_core();
     line(
         core.is_some(),
         "a core of its own for the cycle",
@@ -34,7 +34,7 @@ pub fn doctor() -> String {
         "a constant processor clock",
         "`echo performance | tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor`",
     );
-    let entered = realtime::enter(&Wishes { priority: 80, core, memory: true, awake: true });
+    let entered = threads::enter(&Wishes { priority: 80, core, memory: true, awake: true });
     let refused = entered.refused();
     line(refused.is_empty(), "priority, memory and wakefulness granted", "see below");
     lines.extend(refused.iter().map(|refusal| format!("  {:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)));

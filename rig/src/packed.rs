@@ -4,12 +4,12 @@
 
 use abi::Instance;
 use abi::rig::Bus;
+use runtime::format::utc;
 use runtime::hil::live::Judge;
 use runtime::package::contents::Contents;
 use runtime::package::signature::{Signer, Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
 use runtime::record::log::Sections;
-use runtime::show::utc;
 use std::fs;
 use std::path::Path;
 
@@ -129,7 +129,7 @@ impl Open {
         let bytes = self.package.section(name).map_err(|why| why.to_string())?;
         // SAFETY: the bytes are those that `fric build` wrote, as every hash says, and where keys are trusted as a
         // signature says; who installs a package on a computer without keys vouches for it.
-        let model = unsafe { runtime::blob::load(bytes) };
+        let model = unsafe { runtime::image::load(bytes) };
         model.map(|model| model.instance()).map_err(|why| format!("its program `{name}`: {why}"))
     }
 

@@ -10,14 +10,14 @@ use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
-use runtime::clock::Clock;
-use runtime::drive::sign::SignTest;
+use runtime::drive::polarity_check::SignTest;
 use runtime::hil::cycle::{Command, End, Gauges, Hil, Options, look_ahead};
 use runtime::hil::live::Judge;
 use runtime::hil::operator::{Answer, NO_RESET, Operator, Stamp, Stopper, Why};
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{emergency, watches, words as told};
-use runtime::realtime::{self, Wishes};
+use runtime::realtime::clock::Clock;
+use runtime::realtime::threads::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::fs;
@@ -166,7 +166,7 @@ fn once(wanted: &Wanted, open: &Open, store: &Store, target: &Path) -> Result<En
         (Box::new(time), buses)
     };
     let real_time = (!fast)
-        .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
+        .then(|| threads::enter(&Wishes { priority: 80, core: threads::isolated_core(), memory: true, awake: true }));
     let refused: Vec<String> = real_time.iter().flat_map(|it| it.refused()).map(|it| format!("{it:?}")).collect();
     if !simulated && !refused.is_empty() {
         options.only_simulated = Some("this computer gives no real time: `fric-rig doctor` says why".into());

@@ -6,55 +6,28 @@
 #![cfg_attr(rtsan, feature(sanitize))]
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
-pub mod chance;
-pub mod show;
-pub mod queue;
+pub mod rng;
+pub mod format;
+pub mod spsc;
 
-pub mod verdict;
-mod peak;
-mod hills;
-mod quadrature;
-mod crossing;
-pub mod measure;
 pub mod record;
 
-mod outcome;
+pub mod run;
 
-mod observe;
-
-mod course;
-mod fixed;
+pub mod coupling;
 
 mod solver;
 
-pub mod lag;
-pub mod lookahead;
-mod dry;
-
 pub mod engine;
-pub mod even;
-pub mod estimate;
-pub mod steady;
-pub mod lanes;
-pub mod sweep;
 
-pub mod blob;
+pub mod image;
 pub mod package;
 
-pub mod modes;
-
-pub mod energy;
-pub mod predict;
-
-pub mod clock;
-pub mod histogram;
 pub mod realtime;
-
-pub mod host;
 
 pub mod can;
 
-pub mod bench_rt;
+pub mod latency_test;
 
 pub mod safety;
 
@@ -65,4 +38,4 @@ pub mod drive;
 pub mod hil;
 
 #[cfg(test)]
-mod models;
+mod testing;

@@ -53,7 +53,7 @@ pub struct Seen {
 
 /// How long what is borne, in cycles.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Patience {
+pub struct Timeouts {
     /// Arming: the outputs come up from their safe values.
     pub ramp: u32,
     /// An output outside its limits without a break: then a controlled stop.
@@ -198,7 +198,7 @@ impl Cause {
 
 /// What drives are told.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Order {
+pub enum DriveCommand {
     /// Not armed: enabled drives get their safe values.
     Wait,
     /// Follow the permitted outputs.
@@ -370,7 +370,7 @@ const STANDSTILL: f64 = 0.01;
 pub struct Supervisor {
     outputs: Vec<OutputLimits>,
     drives: Vec<DriveLimits>,
-    patience: Patience,
+    patience: Timeouts,
     /// Cycle in s.
     period: f64,
     stage: Stage,
@@ -393,7 +393,7 @@ impl Supervisor {
     pub fn new(
         outputs: &[OutputLimits],
         drives: &[DriveLimits],
-        patience: Patience,
+        patience: Timeouts,
         period_ns: u64,
     ) -> Result<Supervisor, Refused> {
         for (i, drive) in drives.iter().enumerate() {
@@ -509,7 +509,7 @@ impl Supervisor {
     /// One cycle: judges what was measured and asked for, and leaves in [`Supervisor::permitted`] what may be sent.
     ///
     /// `requests`: one value an output. `seen`: one entry a drive.
-    pub fn judge(&mut self, requests: &[f64], seen: &[Seen]) -> Order {
+    pub fn judge(&mut self, requests: &[f64], seen: &[Seen]) -> DriveCommand {
         assert_eq!((requests.len(), seen.len()), (self.outputs.len(), self.drives.len()), "outputs and drives");
         if !self.on(Protection::Latch) && matches!(self.stage, Stage::Slewing(_) | Stage::Quick(_)) {
             self.stage = Stage::Armed(self.patience.ramp);
@@ -528,13 +528,13 @@ impl Supervisor {
         match self.stage {
             Stage::Idle => {
                 self.rest();
-                Order::Wait
+                DriveCommand::Wait
             }
-            Stage::Armed(_) => Order::Follow,
+            Stage::Armed(_) => DriveCommand::Follow,
             Stage::Slewing(for_cycles) => {
                 let over = self.slew_to_safe() || for_cycles >= self.patience.standstill;
                 self.stage = if over { Stage::Quick(0) } else { Stage::Slewing(for_cycles + 1) };
-                Order::Follow
+                DriveCommand::Follow
             }
             Stage::Quick(for_cycles) => {
                 self.rest();
@@ -543,11 +543,11 @@ impl Supervisor {
                 });
                 let over = for_cycles > 0 && still || for_cycles >= self.patience.standstill;
                 self.stage = if over { Stage::Disabled } else { Stage::Quick(for_cycles + 1) };
-                Order::QuickStop
+                DriveCommand::QuickStop
             }
             Stage::Disabled => {
                 self.rest();
-                Order::Disable
+                DriveCommand::Disable
             }
         }
     }
@@ -750,10 +750,10 @@ mod tests {
         OutputLimits { low: -1.0, high: 2.0, slew: 100.0, safe: 0.0, drive: Some(0), torque: true };
     const FREE: OutputLimits = OutputLimits { slew: f64::INFINITY, ..LIMITS };
     const DRIVE: DriveLimits = DriveLimits { speed: 100.0, travel: (-10.0, 10.0), power: 50.0 };
-    const PATIENCE: Patience = Patience { ramp: 0, clamped: 3, standstill: 5 };
+    const PATIENCE: Timeouts = Timeouts { ramp: 0, clamped: 3, standstill: 5 };
 
     /// Armed, one output, one drive, 1 ms.
-    fn armed(output: OutputLimits, patience: Patience) -> Supervisor {
+    fn armed(output: OutputLimits, patience: Timeouts) -> Supervisor {
         let mut supervisor = Supervisor::new(&[output], &[DRIVE], patience, 1_000_000).unwrap();
         assert!(supervisor.arm());
         supervisor
@@ -772,7 +772,7 @@ mod tests {
     #[test]
     fn nothing_but_safe_values_leaves_before_arming() {
         let mut supervisor = Supervisor::new(&[LIMITS], &[DRIVE], PATIENCE, 1_000_000).unwrap();
-        assert_eq!(supervisor.judge(&[1.5], &at(0.0)), Order::Wait);
+        assert_eq!(supervisor.judge(&[1.5], &at(0.0)), DriveCommand::Wait);
         assert_eq!(supervisor.permitted(), [0.0]);
         assert!(!supervisor.is_armed());
     }
@@ -808,7 +808,7 @@ mod tests {
 
     #[test]
     fn outputs_come_up_from_safe() {
-        let patience = Patience { ramp: 4, ..PATIENCE };
+        let patience = Timeouts { ramp: 4, ..PATIENCE };
         let mut supervisor = armed(FREE, patience);
         let seen: Vec<f64> = (0..6).map(|_| sent(&mut supervisor, 1.0, 0.0)).collect();
         assert_eq!(seen, [0.0, 0.25, 0.5, 0.75, 1.0, 1.0]);
@@ -820,33 +820,33 @@ mod tests {
             let mut supervisor = armed(LIMITS, PATIENCE);
             sent(&mut supervisor, 0.1, 0.0);
             sent(&mut supervisor, 0.15, 0.0);
-            assert_eq!(supervisor.judge(&[bad], &at(0.0)), Order::Follow);
+            assert_eq!(supervisor.judge(&[bad], &at(0.0)), DriveCommand::Follow);
             assert_eq!(supervisor.permitted(), [0.15 - 0.1], "on its way to safe within its slew");
             assert_eq!(supervisor.cause(), Some(Cause::NotFinite(0)));
-            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), Order::Follow);
+            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), DriveCommand::Follow);
             assert_eq!(supervisor.permitted(), [0.0]);
-            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), Order::QuickStop);
+            assert_eq!(supervisor.judge(&[0.5], &at(0.0)), DriveCommand::QuickStop);
         }
     }
 
     #[test]
     fn too_fast_too_far_or_not_a_number_is_a_quick_stop() {
         let mut fast = armed(FREE, PATIENCE);
-        assert_eq!(fast.judge(&[1.0], &at(-100.1)), Order::QuickStop);
+        assert_eq!(fast.judge(&[1.0], &at(-100.1)), DriveCommand::QuickStop);
         assert_eq!((fast.permitted(), fast.cause()), (&[0.0][..], Some(Cause::Speed(0, -100.1))));
         let mut far = armed(FREE, PATIENCE);
-        assert_eq!(far.judge(&[1.0], &[Seen { position: Some(10.1), speed: None }]), Order::QuickStop);
+        assert_eq!(far.judge(&[1.0], &[Seen { position: Some(10.1), speed: None }]), DriveCommand::QuickStop);
         assert_eq!(far.cause(), Some(Cause::Travel(0, 10.1)));
         let mut odd = armed(FREE, PATIENCE);
-        assert_eq!(odd.judge(&[1.0], &at(f64::NAN)), Order::QuickStop);
+        assert_eq!(odd.judge(&[1.0], &at(f64::NAN)), DriveCommand::QuickStop);
     }
 
     #[test]
     fn speed_that_grows_against_the_torque_is_a_run_away() {
         let mut supervisor = armed(FREE, PATIENCE);
-        let mut last = Order::Follow;
+        let mut last = DriveCommand::Follow;
         let mut speed = 1.0;
-        while last == Order::Follow {
+        while last == DriveCommand::Follow {
             last = supervisor.judge(&[-0.5], &at(speed));
             speed += 1.0;
             assert!(speed < 100.0, "never noticed");
@@ -856,10 +856,14 @@ mod tests {
         assert!(speed < 15.0, "noticed at {speed}");
         let mut pushed = armed(FREE, PATIENCE);
         for speed in 0..99 {
-            assert_eq!(pushed.judge(&[0.5], &at(f64::from(speed))), Order::Follow, "with the torque is no run-away");
+            assert_eq!(
+                pushed.judge(&[0.5], &at(f64::from(speed))),
+                DriveCommand::Follow,
+                "with the torque is no run-away"
+            );
         }
         for speed in (1..99).rev() {
-            assert_eq!(pushed.judge(&[-0.5], &at(f64::from(speed))), Order::Follow, "braking is no run-away");
+            assert_eq!(pushed.judge(&[-0.5], &at(f64::from(speed))), DriveCommand::Follow, "braking is no run-away");
         }
     }
 
@@ -871,7 +875,7 @@ mod tests {
         for speed in 0..50 {
             // The second drive counts the other way round.
             let seen = [at(f64::from(speed))[0], at(-f64::from(speed))[0]];
-            assert_eq!(supervisor.judge(&[0.6, 0.4], &seen), Order::Follow);
+            assert_eq!(supervisor.judge(&[0.6, 0.4], &seen), DriveCommand::Follow);
         }
     }
 
@@ -879,7 +883,7 @@ mod tests {
     fn what_is_clamped_too_long_is_stopped() {
         let mut supervisor = armed(LIMITS, PATIENCE);
         for _ in 0..4 {
-            assert_eq!(supervisor.judge(&[9.0], &at(0.0)), Order::Follow);
+            assert_eq!(supervisor.judge(&[9.0], &at(0.0)), DriveCommand::Follow);
         }
         assert_eq!(supervisor.permitted(), [0.4]);
         supervisor.judge(&[9.0], &at(0.0));
@@ -888,7 +892,7 @@ mod tests {
         let mut now_and_then = armed(FREE, PATIENCE);
         for k in 0..40 {
             let request = if k % 3 == 0 { 1.0 } else { 9.0 };
-            assert_eq!(now_and_then.judge(&[request], &at(0.0)), Order::Follow);
+            assert_eq!(now_and_then.judge(&[request], &at(0.0)), DriveCommand::Follow);
         }
     }
 
@@ -898,24 +902,24 @@ mod tests {
         supervisor.trip(Cause::Lost(3));
         for cycle in 0..6 {
             assert!(!supervisor.arm());
-            assert_eq!(supervisor.judge(&[1.0], &at(50.0)), Order::QuickStop, "cycle {cycle}");
+            assert_eq!(supervisor.judge(&[1.0], &at(50.0)), DriveCommand::QuickStop, "cycle {cycle}");
             assert_eq!(supervisor.permitted(), [0.0]);
         }
-        assert_eq!(supervisor.judge(&[1.0], &at(50.0)), Order::Disable, "after its time, still turning");
+        assert_eq!(supervisor.judge(&[1.0], &at(50.0)), DriveCommand::Disable, "after its time, still turning");
         assert!(!supervisor.arm(), "latched");
         supervisor.trip(Cause::Bus(0));
         assert_eq!(supervisor.cause(), Some(Cause::Lost(3)), "the first cause is kept");
         assert!(supervisor.is_disabled() && !supervisor.arm());
-        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Disable, "at rest, and for good");
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), DriveCommand::Disable, "at rest, and for good");
     }
 
     #[test]
     fn standing_drives_are_disabled_at_once() {
         let mut supervisor = armed(FREE, PATIENCE);
         supervisor.trip(Cause::Drive(0));
-        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::QuickStop);
-        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::QuickStop, "two stop frames at least");
-        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), Order::Disable);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), DriveCommand::QuickStop);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), DriveCommand::QuickStop, "two stop frames at least");
+        assert_eq!(supervisor.judge(&[1.0], &at(0.5)), DriveCommand::Disable);
     }
 
     #[test]
@@ -925,12 +929,12 @@ mod tests {
             sent(&mut supervisor, 1.0, 0.0);
         }
         supervisor.trip(Cause::Asked);
-        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), DriveCommand::Follow);
         assert!(supervisor.permitted()[0] > 0.8);
         supervisor.trip(Cause::Energy);
-        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::Follow);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), DriveCommand::Follow);
         supervisor.trip(Cause::Foreign(0, 0x80));
-        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), Order::QuickStop);
+        assert_eq!(supervisor.judge(&[1.0], &at(0.0)), DriveCommand::QuickStop);
         assert_eq!(supervisor.cause(), Some(Cause::Asked));
     }
 
@@ -941,9 +945,9 @@ mod tests {
         sent(&mut supervisor, 1.0, 0.0);
         supervisor.outputs[0].slew = 1e-3;
         supervisor.trip(Cause::Asked);
-        let orders: Vec<Order> = (0..8).map(|_| supervisor.judge(&[1.0], &at(0.0))).collect();
-        assert_eq!(orders[..6], [Order::Follow; 6]);
-        assert_eq!(orders[6..], [Order::QuickStop; 2]);
+        let orders: Vec<DriveCommand> = (0..8).map(|_| supervisor.judge(&[1.0], &at(0.0))).collect();
+        assert_eq!(orders[..6], [DriveCommand::Follow; 6]);
+        assert_eq!(orders[6..], [DriveCommand::QuickStop; 2]);
     }
 
     #[test]
@@ -951,7 +955,7 @@ mod tests {
         let mut supervisor = Supervisor::new(&[LIMITS], &[DRIVE], PATIENCE, 1_000_000).unwrap();
         supervisor.trip(Cause::Watchdog);
         assert!(!supervisor.arm());
-        assert_eq!(supervisor.judge(&[0.0], &at(0.0)), Order::QuickStop);
+        assert_eq!(supervisor.judge(&[0.0], &at(0.0)), DriveCommand::QuickStop);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! most, so that it can be read and changed.
 
 use super::subject::{External, Subject};
-use crate::value::significant;
+use crate::quantity::significant;
 use std::fmt::Write;
 
 /// What is measured before the battery is laid out. SI; straight or rotary.

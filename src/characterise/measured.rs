@@ -1,7 +1,7 @@
 //! What a test of the battery leaves: curves and numbers, and how they are shown.
 
 use crate::plot::{Band, raised};
-use crate::value::{show, significant};
+use crate::quantity::{show, significant};
 use abi::unit::Unit;
 
 /// One test of the battery.

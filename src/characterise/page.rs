@@ -7,7 +7,7 @@ use super::phenomena::Seen;
 use super::study::{Study, figure};
 use crate::equations;
 use crate::plot;
-use crate::value::{show, significant};
+use crate::quantity::{show, significant};
 use std::fmt::Write;
 
 /// Width of a figure in px: two fit beside each other on a laptop.

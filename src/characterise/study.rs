@@ -332,7 +332,7 @@ impl Steady {
         for (name, cases) in results.iter().filter(|(name, _)| name.starts_with("steady_")) {
             let cases = cases.as_ref().map_err(|why| why.clone())?;
             for ran in cases {
-                let speed = ran.label.split_once('=').and_then(|(_, value)| crate::value::parse(value).ok());
+                let speed = ran.label.split_once('=').and_then(|(_, value)| crate::quantity::parse(value).ok());
                 let Some((speed, _)) = speed else { continue };
                 match ran.rows() {
                     Ok(rows) => {

@@ -307,7 +307,7 @@ pub fn params(model: &ast::Model, instance: &Instance) -> Vec<Param> {
         Some(declaration.range.as_ref().map_or(String::new(), range))
     };
     let numbers = |quantity: &abi::description::Quantity| {
-        let text = |value: f64| crate::value::show(value, &quantity.unit, 6);
+        let text = |value: f64| crate::quantity::show(value, &quantity.unit, 6);
         match quantity.range {
             (low, high) if low.is_finite() && high.is_finite() => format!("{} … {}", text(low), text(high)),
             (low, _) if low.is_finite() => format!("≥ {}", text(low)),

@@ -4,15 +4,15 @@ use super::{End, chosen_rig, load, reported};
 use crate::args::BenchRt as Args;
 use crate::compile::{self, Stopwatch};
 use crate::terminal::{Style, Terminal};
-use crate::{project, value};
-use runtime::bench_rt::{self, Fit, Report};
-use runtime::drive::sign::SignTest;
+use crate::{project, quantity};
+use runtime::drive::polarity_check::SignTest;
 use runtime::hil::cycle::{Hil, Options, look_ahead};
 use runtime::hil::simulated::{Pace, World};
 use runtime::hil::{emergency, words};
-use runtime::histogram::Histogram;
-use runtime::host::Host;
-use runtime::realtime::{self, Wishes};
+use runtime::latency_test::{self, Fit, Report};
+use runtime::realtime::histogram::Histogram;
+use runtime::realtime::host_check::Host;
+use runtime::realtime::threads::{self, Wishes};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -26,12 +26,12 @@ pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
     if let Some(file) = &args.file {
         return of_rig(file, args, terminal);
     }
-    let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
+    crate::interrupt::on_interrupt(|| STOP.store(true, Ordering::Relaxed));
     let period_ns = (1e9 / args.rate).round() as u64;
     let cycles = (args.seconds as f64 * args.rate).round() as u64;
-    let core = args.core.or_else(realtime::isolated_core);
+    let core = args.core.or_else(threads::isolated_core);
     let wishes = Wishes { priority: args.priority, core, ..Wishes::default() };
-    let report = bench_rt::run(period_ns, cycles, &wishes, || STOP.load(Ordering::Relaxed));
+    let report = latency_test::run(period_ns, cycles, &wishes, || STOP.load(Ordering::Relaxed));
     if report.cycles == 0 {
         terminal.error("stopped before the first cycle");
         return End::Failed;
@@ -75,8 +75,8 @@ fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
         Ok(made) => made,
         Err(why) => return refused(terminal, &why),
     };
-    let core = args.core.or_else(realtime::isolated_core);
-    let real_time = realtime::enter(&Wishes { priority: args.priority, core, ..Wishes::default() });
+    let core = args.core.or_else(threads::isolated_core);
+    let real_time = threads::enter(&Wishes { priority: args.priority, core, ..Wishes::default() });
     for refusal in real_time.refused() {
         terminal.report(&format!("refused: {:?}: {}\n  mend: {}\n", refusal.what, refusal.reason, refusal.remedy));
     }
@@ -127,14 +127,14 @@ fn histogram(lateness: &Histogram) -> String {
     let line = |(upper_ns, count): &(u64, u64)| {
         // One cycle in a million is still one to see.
         let bar = "━".repeat((BAR * *count as f64 / most).ceil() as usize);
-        let upper = format!("≤ {}", value::duration(*upper_ns as f64 * 1e-9));
-        format!("{upper:>10}  {bar:<40}  {}\n", value::count(*count))
+        let upper = format!("≤ {}", quantity::duration(*upper_ns as f64 * 1e-9));
+        format!("{upper:>10}  {bar:<40}  {}\n", quantity::count(*count))
     };
     octaves.iter().map(line).collect()
 }
 
 fn tell(report: &Report, args: &Args, terminal: &mut Terminal) -> End {
-    let us = |ns: u64| value::significant(ns as f64 / 1000.0, 3);
+    let us = |ns: u64| quantity::significant(ns as f64 / 1000.0, 3);
     let lateness = &report.lateness;
     terminal.line(&format!(
         "lateness µs   p50 {}  p99 {}  p99.9 {}  max {}      receive {} / {}   transmit {} / {}   answer {} / {}",
@@ -153,10 +153,10 @@ fn tell(report: &Report, args: &Args, terminal: &mut Terminal) -> End {
     let (verdict, style, end) = judged(report.fit(), &rate);
     terminal.line(&format!(
         "{} cycles at {rate}: {} missed, {} overruns, {} page faults      verdict: {}",
-        value::count(report.cycles),
-        value::count(report.missed),
-        value::count(report.overruns),
-        value::count(report.page_faults),
+        quantity::count(report.cycles),
+        quantity::count(report.missed),
+        quantity::count(report.overruns),
+        quantity::count(report.page_faults),
         terminal.styled(style, &verdict)
     ));
     let virtual_machine = Host::default().findings().into_iter().find(|finding| finding.topic == "machine");

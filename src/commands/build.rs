@@ -11,7 +11,7 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
     let packs =
         args.out.as_ref().is_some_and(|out| out.extension().is_some_and(|it| it == runtime::package::EXTENSION));
     let emit = match (args.emit, packs) {
-        (None, true) => return super::pack::build(args, terminal),
+        (None, true) => return crate::commands::shared::package::build(args, terminal),
         (Some(emit), false) if args.sign.is_none() => emit,
         (Some(_), false) => {
             terminal.error("--sign is for packages: a rig, with --out NAME.fricpkg");
@@ -95,6 +95,6 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
         terminal.error(&format!("cannot write {}: {error}", out.display()));
         return End::Failed;
     }
-    terminal.report(&format!("wrote {}, {} bytes\n", out.display(), crate::value::count(bytes.len() as u64)));
+    terminal.report(&format!("wrote {}, {} bytes\n", out.display(), crate::quantity::count(bytes.len() as u64)));
     End::Fine
 }

@@ -4,18 +4,18 @@ use super::{End, load, reported};
 use crate::args::Bus as Args;
 use crate::compile::{self, Stopwatch};
 use crate::terminal::Terminal;
-use crate::{project, value};
+use crate::{project, quantity};
 use abi::rig::{Kind, Message};
 use runtime::can::address::Address;
-use runtime::can::hub::Hub;
+use runtime::can::bridge::Hub;
 use runtime::can::log::Entry;
 use runtime::can::sim::Simulation;
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Server;
-use runtime::can::{self, CannotOpen, Event, Filter, Frame, Options, Received, names};
+use runtime::can::{self, CannotOpen, Event, Filter, Frame, Options, Received, cob_ids};
 use runtime::canopen::eds;
-use runtime::clock::Clock;
 use runtime::drive::frames;
+use runtime::realtime::clock::Clock;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
@@ -29,7 +29,7 @@ static STOP: AtomicBool = AtomicBool::new(false);
 const LOOK_NS: u64 = 50_000_000;
 
 pub fn bus(args: &Args, terminal: &mut Terminal) -> End {
-    let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
+    crate::interrupt::on_interrupt(|| STOP.store(true, Ordering::Relaxed));
     let mut known = Known::default();
     for path in &args.names {
         if let Err(end) = known.read(path, terminal) {
@@ -196,12 +196,12 @@ impl Known {
         {
             let field = |(k, field): (usize, &abi::rig::Field)| {
                 let si = frames::read(message, k, frame.data())?;
-                Some(format!("{} = {}", field.name, value::show(si, &field.unit, 4)))
+                Some(format!("{} = {}", field.name, quantity::show(si, &field.unit, 4)))
             };
             let values: Vec<String> = message.fields.iter().enumerate().filter_map(field).collect();
             return format!("{who}: {}", values.join(", "));
         }
-        let mut name = names::canopen(frame).unwrap_or_default();
+        let mut name = cob_ids::canopen(frame).unwrap_or_default();
         let object = name.split(' ').find_map(|word| self.objects.get_key_value(word.trim_end_matches(',')));
         if let (Some((object, says)), true) = (object, name.starts_with("SDO")) {
             name = name.replace(object, &format!("{object} ({says})"));

@@ -7,8 +7,8 @@
 use super::End;
 use crate::args::{Deploy, FetchLog, Host};
 use crate::project;
-use crate::remote::{Failed, Remote};
-use crate::sign::{self, Signing};
+use crate::signing::{self, Signing};
+use crate::ssh::{Failed, Remote};
 use crate::terminal::Terminal;
 use abi::foreign::is_component;
 use runtime::package::signature::{EXTENSION as SIGNATURE, beside};
@@ -116,7 +116,7 @@ fn signing(args: &Deploy, terminal: &mut Terminal) -> Result<Option<Named>, Stri
     let folder = folder.ok_or("no home to keep a key in: name one with --sign, `fric key new` makes it")?.join("fric");
     let path = folder.join("deploy.key");
     if !path.exists() {
-        let (secret, public) = sign::new_pair().map_err(|why| format!("cannot make a key: {why}"))?;
+        let (secret, public) = signing::new_pair().map_err(|why| format!("cannot make a key: {why}"))?;
         project::write_secret(&path, secret.as_bytes())
             .and_then(|()| project::write(&path.with_extension("pub"), public.as_bytes()))
             .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
@@ -188,7 +188,7 @@ fn start(args: &Deploy, remote: &Remote, words: &[String], terminal: &mut Termin
     terminal.print(&said);
     if args.follow || std::io::stdout().is_terminal() {
         // Whoever has seen enough presses Ctrl-C: what was asked for is done.
-        let _ = ctrlc::set_handler(|| ENOUGH.store(true, Ordering::Relaxed));
+        crate::interrupt::on_interrupt(|| ENOUGH.store(true, Ordering::Relaxed));
         let followed = remote.follow(&[rig, "status", "--follow", "--dir", dir], &mut |line| terminal.line(line));
         return match followed {
             Err(why) if !ENOUGH.load(Ordering::Relaxed) => Err(format!("{host}: {}", why.words())),
@@ -226,8 +226,14 @@ fn packed(args: &Deploy, target: &str, key: Option<&Named>, terminal: &mut Termi
     let path = &args.file;
     let key = key.map(|named| &named.key);
     if !is_package(path) {
-        let wanted = super::pack::Wanted { name: args.name.as_deref(), target, features: &[], set: &args.set, key };
-        let (bytes, signature) = super::pack::packed(path, &wanted, terminal)?;
+        let wanted = crate::commands::shared::package::Wanted {
+            name: args.name.as_deref(),
+            target,
+            features: &[],
+            set: &args.set,
+            key,
+        };
+        let (bytes, signature) = crate::commands::shared::package::packed(path, &wanted, terminal)?;
         return Ok(Packed { bytes, signature });
     }
     if args.name.is_some() || !args.set.all.is_empty() {
@@ -241,7 +247,7 @@ fn packed(args: &Deploy, target: &str, key: Option<&Named>, terminal: &mut Termi
     let bytes = fs::read(path).map_err(|error| about(&error))?;
     let package = Package::read(&bytes).map_err(|why| about(&why))?;
     let signature = match key {
-        Some(key) => Some(super::pack::signed(key, &package, &bytes)?),
+        Some(key) => Some(crate::commands::shared::package::signed(key, &package, &bytes)?),
         None => fs::read_to_string(beside(path)).ok(),
     };
     Ok(Packed { bytes, signature })

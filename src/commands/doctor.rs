@@ -7,9 +7,9 @@ use crate::project;
 use crate::terminal::{Style, Terminal};
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
-use runtime::can::{self, Filter, Received, State, names, socketcan};
-use runtime::clock::Clock;
-use runtime::host::{Finding, Host, Verdict};
+use runtime::can::{self, Filter, Received, State, cob_ids, socketcan};
+use runtime::realtime::clock::Clock;
+use runtime::realtime::host_check::{Finding, Host, Verdict};
 use std::path::Path;
 
 /// How long a bus is listened to for another master.
@@ -148,7 +148,7 @@ fn traffic(address: &Address, bit_rate: Option<u32>) -> Finding {
     while bus.wait(until_ns) {
         while let Some(received) = bus.receive() {
             if let Received::Frame(frame, _) = received {
-                let what = names::canopen(&frame).unwrap_or_else(|| frame.to_string());
+                let what = cob_ids::canopen(&frame).unwrap_or_else(|| frame.to_string());
                 let mend = Verdict::Forbids("stop the other master".into());
                 return Finding::new(&topic, format!("somebody else commands: {what}"), mend);
             }

@@ -62,7 +62,7 @@ pub fn drives(args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    let _ = ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed));
+    crate::interrupt::on_interrupt(|| STOP.store(true, Ordering::Relaxed));
     terminal.report(&format!("{}\n", served.describe(&ready.rig)));
     let mut told = |line: &str| {
         if !args.quiet {

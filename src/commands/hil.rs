@@ -4,23 +4,23 @@ use super::prompt::{Rehearsal, prompt};
 use super::{End, chosen_rig, load_from};
 use crate::args::Hil as Args;
 use crate::compile::{self, Options, Ready, Stopwatch};
-use crate::kept::Keeping;
+use crate::source_snapshot::Keeping;
 use crate::terminal::{Style, Terminal};
-use crate::{project, report, stability, value};
+use crate::{loop_stability, project, quantity, report};
 use abi::rig::Rig;
 use runtime::can::address::Address;
 use runtime::can::sim::Simulation;
 use runtime::can::{self, Bus};
-use runtime::clock::Clock;
+use runtime::drive::polarity_check::SignTest;
 use runtime::drive::profiles::Life;
-use runtime::drive::sign::SignTest;
 use runtime::hil::control::PATIENT_NS;
 use runtime::hil::cycle::{Gauges, Hil, Options as HilOptions};
 use runtime::hil::identify::{self, Identification};
 use runtime::hil::live::Judge;
 use runtime::hil::simulated::{MASTER, Pace, World, holds_and_pushes};
 use runtime::hil::{cycle, emergency, watches, words};
-use runtime::realtime::{self, Wishes};
+use runtime::realtime::clock::Clock;
+use runtime::realtime::threads::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use runtime::record::parts::{self, Limits};
 use std::io::IsTerminal;
@@ -105,7 +105,7 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
 
 /// Whether a rig may run: whether it is stable only while it looks ahead; none if it must not.
 fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool> {
-    let (mut against, needs_look) = stability::objections(ready);
+    let (mut against, needs_look) = loop_stability::objections(ready);
     if args.accept_unstable {
         against.clear();
     }
@@ -217,17 +217,17 @@ fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Ter
 
 /// Says what was measured, as text to paste.
 fn measured(asked: &Identification, rows: &[identify::Row], terminal: &mut Terminal) {
-    let milli = |seconds: f64| value::significant(seconds * 1e3, 3);
+    let milli = |seconds: f64| quantity::significant(seconds * 1e3, 3);
     for found in asked.evaluate(rows) {
         let name = &asked.rig.nodes[found.node].name;
         let inertia = found
             .inertia
-            .map_or("it hardly moved".into(), |inertia| format!("inertia {} kg·m²", value::significant(inertia, 3)));
+            .map_or("it hardly moved".into(), |inertia| format!("inertia {} kg·m²", quantity::significant(inertia, 3)));
         terminal.line(&format!(
             "  drive {name}: delay = {} ms, lag = {} ms    ({inertia}; {} N·m rms unexplained)",
             milli(found.delay),
             milli(found.lag),
-            value::significant(found.residual, 2)
+            quantity::significant(found.residual, 2)
         ));
     }
 }
@@ -254,7 +254,7 @@ fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) 
         }
     };
     for text in &args.inject {
-        match runtime::drive::hooks::read(text, &ready.rig) {
+        match runtime::drive::fault_injection::read(text, &ready.rig) {
             Ok(hook) => world.bench().hook(hook),
             Err(why) => {
                 terminal.error(&format!("--inject '{text}': {why}"));
@@ -323,7 +323,7 @@ fn run(
         options.control.measures = true;
     }
     let real_time = (!fast)
-        .then(|| realtime::enter(&Wishes { priority: 80, core: realtime::isolated_core(), memory: true, awake: true }));
+        .then(|| threads::enter(&Wishes { priority: 80, core: threads::isolated_core(), memory: true, awake: true }));
     let refusals: Vec<String> = real_time.iter().flat_map(|real_time| real_time.refused()).map(said).collect();
     if !simulated {
         options.only_simulated = daring(args).map(|option| format!("{option} is for simulated drives only"));
@@ -395,7 +395,7 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
             };
             line += &format!("; misses {by} after {ms} ms");
             if let Some(ns) = status.timeout_measured_ns {
-                line += &format!(", stopped after {} ms", value::significant(ns as f64 * 1e-6, 3));
+                line += &format!(", stopped after {} ms", quantity::significant(ns as f64 * 1e-6, 3));
             }
         }
         line += &match status.deadline_ms {
@@ -410,7 +410,7 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
 }
 
 /// What the host refused, and the remedy.
-fn said(refusal: &realtime::Refusal) -> String {
+fn said(refusal: &threads::Refusal) -> String {
     format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
 }
 
@@ -421,7 +421,11 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
         (true, false) => "simulated drives, wall-clock time",
         (true, true) => "simulated drives, simulated time",
     };
-    terminal.line(&format!("{}  {} Hz, {kind}", terminal.styled(Style::Bold, &rig.name), value::significant(rate, 4)));
+    terminal.line(&format!(
+        "{}  {} Hz, {kind}",
+        terminal.styled(Style::Bold, &rig.name),
+        quantity::significant(rate, 4)
+    ));
     for note in notes {
         terminal.line(&format!("  note: {note}"));
     }
@@ -502,7 +506,7 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
     loop {
         let last = over.load(Ordering::Relaxed);
         let number = |gauge: &std::sync::atomic::AtomicU64| gauge.load(Ordering::Relaxed);
-        let micro = |ns: u64| value::significant(ns as f64 * 1e-3, 3);
+        let micro = |ns: u64| quantity::significant(ns as f64 * 1e-3, 3);
         let mut text = format!(
             "\x1b[2K  {:<32} {:>9.3} s   late {} µs, at most {} µs   {} missed{}\n",
             words::stage(number(&gauges.stage)),
@@ -515,8 +519,8 @@ fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
         for (i, (name, gauge)) in names.iter().zip(&gauges.values).enumerate() {
             let si = f64::from_bits(number(gauge));
             let shown = match i.checked_sub(rig.outputs.len()) {
-                Some(k) => value::show(si, &rig.record[k].unit, 4),
-                None => value::significant(si, 4),
+                Some(k) => quantity::show(si, &rig.record[k].unit, 4),
+                None => quantity::significant(si, 4),
             };
             text += &format!("\x1b[2K    {name:<width$}  {shown}\n");
         }

@@ -3,16 +3,16 @@
 use super::End;
 use crate::args::Inspect;
 use crate::project;
+use crate::quantity::{count, significant};
 use crate::terminal::{Style, Terminal};
-use crate::value::{count, significant};
 use abi::foreign::shown;
 use abi::image::Image;
 use abi::live::{Live, Place};
 use abi::rig::Rig;
 use abi::{Description, Function};
+use runtime::format::utc;
 use runtime::package::signature::{Signer, Trusted, beside};
 use runtime::package::{MOST_BYTES, Package, hash};
-use runtime::show::utc;
 use std::fs;
 
 pub fn inspect(args: &Inspect, terminal: &mut Terminal) -> End {

@@ -3,7 +3,7 @@
 use super::End;
 use crate::args::KeyNew;
 use crate::terminal::Terminal;
-use crate::{project, sign};
+use crate::{project, signing};
 
 pub fn new(args: &KeyNew, terminal: &mut Terminal) -> End {
     let secret = args.name.with_extension("key");
@@ -14,7 +14,7 @@ pub fn new(args: &KeyNew, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     }
-    let (secret_text, public_text) = match sign::new_pair() {
+    let (secret_text, public_text) = match signing::new_pair() {
         Ok(pair) => pair,
         Err(why) => {
             terminal.error(&format!("cannot make keys: {why}"));

@@ -4,15 +4,15 @@ use super::{End, load, reported};
 use crate::args::Linearise;
 use crate::compile::{self, Changes, Linear, Matrices, Options, Ports, Stopwatch};
 use crate::matrices::{self, Matrix};
+use crate::quantity::{parse, show, significant};
 use crate::results::number;
 use crate::terminal::{Style, Terminal};
-use crate::value::{parse, show, significant};
-use crate::{project, value};
+use crate::{project, quantity};
 use abi::Slot;
 use abi::description::{Kind, Quantity};
 use abi::unit::Unit;
+use runtime::coupling::eigenvalues::{Mode, modes};
 use runtime::engine::{self, Continue};
-use runtime::modes::{Mode, modes};
 use serde_json::{Value, json};
 use std::f64::consts::TAU;
 
@@ -220,7 +220,7 @@ fn object(linear: &Linear, found: &Matrices, modes: &[Mode]) -> Value {
 fn words(linear: &Linear, found: &Matrices, modes: &[Mode], terminal: &Terminal) -> String {
     let description = linear.instance.description();
     let mut out = terminal.styled(Style::Bold, &description.name);
-    out += &format!(" at t = {}; all in SI\n", value::duration(linear.instance.get(Slot::TIME)));
+    out += &format!(" at t = {}; all in SI\n", quantity::duration(linear.instance.get(Slot::TIME)));
     let regimes: Vec<String> = description
         .automata
         .iter()

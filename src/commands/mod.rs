@@ -2,32 +2,30 @@
 
 mod bench;
 mod bench_rt;
+mod shared;
 mod build;
 mod bus;
 mod characterise;
 mod check;
-mod cross;
 mod deploy;
 mod doc;
-mod drives;
 mod doctor;
+mod drives;
 mod explain;
 mod fmt;
+mod prompt;
+mod hil;
 mod inspect;
 mod key;
-mod hil;
 mod linearise;
-mod live;
 mod new;
-mod pack;
 mod predict;
-mod prompt;
+mod watch;
 mod repl;
 mod replay;
 mod run;
 mod sweep;
 mod test;
-mod watch;
 
 use crate::args::{Args, Command, Key, Repl};
 use crate::compile::{self, Case, Loaded, Options, Sources, Stages, Stopwatch};
@@ -36,8 +34,8 @@ use crate::{project, report};
 use clap::CommandFactory;
 use grammar::diagnostic::Diagnostic;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use runtime::engine::sweep as runs;
 use runtime::engine::{Continue, Failure, Outcome};
-use runtime::sweep as runs;
 use std::path::Path;
 use std::time::Instant;
 

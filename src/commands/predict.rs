@@ -1,23 +1,23 @@
 //! `fric predict`: says before anything moves whether an emulated contact is stable, and what is too coarse for it.
 //!
-//! The loops come from `stability`, judged by runtime::predict. Advice comes as numbers.
+//! The loops come from `stability`, judged by runtime::coupling::loop_stability. Advice comes as numbers.
 
 use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
 use crate::compile::{self, Changes, Loaded, Options, Ready, Stopwatch};
-use crate::stability::{Contact, contacts};
+use crate::loop_stability::{Contact, contacts};
+use crate::quantity::significant;
 use crate::terminal::Terminal;
-use crate::value::significant;
 use crate::{project, report};
 use abi::Slot;
 use abi::description::{Kind as QuantityKind, Quantity};
 use abi::rig::Kind;
 use grammar::ast::{ExperimentStatement, Item};
+use runtime::coupling::eigenvalues::modes;
+use runtime::coupling::loop_stability::Loop;
 use runtime::engine::{self, Continue};
 use runtime::hil::standard::{self, Figures, Pair};
 use runtime::hil::watches;
-use runtime::modes::modes;
-use runtime::predict::Loop;
 use serde_json::{Value, json};
 
 pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
@@ -317,9 +317,9 @@ fn step_time(ready: &Ready) -> (String, Value) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let words = format!(
         "step        {} here, at most {}, of {}\n",
-        crate::value::duration(median),
-        crate::value::duration(greatest),
-        crate::value::duration(period)
+        crate::quantity::duration(median),
+        crate::quantity::duration(greatest),
+        crate::quantity::duration(period)
     );
     (words, json!({"median": median, "greatest": greatest, "period": period}))
 }

@@ -4,8 +4,8 @@
 //! set that is being judged.
 
 use crate::compile::{self, Changes, Loaded, Options};
-use crate::kept::Kept;
-use crate::stability;
+use crate::loop_stability;
+use crate::source_snapshot::Kept;
 use crate::terminal::Terminal;
 use abi::Instance;
 use grammar::diagnostic::Diagnostic;
@@ -66,7 +66,7 @@ impl Rehearsal {
         if self.accept_unstable {
             return Ok(());
         }
-        let (against, needs_look) = stability::objections(&ready);
+        let (against, needs_look) = loop_stability::objections(&ready);
         if !against.is_empty() {
             return Err(against.join("; "));
         }

@@ -1,8 +1,10 @@
 //! `fric`, `fric repl`: a session at the prompt.
 
 use super::End;
-use super::live::{catch_interrupts, forget_interrupt, run_figure, show_run, stop_on_interrupt, tell_fault};
 use crate::args::{Characterise, Repl};
+use crate::commands::shared::session::{
+    catch_interrupts, forget_interrupt, run_figure, show_run, stop_on_interrupt, tell_fault,
+};
 use crate::compile::Explanation;
 use crate::plot::{self, Axis, Curve, Figure, Panel};
 use crate::repl::{self, COMMANDS, Command, Cut, Editor, Fault, Input, Line, Ran, Session, Value, plain};
@@ -10,7 +12,7 @@ use crate::terminal::{Style, Terminal};
 use crate::{diagram, equations, project, report, results};
 use abi::unit::Unit;
 use runtime::engine::Cause;
-use runtime::verdict::Verdict;
+use runtime::run::verdict::Verdict;
 use std::cell::RefCell;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -262,7 +264,7 @@ impl Prompt<'_> {
         }
         let h = self.time(rest, "step 1 ms")?;
         let (time, all) = self.session.step(h)?;
-        self.terminal.line(&format!("t = {}", runtime::show::time(time)));
+        self.terminal.line(&format!("t = {}", runtime::format::time(time)));
         let width = all.iter().map(|shown| shown.path.chars().count()).max().unwrap_or(0);
         for shown in all {
             let now = plain(&shown.now);
@@ -557,7 +559,7 @@ fn over(text: &str) -> Option<(&str, String, &str, &str, bool)> {
 fn stopped(ran: &Ran) -> Result<(), Fault> {
     match ran.results.iter().find_map(|result| result.as_ref().err()) {
         Some(failure) if failure.cause == Cause::Stopped => {
-            Err(Fault::Words(format!("stopped at {}; the session goes on", runtime::show::time(failure.time))))
+            Err(Fault::Words(format!("stopped at {}; the session goes on", runtime::format::time(failure.time))))
         }
         Some(failure) => Err(Fault::Stopped(Box::new(failure.clone()))),
         None => Ok(()),

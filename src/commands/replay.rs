@@ -3,10 +3,10 @@
 use super::{End, load_text};
 use crate::args::Replay as Args;
 use crate::compile::{self, Changes, Options, Stopwatch};
-use crate::kept::Kept;
 use crate::parquet::{self, Holds};
+use crate::source_snapshot::Kept;
 use crate::terminal::Terminal;
-use crate::{project, report, value};
+use crate::{project, quantity, report};
 use abi::rig::Rig;
 use runtime::hil::control::Control;
 use runtime::hil::cycle::look_ahead;
@@ -92,7 +92,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
                 &format!(
                     "cycle {}: {what} was {recorded:?} and is {computed:?} now, {} cycles before agree",
                     difference.k,
-                    value::count(found.cycles - 1)
+                    quantity::count(found.cycles - 1)
                 ),
             )
         }
@@ -100,14 +100,14 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
         None => {
             terminal.line(&format!(
                 "{rig}: {} cycles and {} states agree to the bit; {ends}",
-                value::count(found.cycles),
-                value::count(found.states)
+                quantity::count(found.cycles),
+                quantity::count(found.states)
             ));
             if found.skipped + found.lost > 0 {
                 terminal.line(&format!(
                     "  {} messages were lost when it was written; {} cycles could not be computed",
-                    value::count(found.lost),
-                    value::count(found.skipped)
+                    quantity::count(found.lost),
+                    quantity::count(found.skipped)
                 ));
             }
             End::Fine

@@ -1,8 +1,8 @@
 //! `fric run`: compiles experiments, runs them, shows and writes what they did.
 
-use super::cross::{Crossed, cross};
 use super::{Done, End, compiled, done, has_experiment, load, sound};
 use crate::args::Run;
+use crate::commands::shared::cross_check::{Crossed, cross};
 use crate::compile::{Loaded, Options, Stages, Stopwatch};
 use crate::plot::{self, Figure};
 use crate::results::{self, Ran};
@@ -10,7 +10,7 @@ use crate::terminal::{Style, Terminal};
 use crate::{figure, project, report};
 use grammar::diagnostic::Diagnostic;
 use runtime::engine::Continue;
-use runtime::even;
+use runtime::engine::even_grid;
 use runtime::record::csv;
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -111,8 +111,11 @@ fn experiment(
             terminal.line("  nothing to write: the experiment has no `plot`");
         }
     }
-    let grids: Result<Vec<_>, _> =
-        args.every.iter().flat_map(|every| cases.iter().map(|case| even::instants(*every, &case.experiment))).collect();
+    let grids: Result<Vec<_>, _> = args
+        .every
+        .iter()
+        .flat_map(|every| cases.iter().map(|case| even_grid::instants(*every, &case.experiment)))
+        .collect();
     let grids = match grids {
         Ok(grids) => grids,
         Err(why) => {
@@ -220,7 +223,7 @@ fn write(
             let evenly = grids.get(k).map(|grid| {
                 let case = &done.cases[k];
                 // How the run ends has been said of the first one.
-                even::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
+                even_grid::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
             });
             csv::write(evenly.as_ref().unwrap_or(recording), &mut bytes).expect("writing to memory does not fail");
             for path in folder.iter().map(|folder| folder.join(format!("{name}.csv"))).chain(args.csv.clone()) {

@@ -13,18 +13,18 @@ use crate::args::Sweep;
 use crate::compile::{self, Changes, Fitted, Loaded, Options, Stopwatch, Varying};
 use crate::parquet::{self, Holds};
 use crate::plot::{self, Axis};
+use crate::quantity::{self, count, significant};
 use crate::terminal::{Style, Terminal};
 use crate::unfinished::{Hash, Mark, Unfinished};
-use crate::value::{self, count, significant};
 use crate::vary::{Dice, Vary};
 use crate::{project, results};
 use abi::plan::{Formula, Measure};
 use abi::{Description, Slot};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use runtime::engine::lanes::{self, Next};
+use runtime::engine::sweep::{self, Desk, Ticket};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
-use runtime::lanes::{self, Next};
-use runtime::sweep::{self, Desk, Ticket};
-use runtime::verdict::Verdict;
+use runtime::run::verdict::Verdict;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::ops::Range;
@@ -300,7 +300,7 @@ impl Table {
                 let (own, watched) = outcome.verdicts.split_at(case.expects());
                 let extremes: Vec<(f64, f64)> = watched.iter().map(extremes).collect();
                 for verdict in own {
-                    let read = |r: &runtime::verdict::Reading| (r.text.clone(), r.unit.from_si(r.value));
+                    let read = |r: &runtime::run::verdict::Reading| (r.text.clone(), r.unit.from_si(r.value));
                     readings.push(verdict.readings.iter().map(read).collect());
                     verdicts.push(verdict.holds);
                 }
@@ -331,13 +331,13 @@ impl Table {
             ColumnKind::Case => case.label.clone(),
             ColumnKind::Varied => {
                 let k = self.vary.iter().position(|vary| vary.path == column.axis.name).expect("it is varied");
-                runtime::show::plain(self.vary[k].unit.from_si(values[k]))
+                runtime::format::plain(self.vary[k].unit.from_si(values[k]))
             }
             ColumnKind::Measure(k, j) => {
                 // Of an expectation that could not be evaluated some measures may be missing.
                 let text = &case.experiment.expects[k].measures[j].text;
                 let found = readings.get(k).and_then(|read| read.iter().find(|(known, _)| known == text));
-                found.map_or(String::new(), |(_, value)| runtime::show::plain(*value))
+                found.map_or(String::new(), |(_, value)| runtime::format::plain(*value))
             }
             ColumnKind::Verdict(k) => verdicts.get(k).map_or(String::new(), bool::to_string),
             ColumnKind::Status => status.split_whitespace().collect::<Vec<_>>().join(" "),
@@ -439,7 +439,7 @@ impl Table {
                 args.experiment,
                 results::solver(&self.cases[0].experiment.solver),
                 count(written),
-                value::duration(wall),
+                quantity::duration(wall),
                 significant(speed, 3),
                 threads,
                 if threads == 1 { "" } else { "s" }
@@ -484,7 +484,7 @@ impl Table {
             ColumnKind::Run => cell == run.to_string(),
             ColumnKind::Case => cell == self.cases[at].label,
             ColumnKind::Varied => {
-                varied.next().is_some_and(|(vary, value)| cell == runtime::show::plain(vary.unit.from_si(*value)))
+                varied.next().is_some_and(|(vary, value)| cell == runtime::format::plain(vary.unit.from_si(*value)))
             }
             ColumnKind::Measure(..) => cell.is_empty() || cell.parse::<f64>().is_ok(),
             ColumnKind::Verdict(_) => matches!(cell, "" | "true" | "false"),
@@ -596,7 +596,7 @@ impl Table {
 fn stopped_by_ctrl_c() -> Arc<AtomicBool> {
     let stopped = Arc::new(AtomicBool::new(false));
     let flag = stopped.clone();
-    let _ = ctrlc::set_handler(move || {
+    crate::interrupt::on_interrupt(move || {
         if flag.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }

@@ -1,13 +1,13 @@
 //! `fric test`: runs every experiment that expects something.
 
-use super::cross::{Crossed, cross};
 use super::{End, compiled, done, load};
 use crate::args::Test;
+use crate::commands::shared::cross_check::{Crossed, cross};
 use crate::compile::{Loaded, Options, Stages, Stopwatch};
 use crate::project;
+use crate::quantity::duration;
 use crate::results;
 use crate::terminal::{Style, Terminal};
-use crate::value::duration;
 use std::path::PathBuf;
 
 pub fn test(args: &Test, terminal: &mut Terminal) -> End {

@@ -1,8 +1,10 @@
 //! `fric watch`: runs an experiment again whenever its text is saved. States go on by name and unit.
 
-use super::live::{catch_interrupts, interrupted, run_figure, show_run, stop_on_interrupt, tell_fault, time_of};
 use super::{End, has_experiment};
 use crate::args::Watch;
+use crate::commands::shared::session::{
+    catch_interrupts, interrupted, run_figure, show_run, stop_on_interrupt, tell_fault, time_of,
+};
 use crate::plot;
 use crate::repl::Session;
 use crate::terminal::Terminal;
@@ -47,7 +49,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                 let draws = run_figure(&ran, false);
                 show_run(&ran, false, terminal);
                 if let Some(carried) = &ran.carried {
-                    terminal.line(&format!("  goes on from t = {}{}", runtime::show::time(passed), told(carried)));
+                    terminal.line(&format!("  goes on from t = {}{}", runtime::format::time(passed), told(carried)));
                 }
                 if let Some(drawn) = draws {
                     terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
@@ -61,7 +63,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                     passed = if from.is_some() { passed } else { 0.0 } + at.as_ref().map_or(0.0, time_of);
                     live = at;
                 }
-                let took = crate::value::duration(begun.elapsed().as_secs_f64());
+                let took = crate::quantity::duration(begun.elapsed().as_secs_f64());
                 terminal.line(&format!("  {took} from text to plot; waiting for {file} (Ctrl-C ends)"));
             }
             // What ran before stays as it is: the next save may be better.

@@ -2,11 +2,11 @@
 //!
 //! In: numbers in the units they are shown in. Out: text for a terminal, an SVG, a PNG. Knows no runs and no files.
 
-mod braille;
 mod decimate;
-mod png;
 mod scale;
 mod svg;
+mod braille;
+mod png;
 
 pub use braille::terminal;
 pub use png::png;

@@ -6,8 +6,8 @@ use abi::image::Target;
 use abi::lanes::Batch;
 use abi::table::{Code, Function, Interpret};
 use abi::{Description, Slot};
-use compiler::backend::wide::{self, Width};
-use compiler::backend::{blob, c, jit};
+use compiler::codegen::lanes::{self, Width};
+use compiler::codegen::{c, image, jit};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -52,7 +52,7 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'stat
         let code = Code::Machine(machine.unwrap_or_else(|why| panic!("{}: {why}", case.name)).0);
         agree(case, expected, &case.on(&code), "machine code in memory");
         // SAFETY: the compiler has just made it.
-        let model = unsafe { runtime::blob::load(&image(case, here)) };
+        let model = unsafe { runtime::image::load(&image(case, here)) };
         let code = model.unwrap_or_else(|why| panic!("{}: {why}", case.name)).code;
         agree(case, expected, &case.on(&code), "an image for this processor");
         let took_part = |width: &&Width| {
@@ -105,7 +105,7 @@ fn same(a: &Result, b: &Result) -> bool {
 fn in_lanes(case: &Case, width: Width) -> Option<Vec<Result>> {
     let pool = &case.description.pool;
     let (in_lanes, step) = case.step.as_ref()?;
-    let lanes = wide::compile(step, case.layout(), pool.len(), width, width.vectors()).ok()?;
+    let lanes = lanes::compile(step, case.layout(), pool.len(), width, width.vectors()).ok()?;
     let alone = case.interpreter();
     let mut batch = Batch::new(lanes);
     let last = batch.width() - 1;
@@ -122,7 +122,7 @@ fn in_lanes(case: &Case, width: Width) -> Option<Vec<Result>> {
 }
 
 fn image(case: &Case, target: Target) -> Vec<u8> {
-    let image = blob::image(&case.functions, &case.description, &case.params, target, &[]);
+    let image = image::image(&case.functions, &case.description, &case.params, target, &[]);
     image.unwrap_or_else(|why| panic!("{}: {why}", case.name)).to_bytes()
 }
 

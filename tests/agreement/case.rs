@@ -2,13 +2,13 @@
 
 use abi::description::Layout;
 use abi::plan::Method;
+use abi::rosenbrock::layout::Trial;
 use abi::table::{Code, Interpret};
-use abi::trial::Trial;
 use abi::{Description, Function, Slot};
-use compiler::backend::interp::Interpreter;
+use compiler::ir::interpret::Interpreter;
+use compiler::ir::program::Program;
 use compiler::ir::random::{self, POOL_LEN, Random};
 use compiler::ir::{Func, Op};
-use compiler::program::Program;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -146,7 +146,7 @@ pub fn of_program(name: String, text: &str, program: &Program, method: Method, s
         name: format!("{name}, {}", method.name()),
         text: text.to_string(),
         marks: marks(program, method),
-        step: compiler::code::of_lanes(program, method),
+        step: compiler::codegen::tiering::of_lanes(program, method),
         functions,
         description: program.description.clone(),
         params: program.params.clone(),

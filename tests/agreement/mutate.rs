@@ -5,8 +5,8 @@
 use crate::campaign::Made;
 use crate::texts::{self, FIXED, Fallen};
 use abi::plan::Method;
+use compiler::ir::program::Program;
 use compiler::ir::random::Random;
-use compiler::program::Program;
 use grammar::ast::{
     BinaryOp, Bind, BindValue, Declaration, EveryStatement, ExperimentStatement, Expr, ExprKind, Instance, Item, Range,
     Statement, SweepOver, TablePoints,

@@ -5,8 +5,8 @@ use crate::support::Texts;
 use abi::plan::Method;
 use compiler::Changes;
 use compiler::experiment::Variant;
+use compiler::ir::program::Program;
 use compiler::ir::random::Random;
-use compiler::program::Program;
 use grammar::ast::{ExperimentStatement, Item, Solver};
 use grammar::diagnostic::Diagnostic;
 

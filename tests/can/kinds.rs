@@ -7,7 +7,7 @@ use runtime::can::sim::{Join, Simulation};
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::{Client, Connection, Server};
 use runtime::can::{Bus, Frame, Options, Received};
-use runtime::clock::{Clock, Monotonic};
+use runtime::realtime::clock::{Clock, Monotonic};
 
 fn simulated(world: Simulation) -> impl Fn(&Options) -> Pair {
     move |options| {

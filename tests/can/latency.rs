@@ -8,11 +8,11 @@ mod rig;
 
 use runtime::can::socketcan::{self, SocketCan};
 use runtime::can::{Bus, Filter, Frame, Options, Received};
-use runtime::clock::{Clock, Monotonic};
 use runtime::hil::counts::Counts;
 use runtime::hil::cycle::{End, Hil, Options as HilOptions};
-use runtime::histogram::Histogram;
-use runtime::realtime::{self, Wishes};
+use runtime::realtime::clock::{Clock, Monotonic};
+use runtime::realtime::histogram::Histogram;
+use runtime::realtime::threads::{self, Wishes};
 use runtime::record::log::{Sections, Settings, Sink};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -146,7 +146,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     let mut bus = SocketCan::open(near, &options, clock).expect("it is up");
     let mut log = File::create("/tmp/log").expect("a guest has a /tmp");
     let memory = planted != Planted::Unlocked;
-    let real_time = realtime::enter(&Wishes { priority: LOOP, memory, ..Wishes::default() });
+    let real_time = threads::enter(&Wishes { priority: LOOP, memory, ..Wishes::default() });
     assert_eq!(real_time.refused(), [], "root of the guest may do all of it");
     // What a recorder would fill, a page every few cycles. Reserved, and mapped only where memory is locked.
     let mut record: Vec<u64> = Vec::with_capacity(64 * cycles as usize);
@@ -162,7 +162,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     for k in 0..cycles + warm {
         if k == warm {
             outcome = Outcome::default();
-            faults_before = realtime::suffered().page_faults;
+            faults_before = threads::suffered().page_faults;
             FOREIGN.store(0, Ordering::Relaxed);
             HEAP.with(|calls| calls.set(0));
         }
@@ -196,7 +196,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     }
     outcome.heap_calls = HEAP.with(Cell::get);
     outcome.foreign_calls = FOREIGN.load(Ordering::Relaxed);
-    outcome.page_faults = realtime::suffered().page_faults - faults_before;
+    outcome.page_faults = threads::suffered().page_faults - faults_before;
     std::hint::black_box(&record);
     // Nothing more may be called on this thread than a loop may: what it holds is left to the end of the process.
     std::mem::forget((bus, log, real_time, record));
@@ -208,7 +208,7 @@ fn answer(far: &str, over: &AtomicBool, memory: bool) {
     let clock = Monotonic::new();
     let options = Options { filter: Filter::Only(vec![0x080, 0x201]), ..Options::default() };
     let mut bus = SocketCan::open(far, &options, clock).expect("it is up");
-    let real_time = realtime::enter(&Wishes { priority: DRIVE, memory, ..Wishes::default() });
+    let real_time = threads::enter(&Wishes { priority: DRIVE, memory, ..Wishes::default() });
     assert_eq!(real_time.refused(), []);
     while !over.load(Ordering::Relaxed) {
         bus.wait(clock.now_ns() + 20_000_000);
@@ -351,7 +351,7 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     let fd = bus.descriptor().expect("a socket");
     let options = HilOptions { arms_itself: true, ..HilOptions::default() };
     let log = Settings { sink: Sink::BlackBox("/tmp/black".into(), 10), cycles_per_block: 100, patient: false };
-    let real_time = realtime::enter(&Wishes { priority: LOOP, ..Wishes::default() });
+    let real_time = threads::enter(&Wishes { priority: LOOP, ..Wishes::default() });
     assert_eq!(real_time.refused(), [], "root of the guest may do all of it");
     let log = Some((log, Sections::default()));
     let made = Hil::new(&asked.rig, asked.program.clone(), Box::new(clock), vec![Box::new(bus)], options, log);
@@ -360,7 +360,7 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     while hil.ended().is_none() && hil.counts().cycles < cycles {
         hil.cycle();
         if hil.counts().cycles == warm && faults.is_none() {
-            faults = Some(realtime::suffered().page_faults);
+            faults = Some(threads::suffered().page_faults);
             watch_calls(fd);
             FOREIGN.store(0, Ordering::Relaxed);
             HEAP.with(|calls| calls.set(0));
@@ -369,7 +369,7 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     let outcome = Outcome {
         heap_calls: HEAP.with(Cell::get),
         foreign_calls: FOREIGN.load(Ordering::Relaxed),
-        page_faults: faults.map_or(u64::MAX, |faults| realtime::suffered().page_faults - faults),
+        page_faults: faults.map_or(u64::MAX, |faults| threads::suffered().page_faults - faults),
         lateness: hil.counts().late.clone(),
         answer: Histogram::default(),
         missed: hil.counts().missed + hil.counts().stale,

@@ -4,10 +4,10 @@ use abi::rig::{Bus as BusOf, Cia402, Kind, Mode, Node, Output, Overrun, Plant, R
 use abi::series::Method;
 use runtime::can::socketcan::SocketCan;
 use runtime::can::{Bus, Options, Received};
-use runtime::clock::{Clock, Monotonic};
 use runtime::drive::Bench;
 use runtime::hil::identify::Identification;
-use runtime::realtime::{self, Wishes};
+use runtime::realtime::clock::{Clock, Monotonic};
+use runtime::realtime::threads::{self, Wishes};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 fn drive(name: &str, node: u8, period_ns: u64) -> Node {
@@ -73,7 +73,7 @@ pub fn drives(rig: &Rig, interface: &str, priority: Option<i32>, over: &AtomicBo
     let clock = Monotonic::new();
     let mut bus = SocketCan::open(interface, &Options::default(), clock).expect("it is up");
     let mut bench = Bench::new(rig, None, 1).expect("servos are simulated");
-    let real_time = priority.map(|priority| realtime::enter(&Wishes { priority, ..Wishes::default() }));
+    let real_time = priority.map(|priority| threads::enter(&Wishes { priority, ..Wishes::default() }));
     assert!(real_time.as_ref().is_none_or(|granted| granted.refused().is_empty()), "{real_time:?}");
     while !over.load(Ordering::Relaxed) {
         bus.wait(bench.due_ns().max(clock.now_ns() + 50_000));

@@ -4,8 +4,8 @@
 
 use crate::{FRIC_RIG, fine, folder, said, text};
 use abi::image::Image;
-use runtime::chance::Chance;
 use runtime::package::Package;
+use runtime::rng::Chance;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};

@@ -233,7 +233,7 @@ fn a_package_for_arm_runs_to_the_bit_as_one_for_x86() {
 
         // The same calls on the package for this processor.
         // SAFETY: the compiler has just made it.
-        let model = unsafe { runtime::blob::load(&program(&intel, name)) }.unwrap();
+        let model = unsafe { runtime::image::load(&program(&intel, name)) }.unwrap();
         assert_eq!(*model.description, image.description, "both say the same of themselves");
         for mut block in begin {
             let mut status = 0;

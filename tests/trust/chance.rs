@@ -1,17 +1,17 @@
 //! Chance for properties: a seeded generator, and how many cases are tried.
 
 /// The runtime's generator, with the draws that cases are made of.
-pub struct Chance(runtime::chance::Chance);
+pub struct Chance(runtime::rng::Chance);
 
 impl Chance {
     /// The generator of one case.
     pub fn new(seed: u64) -> Chance {
-        Chance(runtime::chance::Chance(runtime::chance::Chance(seed).number()))
+        Chance(runtime::rng::Chance(runtime::rng::Chance(seed).number()))
     }
 
     /// The generator whose first number is that of the seed itself.
     pub fn plain(seed: u64) -> Chance {
-        Chance(runtime::chance::Chance(seed))
+        Chance(runtime::rng::Chance(seed))
     }
 
     /// Uniform in [low, high).

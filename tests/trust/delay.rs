@@ -2,7 +2,7 @@
 
 use crate::chance::{Chance, seeds};
 use compiler::rig::Emulated;
-use runtime::predict::{Late, Loop, Shaft, Step};
+use runtime::coupling::loop_stability::{Late, Loop, Shaft, Step};
 
 /// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m², stepped over the coming period with
 /// the newest speed: z' = z + T v, F = K z' + B v.

@@ -10,9 +10,9 @@ use crate::chance::{Chance, seeds};
 use crate::support::{Texts, root, texts_below};
 use abi::plan::{Experiment, Method, Solver};
 use compiler::{Case, Changes, Loaded, Options};
+use runtime::engine::estimate;
 use runtime::engine::{self, Continue, Outcome};
-use runtime::estimate;
-use runtime::verdict::Reading;
+use runtime::run::verdict::Reading;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 

@@ -61,7 +61,7 @@ impl Drawn {
         let Case { instance, experiment, .. } = self.compiled(tol);
         let outcome: Outcome = engine::run(instance, &experiment, &mut |_| Continue::Continue(()))
             .unwrap_or_else(|failure| panic!("{failure} in\n{}", self.text()));
-        let first = |verdict: &runtime::verdict::Verdict| {
+        let first = |verdict: &runtime::run::verdict::Verdict| {
             let reading = &verdict.readings[0];
             (reading.value, reading.time)
         };

@@ -3,12 +3,15 @@
 //! So the interpreter, the derivative pass and every back end are one `match` in one pass over the list.
 //! After `lower` there are no units here, and names serve only printing.
 
+pub mod scc;
 pub mod print;
 pub mod verify;
 pub mod eval;
 pub mod build;
-pub mod left;
+pub mod partial_eval;
 pub mod expr;
+pub mod interpret;
+pub mod program;
 pub mod random;
 
 use abi::Slot;

@@ -2,7 +2,7 @@
 
 use super::two_to;
 use super::{POOL, expand};
-use crate::backend::jit::compile;
+use crate::codegen::jit::compile;
 use crate::ir::build::Build;
 use crate::ir::random::Random;
 use crate::ir::{Binary, Unary};

@@ -8,7 +8,7 @@
 
 pub mod tables;
 pub mod exponential;
-pub mod relaxation;
+pub mod phi_functions;
 mod logarithm;
 mod trigonometric;
 #[cfg(test)]

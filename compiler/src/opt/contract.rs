@@ -13,9 +13,9 @@
 //!
 //! All look at one sum alone and on what it hangs, so mirror images of a contact are fused alike.
 
-use super::regroup::carried;
 use crate::ir::build::Build;
 use crate::ir::{Func, Op, Value, is_not_negative, sign_of};
+use crate::opt::reassociate::carried;
 use abi::{Layout, Slot};
 
 /// Fuses what may be, in a function on blocks of this layout.

@@ -1,6 +1,6 @@
 //! Passes that change how something is computed, before all back ends, so that these still agree to the bit.
 
-pub mod regroup;
+pub mod reassociate;
 pub mod contract;
-pub mod limited;
-pub mod watched;
+pub mod limiter_tests;
+pub mod guard_reduction;

@@ -5,10 +5,10 @@
 //! the hand (docs/prediction.md); `fric predict` computes it from the compiled step.
 
 use super::Places;
-use crate::backend::interp::Interpreter;
-use crate::linearise::{Linear, Matrices, PortSlots};
-use crate::program::Program;
-use crate::units::three_digits;
+use crate::analysis::linearise::{Linear, Matrices, PortSlots};
+use crate::frontend::units::three_digits;
+use crate::ir::interpret::Interpreter;
+use crate::ir::program::Program;
 use abi::description::{Kind as QuantityKind, Quantity};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use abi::series::Method;
@@ -32,7 +32,7 @@ const TORQUE: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 /// asked for.
 pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
     let description = Arc::new(program.description.clone());
-    let functions = crate::code::functions(program, Method::Adaptive);
+    let functions = crate::codegen::tiering::functions(program, Method::Adaptive);
     let interpreter = Interpreter::new(&functions, &description.layout, description.pool.len());
     let mut instance = Instance::new(description.clone(), Code::Interpreted(Arc::new(interpreter)), &program.params);
     instance.start(0.0);
@@ -101,7 +101,7 @@ impl Emulated {
     ///
     /// The program sums the speed over the coming period before it gives the force, so its spring is half a period ahead
     /// of its damper. Source: the crossing of the imaginary axis of J s² (1 + s l) + (B s + K e^{s T/2}) e^{−s (τ − l)} for a
-    /// lag l; within 4 % of the limit of the sampled loop (`runtime::predict`).
+    /// lag l; within 4 % of the limit of the sampled loop (`runtime::coupling::loop_stability`).
     #[allow(
         clippy::disallowed_methods,
         reason = "a warning's limit: shown with three digits, decides nothing that runs"

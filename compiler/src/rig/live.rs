@@ -5,13 +5,13 @@
 //! change if the step reads it and nothing else does that only a start fixes: then a set gives exactly the program that
 //! a start with the same values would.
 
-use crate::checks::unmet;
-use crate::delays;
+use crate::analysis::parameter_checks::unmet;
+use crate::frontend::delays;
+use crate::frontend::source::Files;
+use crate::frontend::system::*;
+use crate::frontend::units::Types;
+use crate::ir::program::Program;
 use crate::lower::{self, Sought};
-use crate::program::Program;
-use crate::source::Files;
-use crate::system::*;
-use crate::units::Types;
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
 use abi::live::{Check, Live, Param, Place};

@@ -5,9 +5,9 @@
 //! set while the rig runs, and the code of a step stays as it is.
 
 use super::live::reached;
+use crate::frontend::system::*;
+use crate::ir::program::Program;
 use crate::lower::Wanted;
-use crate::program::Program;
-use crate::system::*;
 use abi::Slot;
 use abi::description::Guard;
 use abi::unit::{Angle, Dimension};

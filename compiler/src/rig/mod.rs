@@ -6,32 +6,33 @@
 //! the slots of their programs into the plan. Knows no file and no bus.
 
 mod advice;
-mod cut;
+mod partition;
 mod dbc;
+mod nodes;
 mod frames;
 mod live;
 mod margins;
-mod nodes;
 mod plan;
 mod statements;
-mod step;
+mod step_derivative;
 mod wires;
 
-use crate::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
+use crate::analysis::parameter_checks;
+use crate::frontend::causality;
+use crate::frontend::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
+use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
+use crate::frontend::source::{Files, Sources};
+use crate::frontend::system::*;
+use crate::frontend::units::{self, Types};
+use crate::ir::program::Program;
 use crate::lower::{Wanted, evaluate};
-use crate::program::Program;
-use crate::resolve::{ItemRef, Loaded, Lookup, Space};
-use crate::source::{Files, Sources};
-use crate::system::*;
-use crate::units::{self, Types};
-use crate::{causality, checks};
+use crate::rig::partition::{affine, lives, mentioned, nothing, one, pruned, solved};
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
 use abi::live::{self as words, Live};
 use abi::rig::{self, Mode, Overrun, Rig, Signal, What};
 use abi::series::{Method, Series};
 use abi::unit::{Dimension, Unit};
-use cut::{affine, lives, mentioned, nothing, one, pruned, solved};
 use grammar::ast::{self, Expr, Item, Name};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
@@ -39,9 +40,9 @@ use nodes::{Description, Read, Speaks};
 use statements::{Expressions, Statements};
 use std::sync::Arc;
 
+pub use crate::rig::step_derivative::{Discrete, StepDerivative};
 pub use advice::{Emulated, linear};
 pub use frames::{load as bus_load, of_dbc as dbc_messages};
-pub use step::{Discrete, StepDerivative};
 
 /// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.
 pub const PLANT_STEPS: u32 = 50;
@@ -77,7 +78,7 @@ pub fn find(loaded: &Loaded, file: FileId, name: &Name) -> Result<ItemRef, Diagn
             let error = Diagnostic::error("E0201", format!("there is no rig `{}`", name.text))
                 .label(name.span, "not declared and not imported");
             let known = loaded.visible(file, Space::Rig);
-            Err(match crate::names::nearest(&name.text, known) {
+            Err(match crate::frontend::names::nearest(&name.text, known) {
                 Some(near) => error.help(format!("did you mean `{near}`?")),
                 None => error.help("models begin with a capital, rigs with a small letter"),
             })
@@ -316,7 +317,7 @@ impl<'a> Reader<'a, '_> {
         let mut found = Vec::new();
         for name in buses.chain(nodes).chain(parts) {
             match first.iter().find(|known| known.text == name.text) {
-                Some(before) => found.push(crate::resolve::declared_twice(name, before.span)),
+                Some(before) => found.push(crate::frontend::resolve::declared_twice(name, before.span)),
                 None => first.push(name),
             }
         }
@@ -339,7 +340,7 @@ impl<'a> Reader<'a, '_> {
     /// E0204 for a drive or device that is not there.
     fn no_node(&mut self, name: &Name, what: &str) {
         let names = self.descriptions.iter().map(|node| node.name.text.as_str());
-        let near = crate::names::nearest(&name.text, names).map(str::to_string);
+        let near = crate::frontend::names::nearest(&name.text, names).map(str::to_string);
         // A drive whose description is wrong has been reported.
         let declared = self
             .rig
@@ -432,7 +433,7 @@ impl<'a> Reader<'a, '_> {
                 let name = &signal.name.text;
                 let message = format!("`{name}` of `{}` cannot be commanded", node.name.text);
                 let mut error = Diagnostic::error("E0204", message).label(signal.name.span, "no such command");
-                let near = crate::names::nearest(name, known.iter().map(String::as_str));
+                let near = crate::frontend::names::nearest(name, known.iter().map(String::as_str));
                 error = match (near, &description.speaks) {
                     (Some(near), _) => error.help(format!("did you mean `{near}`?")),
                     (None, Speaks::Cia402 { .. }) => {
@@ -678,8 +679,8 @@ impl<'a> Reader<'a, '_> {
         let period = plan.period_ns as f64 * 1e-9;
         let [control_step, plant_step] = [plan.steps, PLANT_STEPS].map(|steps| period / f64::from(steps));
         let rate = self.statements.rate.map(|(_, span)| span);
-        checks::whole_periods(&control, &control_types, control_step, rate, self.diagnostics);
-        checks::whole_periods(&plant.system, &plant_types, plant_step, rate, self.diagnostics);
+        parameter_checks::whole_periods(&control, &control_types, control_step, rate, self.diagnostics);
+        parameter_checks::whole_periods(&plant.system, &plant_types, plant_step, rate, self.diagnostics);
         let periods = |system: &System, step| system.blocks.iter().map(move |block| (block.period, step)).collect();
         let periods: Vec<(ExprId, f64)> = periods(&control, control_step);
         let judged = live::judged(
@@ -806,7 +807,7 @@ impl<'a> Reader<'a, '_> {
             causality::check(system, self.files, &mut found);
         }
         if !failed(&found) {
-            checks::values(system, &types, self.files, &mut found);
+            parameter_checks::values(system, &types, self.files, &mut found);
         }
         let stop = failed(&found) || self.errors() > 0 || self.loaded.has_errors();
         self.diagnostics.extend(found);

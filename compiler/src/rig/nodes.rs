@@ -4,9 +4,9 @@
 //! In: the statements of a rig and the descriptions they name. Out: a [`Description`] for each.
 
 use super::dbc;
-use crate::names::nearest;
-use crate::resolve::{Loaded, Lookup, Space};
-use crate::source::Sources;
+use crate::frontend::names::nearest;
+use crate::frontend::resolve::{Loaded, Lookup, Space};
+use crate::frontend::source::Sources;
 use abi::rig::{Format, Mode, What};
 use abi::unit::Unit;
 use grammar::ast::{self, BinaryOp, Declaration, DeclarationKind, Expr, ExprKind, Item, Name, UnitText};
@@ -305,7 +305,7 @@ impl Describer<'_> {
                 None
             }
             Lookup::Ambiguous(a, b) => {
-                let file = |item: crate::resolve::ItemRef| self.loaded.files.get(item.file).name.clone();
+                let file = |item: crate::frontend::resolve::ItemRef| self.loaded.files.get(item.file).name.clone();
                 let error = Diagnostic::error("E0202", format!("two imports define `{}`", kind.text))
                     .label(kind.span, format!("in {} and in {}", file(a), file(b)));
                 self.diagnostics.push(error.help("import only one of them"));

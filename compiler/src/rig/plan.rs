@@ -2,8 +2,8 @@
 
 use super::margins::{self, Margin};
 use super::*;
+use crate::ir::program::Program;
 use crate::lower::{self, lower};
-use crate::program::Program;
 use frames::{Laid, OnBus};
 
 impl Reader<'_, '_> {
@@ -189,7 +189,7 @@ impl Reader<'_, '_> {
             if !kinds.contains(&bus.kind.text.as_str()) {
                 let error = Diagnostic::error("E0201", format!("there is no bus of kind `{}`", bus.kind.text))
                     .label(bus.kind.span, "not known");
-                self.report(match crate::names::nearest(&bus.kind.text, kinds) {
+                self.report(match crate::frontend::names::nearest(&bus.kind.text, kinds) {
                     Some(near) => error.help(format!("did you mean `{near}`?")),
                     None => error.help(format!("kinds are {}", kinds.join(", "))),
                 });
@@ -225,7 +225,7 @@ impl Reader<'_, '_> {
             let error = Diagnostic::error("E0204", format!("there is no bus `{}`", statement.bus.text))
                 .label(statement.bus.span, "not declared in this rig");
             let names = self.statements.buses.iter().map(|bus| bus.name.text.as_str());
-            let near = crate::names::nearest(&statement.bus.text, names).map(str::to_string);
+            let near = crate::frontend::names::nearest(&statement.bus.text, names).map(str::to_string);
             self.report(match near {
                 Some(near) => error.help(format!("did you mean `{near}`?")),
                 None => error.help(format!("add `bus {} = can(\"can0\", 1 Mbit/s)`", statement.bus.text)),
@@ -593,7 +593,7 @@ impl Cut {
         let super::Lowered { rig, control, .. } = lowered;
         let ends: Vec<(ExprId, Slot)> =
             self.stops.iter().zip(&rig.stops).map(|(condition, stop)| (*condition, stop.slot)).collect();
-        let fixed = crate::unstable::Fixed {
+        let fixed = crate::analysis::step_stability_report::Fixed {
             system: &self.control,
             types: &self.control_types,
             program: control,
@@ -604,9 +604,9 @@ impl Cut {
             ends: &ends,
             rig: true,
         };
-        let mut found = crate::unstable::check(&fixed, files);
+        let mut found = crate::analysis::step_stability_report::check(&fixed, files);
         let (system, types) = (fixed.system, fixed.types);
-        found.extend(crate::acting::check(system, types, control, rig.plant.inertia, fixed.run));
+        found.extend(crate::analysis::acting_mass::check(system, types, control, rig.plant.inertia, fixed.run));
         found.retain(|said| said.is_error() || !self.allowed(said));
         found
     }

@@ -1,7 +1,7 @@
 //! The statements of a rig sorted by kind, each where there is one; and the numbers in them that must be known before
 //! anything runs.
 
-use crate::flatten::Scope;
+use crate::frontend::flatten::Scope;
 use abi::unit::Unit;
 use grammar::ast::{self, Expr, Name, RigStatement};
 use grammar::diagnostic::Diagnostic;

@@ -18,7 +18,7 @@ impl Reader<'_, '_> {
             let Some(found) = found else {
                 let names = system.var_ids().filter(own).map(|id| system.var(id)).filter(|var| given_kind(var.kind));
                 let names: Vec<&str> = names.map(|var| var.name.as_str()).collect();
-                let near = crate::names::nearest(&name.text, names.iter().copied());
+                let near = crate::frontend::names::nearest(&name.text, names.iter().copied());
                 let error = Diagnostic::error("E0204", format!("there is no `{}` in {model}", name.text))
                     .label(name.span, "not an output or state of the part");
                 let help = match near {

@@ -3,7 +3,7 @@
 //! In: an open descriptor and bytes. Out: bytes, nothing yet, or that the other end is gone. The calls of the kernel that
 //! the buses share are here, and nothing of any protocol.
 
-use crate::clock::{Clock, Monotonic};
+use crate::realtime::clock::{Clock, Monotonic};
 use std::io;
 use std::os::fd::RawFd;
 

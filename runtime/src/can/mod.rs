@@ -2,13 +2,14 @@
 //!
 //! In: addresses and frames. Out: frames, stamps and events of the bus. Knows no drive and no model.
 
-pub mod names;
-pub mod wire;
-
-pub mod sim;
+pub mod cob_ids;
+pub mod frame_length;
 
 pub mod address;
 pub mod descriptor;
+
+pub mod sim;
+
 pub mod slcan;
 pub mod socketcan;
 pub mod socketcand;
@@ -16,7 +17,7 @@ pub mod socketcand;
 pub mod log;
 pub mod replay;
 
-pub mod hub;
+pub mod bridge;
 
 use address::Address;
 use sim::{Join, Simulation};

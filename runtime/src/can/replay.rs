@@ -6,7 +6,7 @@
 use super::log::{self, Entry};
 use super::sim::Simulation;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Received, Refused};
-use crate::clock::Clock;
+use crate::realtime::clock::Clock;
 use std::path::Path;
 
 /// A log as a bus.

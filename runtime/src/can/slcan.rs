@@ -10,7 +10,7 @@
 use super::address::SLCAN_BIT_RATES;
 use super::descriptor::{self, Incoming, Moved, Outgoing};
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
-use crate::clock::{Clock, Monotonic};
+use crate::realtime::clock::{Clock, Monotonic};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd, RawFd};

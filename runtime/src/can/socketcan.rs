@@ -5,7 +5,7 @@
 
 use super::descriptor;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
-use crate::clock::{Clock, Monotonic};
+use crate::realtime::clock::{Clock, Monotonic};
 use ::socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl};
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};

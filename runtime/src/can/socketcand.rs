@@ -8,7 +8,7 @@
 
 use super::descriptor::{self, Incoming, Moved, Outgoing};
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
-use crate::clock::{Clock, Monotonic};
+use crate::realtime::clock::{Clock, Monotonic};
 use std::io::{self, Cursor, Read, Write};
 use std::net::{TcpListener, TcpStream, ToSocketAddrs};
 use std::os::fd::{AsRawFd, RawFd};

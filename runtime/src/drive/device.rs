@@ -3,9 +3,9 @@
 //! In: its frames, commands. Out: its signals, the frames to send.
 
 use super::frames;
-use super::trouble::{Reading, TroubleKind};
 use crate::can::Frame;
 use crate::canopen::Send;
+use crate::drive::faults::{Reading, TroubleKind};
 use abi::rig::Message;
 
 /// Longest time between two frames of ours where nobody names one.

@@ -6,15 +6,15 @@
 
 use super::Send;
 use super::device::Device;
-use super::master::{Drive, Limits, Setting, Status};
 use super::profiles::{self, Transport};
-use super::script::Watching;
-use super::sign::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
 use super::state::{Goal, State};
-use super::trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 use crate::can::Frame;
 use crate::canopen::service::{self, Service};
 use crate::canopen::{Nmt, NmtState};
+use crate::drive::cia402::{Drive, Limits, Setting, Status};
+use crate::drive::faults::{Reading, Refusal, Trouble, TroubleKind, Why};
+use crate::drive::polarity_check::{Bounds, PATIENCE, PATIENCE_BY_HAND, Push, Sample, SignTest, Verdict};
+use crate::drive::sdo_sequence::Watching;
 use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use std::fmt;

@@ -132,7 +132,7 @@ pub fn fill(message: &Message, value: impl Fn(usize) -> f64, data: &mut [u8; 8])
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::Chance;
+    use crate::rng::Chance;
     use abi::unit::Unit;
 
     fn field(start_bit: u16, bits: u16, big_endian: bool, format: Format) -> Field {

@@ -9,29 +9,27 @@ pub mod state;
 pub mod units;
 pub mod frames;
 pub mod timing;
-pub mod trouble;
-pub mod script;
-pub mod sign;
-pub mod master;
+pub mod faults;
+pub mod sdo_sequence;
+pub mod polarity_check;
+pub mod cia402;
 pub mod device;
 pub mod fieldbus;
-pub mod hooks;
+pub mod fault_injection;
 pub mod simulated;
-pub mod bench;
-pub mod attend;
+pub mod simulated_plant;
+pub mod bus_stub;
 pub mod serve;
 
-pub use attend::attend;
-pub use bench::{Bench, Shaft};
+pub use crate::drive::bus_stub::attend;
+pub use crate::drive::cia402::{Limits, Status};
+pub use crate::drive::fault_injection::{Effect, Hook, Start};
+pub use crate::drive::faults::{Reading, Refusal, Trouble, TroubleKind, Why};
+pub use crate::drive::simulated_plant::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
-pub use hooks::{Effect, Hook, Start};
-pub use master::{Limits, Status};
-pub use trouble::{Reading, Refusal, Trouble, TroubleKind, Why};
 
 /// Takes the frames that go out: the bus (an index into [`abi::rig::Rig::buses`]) and the frame.
 pub type Send<'a> = &'a mut dyn FnMut(usize, crate::can::Frame);
 
-#[cfg(test)]
-mod samples;
 #[cfg(test)]
 mod tests;

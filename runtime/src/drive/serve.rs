@@ -3,17 +3,18 @@
 //! In: a rig, the part of its system that lies behind the drives, ways to the outside. Out: frames there, and in words how
 //! the states of the drives change. Knows neither terminals nor files but the links of pseudo-terminals.
 
-use super::bench::Bench;
-use super::{attend, hooks};
+use super::attend;
+use crate::can;
 use crate::can::address::Address;
-use crate::can::hub::Hub;
+use crate::can::bridge::Hub;
 use crate::can::sim::{SimBus, Simulation};
 use crate::can::slcan::Slcan;
 use crate::can::socketcand::Server;
-use crate::can::{self};
 use crate::canopen::eds;
-use crate::clock::Clock;
-use crate::realtime::{self, Wishes};
+use crate::drive::fault_injection;
+use crate::drive::simulated_plant::Bench;
+use crate::realtime::clock::Clock;
+use crate::realtime::threads::{self, Wishes};
 use abi::Instance;
 use abi::rig::{Kind, Rig};
 use std::path::PathBuf;
@@ -34,7 +35,7 @@ pub struct Doors {
     pub tcp: Option<u16>,
     /// What drives say they have besides what their simulation knows.
     pub sheets: Vec<Sheet>,
-    /// What fails, as [`hooks::read`] takes it.
+    /// What fails, as [`fault_injection::read`] takes it.
     pub inject: Vec<String>,
     /// From which all that is random follows.
     pub seed: u64,
@@ -117,7 +118,7 @@ impl Served {
             }
         }
         for text in &doors.inject {
-            bench.hook(hooks::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?);
+            bench.hook(fault_injection::read(text, rig).map_err(|why| misused(format!("--inject '{text}': {why}")))?);
         }
         let world = Simulation::real_time();
         let clock = world.monotonic().expect("this world's time is real");
@@ -166,7 +167,7 @@ impl Served {
     pub fn serve(self, rig: &Rig, duration: Option<f64>, over: &dyn Fn() -> bool, told: &mut dyn FnMut(&str)) {
         let Served { world, buses, mut hubs, mut server, bench, .. } = self;
         // A drive keeps its time however busy a computer is: where it may, this one stands just below a loop beside it.
-        let _real_time = realtime::enter(&Wishes { priority: PRIORITY, core: None, memory: false, awake: false });
+        let _real_time = threads::enter(&Wishes { priority: PRIORITY, core: None, memory: false, awake: false });
         let bench = attend(&world, &buses, rig, bench);
         let until_ns = duration.map_or(u64::MAX, |seconds| world.now_ns().saturating_add((seconds * 1e9) as u64));
         let also: Vec<i32> = server.iter().map(Server::descriptor).collect();

@@ -4,7 +4,6 @@
 //! dead time → slope limit (mode 4) → saturation → first-order lag; what is told passes the encoder, a filter and the
 //! drive's units. Its time-outs work. [`Effect`]s make it fail.
 
-use super::hooks::Effect;
 use super::profiles::{self, Life, Path, Profile};
 use super::state::{Machine, State, Times, status};
 use super::units::Scale;
@@ -12,6 +11,7 @@ use crate::can::Frame;
 use crate::canopen::node::{Happening, Loss, Node};
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, Nmt, NmtState, Object, ObjectDictionary, Send, Type};
+use crate::drive::fault_injection::Effect;
 use abi::rig::Cia402;
 
 /// Commands on their way to the motor.

@@ -1,13 +1,13 @@
 //! A master against simulated drives, without a bus between them.
 
-use super::hooks::{self, Hook};
-use super::samples::*;
 use super::simulated::Behaviour;
 use super::state::State;
 use super::*;
 use crate::can::Frame;
 use crate::canopen::object::Entry;
 use crate::canopen::{Access, NmtState, Object, Service, Type};
+use crate::drive::fault_injection::{self, Hook};
+use crate::testing::drives::*;
 use abi::rig::{Kind, Mode, Rig, What};
 
 fn table(rig: &Rig) -> Table {
@@ -259,7 +259,7 @@ fn wrong_signs_and_scales_are_refused() {
     let refused = |text: &str| {
         let rig = rig(Mode::Torque);
         let mut table = table(&rig);
-        table.bench.hook(hooks::read(text, &rig).unwrap());
+        table.bench.hook(fault_injection::read(text, &rig).unwrap());
         table.refused()
     };
     let words = [
@@ -318,7 +318,7 @@ fn after(text: &str) -> (Vec<(Option<usize>, TroubleKind)>, usize, Table) {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
     table.arm();
-    let hook: Hook = hooks::read(&format!("{text} at 0 s"), &rig).unwrap();
+    let hook: Hook = fault_injection::read(&format!("{text} at 0 s"), &rig).unwrap();
     table.bench.hook(hook);
     for tick in 1..=100 {
         table.tick();
@@ -411,7 +411,7 @@ fn prepared_frames_stop_both_drives() {
 fn a_device_is_read_and_told() {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
-    table.bench.hook(hooks::read("panel.enable = 0 at 500 ms for 100 ms", &rig).unwrap());
+    table.bench.hook(fault_injection::read("panel.enable = 0 at 500 ms for 100 ms", &rig).unwrap());
     let enable = abi::rig::Signal { node: PANEL, what: What::Field(0, 0) };
     assert_eq!(table.fieldbus.reading(enable).age, Reading::NEVER);
     table.ticks(499);
@@ -500,7 +500,7 @@ fn a_converter_of_the_fc302_kind_lives_by_guarding() {
 #[test]
 fn hooks_are_read_or_refused_in_words() {
     let rig = rig(Mode::Torque);
-    let read = |text: &str| hooks::read(text, &rig);
+    let read = |text: &str| fault_injection::read(text, &rig);
     let hook = read("servo encoder frozen when load.speed > 10 rad/s for 20 ms").unwrap();
     assert_eq!((hook.node, hook.effect, hook.lasts_ns), (SERVO, Effect::EncoderFrozen, Some(20_000_000)));
     let signal = abi::rig::Signal { node: LOAD, what: What::Speed };
@@ -527,7 +527,7 @@ fn hooks_are_read_or_refused_in_words() {
 fn two_drives_start_up_over_a_bus() {
     use crate::can::sim::Simulation;
     use crate::can::{Bus, Received};
-    use crate::clock::Clock;
+    use crate::realtime::clock::Clock;
     let rig = rig(Mode::Torque);
     let simulation = Simulation::new();
     let bus = simulation.bus("can0", 1_000_000);
@@ -577,7 +577,7 @@ fn a_drive_that_holds_speed_turns_the_other_for_its_test() {
     (rig.outputs[LOAD].low, rig.outputs[LOAD].high) = (-1.0, 1.0);
     table(&rig).arm();
     let mut table = table(&rig);
-    table.bench.hook(hooks::read("load speed scale -1 at 0 s", &rig).unwrap());
+    table.bench.hook(fault_injection::read("load speed scale -1 at 0 s", &rig).unwrap());
     let refusal = table.refused();
     assert!(refusal.starts_with("load (node 3): by its position it turned by"), "{refusal}");
 }

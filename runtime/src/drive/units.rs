@@ -93,7 +93,7 @@ impl Counter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::Chance;
+    use crate::rng::Chance;
 
     #[test]
     fn torque_is_told_in_thousandths_of_rated_torque() {

@@ -4,19 +4,19 @@
 //! In every test, in every cycle: no command beyond its limit, no torque on the shaft beyond that of its drive. At the end
 //! of every stop: no drive under torque.
 
-use super::bench;
 use super::control;
 use super::cycle::{Command, End, Hil, Operator, Options, look_ahead};
 use super::live::Set;
 use super::simulated::{BENCH, MASTER, Pace, World};
 use crate::can::sim::{Fault, Kind as FaultKind, Port};
 use crate::can::{Bus, Frame};
-use crate::drive::hooks::{self, Effect, Hook, Start};
-use crate::drive::sign::SignTest;
+use crate::drive::fault_injection::{self, Effect, Hook, Start};
+use crate::drive::polarity_check::SignTest;
 use crate::drive::{self, Step};
 use crate::record::log::{Sections, Settings, Sink};
 use crate::record::parts::Limits;
-use crate::safety::{Cause, Order};
+use crate::safety::{Cause, DriveCommand};
+use crate::testing::rigs;
 use abi::rig::{Cia402, Kind, Overrun, Rig};
 use abi::{Instance, Slot};
 use std::os::unix::fs::OpenOptionsExt;
@@ -61,7 +61,7 @@ fn cia402(rig: &mut Rig, node: usize) -> &mut Cia402 {
 
 impl Stand {
     fn new(options: Options, seed: u64, change: impl FnOnce(&mut Rig, &mut Instance)) -> Stand {
-        let (mut rig, mut model, plant) = bench::pair();
+        let (mut rig, mut model, plant) = rigs::pair();
         change(&mut rig, &mut model);
         Stand::of((rig, model, plant), options, seed, None)
     }
@@ -72,7 +72,7 @@ impl Stand {
         let mut world = World::new(&rig, Some(plant), Pace::Fast, seed).unwrap();
         let masters = world.masters();
         let log = log.map(|settings| (settings, Sections::default()));
-        let judge = bench::judge(&model);
+        let judge = rigs::judge(&model);
         let (mut hil, operator) = Hil::new(&rig, model, world.clock(), masters, options, log).unwrap();
         hil.judged_by(judge);
         let power = cia402(&mut rig, 0).max_power.unwrap_or(f64::INFINITY);
@@ -112,7 +112,7 @@ impl Stand {
             if self.cause.is_none() {
                 self.cause = supervisor.cause().map(|cause| (cause, now));
             }
-            let follows = self.hil.order() == Order::Follow;
+            let follows = self.hil.order() == DriveCommand::Follow;
             let speeds = self.hil.seen().iter().map(|seen| seen.speed.unwrap_or(0.0)).collect::<Vec<f64>>();
             for (i, (limits, value)) in supervisor.outputs().iter().zip(supervisor.permitted()).enumerate() {
                 assert!(limits.low <= *value && *value <= limits.high, "{value} at {now} ns");
@@ -132,7 +132,7 @@ impl Stand {
 
     fn hook(&mut self, text: &str) -> u64 {
         let now = self.now();
-        let hook = hooks::read(&format!("{text} at {} s", now as f64 * 1e-9), &self.rig).unwrap();
+        let hook = fault_injection::read(&format!("{text} at {} s", now as f64 * 1e-9), &self.rig).unwrap();
         self.world.bench().hook(hook);
         now
     }
@@ -459,7 +459,7 @@ fn row_13_a_drive_that_is_not_ours_gets_no_permission() {
 #[test]
 fn row_13_a_safe_value_that_would_move_a_drive_before_arming() {
     for safe in [0.5, -1e-9] {
-        let (mut rig, model, plant) = bench::pair();
+        let (mut rig, model, plant) = rigs::pair();
         rig.outputs[1].safe = safe;
         let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
         let masters = world.masters();
@@ -480,7 +480,7 @@ fn row_8_a_bus_that_goes_off_does_not_come_back_to_motion() {
     while stand.hil.ended().is_none() {
         stand.cycle();
         let order = stand.order();
-        assert!(order != Order::Follow && order != Order::Wait, "motion came back");
+        assert!(order != DriveCommand::Follow && order != DriveCommand::Wait, "motion came back");
     }
     stand.at_rest();
 }
@@ -697,7 +697,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
     let mut options = std::fs::OpenOptions::new();
     let reader = options.read(true).custom_flags(libc::O_NONBLOCK).open(&path).unwrap();
     let log = Settings { sink: Sink::File(path, Limits::default()), cycles_per_block: 100, patient: false };
-    let mut stand = Stand::of(bench::pair(), quick(), 1, Some(log));
+    let mut stand = Stand::of(rigs::pair(), quick(), 1, Some(log));
     stand.reach(Step::Armed);
     while stand.hil.counts().log_dropped == 0 {
         stand.goes_on(100 * MS);
@@ -720,7 +720,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
 
 /// The bristle, its load so late; looking ahead or not.
 fn late_bristle(delay: f64, predict: bool, swing: f64) -> (Rig, Instance, Instance) {
-    let (mut rig, mut model, plant) = bench::bristle();
+    let (mut rig, mut model, plant) = rigs::bristle();
     rig.nodes[0].delay = delay;
     rig.predict = predict.then_some(0);
     param(&mut model, 0, swing);
@@ -800,7 +800,7 @@ impl Stand {
         (cause, at - since)
     }
 
-    fn order(&self) -> Order {
+    fn order(&self) -> DriveCommand {
         self.hil.order()
     }
 }

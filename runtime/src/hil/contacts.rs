@@ -5,17 +5,17 @@
 //! the simulation itself: its equations, which the test wrote, and the energy, which is a state beside them. `FRIC_SEED=n`
 //! repeats one seed; `FRIC_RUNS=n` says how many there are.
 
-use super::bench;
 use super::campaign::quick;
 use super::cycle::{End, Hil, look_ahead};
 use super::simulated::{Pace, World};
-use crate::chance::Chance;
-use crate::clock::Clock;
 use crate::drive::Step;
-use crate::drive::bench::Bench;
-use crate::drive::hooks::{Effect, Hook, Start};
-use crate::models::Model;
+use crate::drive::fault_injection::{Effect, Hook, Start};
+use crate::drive::simulated_plant::Bench;
+use crate::realtime::clock::Clock;
+use crate::rng::Chance;
 use crate::safety::Cause;
+use crate::testing::models::Model;
+use crate::testing::rigs;
 use abi::rig::{Kind, Rig, Signal, What};
 use abi::{Function, Instance};
 use std::collections::VecDeque;
@@ -118,7 +118,7 @@ impl Script {
     /// Rig, control program, plant program. `at`: time of the event, s.
     fn build(&self, at: f64) -> (Rig, Instance, Instance) {
         let Script { inertia, bearings, stiffness, most, damping, swing, hertz, event, .. } = *self;
-        let (mut rig, _, _) = bench::bristle();
+        let (mut rig, _, _) = rigs::bristle();
         let control = Model::new("Bristle")
             .inputs(2)
             .state("z", "rad")

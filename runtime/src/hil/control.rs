@@ -6,10 +6,10 @@
 
 use super::coupling::{Coupling, Verdict};
 use super::followed::Followed;
-use super::watches::{self, bounds_of};
+use super::watches::{self, Bounds, bounds_of};
+use crate::coupling::predictor::Wired;
 use crate::drive::profiles;
-use crate::lookahead::Wired;
-use crate::safety::{Cause, Order, Patience, Protection, Seen, Supervisor, is_present};
+use crate::safety::{Cause, DriveCommand, Protection, Seen, Supervisor, Timeouts, is_present};
 use abi::rig::{Kind, Overrun, Rig, Signal, What};
 use abi::{Function, Instance, Slot};
 
@@ -170,15 +170,6 @@ impl Default for Options {
     }
 }
 
-/// Greatest torque and speed of a drive, where known.
-#[derive(Clone, Copy, PartialEq, Debug, Default)]
-pub struct Bounds {
-    /// N·m
-    pub torque: Option<f64>,
-    /// rad/s
-    pub speed: Option<f64>,
-}
-
 /// The part of a cycle that only computes.
 pub struct Control {
     model: Instance,
@@ -245,7 +236,7 @@ impl Control {
         for output in &rig.outputs {
             outputs.push(watches::output_limits(rig, output, &moving, bounds)?);
         }
-        let patience = Patience {
+        let patience = Timeouts {
             ramp: ticks(options.ramp_ns),
             clamped: ticks(options.clamped_ns),
             standstill: ticks(options.standstill_ns),
@@ -405,7 +396,7 @@ impl Control {
 
     /// One cycle. Who asks for outputs must have armed the supervisor.
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
-    pub fn cycle(&mut self, told: &Told) -> Order {
+    pub fn cycle(&mut self, told: &Told) -> DriveCommand {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
         let armed = told.source != Source::Nobody;
         self.refused_set = None;
@@ -449,7 +440,7 @@ impl Control {
         if computes {
             self.coupling.sent(self.supervisor.permitted());
         }
-        self.follows = armed && order == Order::Follow;
+        self.follows = armed && order == DriveCommand::Follow;
         order
     }
 
@@ -695,7 +686,7 @@ impl Control {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::bench;
+    use crate::testing::rigs;
     use abi::rig::{Field, Format, Input, Message, Node};
 
     const FRESH: u32 = 0;
@@ -712,7 +703,7 @@ mod tests {
         }
 
         fn of(change: impl FnOnce(&mut Rig), options: Options) -> Way {
-            let (mut rig, model) = bench::rig();
+            let (mut rig, model) = rigs::rig();
             change(&mut rig);
             let options = Options { ramp_ns: 0, blend_ns: 10_000_000, ..options };
             let mut control = Control::new(&rig, model, None, &[], options).unwrap();
@@ -806,7 +797,7 @@ mod tests {
 
     /// A device of the rig that tells a float at its own pace, with some `timeout` or none, and its readings' place.
     fn with_device(timeout_ns: u64) -> (Control, usize) {
-        let (mut rig, model) = bench::rig();
+        let (mut rig, model) = rigs::rig();
         let field = Field {
             name: "force".into(),
             start_bit: 0,
@@ -822,7 +813,7 @@ mod tests {
         let (name, fields) = ("force".to_string(), vec![field]);
         let message = Message { name, id: 0x1A0, extended: false, length: 4, send: false, period_ns: 0, fields };
         let (kind, signal) = (Kind::Frames(vec![message]), Signal { node: 1, what: What::Field(0, 0) });
-        rig.nodes.push(Node { kind, moves: false, timeout_ns, ..bench::drive("sensor", 9) });
+        rig.nodes.push(Node { kind, moves: false, timeout_ns, ..rigs::drive("sensor", 9) });
         let input = rig.inputs[0];
         rig.inputs.push(Input { signal, ..input });
         let mut control = Control::new(&rig, model, None, &[], Options::default()).unwrap();
@@ -835,9 +826,9 @@ mod tests {
     fn what_a_device_tells_is_a_number_or_the_one_before_and_three_that_are_none_stop_the_rig() {
         let mut stopped = [0; 2];
         for seed in 0..500 {
-            let mut chance = crate::chance::Chance(seed);
+            let mut chance = crate::rng::Chance(seed);
             let timeout = [0, 15, 40][chance.below(3) as usize];
-            let (mut control, at) = with_device(timeout * bench::PERIOD_NS);
+            let (mut control, at) = with_device(timeout * rigs::PERIOD_NS);
             let (every, wrong) = (1 + chance.below(12), chance.fraction());
             // Since when it came, and since the last number; the numbers that were none since then.
             let (mut newest, mut age, mut number, mut since, mut none) = (0.0, Reading::NEVER, 0.0, 0, 0);
@@ -913,7 +904,7 @@ mod tests {
     /// cycle on; the cycle in which that is found, and the speeds read.
     fn read_at_any_time(seed: u64, stands: usize) -> (Option<usize>, Vec<f64>) {
         let (acceleration, period, most) = SHAFT;
-        let mut chance = crate::chance::Chance(seed);
+        let mut chance = crate::rng::Chance(seed);
         let jitter = chance.fraction();
         let (mut run, mut speeds) = (Disagreement::default(), Vec::new());
         let (mut now, mut due, mut angle, mut speed) = (0.0, 0.0, 0.0, chance.between(-200.0, 200.0));
@@ -1018,7 +1009,7 @@ mod tests {
 
     #[test]
     fn a_rig_without_bounds_is_refused_in_words() {
-        let (mut rig, model) = bench::rig();
+        let (mut rig, model) = rigs::rig();
         let Kind::Cia402(drive) = &mut rig.nodes[0].kind else { unreachable!() };
         drive.max_speed = None;
         let why = |bounds: &[Bounds]| Control::new(&rig, model.clone(), None, bounds, Options::default()).err();

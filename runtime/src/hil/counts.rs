@@ -1,7 +1,7 @@
 //! What a rig counts while it runs.
 
 use super::coupling;
-use crate::histogram::Histogram;
+use crate::realtime::histogram::Histogram;
 
 /// What was counted.
 #[derive(Clone, Default)]

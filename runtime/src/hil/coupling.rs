@@ -4,8 +4,8 @@
 //! act, whether that could be believed, and whether a contact gives back more than it can hold. Knows neither clock nor
 //! bus, so that a replay of the same readings gives the same bits. Allocates when it is made, never later.
 
-use crate::energy::{Energy, Sign};
-use crate::lookahead::{Ahead, Wired};
+use crate::coupling::passivity::{Energy, Sign};
+use crate::coupling::predictor::{Ahead, Wired};
 use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use abi::{Instance, Slot};
@@ -261,13 +261,13 @@ fn turned(rig: &Rig, model: &Instance, speeds: &[Slot], output: Slot) -> Option<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::bench;
-    use crate::models::Model;
+    use crate::testing::models::Model;
+    use crate::testing::rigs;
     use abi::Function;
 
     /// The rig of one drive, its model a bristle: dz/dt = v − σ0 |v| z / g with g = 0.34 N·m.
     fn bristle() -> (Rig, Instance) {
-        let (mut rig, _) = bench::rig();
+        let (mut rig, _) = rigs::rig();
         let (sigma0, g) = (260.0, 0.34);
         let model = Model::new("Bristle")
             .inputs(1)
@@ -301,7 +301,7 @@ mod tests {
 
     #[test]
     fn a_spring_without_end_is_no_contact() {
-        let (rig, model) = bench::rig();
+        let (rig, model) = rigs::rig();
         assert_eq!(Coupling::new(&rig, None, &WATCHED, &model).stores().count(), 0);
     }
 

@@ -8,19 +8,20 @@
 //! computing of [`Control`], the commands, housekeeping. From the moment the drives may move, a cycle does not allocate,
 //! lock or write anything but frames; what it leaves behind goes through queues that never wait.
 
-use super::control::{Bounds, Control, Reading, Source, Told};
+use super::control::{Control, Reading, Source, Told};
 use super::counts::Counts;
 use super::live::{Judge, Objection};
 use super::operator::{self, Answer, Commands, Why};
 pub use super::operator::{Command, Operator};
 use super::trace::{self, Passed, Shape};
+use super::watches::Bounds;
 use super::{control, emergency, watches};
 use crate::can::{Bus, Event, Frame, Received};
-use crate::clock::Clock;
+use crate::coupling::predictor::Wired;
 use crate::drive::{self, Fieldbus, Request, Step, Trouble, TroubleKind, timing};
-use crate::lookahead::Wired;
+use crate::realtime::clock::Clock;
 use crate::record::log::{self, Log, Sections};
-use crate::safety::{Cause, Clamps, Order, Protection, Seen, Supervisor, is_present};
+use crate::safety::{Cause, Clamps, DriveCommand, Protection, Seen, Supervisor, is_present};
 use abi::Instance;
 use abi::rig::{Rig, Signal};
 use std::io;
@@ -86,7 +87,7 @@ pub struct Gauges {
     pub now_ns: AtomicU64,
     /// Cycles in which the model ran.
     pub cycles: AtomicU64,
-    /// [`Step`] of the start-up as a number, then [`Order`] as a number from 100.
+    /// [`Step`] of the start-up as a number, then [`DriveCommand`] as a number from 100.
     pub stage: AtomicU64,
     /// How late the last cycle began, ns.
     pub late_ns: AtomicU64,
@@ -205,7 +206,7 @@ pub struct Hil {
     cycle: trace::Cycle,
     signals: Vec<Signal>,
     words: Vec<u64>,
-    order: Order,
+    order: DriveCommand,
     overload: u32,
     first_trouble: Option<Trouble>,
     /// Cycles of the model that are left; none: no end.
@@ -278,7 +279,7 @@ impl Hil {
             cycle: trace::Cycle::new(empty),
             signals: Vec::new(),
             words: Vec::with_capacity(1 << 14),
-            order: Order::Wait,
+            order: DriveCommand::Wait,
             overload: 0,
             first_trouble: None,
             over: false,
@@ -327,7 +328,7 @@ impl Hil {
     }
 
     /// What the drives were told in the last cycle.
-    pub fn order(&self) -> Order {
+    pub fn order(&self) -> DriveCommand {
         self.order
     }
 
@@ -510,7 +511,7 @@ impl Hil {
     /// What a gauge shows of the start-up and of a stop.
     fn stage(&self) -> u64 {
         match self.order {
-            Order::Wait | Order::Follow => self.fieldbus.step() as u64,
+            DriveCommand::Wait | DriveCommand::Follow => self.fieldbus.step() as u64,
             order => 100 + trace::order_number(order),
         }
     }
@@ -552,7 +553,7 @@ impl Hil {
     }
 
     /// Computes, once the drives have told their limits.
-    fn compute(&mut self, ticks: u32) -> Order {
+    fn compute(&mut self, ticks: u32) -> DriveCommand {
         let step = self.fieldbus.step();
         // This takes many periods, since memory is mapped and locked. So it is done before a drive waits for SYNC or for our
         // life sign: the ticks that pass meanwhile are nobody's.
@@ -560,7 +561,7 @@ impl Hil {
             self.begin_control();
         }
         self.take_set();
-        let Some(control) = &mut self.control else { return Order::Wait };
+        let Some(control) = &mut self.control else { return DriveCommand::Wait };
         let cycle = &mut self.cycle;
         // Before the drives are enabled a bus may be silent: the start-up judges that.
         if step <= Step::AwaitEnable {
@@ -678,7 +679,7 @@ impl Hil {
     }
 
     /// Commands and orders to the nodes.
-    fn tell(&mut self, order: Order) {
+    fn tell(&mut self, order: DriveCommand) {
         let Hil { fieldbus, wires, control, rig, .. } = self;
         let Some(control) = control else { return };
         for (output, value) in rig.outputs.iter().zip(control.supervisor().permitted()) {
@@ -686,16 +687,16 @@ impl Hil {
         }
         if order != self.order {
             match order {
-                Order::QuickStop => {
+                DriveCommand::QuickStop => {
                     for bus in 0..rig.buses.len() {
                         fieldbus.stop_frames(bus).iter().for_each(|frame| wires.send(bus, *frame));
                     }
                     fieldbus.request(Request::QuickStop);
                 }
-                Order::Disable => {
+                DriveCommand::Disable => {
                     fieldbus.request(Request::Disable);
                 }
-                Order::Wait | Order::Follow => {}
+                DriveCommand::Wait | DriveCommand::Follow => {}
             }
         }
         self.order = order;
@@ -771,7 +772,7 @@ impl Hil {
     fn go_on(&mut self, now_ns: u64) {
         if let Some(left) = &mut self.left
             && self.cycle.source == Source::Model
-            && self.order == Order::Follow
+            && self.order == DriveCommand::Follow
         {
             *left = left.saturating_sub(u64::from(self.cycle.ticks));
             self.over = *left == 0;

@@ -9,10 +9,11 @@ use super::control::Control;
 use super::cycle::{Command, End, Hil};
 use super::replay::Replay;
 use super::simulated::{Pace, World};
-use super::{bench, trace};
-use crate::chance::Chance;
+use super::trace;
 use crate::record::log::{CYCLE, LOST, Message, Reader, STATE, Sections, Settings, Sink};
 use crate::record::parts::{Disk, Limits, System};
+use crate::rng::Chance;
+use crate::testing::rigs;
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 use std::sync::{Arc, Condvar, Mutex};
@@ -245,7 +246,7 @@ fn run(script: &Script) -> Result<Fate, String> {
     let limits = Limits { part: script.part, ..Limits::default() };
     let sink = Sink::On(Box::new(disk.clone()), path.clone(), limits, script.queue);
     let settings = Settings { sink, cycles_per_block: script.cycles_per_block, patient: false };
-    let (rig, mut model, plant) = bench::pair();
+    let (rig, mut model, plant) = rigs::pair();
     if script.fails {
         let slot = model.description().layout.params.slot(2);
         model.set(slot, script.cycles as f64 * 1e-3);

@@ -6,8 +6,8 @@
 //! There is one rig in a process, hence one table.
 
 use crate::can::Prepared;
-use crate::clock::{Clock, Monotonic};
-use crate::realtime;
+use crate::realtime::clock::{Clock, Monotonic};
+use crate::realtime::threads;
 use crate::safety::{Protection, is_present};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, AtomicU32, AtomicU64, Ordering};
@@ -190,7 +190,7 @@ impl Watchdog {
         let (watching, clock) = (shared.clone(), Monotonic::new());
         let patience_ns = u64::try_from(patience.as_nanos()).unwrap_or(u64::MAX / 2);
         let thread = std::thread::Builder::new().name("fric watchdog".into()).spawn(move || {
-            realtime::stand_by(PRIORITY);
+            threads::stand_by(PRIORITY);
             let mut bitten_ns = 0;
             while !watching.over.load(Ordering::Acquire) {
                 let beat_ns = watching.beat_ns.load(Ordering::Acquire);

@@ -6,7 +6,7 @@
 
 use super::emergency::{guard, prepare};
 use crate::can::Prepared;
-use crate::chance::Chance;
+use crate::rng::Chance;
 use std::fs::File;
 use std::hint::black_box;
 use std::os::fd::AsRawFd;

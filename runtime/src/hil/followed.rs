@@ -172,11 +172,11 @@ fn ticks(ns: u64, period_ns: u64) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::Chance;
-    use crate::hil::bench;
+    use crate::rng::Chance;
+    use crate::testing::rigs;
 
     fn watch(delay: f64, lag: f64) -> Followed {
-        let (mut rig, _) = bench::rig();
+        let (mut rig, _) = rigs::rig();
         (rig.nodes[0].delay, rig.nodes[0].lag) = (delay, lag);
         let limits =
             OutputLimits { low: -1.0, high: 1.0, slew: f64::INFINITY, safe: 0.0, drive: Some(0), torque: true };

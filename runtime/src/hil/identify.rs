@@ -257,13 +257,13 @@ pub fn rows(hil: &mut super::cycle::Hil, asked: &Identification) -> Vec<Row> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::bench;
     use crate::hil::cycle::{End, Hil, Options};
     use crate::hil::simulated::{Pace, World};
+    use crate::testing::rigs;
 
     #[test]
     fn what_is_measured_on_simulated_drives_is_what_they_are() {
-        let (mut rig, _, plant) = bench::pair();
+        let (mut rig, _, plant) = rigs::pair();
         for (node, delay, lag) in [(0, 0.8e-3, 0.6e-3), (1, 1.5e-3, 0.5e-3)] {
             (rig.nodes[node].delay, rig.nodes[node].lag) = (delay, lag);
         }
@@ -287,7 +287,7 @@ mod tests {
 
     #[test]
     fn a_rig_without_torque_is_refused() {
-        let (mut rig, _, _) = bench::pair();
+        let (mut rig, _, _) = rigs::pair();
         for node in &mut rig.nodes {
             if let Kind::Cia402(drive) = &mut node.kind {
                 drive.mode = Mode::Speed;

@@ -5,18 +5,18 @@
 //! its own, at the pace of the wall; the drives live in the test's, which sees their true torque. `FRIC_SEED=n` repeats one seed;
 //! `FRIC_RUNS=n` says how many there are.
 
-use super::bench;
 use super::campaign::quick;
 use super::cycle::Hil;
-use crate::can::hub::Hub;
+use crate::can::bridge::Hub;
 use crate::can::sim::Simulation;
 use crate::can::socketcand::Server;
 use crate::can::{self, socketcand};
-use crate::chance::Chance;
-use crate::clock::Clock;
 use crate::drive::attend;
-use crate::drive::bench::Bench;
+use crate::drive::simulated_plant::Bench;
 use crate::drive::state::State;
+use crate::realtime::clock::Clock;
+use crate::rng::Chance;
+use crate::testing::rigs;
 use abi::Instance;
 use abi::rig::Rig;
 use std::process::{Command, Stdio};
@@ -73,7 +73,7 @@ impl Script {
     }
 
     fn build(&self) -> (Rig, Instance, Instance) {
-        let (mut rig, model, plant) = bench::pair();
+        let (mut rig, model, plant) = rigs::pair();
         rig.nodes.iter_mut().for_each(|node| node.timeout_ns = 3 * self.period_ns);
         (rig.period_ns, rig.watchdog_ns) = (self.period_ns, self.watchdog_ns);
         (rig, model, plant)

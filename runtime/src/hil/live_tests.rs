@@ -1,15 +1,15 @@
 //! Commands and sets of parameters as many at once as somebody likes: each is answered once, and after each cycle
 //! everything holds that a start checks.
 
-use super::bench;
 use super::campaign::quick;
 use super::control;
 use super::cycle::{Hil, Options, look_ahead};
 use super::live::{Judge, Objection, Set};
 use super::operator::{Answer, Command, Operator, PLACES, Stamp, Ticket, Why};
 use super::simulated::{Pace, World};
-use crate::chance::Chance;
 use crate::drive::Step;
+use crate::rng::Chance;
+use crate::testing::rigs;
 use abi::Slot;
 use std::collections::HashMap;
 
@@ -25,12 +25,12 @@ struct Stand {
 
 impl Stand {
     fn new(arms_itself: bool) -> Stand {
-        let (rig, model, plant) = bench::pair();
+        let (rig, model, plant) = rigs::pair();
         let look = look_ahead(&rig, &plant).unwrap();
         let mut options = Options { arms_itself, look, ..quick() };
         // A command may stay at its limit as long as on a rig.
         options.control.clamped_ns = control::Options::default().clamped_ns;
-        let judge = bench::judge(&model);
+        let judge = rigs::judge(&model);
         let slots = [0, 1, 2].map(|i| model.description().layout.params.slot(i));
         let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
         let masters = world.masters();
@@ -211,7 +211,7 @@ fn a_set_while_the_rig_is_stopped_or_waits_is_taken() {
 
 #[test]
 fn without_a_judge_no_parameter_changes_and_after_the_end_that_is_said() {
-    let (rig, model, plant) = bench::pair();
+    let (rig, model, plant) = rigs::pair();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     let slot = model.description().layout.params.slot(0);
     let (mut hil, mut operator) =

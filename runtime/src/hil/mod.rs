@@ -8,19 +8,16 @@ pub mod standard;
 pub mod watches;
 pub mod followed;
 pub mod control;
+pub mod live;
 pub mod trace;
 pub mod replay;
 pub mod emergency;
 pub mod counts;
 pub mod words;
-pub mod live;
 pub mod operator;
 pub mod cycle;
 pub mod identify;
 pub mod simulated;
-
-#[cfg(test)]
-mod bench;
 
 #[cfg(test)]
 mod tests;

@@ -7,9 +7,9 @@
 
 use super::live::{Objection, Set};
 use super::words;
-use crate::clock::monotonic_ns;
-use crate::queue::{Receiver, Sender, queue};
+use crate::realtime::clock::monotonic_ns;
 use crate::safety::{Protection, is_present};
+use crate::spsc::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

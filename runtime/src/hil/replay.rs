@@ -151,7 +151,7 @@ impl<'a> Replay<'a> {
         difference.map_or(Ok(()), |difference| Err(Stopped::Differs(difference)))
     }
 
-    fn first_difference(&self, recorded: &Cycle, order: crate::safety::Order) -> Option<Difference> {
+    fn first_difference(&self, recorded: &Cycle, order: crate::safety::DriveCommand) -> Option<Difference> {
         let k = recorded.k;
         let supervisor = self.control.supervisor();
         let differ = |what: fn(usize) -> What, old: &[f64], new: &[f64]| {

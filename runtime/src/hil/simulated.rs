@@ -5,8 +5,8 @@
 
 use crate::can::sim::{Actor, Port, SimBus, Simulation};
 use crate::can::{Bus, Received};
-use crate::clock::Clock;
-use crate::drive::bench::Bench;
+use crate::drive::simulated_plant::Bench;
+use crate::realtime::clock::Clock;
 use abi::Instance;
 use abi::rig::{Kind, Mode, Node, Rig};
 use std::cell::{RefCell, RefMut};

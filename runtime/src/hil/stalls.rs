@@ -6,17 +6,17 @@
 //! reads from the clock around each cycle, and how late its own sleeps end meanwhile. `FRIC_SEED=n` repeats one seed;
 //! `FRIC_RUNS=n` says how many there are.
 
-use super::bench;
 use super::campaign::quick;
 use super::cycle::{Command, End, Hil};
 use super::emergency::Watchdog;
 use super::simulated::{Pace, World};
 use crate::can::sim::{Port, Simulation};
 use crate::can::{Bus, Frame, Health, Received, Refused};
-use crate::chance::Chance;
-use crate::clock::{Clock, monotonic_ns};
 use crate::drive::Step;
+use crate::realtime::clock::{Clock, monotonic_ns};
+use crate::rng::Chance;
 use crate::safety::Cause;
+use crate::testing::rigs;
 use std::cell::RefCell;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -177,7 +177,7 @@ struct Shown {
 /// # Errors
 /// What is not as promised.
 fn run(script: &Script) -> Result<Shown, String> {
-    let (mut rig, model, plant) = bench::pair();
+    let (mut rig, model, plant) = rigs::pair();
     rig.nodes.iter_mut().for_each(|node| node.timeout_ns = 3 * script.period_ns);
     (rig.period_ns, rig.watchdog_ns) = (script.period_ns, 5 * script.period_ns);
     let world = World::new(&rig, Some(plant), Pace::Fast, script.seed).unwrap();

@@ -6,8 +6,8 @@
 //! another drive that pulls.
 
 use super::coupling::{Contact, contacts};
-use crate::lag::Lag;
-use crate::lookahead::{self, Lookahead, Torque};
+use crate::coupling::lag::Lag;
+use crate::coupling::predictor::{self, Lookahead, Torque};
 use abi::rig::{Kind, Rig, What};
 use abi::{Instance, Slot};
 
@@ -152,7 +152,7 @@ impl Stand<'_> {
         let node = &rig.nodes[output.signal.node];
         let Kind::Cia402(drive) = &node.kind else { return None };
         // The contact acts against the motion: which way its drive turns the shaft is the plant's to say.
-        let sign = lookahead::sign(rig, plant, output.signal, output.signal.node);
+        let sign = predictor::sign(rig, plant, output.signal, output.signal.node);
         let period = rig.period_ns as f64 * 1e-9;
         let dead_ns = (node.delay * 1e9).round() as u64 + if drive.at_sync { rig.period_ns } else { 0 };
         let (speeds, positions) = (self.slots(What::Speed), self.slots(What::Position));
@@ -228,13 +228,13 @@ impl Stand<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::bench;
+    use crate::testing::rigs;
 
     /// A bristle of 20 N·m/rad that slips at 0.34 N·m on a shaft of 0.012 kg·m²: played 0.8 ms late it is nearly itself,
     /// played 30 ms late it chatters by itself.
     #[test]
     fn a_late_contact_shows_in_the_figures() {
-        let (mut rig, model, plant) = bench::bristle();
+        let (mut rig, model, plant) = rigs::bristle();
         let figures = |rig: &Rig| standard(rig, &model, &plant).swap_remove(0);
         let near = figures(&rig);
         assert_eq!(rig.nodes[near.node].name, "load");

@@ -1,6 +1,5 @@
 //! A whole rig in simulated time: start, run, stop, log and replay.
 
-use super::bench;
 use super::control::Control;
 use super::cycle::{End, Hil, Options, look_ahead};
 use super::replay::{Replay, Stopped};
@@ -8,6 +7,7 @@ use super::simulated::{Pace, World};
 use super::trace;
 use crate::record::log::{Reader, Sections, Settings, Sink};
 use crate::record::parts::Limits;
+use crate::testing::rigs;
 use abi::Instance;
 use abi::rig::Rig;
 use std::path::Path;
@@ -22,13 +22,13 @@ type Made = (Rig, Instance, Instance);
 
 /// The pair of drives, the load looking ahead.
 fn looking_ahead() -> Made {
-    let (rig, control, plant) = bench::pair();
+    let (rig, control, plant) = rigs::pair();
     (Rig { predict: Some(0), ..rig }, control, plant)
 }
 
 /// Runs the pair of drives for a time; leaves a log.
 fn run(seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
-    run_of(bench::pair(), seconds, log)
+    run_of(rigs::pair(), seconds, log)
 }
 
 fn run_of((rig, model, plant): Made, seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
@@ -46,7 +46,7 @@ fn run_of((rig, model, plant): Made, seconds: f64, log: Option<&Path>) -> (End, 
 }
 
 fn replay(path: &Path, change: impl Fn(&mut crate::record::log::Message)) -> Result<u64, Stopped> {
-    replay_of(bench::pair(), path, change)
+    replay_of(rigs::pair(), path, change)
 }
 
 fn replay_of(
@@ -141,7 +141,7 @@ fn two_equal_runs_leave_equal_logs() {
 
 #[test]
 fn a_rig_whose_drives_are_not_there_is_refused() {
-    let (rig, model, plant) = bench::pair();
+    let (rig, model, plant) = rigs::pair();
     let mut world = World::new(&rig, Some(plant), Pace::Fast, 1).unwrap();
     world.bus(0).unplug(super::simulated::BENCH, 0, u64::MAX);
     let masters = world.masters();

@@ -3,9 +3,10 @@
 //! In: the numbers of a cycle. Out: messages of a log, and the numbers again. Writing allocates nothing once its buffer
 //! has grown.
 
-use super::control::{Bounds, Control, Options, Reading, Source};
+use super::control::{Control, Options, Reading, Source};
+use super::watches::Bounds;
 use crate::can::Frame;
-use crate::safety::{Cause, Clamps, Order};
+use crate::safety::{Cause, Clamps, DriveCommand};
 use abi::Slot;
 use abi::rig::Rig;
 
@@ -29,7 +30,7 @@ pub struct Cycle {
     /// Who asked for outputs.
     pub source: Source,
     /// What the drives were told.
-    pub order: Order,
+    pub order: DriveCommand,
     /// The outputs were given to whoever asks, just before this cycle.
     pub arms: bool,
     /// Where the start-up was.
@@ -88,12 +89,12 @@ fn source_number(source: Source) -> u64 {
 }
 
 /// An order as a number.
-pub(super) fn order_number(order: Order) -> u64 {
+pub(super) fn order_number(order: DriveCommand) -> u64 {
     match order {
-        Order::Wait => 0,
-        Order::Follow => 1,
-        Order::QuickStop => 2,
-        Order::Disable => 3,
+        DriveCommand::Wait => 0,
+        DriveCommand::Follow => 1,
+        DriveCommand::QuickStop => 2,
+        DriveCommand::Disable => 3,
     }
 }
 
@@ -118,7 +119,7 @@ impl Cycle {
             phases_ns: [0; 3],
             ticks: 1,
             source: Source::Nobody,
-            order: Order::Wait,
+            order: DriveCommand::Wait,
             arms: false,
             step: 0,
             statuses: vec![0; shape.drives],
@@ -188,10 +189,10 @@ impl Cycle {
                 _ => return None,
             },
             order: match fifth >> 40 & 0xff {
-                0 => Order::Wait,
-                1 => Order::Follow,
-                2 => Order::QuickStop,
-                3 => Order::Disable,
+                0 => DriveCommand::Wait,
+                1 => DriveCommand::Follow,
+                2 => DriveCommand::QuickStop,
+                3 => DriveCommand::Disable,
                 _ => return None,
             },
             arms: fifth >> 56 & 1 == 1,
@@ -346,7 +347,7 @@ mod tests {
             phases_ns: [1, 2, u32::MAX],
             ticks: 3,
             source: Source::StartUp,
-            order: Order::QuickStop,
+            order: DriveCommand::QuickStop,
             arms: true,
             step: 11,
             statuses: vec![0x1637, 0x0218],

@@ -3,12 +3,20 @@
 //! In: a rig, what its drives have told. Out: limits for the supervisor, and in words which watch a drive has not. A drive with a
 //! profile has all of them; one described by frames those for which it tells something and the rig names a limit.
 
-use super::control::Bounds;
-use crate::clock::monotonic_ns;
+use crate::realtime::clock::monotonic_ns;
 use crate::safety::{DriveLimits, OutputLimits, Protection, Refused, is_present};
 use abi::Instance;
 use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
 use abi::unit::three_digits;
+
+/// Greatest torque and speed of a drive, where known.
+#[derive(Clone, Copy, PartialEq, Debug, Default)]
+pub struct Bounds {
+    /// N·m
+    pub torque: Option<f64>,
+    /// rad/s
+    pub speed: Option<f64>,
+}
 
 /// The signal by which a node tells its torque, its speed or its position.
 pub fn told(rig: &Rig, node: usize, what: What) -> Option<Signal> {
@@ -190,9 +198,9 @@ pub fn refusal(rig: &Rig, moving: &[usize], refused: Refused) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hil::bench;
     use crate::hil::control::{Control, Options, Reading, Source, Told};
     use crate::safety::Cause;
+    use crate::testing::rigs;
     use abi::Instance;
     use abi::rig::{Field, Format, Message, Within};
     use abi::unit::Unit;
@@ -200,12 +208,12 @@ mod tests {
     /// Periods around what a step takes here, whatever else this computer does.
     #[test]
     fn a_computer_that_is_too_slow_is_refused() {
-        let (rig, control) = bench::rig();
+        let (rig, control) = rigs::rig();
         let steps = 100;
         let of = |period_ns: u64| Rig { period_ns, steps, ..rig.clone() };
         let measured_ns = (step_time(&of(1_000_000), &control).0 * 1e9) as u64;
         for seed in 0..20 {
-            let mut chance = crate::chance::Chance(seed);
+            let mut chance = crate::rng::Chance(seed);
             let short = measured_ns / (4 + chance.below(40)) + 1;
             let why = too_slow(&of(short), &control);
             assert!(why.is_some_and(|why| why.contains("more than half of a period")), "{short} of {measured_ns} ns");
@@ -233,7 +241,7 @@ mod tests {
 
     /// The spring, its drive described by frames: torque in, and these signals back.
     fn framed(tells: &[(&str, &str)], within: Within) -> (Rig, Instance) {
-        let (mut rig, model) = bench::rig();
+        let (mut rig, model) = rigs::rig();
         let mut messages = vec![message("command", "N·m", 0x205, true)];
         messages.extend((0x185..).zip(tells).map(|(id, (name, unit))| message(name, unit, id, false)));
         (rig.nodes[0].kind, rig.nodes[0].within) = (Kind::Frames(messages), within);
@@ -302,7 +310,7 @@ mod tests {
         // Which of two speeds is the drive's own, only its name can say.
         assert!(said(&[("a", "rpm"), ("b", "rpm")], WITHIN).contains("speed (it tells no speed)"));
         assert!(!said(&[("a", "rpm"), ("speed", "rpm")], WITHIN).contains("speed (it tells no speed)"));
-        assert_eq!(lacking(&bench::pair().0), Vec::<String>::new());
+        assert_eq!(lacking(&rigs::pair().0), Vec::<String>::new());
     }
 
     #[test]

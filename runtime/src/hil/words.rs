@@ -2,9 +2,9 @@
 
 use super::counts::Counts;
 use crate::drive::Step;
-use crate::histogram::Histogram;
+use crate::format;
+use crate::realtime::histogram::Histogram;
 use crate::safety::Cause;
-use crate::show;
 use abi::Description;
 use abi::rig::{Kind, Rig, Signal, What};
 use std::fmt::Write;
@@ -39,7 +39,7 @@ pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, t
         Cause::NotFinite(i) => format!("the model gave no number for {}", output(i)),
         Cause::Guard(status) => match model.guards.get(usize::try_from(status).unwrap_or(0).wrapping_sub(1)) {
             Some(guard) => {
-                let (low, high) = guard.bounds(|bound| show::quantity(bound, &guard.unit));
+                let (low, high) = guard.bounds(|bound| format::quantity(bound, &guard.unit));
                 format!("{} left its range {low} .. {high}", guard.path)
             }
             None => format!("the model could not go on (status {status})"),

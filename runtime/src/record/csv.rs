@@ -3,7 +3,7 @@
 //! Values stand in the units shown, as the shortest decimals that read back to the same bits.
 
 use super::Recording;
-use crate::show;
+use crate::format;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -44,7 +44,7 @@ pub fn write(recording: &Recording, to: impl Write) -> io::Result<()> {
     csv.write_record(std::iter::once("t [s]".to_string()).chain(header))?;
     for row in recording.rows() {
         let shown = recording.columns().iter().zip(&row[1..]).map(|(column, value)| column.unit.from_si(*value));
-        csv.write_record(std::iter::once(row[0]).chain(shown).map(show::plain))?;
+        csv.write_record(std::iter::once(row[0]).chain(shown).map(format::plain))?;
     }
     csv.flush()
 }

@@ -14,7 +14,7 @@ use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK
 use super::claim::Claim;
 use super::packed;
 use super::parts::{self, Disk, Limits};
-use crate::queue::{Receiver, Sender, queue};
+use crate::spsc::{Receiver, Sender, queue};
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, BufReader, Write};
@@ -661,7 +661,7 @@ fn part_of(head: &Sections) -> Option<(u32, u32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::Chance;
+    use crate::rng::Chance;
 
     fn head() -> Sections {
         Sections::default().with("rig", "r").with("empty", "").with("bytes", [0, 255, 3])

@@ -69,7 +69,7 @@ fn through(bytes: &mut [u8], change: impl Fn(u64, u64) -> (u64, u64)) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::Chance;
+    use crate::rng::Chance;
 
     fn block(chance: &mut Chance) -> Vec<u8> {
         let mut words: Vec<u64> = Vec::new();

@@ -15,15 +15,15 @@ use super::points::Points;
 use super::rosenbrock::Rosenbrock;
 use super::step::{Step, System, copy};
 use super::surfaces::{Crossing, Surfaces};
-use crate::course::{Course, Rest};
-use crate::observe::{Observer, check_finite, check_status};
-use crate::outcome::{Cause, Chatter, Continue, Stop, Work};
+use crate::run::observe::{Observer, check_finite, check_status};
+use crate::run::outcome::{Cause, Chatter, Continue, Stop, Work};
+use crate::run::stepper::{Rest, Stepper};
 use abi::description::{Guard, Kind};
-use abi::pace::{
+use abi::plan::Experiment;
+use abi::rosenbrock::step_control::{
     BEFORE_SURFACE, GREATEST_GAIN, HALFWAY, LEAST_ERROR, LEAST_GAIN, LEAST_ROOT, LEAST_STEP, MOST_BEFORE_SURFACE,
     MOST_REFUSED, NEARLY, SAFETY, inverse_fifth_root,
 };
-use abi::plan::Experiment;
 use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -911,7 +911,7 @@ impl Adaptive {
     }
 }
 
-impl Course for Adaptive {
+impl Stepper for Adaptive {
     fn function(&self) -> Function {
         Function::Rosenbrock
     }

@@ -6,7 +6,7 @@
 
 use super::step::{Step, System, copy};
 use abi::description::Segment;
-use abi::trial::{PIVOT, Trial};
+use abi::rosenbrock::layout::{PIVOT, Trial};
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 

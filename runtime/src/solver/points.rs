@@ -6,9 +6,9 @@
 //! changes no step.
 
 use super::step::{Step, System};
-use crate::measure::{Demand, Wants};
-use crate::observe::{Observer, check_status};
-use crate::outcome::Stop;
+use crate::run::measure::{Demand, Wants};
+use crate::run::observe::{Observer, check_status};
+use crate::run::outcome::Stop;
 use abi::plan::Experiment;
 use abi::{Function, Instance};
 

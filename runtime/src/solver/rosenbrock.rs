@@ -11,7 +11,7 @@
 use super::linear;
 use super::sparse::Sparse;
 use super::step::{Step, System};
-use abi::rodas5p::{A, C, D, GAMMA, H, STAGES, W};
+use abi::rosenbrock::coefficients::{A, C, D, GAMMA, H, STAGES, W};
 
 /// Room for the stages and the matrix.
 pub(crate) struct Rosenbrock {
@@ -155,8 +155,8 @@ fn combine<const COUNT: usize>(weights: &[f64], u: &[f64], n: usize, i: usize) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::models;
     use crate::solver::order::violation;
+    use crate::testing::models;
 
     type Matrix = Vec<Vec<f64>>;
 

@@ -1,7 +1,7 @@
 //! Whole adaptive runs against closed forms and published figures.
 
 use crate::engine::{Cause, Continue, Failure, Outcome, run};
-use crate::models::{self, Contact, Model, adaptive, plot, reading};
+use crate::testing::models::{self, Contact, Model, adaptive, plot, reading};
 use abi::plan::{Experiment, MeasureKind};
 use abi::{Function, Instance};
 

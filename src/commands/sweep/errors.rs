@@ -6,15 +6,15 @@
 
 use super::{Table, extremes};
 use crate::compile::Fitted;
+use crate::quantity::{count, significant};
 use crate::results;
-use crate::value::{count, significant};
 use crate::vary::Dice;
 use abi::plan::{Expect, Experiment, Formula, Method, Solver};
 use abi::unit::Unit;
+use runtime::engine::estimate;
+use runtime::engine::sweep;
 use runtime::engine::{self, Continue};
-use runtime::estimate;
-use runtime::sweep;
-use runtime::verdict::Verdict;
+use runtime::run::verdict::Verdict;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 

@@ -6,8 +6,8 @@
 use super::{Column, ColumnKind, Table};
 use crate::args::Sweep;
 use crate::plot::{Curve, Figure, Panel};
+use crate::quantity::{count, significant};
 use crate::results;
-use crate::value::{count, significant};
 use std::io;
 use std::path::Path;
 

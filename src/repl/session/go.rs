@@ -6,12 +6,12 @@
 use super::words::{Value, rewired, unit_as_typed};
 use super::{Fault, Session, Setup, What, begin, found};
 use crate::compile::{self, Case, Changes, Listed, Options, Varying};
-use crate::{project, value};
+use crate::{project, quantity};
 use abi::plan::{Method, Series};
 use abi::unit::Unit;
 use abi::{Function, Instance, Slot};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
-use runtime::{steady, sweep};
+use runtime::engine::{equilibrium, sweep};
 
 /// The parameter over which a curve is drawn.
 const SWEPT: &str = "swept";
@@ -326,11 +326,12 @@ impl Session {
             let mut instance = fitted.instance;
             if steady {
                 instance.start(0.0);
-                instance = steady::settle(instance, STEADY_TOL, watch).map_err(|why| match why {
-                    steady::Restless::Failed(failure) => Fault::Stopped(Box::new(failure)),
-                    steady::Restless::Moves { .. } => {
-                        Fault::Words(format!("at {path} = {} it {why}; leave `steady` out", value::show(x, &over.1, 3)))
-                    }
+                instance = equilibrium::settle(instance, STEADY_TOL, watch).map_err(|why| match why {
+                    equilibrium::Restless::Failed(failure) => Fault::Stopped(Box::new(failure)),
+                    equilibrium::Restless::Moves { .. } => Fault::Words(format!(
+                        "at {path} = {} it {why}; leave `steady` out",
+                        quantity::show(x, &over.1, 3)
+                    )),
                 })?;
                 instance.call(Function::Outputs);
             } else {

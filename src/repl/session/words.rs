@@ -2,7 +2,7 @@
 //!
 //! In: values, instances as typed. Out: texts. Knows no session.
 
-use crate::value;
+use crate::quantity;
 use abi::unit::Unit;
 use grammar::span::FileId;
 
@@ -33,10 +33,10 @@ pub fn plain(value: &Value) -> String {
             (prefixed.dimension == unit.dimension).then_some(prefixed)
         });
         if let Some(chosen) = chosen {
-            return value::show(value.si, &chosen, 6);
+            return quantity::show(value.si, &chosen, 6);
         }
     }
-    value::show(value.si, unit, 6)
+    quantity::show(value.si, unit, 6)
 }
 
 /// A value as a text that reads as exactly that value.
@@ -54,7 +54,7 @@ pub(super) fn literal(value: &Value) -> String {
 /// The unit behind the number that a text begins with.
 pub(super) fn unit_as_typed(text: &str) -> Option<Unit> {
     let text = text.trim().trim_start_matches('-').trim_start();
-    value::parse(text).ok().map(|(_, unit)| unit).filter(|unit| !unit.text.is_empty())
+    quantity::parse(text).ok().map(|(_, unit)| unit).filter(|unit| !unit.text.is_empty())
 }
 
 pub(super) fn counted(n: usize, one: &str) -> String {

@@ -3,7 +3,7 @@
 //! In: a seed and what was planted. Out: what becomes of each frame. Knows nothing of the line.
 
 use super::super::Frame;
-use crate::chance::Chance;
+use crate::rng::Chance;
 
 /// What goes wrong.
 #[derive(Clone, Copy, PartialEq, Debug)]

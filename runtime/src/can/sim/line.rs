@@ -3,9 +3,10 @@
 //! In: frames with their times. Out: deliveries, events and error counters of each node. Bits are real ones, times whole
 //! nanoseconds; nothing here waits, and nothing allocates after a node has joined. Source: ISO 11898-1:2015, 10.8, 12.
 
-use super::super::{Event, Filter, Frame, Health, Received, Refused, State, wire};
+use super::super::{Event, Filter, Frame, Health, Received, Refused, State};
 use super::fault::{Fault, Faults, Kind, corrupted};
-use crate::chance::Chance;
+use crate::can::frame_length;
+use crate::rng::Chance;
 use std::collections::VecDeque;
 
 /// Frames a node may have waiting for the line.
@@ -105,7 +106,7 @@ impl Node {
         let waiting = place.map(|place| (self.waiting[place].0, Some(place)));
         let babble = self.babble.as_ref().filter(|babble| babble.next_ns <= now_ns && babble.next_ns < babble.until_ns);
         let babble = babble.map(|babble| (babble.frame, None));
-        waiting.into_iter().chain(babble).min_by_key(|(frame, _)| wire::arbitration(frame))
+        waiting.into_iter().chain(babble).min_by_key(|(frame, _)| frame_length::arbitration(frame))
     }
 
     fn deliver(&mut self, received: Received) {
@@ -351,21 +352,22 @@ impl Line {
         let able =
             |&(_, node): &(usize, &Node)| node.joined && !matches!(node.health.state, State::BusOff | State::Down);
         let all = || self.nodes.iter().enumerate().filter(able).filter_map(offers);
-        let Some((at, frame, place)) = all().filter(plugged).min_by_key(|(_, frame, _)| wire::arbitration(frame))
+        let Some((at, frame, place)) =
+            all().filter(plugged).min_by_key(|(_, frame, _)| frame_length::arbitration(frame))
         else {
             return self.send_into_nothing(start_ns);
         };
-        let key = wire::arbitration(&frame);
+        let key = frame_length::arbitration(&frame);
         let collides = all()
             .filter(plugged)
-            .any(|(other, theirs, _)| other != at && wire::arbitration(&theirs) == key && theirs != frame);
+            .any(|(other, theirs, _)| other != at && frame_length::arbitration(&theirs) == key && theirs != frame);
         let rate = self.nodes[at].bit_rate;
         let others = || self.nodes.iter().enumerate().filter(|&(other, node)| other != at && node.takes_part(start_ns));
         // A node with another bit rate sees nonsense and says so, as long as its error flags are dominant.
         let misread =
             others().any(|(_, node)| node.bit_rate != rate && node.health.state == State::Active && !node.listen_only);
         let acknowledged = others().any(|(_, node)| node.bit_rate == rate && !node.listen_only);
-        let whole = wire::bits(&frame);
+        let whole = frame_length::bits(&frame);
         let shorted = (self.short.0..self.short.1).contains(&start_ns);
         let struck = |kind| kind == Kind::Disturb;
         let disturbed = self.nodes[at].faults.strike(&frame, start_ns, &mut self.chance, struck).is_some();
@@ -382,8 +384,8 @@ impl Line {
         };
         let echoes = if end == Ending::Disturbed { self.chance.below(7) as u32 } else { 0 };
         // Error flag, the flags of those that noticed it by it, delimiter.
-        let ends = error_at.map_or(whole - wire::SPACE, |at| at + 6 + echoes + DELIMITER);
-        let (ends_ns, free_ns) = (start_ns + ns(ends, rate), start_ns + ns(ends + wire::SPACE, rate));
+        let ends = error_at.map_or(whole - frame_length::SPACE, |at| at + 6 + echoes + DELIMITER);
+        let (ends_ns, free_ns) = (start_ns + ns(ends, rate), start_ns + ns(ends + frame_length::SPACE, rate));
         self.busy_ns += free_ns - start_ns;
         self.underway = Some(Underway { node: at, frame, place, ends_ns, free_ns, end });
     }
@@ -392,7 +394,7 @@ impl Line {
     fn send_into_nothing(&mut self, start_ns: u64) {
         for node in self.nodes.iter_mut().filter(|node| node.joined) {
             if let Some((frame, _)) = node.offers(start_ns) {
-                node.not_before_ns = start_ns + ns(wire::bits(&frame) + 6 + SUSPEND, node.bit_rate);
+                node.not_before_ns = start_ns + ns(frame_length::bits(&frame) + 6 + SUSPEND, node.bit_rate);
                 if !std::mem::replace(&mut node.complained, true) {
                     node.deliver(Received::Event(Event::NotAcknowledged, start_ns));
                 }

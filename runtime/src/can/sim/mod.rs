@@ -16,7 +16,7 @@ mod fault;
 mod line;
 
 use super::{Bus, Filter, Frame, Health, Received, Refused, descriptor};
-use crate::clock::{Clock, Monotonic, Simulated};
+use crate::realtime::clock::{Clock, Monotonic, Simulated};
 pub use fault::{Fault, Kind};
 use line::Line;
 use std::cell::{Cell, RefCell};

@@ -1,7 +1,7 @@
 //! A line by its times, its losers and its counters.
 
 use super::*;
-use crate::can::{Event, State, wire};
+use crate::can::{Event, State, frame_length};
 
 const RATE: u32 = 1_000_000;
 
@@ -35,7 +35,7 @@ fn events(port: &mut Port) -> Vec<Event> {
 fn a_frame_takes_its_bits() {
     let (simulation, bus, mut a, mut b) = pair();
     let frame = Frame::new(0x181, &[1, 2, 3, 4, 5, 6, 7, 8]);
-    let whole_ns = u64::from(wire::bits(&frame)) * 1000;
+    let whole_ns = u64::from(frame_length::bits(&frame)) * 1000;
     a.send(frame).expect("the queue is empty");
     assert!(b.wait(1_000_000) && simulation.now_ns() == whole_ns - 3000, "at {} ns", simulation.now_ns());
     assert_eq!(frames(&mut b), [(frame, whole_ns - 3000)]);
@@ -61,7 +61,8 @@ fn the_least_identifier_wins_and_the_loser_follows_at_once() {
     simulation.run_to(1_000_000);
     let mut listener = frames(&mut a);
     assert_eq!(listener.remove(0).0, second);
-    let end = |frames: &[Frame]| frames.iter().map(|frame| u64::from(wire::bits(frame)) * 1000).sum::<u64>() - 3000;
+    let end =
+        |frames: &[Frame]| frames.iter().map(|frame| u64::from(frame_length::bits(frame)) * 1000).sum::<u64>() - 3000;
     assert_eq!(frames(&mut c), [(first, end(&[first])), (second, end(&[first, second]))]);
     assert_eq!(listener, [(third, end(&[first, second, third]))]);
 }
@@ -238,7 +239,7 @@ fn an_actor_answers_while_the_master_waits() {
         master.send(sync).expect("the queue is empty");
         assert!(master.wait(begin_ns + 450_000), "cycle {cycle}");
         let (answer, at_ns) = frames(&mut master)[0];
-        let bits = u64::from(wire::bits(&sync) + wire::bits(&answer)) - 6;
+        let bits = u64::from(frame_length::bits(&sync) + frame_length::bits(&answer)) - 6;
         assert_eq!(at_ns - begin_ns, bits * 1000 + 100_000);
     }
 }

@@ -9,12 +9,12 @@ use super::space::{Ill, MS, Script, What};
 use super::wire::{self, Told, Traffic};
 use crate::can::Frame;
 use crate::canopen::Object;
-use crate::clock::Clock;
 use crate::drive::state::State;
 use crate::drive::{Effect, Step};
 use crate::hil::cycle::Hil;
 use crate::hil::simulated::World;
-use crate::safety::{Order, Reaction};
+use crate::realtime::clock::Clock;
+use crate::safety::{DriveCommand, Reaction};
 use abi::rig::{Kind, Mode, Rig};
 use std::collections::VecDeque;
 
@@ -317,11 +317,11 @@ impl Judge {
             return Err(at(Broken::Overrun, format!("{} cycles in a row missed a tick", self.behind)));
         }
 
-        let moves = self.armed.is_some() && order == Order::Follow;
-        if self.ordered && matches!(order, Order::Follow | Order::Wait) {
+        let moves = self.armed.is_some() && order == DriveCommand::Follow;
+        if self.ordered && matches!(order, DriveCommand::Follow | DriveCommand::Wait) {
             return Err(at(Broken::Latch, format!("the drives are told {order:?} after a stop")));
         }
-        self.ordered |= matches!(order, Order::QuickStop | Order::Disable);
+        self.ordered |= matches!(order, DriveCommand::QuickStop | DriveCommand::Disable);
 
         if let Some(control) = hil.control() {
             let (permitted, requests) = (control.supervisor().permitted(), control.requests());
@@ -345,7 +345,7 @@ impl Judge {
 
     /// What has come from the buses, and what is made of it.
     fn judge_traffic(&mut self, hil: &Hil, rig: &Rig, traffic: &Traffic, now_ns: u64) -> Result<(), (Broken, String)> {
-        let quick = matches!(hil.order(), Order::QuickStop | Order::Disable);
+        let quick = matches!(hil.order(), DriveCommand::QuickStop | DriveCommand::Disable);
         let stops = self.tripped_ns.is_some();
         let ended = matches!(hil.step(), Step::Refused | Step::Stopped) || hil.ended().is_some();
         let foreign = traffic.came.iter().find(|(bus, frame, _)| wire::is_foreign(rig, *bus, frame));

@@ -8,13 +8,13 @@ use super::rigs::{Made, PLAIN, Sort};
 use super::run::behaviour;
 use super::space::MS;
 use crate::can::sim::{Fault, Kind as Planting};
-use crate::chance::Chance;
-use crate::clock::Clock;
-use crate::drive::bench::Bench;
-use crate::drive::hooks::{Effect, Hook, Start};
+use crate::drive::fault_injection::{Effect, Hook, Start};
+use crate::drive::simulated_plant::Bench;
 use crate::hil::campaign::quick;
 use crate::hil::cycle::{End, Hil};
 use crate::hil::simulated::{MASTER, Pace, World};
+use crate::realtime::clock::Clock;
+use crate::rng::Chance;
 use crate::safety::Cause;
 use abi::rig::Rig;
 use std::collections::VecDeque;
@@ -93,14 +93,14 @@ impl Script {
 }
 
 /// Commands and what the shaft was, the newest last.
-struct Course {
+struct Stepper {
     commands: VecDeque<f64>,
     /// Ticks of a command that may be under way, and of one that a slow loop may still follow.
     way: usize,
     slow: usize,
 }
 
-impl Course {
+impl Stepper {
     /// How far a value lies outside the commands of the last ticks.
     fn outside(&self, ticks: usize, value: f64) -> f64 {
         let last = self.commands.iter().rev().take(ticks);
@@ -132,7 +132,7 @@ fn run(script: &Script) -> Result<Option<u64>, String> {
     }
     let ticks = |seconds: f64| (seconds * 1e9) as usize / rig.period_ns as usize + 4;
     let (way, slow) = (ticks(script.delay), ticks(script.delay + SETTLES));
-    let mut course = Course { commands: VecDeque::from(vec![0.0; slow]), way, slow };
+    let mut course = Stepper { commands: VecDeque::from(vec![0.0; slow]), way, slow };
     let half = 0.5 * (rig.outputs[SERVO].high - rig.outputs[SERVO].low);
     let begun_ns = world.simulation().now_ns();
     let fault_ns = begun_ns + script.after;

@@ -2,9 +2,9 @@
 //!
 //! In: a few numbers. Out: a rig with its control and its plant program, all written by hand.
 
-use crate::hil::bench;
 use crate::hil::live::Judge;
-use crate::models::{Model, View};
+use crate::testing::models::{Model, View};
+use crate::testing::rigs;
 use abi::live::{Check, Live, Param, Place};
 use abi::rig::{
     Bus, Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output, Overrun, Plant, Rig, Signal, What,
@@ -186,14 +186,14 @@ impl Made {
                 seen: (0..modes.len()).flat_map(seen).collect(),
                 inertia: Some(INERTIA),
             },
-            ..bench::rig().0
+            ..rigs::rig().0
         };
         (rig, control, plant)
     }
 
     fn node(&self, at: usize, mode: Option<Mode>) -> Node {
         let name = ["load", "servo"][at];
-        let made = bench::drive(name, 3 + at as u8);
+        let made = rigs::drive(name, 3 + at as u8);
         let bus = if self.sort == Sort::TwoBuses { at } else { 0 };
         let Some(mode) = mode else { return Node { bus, kind: described(self.float), ..made } };
         let Kind::Cia402(drive) = made.kind else { unreachable!("a drive of the bench follows CiA 402") };
@@ -330,7 +330,7 @@ fn described(float: bool) -> Kind {
         extended: false,
         length,
         send,
-        period_ns: bench::PERIOD_NS,
+        period_ns: rigs::PERIOD_NS,
         fields: vec![field],
     };
     Kind::Frames(vec![

@@ -4,9 +4,9 @@
 //! be pasted into `scripts.rs` as a test.
 
 use super::rigs::{FRAME_ANSWER, FRAME_COMMAND, Made, PLAIN, Sort};
-use crate::chance::Chance;
 use crate::drive::Effect;
 use crate::hil::simulated::{BENCH, MASTER};
+use crate::rng::Chance;
 use std::fmt;
 
 pub const MS: u64 = 1_000_000;

@@ -1,0 +1,146 @@
+//! Whether a sampled contact knows the mass on which it acts.
+//!
+//! In: a system with its program. Out: W0705 where a contact that gives its force at ticks and takes a mass `m` (KFMClip)
+//! takes one that is far from the mass that its force moves. In each tick it sets its speed to 0 by F = m v/h, so that
+//! 1 − m/M of it remains on a mass M: with m > 2 M the contact chatters, with m much less it stops after many ticks. The mass
+//! M is 1/|a|, a the change of the speed's rate by the force.
+
+use crate::frontend::system::*;
+use crate::frontend::units::{Types, three_digits};
+use crate::ir::interpret::Interpreter;
+use crate::ir::program::Program;
+use abi::plan::Method;
+use abi::table::Code;
+use abi::unit::{Dimension, Unit};
+use abi::{Function, Instance};
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
+use std::sync::Arc;
+
+const MASS: Dimension = Dimension::of([1, 0, 0, 0, 0]);
+const INERTIA: Dimension = Dimension::of([1, 2, 0, 0, 0]);
+/// Parts of the mass that a contact may take for the whole: within these it stops in a few ticks.
+const FITS: std::ops::RangeInclusive<f64> = 0.5..=1.5;
+
+/// A sampled contact: the quantities that matter.
+struct Contact {
+    speed: VarId,
+    force: VarId,
+    mass: VarId,
+}
+
+fn contacts(system: &System, types: &Types) -> Vec<Contact> {
+    let named = |part: InstanceId, kind: VarKind, name: &str| {
+        system.var_ids().find(|id| {
+            let var = system.var(*id);
+            var.instance == part && var.kind == kind && var.name == name
+        })
+    };
+    let parts = (0..system.instances.len() as u32).map(InstanceId);
+    parts
+        .filter_map(|part| {
+            let force = named(part, VarKind::Output, "F")?;
+            let held = matches!(system.var(force).definition, Definition::Held { .. });
+            let mass = named(part, VarKind::Param, "m")?;
+            let fits = [MASS, INERTIA].contains(&types.units[mass.0 as usize].dimension);
+            let contact = Contact { speed: named(part, VarKind::Input, "v")?, force, mass };
+            (held && fits).then_some(contact)
+        })
+        .collect()
+}
+
+/// What is to be said of the contacts of a system. `elsewhere`: the mass that they move where the system does not hold it,
+/// in SI, as in the control program of a rig. `place`: what is run.
+pub fn check(
+    system: &System,
+    types: &Types,
+    program: &Program,
+    elsewhere: Option<f64>,
+    place: Span,
+) -> Vec<Diagnostic> {
+    let contacts = contacts(system, types);
+    if contacts.is_empty() {
+        return Vec::new();
+    }
+    let description = Arc::new(program.description.clone());
+    let functions = crate::codegen::tiering::functions(program, Method::Adaptive);
+    let interpreter = Interpreter::new(&functions, &description.layout, description.pool.len());
+    let mut at = Instance::new(description, Code::Interpreted(Arc::new(interpreter)), &program.params);
+    at.start(0.0);
+    contacts.iter().filter_map(|contact| said(contact, system, types, &at, elsewhere, place)).collect()
+}
+
+fn said(
+    contact: &Contact,
+    system: &System,
+    types: &Types,
+    at: &Instance,
+    elsewhere: Option<f64>,
+    place: Span,
+) -> Option<Diagnostic> {
+    let slot = |id: VarId| at.description().quantity(&system.var(id).path).map(|quantity| quantity.slot);
+    let force = slot(contact.force)?;
+    let Definition::Value(mass, _) = system.var(contact.mass).definition else { return None };
+    let told = crate::lower::evaluate(system, types, &[mass])[0];
+    // How far a force of 1 moves each rate, and so the speed.
+    let layout = &at.description().layout;
+    let rates = |force_is: f64| {
+        let mut moved = at.clone();
+        moved.set(force, force_is);
+        moved.call(Function::Derivatives);
+        moved
+    };
+    let (still, pushed) = (rates(0.0), rates(1.0));
+    let gain: f64 = parts_of(system, contact.speed)
+        .into_iter()
+        .filter_map(|(state, share)| {
+            let number = slot(state)?.index() - layout.states.start as usize;
+            let rate = layout.derivatives.slot(number);
+            Some(share * (pushed.get(rate) - still.get(rate)))
+        })
+        .sum();
+    let acts_on = if gain != 0.0 && gain.is_finite() { Some(1.0 / gain.abs()) } else { elsewhere }?;
+    if FITS.contains(&(told / acts_on)) || !acts_on.is_finite() {
+        return None;
+    }
+    let (var, unit) = (system.var(contact.mass), &types.units[contact.mass.0 as usize]);
+    let shown = |value: f64| shown(value, unit);
+    let effect = if told > acts_on { "the contact throws the speed to and fro" } else { "the contact stops late" };
+    let path = &var.path;
+    Some(
+        Diagnostic::warning("W0705", format!("`{path}` is not the mass on which the contact acts"))
+            .label(place, format!("it acts on {}, and `{path}` is {}", shown(acts_on), shown(told)))
+            .label(var.span, "the mass that each tick stops")
+            .help(format!("{effect}; write `m = {}`. To keep it: `allow chatter \"...\"`", shown(acts_on))),
+    )
+}
+
+/// The states of which a quantity is a sum, with their signs; nothing where it is anything else.
+fn parts_of(system: &System, id: VarId) -> Vec<(VarId, f64)> {
+    let (mut found, mut open) = (Vec::new(), vec![(Node::Var(id), 1.0)]);
+    while let Some((node, sign)) = open.pop() {
+        match node {
+            Node::Var(id) => match system.var(id).definition {
+                Definition::Continuous { .. } => found.push((id, sign)),
+                Definition::Value(value, _) => open.push((system.node(value).clone(), sign)),
+                _ => return Vec::new(),
+            },
+            Node::Fits { value, .. } => open.push((system.node(value).clone(), sign)),
+            Node::Negate(a) => open.push((system.node(a).clone(), -sign)),
+            Node::Binary(BinaryOp::Add, a, b) => {
+                open.extend([(system.node(a).clone(), sign), (system.node(b).clone(), sign)])
+            }
+            Node::Binary(BinaryOp::Subtract, a, b) => {
+                open.extend([(system.node(a).clone(), sign), (system.node(b).clone(), -sign)])
+            }
+            _ => return Vec::new(),
+        }
+    }
+    found
+}
+
+/// Three digits in a unit.
+fn shown(value: f64, unit: &Unit) -> String {
+    format!("{} {unit}", three_digits(unit.from_si(value)))
+}

@@ -1,0 +1,533 @@
+//! The physics of a model that fits `Friction`: does it jump at rest, does it hold, does it dissipate?
+//!
+//! In: a model on its own. Out: warnings, and a [`Verdict`] for those who ask. The model's own functions are evaluated
+//! by the reference interpreter on a fixed grid; where that finds nothing wrong with the dissipation, a proof by intervals
+//! is tried. The work is bounded and the answer the same everywhere.
+
+use crate::analysis::interval_proof::{Claim, Range, prove};
+use crate::analysis::memo::Memo;
+use crate::frontend::system::*;
+use crate::frontend::units::{Types, three_digits};
+use crate::ir::build::{Build, Env};
+use crate::ir::expr::Shared;
+use crate::ir::program::Program;
+use crate::ir::{Func, Op, Value};
+use crate::lower::{Lowered, Wanted, lower};
+use crate::numerics::autodiff;
+use abi::description::Slot;
+use abi::unit::{Dimension, Unit};
+use grammar::diagnostic::Diagnostic;
+use std::rc::Rc;
+
+/// What is known of the dissipation of a model.
+#[derive(Clone, PartialEq, Debug)]
+pub enum Verdict {
+    /// Proven for all velocities from 1e-6 m/s to 10 m/s or to the ends of their range, all states within theirs, and all
+    /// external forces within theirs or up to 1e6 N.
+    Proved,
+    /// No counterexample among so many points.
+    Holds(usize),
+    /// Power is given out at this point.
+    Fails(Counterexample),
+    /// A model with states needs a `storage` to say.
+    NotChecked,
+}
+
+/// Where a model gives out power.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Counterexample {
+    /// Velocity, SI.
+    pub v: f64,
+    /// Continuous states, SI, in the order of the layout.
+    pub states: Vec<f64>,
+    /// Friction force, SI.
+    pub force: f64,
+}
+
+const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
+const FORCE: Dimension = Dimension::of([1, 1, -2, 0, 0]);
+/// Operations that may be interpreted for one verdict: less than a second.
+const WORK: usize = 100_000_000;
+/// Steps that a proof may take: as long again.
+const PROOF: usize = 8_000_000;
+/// Velocities, m/s, and external forces, N, of a model that declares no narrower range.
+const SPEEDS: (f64, f64) = (1e-6, 10.0);
+const LARGEST_LOAD: f64 = 1e6;
+/// A velocity at which every regularised sign is still next to nothing, m/s.
+const CRAWL: f64 = 1e-15;
+
+/// The ports of a friction model on its own.
+struct Contact {
+    v: VarId,
+    force: VarId,
+    external: Option<VarId>,
+}
+
+fn contact(system: &System, types: &Types) -> Option<Contact> {
+    let port = |name: &str, kind: VarKind, dimension: Dimension| {
+        system.var_ids().find(|id| {
+            let var = system.var(*id);
+            var.instance == InstanceId(0)
+                && var.name == name
+                && var.kind == kind
+                && types.units[id.0 as usize].dimension == dimension
+        })
+    };
+    let (v, force) = (port("v", VarKind::Input, VELOCITY)?, port("F", VarKind::Output, FORCE)?);
+    Some(Contact { v, force, external: port("F_ext", VarKind::Input, FORCE) })
+}
+
+/// A model that can be evaluated at points.
+struct Bench {
+    program: Program,
+    outputs: Rc<Func>,
+    start: Rc<Func>,
+    v: Slot,
+    external: Option<Slot>,
+    force: Slot,
+    /// Writes dV/dt into the first slot of the jacobian, if there is a `storage` and a state.
+    flow: Option<Rc<Func>>,
+    /// Where the stored energy is.
+    energy: Option<Slot>,
+    /// For each regime, whether it would be left: slots that are 1 where a level of a transition holds.
+    exits: Vec<Vec<Slot>>,
+    /// For each continuous state, whether force or storage depend on it.
+    matters: Vec<bool>,
+    block: Vec<f64>,
+}
+
+impl Bench {
+    fn new(system: &System, types: &Types, contact: &Contact) -> Option<Bench> {
+        // Every open parameter must have a value, every other input too.
+        let open = system.var_ids().any(|id| {
+            let var = system.var(id);
+            matches!(var.definition, Definition::Free | Definition::Missing)
+                && id != contact.v
+                && Some(id) != contact.external
+        });
+        if open {
+            return None;
+        }
+        let energy = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0));
+        let energy = energy.map(|(_, expr)| Wanted { expr: *expr, text: "storage".into(), unit: None });
+        let stored = energy.is_some();
+        let mut wanted: Vec<Wanted> = energy.into_iter().collect();
+        let automaton = system.automata.first();
+        for (k, regime) in automaton.iter().flat_map(|automaton| &automaton.regimes).enumerate() {
+            let exit = |(i, transition): (usize, &Transition)| {
+                let text = format!("exit {i} of regime {k}");
+                Wanted { expr: transition.condition, text, unit: None }
+            };
+            wanted.extend(regime.transitions.iter().enumerate().map(exit));
+        }
+        let Lowered { program, observed } = lower(system, types, &wanted);
+        let (energy, mut exit) = observed.split_at(usize::from(stored));
+        let flow = energy.first().and_then(|energy| energy_flow(&program, *energy));
+        let mut exits = Vec::new();
+        for regime in automaton.iter().flat_map(|automaton| &automaton.regimes) {
+            let (own, rest) = exit.split_at(regime.transitions.len());
+            exits.push(own.to_vec());
+            exit = rest;
+        }
+        let slot = |id: VarId| program.description.quantity(&system.var(id).path).map(|quantity| quantity.slot);
+        let (v, force) = (slot(contact.v)?, slot(contact.force)?);
+        let external = contact.external.and_then(slot);
+        let matters = depends(&program, [force].into_iter().chain(energy.first().copied()));
+        let outputs = Rc::new(crate::math::expand(&program.outputs));
+        let start = Rc::new(crate::math::expand(&program.start));
+        let flow = flow.map(Rc::new);
+        let mut block = vec![0.0; program.description.layout.size()];
+        block[program.description.layout.params.range()].copy_from_slice(&program.params);
+        let energy = energy.first().copied();
+        Some(Bench { program, outputs, start, v, external, force, flow, energy, exits, matters, block })
+    }
+
+    fn run(&mut self, func: &Func) {
+        crate::ir::interpret::run_once(func, &mut self.block, &self.program.description.pool);
+    }
+
+    /// The force at this velocity, from the states it starts in.
+    fn force_at(&mut self, v: f64, external: f64) -> f64 {
+        self.block[self.v.index()] = v;
+        if let Some(slot) = self.external {
+            self.block[slot.index()] = external;
+        }
+        let (start, outputs) = (self.start.clone(), self.outputs.clone());
+        self.run(&start);
+        self.run(&outputs);
+        self.block[self.force.index()]
+    }
+}
+
+/// Warnings of a friction model; nothing for other models.
+pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
+    let Some(contact) = contact(system, types) else { return };
+    let Some(mut bench) = Bench::new(system, types, &contact) else { return };
+    let force = system.var(contact.force);
+    let memory = !system.automata.is_empty()
+        || system.vars.iter().any(|var| !matches!(var.definition, Definition::Value(..) | Definition::Free));
+    // Whatever pushes from outside, a force that is 0 at rest carries nothing.
+    let loads: &[f64] = if contact.external.is_some() { &[1.0, -1.0] } else { &[] };
+    let scale = bench.force_at(1.0, 0.0).abs().max(f64::MIN_POSITIVE);
+    let answers = loads.iter().any(|load| bench.force_at(0.0, *load).abs() > 1e-3 * scale);
+    if !memory && !answers {
+        let (plus, minus) = (bench.force_at(CRAWL, 0.0), bench.force_at(-CRAWL, 0.0));
+        if (plus - minus).abs() > 1e-3 * scale {
+            let text = format!("from {} N to {} N at v = 0", three_digits(minus), three_digits(plus));
+            let warning = Diagnostic::warning("W0701", "this friction force jumps at rest")
+                .label(force.span, text)
+                .help("in a loop that comes to rest it will chatter: use KFM or Karnopp there, or a smooth sign,\n`tanh(v / v0)`. For a static map: `allow jumps \"...\"`");
+            found.push(warning);
+        } else if plus.abs() <= 1e-3 * scale {
+            creep(system, &mut bench, force, found);
+        }
+    }
+    if let Verdict::Fails(point) = dissipation_of(system, &contact, &mut bench) {
+        found.push(pushes(system, types, force, &bench, &point));
+    }
+}
+
+/// The load that a contact without stiction gives way to, and how fast.
+fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagnostic>) {
+    let coulomb = system
+        .var_ids()
+        .find(|id| system.var(*id).name == "Fc" && system.var(*id).instance == InstanceId(0))
+        .and_then(|id| bench.program.description.quantity(&system.var(id).path))
+        .map(|quantity| bench.block[quantity.slot.index()])
+        .filter(|value| *value > 0.0);
+    let largest = (-60..=10).map(|k| bench.force_at(decade(k, 10), 0.0)).fold(0.0, f64::max);
+    if largest <= 0.0 {
+        return; // No friction at all: nothing that could hold.
+    }
+    let load = 0.5 * coulomb.unwrap_or(largest);
+    // The least speed at which the force reaches the load: bracketed by a grid, then halved.
+    let Some(k) = (-90..=20).find(|k| bench.force_at(decade(*k, 10), 0.0) >= load) else { return };
+    let (mut low, mut high) = (decade(k - 1, 10), decade(k, 10));
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if bench.force_at(middle, 0.0) >= load { high = middle } else { low = middle }
+    }
+    let warning = Diagnostic::warning("W0702", "this friction model cannot hold a load")
+        .label(force.span, format!("{} N moves it at {}", three_digits(load), speed(high)))
+        .help("at rest it carries nothing: use KFM, Karnopp or a model with a bristle to hold a load.\nTo keep it: `allow creep \"...\"`");
+    found.push(warning);
+}
+
+/// 10^(k/n), from a table of exact powers and roots so that it is the same everywhere.
+fn decade(k: i32, n: i32) -> f64 {
+    let whole = k.div_euclid(n);
+    let part = f64::from(k.rem_euclid(n)) / f64::from(n);
+    // exp(part · ln 10) by its series: exact enough for a grid, and the same on every machine.
+    let x = part * std::f64::consts::LN_10;
+    let (mut term, mut sum) = (1.0, 1.0);
+    for i in 1..40 {
+        term *= x / f64::from(i);
+        sum += term;
+    }
+    (0..whole.abs()).fold(sum, |value, _| if whole > 0 { value * 10.0 } else { value / 10.0 })
+}
+
+/// A speed with a handy prefix.
+fn speed(v: f64) -> String {
+    let (scale, unit) = match v.abs() {
+        x if x < 1e-6 => (1e-9, "nm/s"),
+        x if x < 1e-3 => (1e-6, "um/s"),
+        x if x < 1.0 => (1e-3, "mm/s"),
+        _ => (1.0, "m/s"),
+    };
+    format!("{} {unit}", three_digits(v / scale))
+}
+
+/// Whether a friction model on its own dissipates: F v − dV/dt ≥ 0, and F v ≥ min(0, F_ext v) with an external force.
+pub fn dissipation(system: &System, types: &Types) -> Option<Verdict> {
+    let contact = contact(system, types)?;
+    let mut bench = Bench::new(system, types, &contact)?;
+    Some(dissipation_of(system, &contact, &mut bench))
+}
+
+fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
+    static KNOWN: Memo<Verdict> = Memo::new();
+    let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
+    let also = [contact.v.0, contact.force.0, contact.external.map_or(u32::MAX, |id| id.0), u32::from(energy)];
+    let program = bench.program.clone();
+    KNOWN.answer(&program, &also.map(u64::from), || match sampled(system, contact, bench) {
+        Verdict::Holds(_) if proved(system, contact, bench) => Verdict::Proved,
+        verdict => verdict,
+    })
+}
+
+/// Whether intervals prove what samples did not refute: in every regime and for both directions.
+fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
+    let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
+    let layout = bench.program.description.layout.clone();
+    let description = bench.program.description.clone();
+    let range = |slot: Slot| description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
+    let (low, high) = range(bench.v).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
+    // Everything but velocity, load and the states that matter stays where it starts.
+    bench.force_at(SPEEDS.0, 0.0);
+    let mut work = PROOF;
+    for regime in 0..bench.exits.len().max(1) {
+        for sign in [1.0, -1.0] {
+            // |v| in its range of this sign; the function reads it in the slot of v.
+            let (least, most) = if sign > 0.0 { (low, high) } else { (-high, -low) };
+            let (least, most) = (least.max(SPEEDS.0), most.min(SPEEDS.1));
+            if least >= most {
+                continue;
+            }
+            let mut inputs = vec![(bench.v, Range { low: least, high: most })];
+            if let (Some(slot), Some(_)) = (bench.external, contact.external) {
+                let (low, high) = range(slot).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
+                inputs.push((slot, Range { low: low.max(-LARGEST_LOAD), high: high.min(LARGEST_LOAD) }));
+            }
+            for k in (0..layout.states.len as usize).filter(|k| bench.matters[*k]) {
+                let slot = layout.states.slot(k);
+                let Some((low, high)) = range(slot).filter(|(low, high)| low.is_finite() && high.is_finite()) else {
+                    return false;
+                };
+                inputs.push((slot, Range { low, high }));
+            }
+            let build = Shared::new(Build::new("dissipation").with_pool(description.pool.clone()));
+            let mut env = Env::new();
+            {
+                let mut build = build.borrow_mut();
+                let held = (0..layout.size()).filter(|slot| inputs.iter().all(|(input, _)| input.index() != *slot));
+                for slot in held {
+                    let mut value = bench.block[slot];
+                    if layout.regimes.range().next() == Some(slot) {
+                        value = regime as f64;
+                    }
+                    let value = build.real(value);
+                    env.insert(Slot(slot as u32), value);
+                }
+                if sign < 0.0 {
+                    let speed = build.load(bench.v);
+                    let v = build.neg(speed);
+                    env.insert(bench.v, v);
+                }
+            }
+            let states: Vec<Slot> = (0..layout.states.len as usize).map(|k| layout.states.slot(k)).collect();
+            let mut after = env.clone();
+            let gradients = autodiff::inline(&build, &bench.program.outputs, &mut after, &states);
+            let mut build = build.into_inner();
+            let mut rates = env.clone();
+            build.inline(&bench.program.derivatives, &mut rates);
+            let mut flow = build.real(0.0);
+            for k in 0..states.len() {
+                let slope = bench
+                    .energy
+                    .and_then(|energy| gradients.get(&energy))
+                    .and_then(|gradient| autodiff::entry(gradient, k as u32));
+                if let Some(slope) = slope.filter(|_| energy) {
+                    let rate = rates.get(&layout.derivatives.slot(k)).copied();
+                    let Some(rate) = rate else { return false };
+                    let term = build.mul(slope, rate);
+                    flow = build.add(flow, term);
+                }
+            }
+            let v = build.read(bench.v, &env);
+            let force = after[&bench.force];
+            let lost = |build: &mut Build, force| {
+                let power = build.mul(force, v);
+                build.sub(power, flow)
+            };
+            // F v ≥ min(0, F_ext v): one of both.
+            let mut any = vec![lost(&mut build, force)];
+            if let Some(slot) = bench.external {
+                let external = build.read(slot, &env);
+                let rest = build.sub(force, external);
+                any.push(lost(&mut build, rest));
+            }
+            let exits = bench.exits.get(regime).cloned().unwrap_or_default();
+            let (one, zero, half) = (build.real(1.0), build.real(0.0), build.real(0.5));
+            for slot in &exits {
+                let value = build.read(*slot, &after);
+                let left = build.less(half, value);
+                any.push(build.select(left, one, zero));
+            }
+            // Stored, so that all of it counts as used.
+            for (k, value) in any.iter().enumerate() {
+                build.store(Slot((layout.size() + k) as u32), *value);
+            }
+            let func = build.finish();
+            let stored = |k: usize| {
+                let slot = layout.size() + k;
+                func.stores.iter().find(|(at, _)| at.index() == slot).expect("it was just stored").1
+            };
+            let claims = any.len() - exits.len();
+            let claimed: Vec<Value> = (0..claims).map(stored).collect();
+            let mut unless = Vec::new();
+            let mut left = false;
+            for value in (claims..any.len()).map(stored) {
+                match func.ops[value.index()] {
+                    Op::Select(condition, ..) => unless.push(condition),
+                    // A regime that would be left at once is no regime; one that never is has nothing to leave out.
+                    Op::Real(bits) => left |= f64::from_bits(bits) > 0.5,
+                    _ => return false,
+                }
+            }
+            if left {
+                continue;
+            }
+            if !prove(&Claim { func: &func, any: &claimed, unless: &unless }, &inputs, &description.pool, &mut work) {
+                return false;
+            }
+        }
+    }
+    true
+}
+
+/// The verdict from samples.
+fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
+    let layout = bench.program.description.layout.clone();
+    let n = layout.states.len as usize;
+    let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
+    // What the force does not depend on stores nothing.
+    let memory = bench.matters.contains(&true);
+    if memory && storage.is_none() || !system.blocks.is_empty() || !system.delays.is_empty() {
+        return Verdict::NotChecked;
+    }
+    let flow = bench.flow.clone();
+    // States at the ends of their ranges, at rest and half-way; those without a range where they start.
+    let mut choices: Vec<Vec<f64>> = Vec::new();
+    for k in 0..n {
+        let slot = layout.states.slot(k);
+        let range = bench.program.description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
+        choices.push(match range {
+            Some((low, high)) if low.is_finite() && high.is_finite() => {
+                vec![low, high, 0.0_f64.clamp(low, high), 0.5 * low, 0.5 * high]
+            }
+            _ if !bench.matters[k] => Vec::new(),
+            _ => return Verdict::NotChecked,
+        });
+    }
+    if choices.iter().filter(|choice| !choice.is_empty()).count() > 4 || system.automata.len() > 1 {
+        return Verdict::NotChecked;
+    }
+    let corners: usize = choices.iter().map(|choice| choice.len().max(1)).product();
+    let regime = layout.regimes.range().next();
+    let externals: &[f64] =
+        if contact.external.is_some() { &[0.0, 0.3, -0.3, 1.0, -1.0, 3.0, -3.0, 10.0, -10.0] } else { &[0.0] };
+    let (mut points, mut looked) = (0, 0);
+    let cost = bench.start.ops.len() + 2 * bench.outputs.ops.len() + flow.as_ref().map_or(0, |flow| flow.ops.len());
+    let most = WORK / cost.max(1);
+    // Powers of ten first, so that a counterexample has a round velocity; then the grid between them.
+    let speeds = (-6..=1).map(|k| decade(k, 1)).chain((-60..=10).map(|k| decade(k, 10)));
+    for v in speeds.flat_map(|v| [v, -v]) {
+        for &external in externals {
+            // A model without regimes is in its only one.
+            for at in 0..corners * bench.exits.len().max(1) {
+                looked += 1;
+                if looked > most {
+                    return Verdict::Holds(points);
+                }
+                bench.force_at(v, external);
+                let mut rest = at % corners;
+                for (choice, state) in choices.iter().zip(&mut bench.block[layout.states.range()]) {
+                    // A state without choices stays where it starts.
+                    if !choice.is_empty() {
+                        *state = choice[rest % choice.len()];
+                        rest /= choice.len();
+                    }
+                }
+                let states = bench.block[layout.states.range()].to_vec();
+                if let Some(slot) = regime {
+                    bench.block[slot] = (at / corners) as f64;
+                }
+                let outputs = bench.outputs.clone();
+                bench.run(&outputs);
+                // Where a regime would be left at once it is not.
+                let left = bench.exits.get(at / corners);
+                if left.is_some_and(|exits| exits.iter().any(|slot| bench.block[slot.index()] > 0.5)) {
+                    continue;
+                }
+                let force = bench.block[bench.force.index()];
+                let rise = match &flow {
+                    Some(flow) => {
+                        bench.run(flow);
+                        bench.block[layout.jacobian.start as usize]
+                    }
+                    None => 0.0,
+                };
+                let given = if contact.external.is_some() { (external * v).min(0.0) } else { 0.0 };
+                let lost = force * v - rise - given;
+                let scale = (force * v).abs() + rise.abs();
+                points += 1;
+                if lost < -1e-9 * scale {
+                    return Verdict::Fails(Counterexample { v, states, force });
+                }
+            }
+        }
+    }
+    Verdict::Holds(points)
+}
+
+/// For each continuous state, whether one of these outputs depends on it.
+fn depends(program: &Program, outputs: impl Iterator<Item = Slot>) -> Vec<bool> {
+    let states: Vec<Slot> = program.description.layout.states.range().map(|slot| Slot(slot as u32)).collect();
+    let build = Shared::new(Build::new("dependence"));
+    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let mut found = vec![false; states.len()];
+    for (k, _) in outputs.filter_map(|slot| gradients.get(&slot)).flatten() {
+        found[*k as usize] = true;
+    }
+    found
+}
+
+/// dV/dt = Σ ∂V/∂x · dx/dt, where V is the output in slot `energy`; none without states.
+fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
+    let layout = &program.description.layout;
+    let n = layout.states.len as usize;
+    if n == 0 || layout.jacobian.len == 0 {
+        return None;
+    }
+    let states: Vec<Slot> = (0..n).map(|k| layout.states.slot(k)).collect();
+    let build = Shared::new(Build::new("energy flow"));
+    let gradients = autodiff::inline(&build, &program.outputs, &mut Env::new(), &states);
+    let mut build = build.into_inner();
+    let mut env = Env::new();
+    build.inline(&program.derivatives, &mut env);
+    let mut flow = build.real(0.0);
+    for k in 0..n {
+        let Some(slope) = gradients.get(&energy).and_then(|gradient| autodiff::entry(gradient, k as u32)) else {
+            continue;
+        };
+        let term = build.mul(slope, env[&layout.derivatives.slot(k)]);
+        flow = build.add(flow, term);
+    }
+    build.store(layout.jacobian.slot(0), flow);
+    Some(crate::math::expand(&build.finish()))
+}
+
+fn pushes(system: &System, types: &Types, force: &Var, bench: &Bench, point: &Counterexample) -> Diagnostic {
+    let states = system.var_ids().filter(|id| matches!(system.var(*id).definition, Definition::Continuous { .. }));
+    let mut at = vec![format!("v = {} m/s", three_digits(point.v))];
+    for (id, value) in states.zip(&point.states) {
+        let unit = &types.units[id.0 as usize];
+        at.push(format!("{} = {} {}", system.var(id).name, three_digits(unit.from_si(*value)), plain(unit)));
+    }
+    let force_text = format!("F = {} N", three_digits(point.force));
+    let mut warning = Diagnostic::warning("W0703", "this friction model can push: it is not dissipative")
+        .label(force.span, format!("at {}: {force_text}, so it drives the motion", at.join(", ")));
+    if let Some((_, energy)) = system.storages.first() {
+        warning = warning.label(system.span(*energy), "and gives out more than it has stored");
+    }
+    let value = |name: &str| {
+        let quantity = bench.program.description.quantity(name)?;
+        Some(bench.block[quantity.slot.index()])
+    };
+    let keep = "To keep it: `allow not-dissipative \"...\"`";
+    match (value("sigma1"), value("sigma2"), value("Fs"), value("Fc")) {
+        (Some(sigma1), Some(_), Some(fs), Some(fc)) if fc > 0.0 => {
+            let needed = three_digits(sigma1 * (fs - fc) / fc);
+            warning.help(format!(
+                "holds when sigma2 >= sigma1*(Fs - Fc)/Fc ({needed} N·s/m for these values), or let sigma1 fade\nwith speed, as LuGre does for vd = 10 mm/s. {keep}"
+            ))
+        }
+        _ => warning.help(keep),
+    }
+}
+
+/// A unit in letters that a text can hold.
+fn plain(unit: &Unit) -> String {
+    unit.to_string().replace('µ', "u")
+}

@@ -1,0 +1,357 @@
+//! Proves that nothing divides by zero or leaves the domain of a function, whatever the parameters, inputs and states
+//! are within their declared ranges.
+//!
+//! In: a model on its own, flat and typed. Out: diagnostics. What a divisor or an argument can be says [`Reach`].
+
+use crate::frontend::source::Files;
+use crate::frontend::system::*;
+use crate::frontend::units::Types;
+use crate::ranges::interval::planted;
+use crate::ranges::reach::{Reach, whole};
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
+use std::collections::HashSet;
+
+/// Reports what cannot be proven safe, and comparisons that practically never hold.
+pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    equalities(system, types, files, diagnostics);
+    let mut reach = Reach::new(system);
+    let mut visit = Visit { seen: vec![HashSet::new()], constants: false };
+    for root in roots(system) {
+        visit.walk(&mut reach, root, types, files, diagnostics);
+    }
+}
+
+/// Reports what an experiment gives to the model it runs and what is certainly undefined: `u = chirp(…, 0 s)`. Only
+/// constants are judged: what depends on time need not reach during the run what it could reach later.
+pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, diagnostics: &mut Vec<Diagnostic>) {
+    let mut reach = Reach::new(system);
+    let mut visit = Visit { seen: vec![HashSet::new()], constants: true };
+    let written = |id: ExprId| {
+        let span = system.span(id);
+        span.file == run.file && run.start <= span.start && span.end <= run.end
+    };
+    for var in &system.vars {
+        match var.definition {
+            Definition::Value(value, Origin::Argument { .. }) if written(value) => {
+                visit.walk(&mut reach, value, types, files, diagnostics);
+            }
+            Definition::Value(value, Origin::Override) => visit.walk(&mut reach, value, types, files, diagnostics),
+            Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. } if written(initial) => {
+                visit.walk(&mut reach, initial, types, files, diagnostics);
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Every expression that is evaluated before or while a model runs.
+fn roots(system: &System) -> Vec<ExprId> {
+    let mut out = Vec::new();
+    for var in &system.vars {
+        match var.definition {
+            Definition::Value(_, Origin::Argument { .. }) if planted::is("arguments are not walked") => {}
+            Definition::Value(value, _) | Definition::Held { value, .. } => out.push(value),
+            Definition::Continuous { initial, rate, path, .. } => {
+                out.extend([initial, path.map_or(rate, |(value, _)| value)]);
+            }
+            Definition::Sampled { initial, next, .. } => out.extend([initial, next]),
+            Definition::Free | Definition::Missing => {}
+        }
+        out.extend([var.range.low, var.range.high].into_iter().flatten().map(|(bound, _)| bound));
+    }
+    out.extend(system.blocks.iter().map(|block| block.period));
+    for automaton in &system.automata {
+        for transition in automaton.regimes.iter().flat_map(|regime| &regime.transitions) {
+            out.push(transition.condition);
+            out.extend(transition.resets.iter().map(|(_, value)| *value));
+        }
+    }
+    for event in &system.events {
+        out.push(event.condition);
+        out.extend(event.resets.iter().map(|(_, value)| *value));
+    }
+    out.extend(system.crossings.iter().map(|crossing| crossing.difference));
+    out.extend(system.requires.iter().map(|require| require.condition));
+    out
+}
+
+// ---- equality of computed quantities
+
+fn equalities(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
+    for (k, node) in system.nodes.iter().enumerate() {
+        let Node::Binary(BinaryOp::Equal | BinaryOp::NotEqual, a, b) = node else { continue };
+        if types.boolean[a.0 as usize] || (!computed(system, *a) && !computed(system, *b)) {
+            continue;
+        }
+        let side = if computed(system, *a) { *a } else { *b };
+        let dimension = types.nodes[side.0 as usize].unwrap_or(abi::unit::Dimension::NONE);
+        let kind = dimension.describe();
+        let kind = kind.strip_prefix("a ").or(kind.strip_prefix("an ")).unwrap_or(&kind).to_string();
+        let other = if side == *a { *b } else { *a };
+        let zero = system.literal(other) == Some(0.0);
+        let exactly = if zero { "exactly zero".to_string() } else { "exactly equal to another".into() };
+        let name = files.slice(system.span(side));
+        let mut error = Diagnostic::error("E0306", format!("a computed {kind} is practically never {exactly}"))
+            .label(system.spans[k], "this branch would not be taken");
+        error = if kind == "velocity" && zero {
+            error.help(format!(
+                "say what you mean by rest:\n  - a dead band, as in Karnopp: `if abs({name}) < Dv then ...`\n  - or regimes, as in KFM: `go stick when {name} falls 0`"
+            ))
+        } else {
+            error.help(format!("compare with a tolerance: `abs({name} - …) < …`, or use `crosses` for an instant"))
+        };
+        diagnostics.push(error);
+    }
+}
+
+/// Whether the value changes during a run.
+fn computed(system: &System, id: ExprId) -> bool {
+    match system.node(id) {
+        Node::Var(var) => match (&system.var(*var).kind, &system.var(*var).definition) {
+            (VarKind::Param, _) => false,
+            (_, Definition::Value(value, _)) => computed(system, *value),
+            _ => true,
+        },
+        Node::Time | Node::Rate(_) | Node::PathRate(_) => true,
+        node => node.operands().any(|operand| computed(system, operand)),
+    }
+}
+
+// ---- divisions and domains
+
+struct Visit {
+    /// Whether only divisors and arguments that are constants are judged.
+    constants: bool,
+    /// Nodes visited without facts, and under each of those that hold: their operands need no second look.
+    seen: Vec<HashSet<ExprId>>,
+}
+
+impl Visit {
+    fn walk(&mut self, reach: &mut Reach, id: ExprId, types: &Types, files: &Files, found: &mut Vec<Diagnostic>) {
+        if self.seen.iter().any(|seen| seen.contains(&id)) {
+            return;
+        }
+        self.seen.last_mut().expect("there is one without facts").insert(id);
+        let system = reach.system();
+        match system.node(id) {
+            Node::If(c, a, b) => {
+                self.walk(reach, *c, types, files, found);
+                let decided = reach.decide(*c);
+                for (holds, value) in [(true, *a), (false, *b)] {
+                    // A branch that no argument takes is not evaluated.
+                    if decided != Some(!holds) {
+                        self.seen.push(HashSet::new());
+                        reach.assuming(*c, holds, |reach| self.walk(reach, value, types, files, found));
+                        self.seen.pop();
+                    }
+                }
+            }
+            node => {
+                for operand in node.operands() {
+                    self.walk(reach, operand, types, files, found);
+                }
+            }
+        }
+        let judged = match system.node(id) {
+            Node::Binary(BinaryOp::Divide, _, x) | Node::Binary(BinaryOp::Power, x, _) => Some(*x),
+            Node::Call(Builtin::Chirp, args) => Some(args[3]),
+            Node::Call(Builtin::Noise, args) => Some(args[1]),
+            Node::Call(_, args) => args.first().copied(),
+            _ => None,
+        };
+        if self.constants && !judged.is_some_and(|x| reach.interval(x).is_point()) {
+            return;
+        }
+        match system.node(id) {
+            Node::Binary(BinaryOp::Divide, _, b) if reach.interval(*b).has_zero() => {
+                found.push(division(reach, types, files, *b));
+            }
+            Node::Binary(BinaryOp::Power, a, b) => self.power(reach, *a, *b, types, files, found),
+            Node::Call(Builtin::Sqrt, args) if !reach.interval(args[0]).is_not_negative() => {
+                found.push(domain(reach, files, args[0], "`sqrt`", "negative", ">= 0", "abs"));
+            }
+            Node::Call(Builtin::Log, args) if !reach.interval(args[0]).is_positive() => {
+                found.push(domain(reach, files, args[0], "`log`", "zero or negative", "> 0", "max"));
+            }
+            Node::Call(Builtin::Log1p, args) => {
+                let x = reach.interval(args[0]);
+                if x.low <= -1.0 && !x.is_empty() {
+                    found.push(domain(reach, files, args[0], "`log1p`", "-1 or less", "> -1", "max"));
+                }
+            }
+            // The time in which a chirp sweeps, and for which noise keeps a value.
+            Node::Call(Builtin::Chirp, args) if !reach.interval(args[3]).is_positive() => {
+                found.push(domain(reach, files, args[3], "`chirp`", "zero or negative", "> 0", "max"));
+            }
+            Node::Call(Builtin::Noise, args) if !reach.interval(args[1]).is_positive() => {
+                found.push(domain(reach, files, args[1], "`noise`", "zero or negative", "> 0", "max"));
+            }
+            Node::Call(arc @ (Builtin::Asin | Builtin::Acos), args) => {
+                let x = reach.interval(args[0]);
+                if (x.low < -1.0 || x.high > 1.0) && !x.is_empty() {
+                    let arc = format!("`{}`", arc.name());
+                    found.push(domain(reach, files, args[0], &arc, "beyond -1 .. 1", "-1 .. 1", "clamp"));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// A power with a negative exponent divides; one whose exponent is not whole has no negative base.
+    fn power(
+        &mut self,
+        reach: &mut Reach,
+        a: ExprId,
+        b: ExprId,
+        types: &Types,
+        files: &Files,
+        found: &mut Vec<Diagnostic>,
+    ) {
+        let system = reach.system();
+        let x = reach.interval(a);
+        match system.literal(b) {
+            Some(n) if n.fract() == 0.0 && n >= 0.0 => {}
+            Some(n) if n.fract() == 0.0 => {
+                let divisor = if whole(n) { x.power(n.abs() as u32) } else { x };
+                if divisor.has_zero() {
+                    found.push(division(reach, types, files, a));
+                }
+            }
+            _ if x.is_not_negative() => {
+                let n = reach.interval(b);
+                if x.has_zero() && n.low < 0.0 && !n.is_empty() && !planted::is("zero has any power") {
+                    found.push(match system.literal(b) {
+                        Some(_) => division(reach, types, files, a),
+                        None => {
+                            let (base, power) = (files.slice(system.span(a)), files.slice(system.span(b)));
+                            Diagnostic::error("E0601", format!("`{base}` can be zero and `{power}` negative: this can divide by zero"))
+                                .label(system.span(b), "not proven to be at least 0")
+                                .label(system.span(a), "not proven to stay away from 0")
+                                .help(format!("declare the range of one of them, so that `{base}` is `in > 0` or `{power}` is `in >= 0`"))
+                        }
+                    });
+                }
+            }
+            _ => found.push(domain(reach, files, a, "a power", "negative", "0", "abs")),
+        }
+    }
+}
+
+fn domain(reach: &Reach, files: &Files, id: ExprId, what: &str, can_be: &str, range: &str, guard: &str) -> Diagnostic {
+    let text = files.slice(reach.system().span(id));
+    let shown = match guard {
+        "clamp" => format!("clamp({text}, -1, 1)"),
+        "max" => format!("max({text}, …)"),
+        other => format!("{other}({text})"),
+    };
+    // A power of a negative number is one only if its exponent is whole.
+    let (what, range) = if range == "0" { ("a power with this exponent", ">= 0") } else { (what, range) };
+    Diagnostic::error("E0602", format!("`{text}` can be {can_be}, where {what} is not defined"))
+        .label(reach.system().span(id), format!("not proven to be {}", range.replace("-1 .. 1", "within -1 .. 1")))
+        .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{shown}`"))
+}
+
+/// `param Fc [N] = 1 N`: the declaration of a quantity as written, without what stands behind its value.
+fn declaration(system: &System, files: &Files, var: &Var) -> String {
+    let behind = &files.get(var.span.file).text[var.span.end as usize..];
+    let unit = behind.trim_start_matches(' ').strip_prefix('[').and_then(|rest| rest.split_once(']'));
+    let unit = unit.map_or(String::new(), |(unit, _)| format!(" [{unit}]"));
+    let value = match var.definition {
+        Definition::Value(value, Origin::Default) => format!(" = {}", files.slice(system.span(value))),
+        _ => String::new(),
+    };
+    format!("{} {}{unit}{value}", var.kind.word(), var.name)
+}
+
+/// E0601: names the parameter whose range would mend it, if one does.
+fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) -> Diagnostic {
+    let system = reach.system();
+    let text = files.slice(system.span(divisor));
+    let here = with_slash(files, system.span(divisor));
+    let message = format!("`{text}` can be zero, so this can divide by zero");
+    let (params, path) = sources(system, divisor);
+    for &param in &params {
+        let var = system.var(param);
+        let Some(range_span) = var.range_span else { continue };
+        if reach.if_strict(param, divisor).has_zero() {
+            continue;
+        }
+        let mut error = Diagnostic::error("E0601", message).label(range_span, format!("{} may be 0", var.name));
+        if let Some(&middle) = path.first() {
+            let middle_var = system.var(middle);
+            let unit = types.units[middle.0 as usize].to_string();
+            let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+            let far = vanishing(system, middle).map_or(String::new(), |input| format!(" for large {input}"));
+            error = error.label(middle_var.span, format!("then {} reaches 0{unit}{far}", middle_var.name));
+        }
+        let default = match var.definition {
+            Definition::Value(value, _) => format!(" = {}", files.slice(system.span(value))),
+            _ => String::new(),
+        };
+        return error.label(here, "here").help(format!("declare `{} {}{default} in > 0`", var.kind.word(), var.name));
+    }
+    let error = Diagnostic::error("E0601", message).label(here, "not proven to stay away from 0");
+    let free = params.iter().map(|id| system.var(*id)).find(|var| var.range_span.is_none());
+    match (system.node(divisor), free) {
+        (Node::Var(id), _) if matches!(system.var(*id).kind, VarKind::Param | VarKind::Input) => {
+            let var = system.var(*id);
+            error
+                .label(var.span, "declared without a range")
+                .help(format!("declare its range: `{} in > 0`", declaration(system, files, var)))
+        }
+        (_, Some(var)) => error
+            .label(var.span, format!("{} has no range", var.name))
+            .help(format!("declare its range: `{} in > 0`", declaration(system, files, var))),
+        _ => error
+            .help(format!("guard it: `if abs({text}) > … then … / {text} else …`, or keep it away from 0 with `max`")),
+    }
+}
+
+/// The span with the `/` before it.
+fn with_slash(files: &Files, span: Span) -> Span {
+    let before = &files.get(span.file).text[..span.start as usize];
+    let trimmed = before.trim_end_matches(|c: char| c.is_whitespace() || c == '(');
+    match trimmed.strip_suffix('/') {
+        Some(rest) => Span::new(span.file, rest.len(), span.end as usize),
+        None => span,
+    }
+}
+
+/// Parameters an expression depends on, and the named quantities on the way.
+fn sources(system: &System, id: ExprId) -> (Vec<VarId>, Vec<VarId>) {
+    let (mut params, mut path) = (Vec::new(), Vec::new());
+    let mut stack = vec![id];
+    while let Some(id) = stack.pop() {
+        if let Node::Var(var) = system.node(id) {
+            match (system.var(*var).kind, &system.var(*var).definition) {
+                (VarKind::Param | VarKind::Input, _) if !params.contains(var) => params.push(*var),
+                (VarKind::Let | VarKind::Output, Definition::Value(value, _)) if !path.contains(var) => {
+                    path.push(*var);
+                    stack.push(*value);
+                }
+                _ => {}
+            }
+        }
+        let operands: Vec<ExprId> = system.node(id).operands().collect();
+        stack.extend(operands.into_iter().rev());
+    }
+    (params, path)
+}
+
+/// The input that makes an exponential in a quantity vanish.
+fn vanishing(system: &System, id: VarId) -> Option<String> {
+    let Definition::Value(value, _) = system.var(id).definition else { return None };
+    let mut stack = vec![(value, false)];
+    while let Some((id, inside)) = stack.pop() {
+        match system.node(id) {
+            Node::Var(var) if inside && system.var(*var).kind == VarKind::Input => {
+                return Some(system.var(*var).name.clone());
+            }
+            Node::Call(Builtin::Exp, args) => stack.push((args[0], true)),
+            node => stack.extend(node.operands().map(|operand| (operand, inside))),
+        }
+    }
+    None
+}

@@ -1,0 +1,85 @@
+//! Answers about a program that take a while, kept for as long as this process runs: a text that is checked again after
+//! an edit asks again only about what has changed.
+//!
+//! In: a program and whatever else the answer depends on. Out: the answer, computed or remembered; the same either way.
+
+use crate::ir::program::Program;
+use std::collections::HashMap;
+use std::collections::hash_map::DefaultHasher;
+use std::hash::{Hash, Hasher};
+use std::sync::Mutex;
+
+/// Answers that are kept; when there are more, all are forgotten.
+const MOST: usize = 1024;
+
+/// Answers to one question about programs.
+pub struct Memo<T>(Mutex<Option<HashMap<u64, T>>>);
+
+impl<T: Clone> Memo<T> {
+    /// None yet.
+    pub const fn new() -> Memo<T> {
+        Memo(Mutex::new(None))
+    }
+
+    /// The answer about a program, from before if it was asked. `also`: what else it depends on.
+    pub fn answer(&self, program: &Program, also: &[u64], compute: impl FnOnce() -> T) -> T {
+        let key = key(program, also);
+        let known = |answers: &Option<HashMap<u64, T>>| answers.as_ref()?.get(&key).cloned();
+        // Whoever panicked while holding it left it as it was.
+        let lock = || self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if let Some(known) = known(&lock()) {
+            return known;
+        }
+        let answer = compute();
+        let mut guard = lock();
+        let answers = guard.get_or_insert_default();
+        if answers.len() >= MOST {
+            answers.clear();
+        }
+        answers.insert(key, answer.clone());
+        answer
+    }
+}
+
+impl<T: Clone> Default for Memo<T> {
+    fn default() -> Memo<T> {
+        Memo::new()
+    }
+}
+
+/// A hash of all that a program computes: its functions as printed, its numbers by their bits, its ranges.
+fn key(program: &Program, also: &[u64]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    for func in [Some(&program.start), Some(&program.outputs), Some(&program.derivatives)]
+        .into_iter()
+        .chain([program.tick.as_ref(), program.transitions.as_ref()])
+        .flatten()
+    {
+        func.to_string().hash(&mut hasher);
+    }
+    for number in program.params.iter().chain(program.description.pool.iter()) {
+        number.to_bits().hash(&mut hasher);
+    }
+    for quantity in &program.description.quantities {
+        (&quantity.path, quantity.range.0.to_bits(), quantity.range.1.to_bits()).hash(&mut hasher);
+    }
+    also.hash(&mut hasher);
+    hasher.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_same_question_is_answered_once() {
+        let answers = Memo::new();
+        let program = Program::default();
+        let other = Program { params: vec![1.0], ..Program::default() };
+        let mut asked = 0;
+        for (program, also) in [(&program, 1), (&program, 1), (&program, 2), (&other, 1), (&program, 1)] {
+            answers.answer(program, &[also], || asked += 1);
+        }
+        assert_eq!(asked, 3);
+    }
+}

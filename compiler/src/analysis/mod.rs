@@ -1,0 +1,16 @@
+//! What is found out about a checked system or its program, and told to people.
+//!
+//! In: a flat system, its program, a step. Out: diagnostics, verdicts with their reasons, linear models, explanations. Changes
+//! nothing of what it looks at.
+
+pub mod parameter_checks;
+pub mod domains;
+pub mod memo;
+pub mod interval_proof;
+pub mod dissipation;
+pub mod step_stability;
+pub mod acting_mass;
+pub mod lints;
+pub mod explain;
+pub mod step_stability_report;
+pub mod linearise;

@@ -1,0 +1,379 @@
+//! Says that a fixed step is unstable, or that it chatters, in the words of the text.
+//!
+//! In: a system with its program, its method and its step. Out: E0702 where it happens inside of the ranges, W0704 where
+//! ranges are open or the model itself grows too fast for `implicit`, W0705. What is found, and how, is told in
+//! [`stability`](crate::analysis::step_stability).
+
+use crate::analysis::explain::{Own, states};
+use crate::analysis::memo::Memo;
+use crate::analysis::step_stability::{Along, Bench, Chatter, Singular, Unstable, ten_to};
+use crate::frontend::source::Files;
+use crate::frontend::system::*;
+use crate::frontend::units::Types;
+use crate::ir::program::Program;
+use crate::numerics::fixed_step;
+use abi::Slot;
+use abi::plan::Method;
+use abi::unit::Unit;
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
+
+/// A system in fixed steps, and the places of the text that say so.
+pub struct Fixed<'a> {
+    /// What is stepped.
+    pub system: &'a System,
+    /// Its types.
+    pub types: &'a Types,
+    /// Its program, rings sized for the step.
+    pub program: &'a Program,
+    /// How.
+    pub method: Method,
+    /// Length of a step in s.
+    pub step: f64,
+    /// Where the method is named, or else the step.
+    pub place: Span,
+    /// What is run: `Servo(…)`.
+    pub run: Span,
+    /// Conditions that end a run, and the outputs that say so.
+    pub ends: &'a [(ExprId, Slot)],
+    /// Whether a step of another length is a matter of `step`, or of `rate`.
+    pub rig: bool,
+}
+
+/// What is to be said of it, at most one thing of each kind.
+pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
+    let ends: Vec<Slot> = fixed.ends.iter().map(|(_, slot)| *slot).collect();
+    let Some(bench) = Bench::new(fixed.program, &ends) else { return Vec::new() };
+    let stable = |method: Method| bench.unstable(method, fixed.step).is_none();
+    // What jumps to and fro is also thrown off: the jump is the cause.
+    let look = || match bench.chatters(fixed.method, fixed.step) {
+        Some(chatter) => Finding::Chatters(chatter),
+        None => {
+            let unstable = bench.unstable(fixed.method, fixed.step);
+            // What is unstable inside of ranges is an error, which a warning does not replace.
+            let open = unstable.as_ref().is_none_or(|found| found.along.as_ref().is_some_and(|along| !along.closed));
+            let look = open && fixed.method == Method::Implicit;
+            match (look.then(|| bench.singular(fixed.step)).flatten(), unstable) {
+                (Some(singular), _) => Finding::Singular(singular),
+                (None, Some(unstable)) => {
+                    Finding::Unstable(unstable, fixed.method != Method::Implicit && stable(Method::Implicit))
+                }
+                (None, None) => Finding::Nothing,
+            }
+        }
+    };
+    static KNOWN: Memo<Finding> = Memo::new();
+    let also: Vec<u64> =
+        ends.iter().map(|slot| u64::from(slot.0)).chain([fixed.step.to_bits(), fixed.method as u64]).collect();
+    match KNOWN.answer(fixed.program, &also, look) {
+        Finding::Unstable(unstable, implicit) => vec![fixed.unstable(&unstable, implicit, files)],
+        Finding::Singular(singular) => vec![fixed.singular(&singular)],
+        Finding::Chatters(chatter) => vec![fixed.chatters(&chatter)],
+        Finding::Nothing => Vec::new(),
+    }
+}
+
+#[derive(Clone)]
+enum Finding {
+    /// And whether `implicit` is stable with this step.
+    Unstable(Unstable, bool),
+    Singular(Singular),
+    Chatters(Chatter),
+    Nothing,
+}
+
+impl Fixed<'_> {
+    /// The continuous state of this number.
+    fn state(&self, number: usize) -> VarId {
+        let continuous = |id: &VarId| matches!(self.system.var(*id).definition, Definition::Continuous { .. });
+        self.system.var_ids().filter(continuous).nth(number).expect("the program has a slot for each state")
+    }
+
+    fn unstable(&self, unstable: &Unstable, implicit: bool, files: &Files) -> Diagnostic {
+        let (system, id) = (self.system, self.state(unstable.state));
+        let var = system.var(id);
+        let (method, step) = (self.method.name(), time(self.step));
+        let own = states(system, self.program).into_iter().find(|state| state.path == var.path).map(|state| state.own);
+        let linear = own == Some(Own::Affine) && matches!(self.method, Method::Euler | Method::Rk4);
+        let stiff = unstable.rate * self.step > 1.0;
+        let place = match system.instance(var.instance).path.is_empty() {
+            true => self.run,
+            // A part of a library is not to be changed: what is run is.
+            false if system.instance(var.instance).span.file != self.place.file => self.run,
+            false => whole_instance(files, system.instance(var.instance).span),
+        };
+        let scanned = unstable.along.as_ref().and_then(|along| Some((along, self.name_of(along, var.instance)?)));
+        let open = scanned.as_ref().is_some_and(|(along, _)| !along.closed);
+        let needed = two_digits_time(unstable.stable);
+
+        let message = match open {
+            true => format!("{method} at {step} is a large step for this model"),
+            false => format!("{method} at {step} is not stable for this model"),
+        };
+        let mut out = if open { Diagnostic::warning("W0704", message) } else { Diagnostic::error("E0702", message) };
+        let rate = match &scanned {
+            Some((along, (_, unit))) if stiff && !along.inward => {
+                format!("a rate of {} 1/s per {}", two_digits(unstable.rate / along.farthest * unit.scale), unit.text)
+            }
+            _ if stiff => format!("a rate of {} 1/s", two_digits(unstable.rate)),
+            _ => "it swings faster than such steps can follow".into(),
+        };
+        let equation = self.slope(id).filter(|_| stiff).map(|slope| format!("{slope}: ")).unwrap_or_default();
+        let about = if stiff { String::new() } else { format!("`{}`: ", var.path) };
+        out = out.label(place, format!("{about}{equation}{rate}"));
+        let limit = match &scanned {
+            Some((along, (name, unit))) => {
+                let (limit, far) = (amount(along.limit, unit), amount(along.farthest, unit));
+                match (along.inward, open) {
+                    (true, _) => {
+                        format!("stable at {step} only for |{name}| >= {limit}; at rest it would need {needed}")
+                    }
+                    (false, true) => {
+                        format!(
+                            "stable at {step} only for |{name}| <= {limit}; at {far} it would need a step of {needed}"
+                        )
+                    }
+                    (false, false) => format!("stable at {step} only for |{name}| <= {limit}"),
+                }
+            }
+            None => format!("stable below a step of {needed} only"),
+        };
+        out = out.label(self.place, limit);
+        if let Some((along, _)) = scanned.as_ref().filter(|(along, _)| along.closed)
+            && let Some(end) = self.end(along)
+        {
+            out = out.label(end, format!("up to here it would need a step of {needed}"));
+        }
+        let derivative = format!("d{}/dt", var.name);
+        let file = &files.get(self.place.file).name;
+        let shorter = match self.rig {
+            true => format!("divide the period: `solver {method} step {}`", below(unstable.stable)),
+            false => format!("write `step {}`", below(unstable.stable)),
+        };
+        let help = match (linear && stiff, implicit) {
+            (true, _) => format!(
+                "{derivative} is linear in {}, so `solver expo` steps it exactly at any speed.\n\
+                 `fric explain {file} --step` shows the numbers per state",
+                var.name
+            ),
+            (false, true) => format!("`solver implicit` is stable at this step; or {shorter}"),
+            (false, false) => format!("{shorter}{}", if self.rig { "" } else { ", or leave `solver` out: adaptive" }),
+        };
+        let keep = if open { "\nTo keep it: `allow large-step \"...\"`" } else { "" };
+        out.help(format!("{help}{keep}"))
+    }
+
+    fn singular(&self, singular: &Singular) -> Diagnostic {
+        let (slot, value) = singular.at;
+        let quantities = &self.program.description.quantities;
+        let moved = quantities.iter().find(|quantity| quantity.slot == slot).expect("it was moved");
+        let unit = self.system.var_ids().find(|id| self.system.var(*id).path == moved.path);
+        let unit = unit.map_or(&moved.unit, |id| &self.types.units[id.0 as usize]);
+        let (at, step) = (amount(value, unit), time(self.step));
+        let rate = two_digits(singular.rate);
+        // With γhλ at most a half, the equations of a step are far from singular.
+        let shorter = below(0.5 / (fixed_step::GAMMA * singular.rate));
+        let shorter = if self.rig {
+            format!("divide the period: `solver implicit step {shorter}`")
+        } else {
+            format!("write `step {shorter}`")
+        };
+        Diagnostic::warning("W0704", format!("implicit at {step} is a large step for this model"))
+            .label(self.run, format!("near {} = {at} the model itself grows at {rate} 1/s", moved.path))
+            .label(
+                self.place,
+                format!(
+                    "from {} 1/s on a step overshoots without limit",
+                    two_digits(1.0 / (fixed_step::GAMMA * self.step))
+                ),
+            )
+            .help(format!(
+                "{shorter}{}\nTo keep it: `allow large-step \"...\"`",
+                if self.rig { "" } else { ", or leave `solver` out: adaptive" }
+            ))
+    }
+
+    fn chatters(&self, chatter: &Chatter) -> Diagnostic {
+        let id = self.state(chatter.state);
+        let (var, unit) = (self.system.var(id), &self.types.units[id.0 as usize]);
+        let far = amount(chatter.amplitude, unit);
+        Diagnostic::warning("W0705", format!("`{}` never comes to rest with a fixed step", var.path))
+            .label(self.place, format!("steps throw it to and fro by {far}"))
+            .label(var.span, "its rate jumps where this changes its sign")
+            .help(
+                "a force that jumps needs a contact that holds: `Sticking(law = ...)` keeps this law and rests exactly at\n\
+                 any step, KFM and Karnopp have laws of their own, LuGre a bristle; or take a smooth sign,\n\
+                 `tanh(v / v0)`. To keep it: `allow chatter \"...\"`",
+            )
+    }
+
+    /// What the owner of a state calls the quantity that was moved, and its unit.
+    fn name_of(&self, along: &Along, owner: InstanceId) -> Option<(String, Unit)> {
+        let system = self.system;
+        let moved = self.program.description.quantities.iter().find(|quantity| quantity.slot == along.slot)?;
+        let moved = system.var_ids().find(|id| system.var(*id).path == moved.path)?;
+        // An input that is handed on under other names is the same.
+        let source = |id: VarId| {
+            let mut id = id;
+            for _ in 0..system.vars.len() {
+                let Definition::Value(value, _) = system.var(id).definition else { break };
+                let Some(next) = system.alias(value) else { break };
+                id = next;
+            }
+            id
+        };
+        let inputs = system.var_ids().filter(|id| system.var(*id).instance == owner);
+        let mut inputs = inputs.filter(|id| system.var(*id).kind == VarKind::Input);
+        let named = inputs.find(|id| source(*id) == moved);
+        let id = named.unwrap_or(moved);
+        let var = system.var(id);
+        let name = if var.instance == owner { &var.name } else { &var.path };
+        Some((name.clone(), self.types.units[id.0 as usize].clone()))
+    }
+
+    /// Where the text says that it goes no farther: the number in the condition that ends a run, or a range.
+    fn end(&self, along: &Along) -> Option<Span> {
+        let system = self.system;
+        let near = |id: ExprId| {
+            let value = crate::lower::evaluate(system, self.types, &[id])[0].abs();
+            (value - along.farthest).abs() <= 1e-3 * along.farthest
+        };
+        let mut stack: Vec<ExprId> = self.ends.iter().map(|(condition, _)| *condition).collect();
+        while let Some(id) = stack.pop() {
+            match system.node(id) {
+                Node::Binary(BinaryOp::Or | BinaryOp::And, a, b) => stack.extend([*a, *b]),
+                Node::Binary(_, a, b) => {
+                    if let Some(end) = [*a, *b].into_iter().find(|side| near(*side)) {
+                        return Some(system.span(end));
+                    }
+                }
+                _ => {}
+            }
+        }
+        let moved = self.program.description.quantities.iter().find(|quantity| quantity.slot == along.slot)?;
+        system.vars.iter().find(|var| var.path == moved.path)?.range_span
+    }
+
+    /// `dz/dt = ... - sigma0*|v|/g * z`: of an equation the term that holds its own state, if there is one.
+    fn slope(&self, id: VarId) -> Option<String> {
+        let system = self.system;
+        let var = system.var(id);
+        let Definition::Continuous { rate, path: None, .. } = var.definition else { return None };
+        let mut terms: Vec<(bool, ExprId)> = Vec::new();
+        let mut stack = vec![(true, rate)];
+        while let Some((plus, term)) = stack.pop() {
+            match system.node(term) {
+                Node::Binary(BinaryOp::Add, a, b) => stack.extend([(plus, *b), (plus, *a)]),
+                Node::Binary(BinaryOp::Subtract, a, b) => stack.extend([(!plus, *b), (plus, *a)]),
+                Node::Negate(a) => stack.push((!plus, *a)),
+                _ => terms.push((plus, term)),
+            }
+        }
+        let holds = |term: &(bool, ExprId)| match system.node(term.1) {
+            Node::Binary(BinaryOp::Multiply, coefficient, z) => {
+                matches!(system.node(*z), Node::Var(at) if *at == id).then_some((term.0, *coefficient))
+            }
+            _ => None,
+        };
+        let (plus, coefficient) = terms.iter().find_map(holds)?;
+        let sign = match (terms.len() > 1, plus) {
+            (true, true) => "... + ",
+            (true, false) => "... - ",
+            (false, true) => "",
+            (false, false) => "-",
+        };
+        let coefficient = self.tight(coefficient, 0)?;
+        (coefficient.len() <= 40).then(|| format!("d{0}/dt = {sign}{coefficient} * {0}", var.name))
+    }
+
+    /// A product of names and numbers without blanks, |x| for its size; none for anything else.
+    fn tight(&self, id: ExprId, depth: u32) -> Option<String> {
+        let system = self.system;
+        if depth > 8 {
+            return None;
+        }
+        Some(match system.node(id) {
+            Node::Var(var) => system.var(*var).name.clone(),
+            Node::Fits { value, .. } => self.tight(*value, depth)?,
+            Node::Number { value, dimension, .. } if dimension.is_none_or(|d| d.is_none()) => two_digits(*value),
+            Node::Call(Builtin::Abs, args) => format!("|{}|", self.tight(args[0], depth + 1)?),
+            Node::Binary(BinaryOp::Multiply, a, b) => {
+                format!("{}*{}", self.tight(*a, depth + 1)?, self.tight(*b, depth + 1)?)
+            }
+            Node::Binary(BinaryOp::Divide, a, b) if !matches!(system.node(*b), Node::Binary(..)) => {
+                format!("{}/{}", self.tight(*a, depth + 1)?, self.tight(*b, depth + 1)?)
+            }
+            _ => return None,
+        })
+    }
+}
+
+/// `rotary LuGre(…)` from the name in it.
+fn whole_instance(files: &Files, name: Span) -> Span {
+    let text = &files.get(name.file).text;
+    let before = text[..name.start as usize].trim_end();
+    let start = match before.strip_suffix("rotary") {
+        Some(rest) if !rest.ends_with(|c: char| c.is_ascii_alphanumeric() || c == '_') => rest.len(),
+        _ => name.start as usize,
+    };
+    let mut depth = 0;
+    for (at, c) in text[name.end as usize..].char_indices() {
+        match c {
+            '(' => depth += 1,
+            ')' if depth == 1 => return Span::new(name.file, start, name.end as usize + at + 1),
+            ')' => depth -= 1,
+            c if depth == 0 && !c.is_whitespace() => break,
+            '\n' => break, // A label spans one line.
+            _ => {}
+        }
+    }
+    Span::new(name.file, start, name.end as usize)
+}
+
+/// A number with two digits.
+fn two_digits(x: f64) -> String {
+    let scientific = format!("{x:.1e}");
+    let (mantissa, exponent) = scientific.split_once('e').unwrap_or((&scientific, "0"));
+    let mantissa = mantissa.strip_suffix(".0").unwrap_or(mantissa);
+    match exponent.parse::<i32>() {
+        Ok(power @ -3..=3) => {
+            let decimals = (1 - power).max(0) as usize;
+            let rounded: f64 = scientific.parse().unwrap_or(x);
+            let text = format!("{rounded:.decimals$}");
+            if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_string() } else { text }
+        }
+        _ => format!("{mantissa}e{exponent}"),
+    }
+}
+
+/// A value in the unit of a quantity, with a handy prefix where that is a plain one.
+fn amount(value: f64, unit: &Unit) -> String {
+    let prefixed = [(1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n")];
+    let plain = unit.scale == 1.0 && unit.text.starts_with(['m', 'r', 'N']) && !unit.text.contains('^');
+    let (scale, prefix) = match plain {
+        true => *prefixed.iter().find(|(scale, _)| value.abs() >= 0.0999 * scale).unwrap_or(&prefixed[3]),
+        false => (unit.scale, ""),
+    };
+    format!("{} {prefix}{}", two_digits(value / scale), unit.text).trim_end().to_string()
+}
+
+const TIMES: [(f64, &str); 4] = [(1.0, "s"), (1e-3, "ms"), (1e-6, "us"), (1e-9, "ns")];
+
+fn time(t: f64) -> String {
+    let (scale, unit) = TIMES.into_iter().find(|(scale, _)| t >= 0.999 * scale).unwrap_or(TIMES[3]);
+    format!("{} {unit}", crate::frontend::units::three_digits(t / scale))
+}
+
+/// A time with two digits.
+pub fn two_digits_time(t: f64) -> String {
+    let (scale, unit) = TIMES.into_iter().find(|(scale, _)| t >= 0.999 * scale).unwrap_or(TIMES[3]);
+    format!("{} {unit}", two_digits(t / scale))
+}
+
+/// The round time below: 1, 2 or 5 of a power of ten.
+fn below(t: f64) -> String {
+    let round = (-9..=0).rev().flat_map(|power| [5.0, 2.0, 1.0].map(|digit| digit * ten_to(power)));
+    let mut round = round;
+    two_digits_time(round.find(|x| *x <= t).unwrap_or(1e-9))
+}

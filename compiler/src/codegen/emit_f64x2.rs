@@ -1,0 +1,483 @@
+//! Lanes in vectors of two numbers, which every processor has that there is machine code for, through Cranelift.
+//!
+//! In: an expanded function. Out: a function of Cranelift's with the signature of [`LanesEntry`](abi::lanes::LanesEntry),
+//! built as the other widths are (see [`super`]). It is to be compiled in its order: several vectors stand side by side there,
+//! and must stay so. Loads and constants are read from memory where they are used, as operands of instructions, for there
+//! are only 16 registers.
+
+use crate::codegen::emit::signature;
+use crate::codegen::unsupported::Unsupported;
+use crate::ir::scc::topological_order;
+use crate::ir::{Func, Op, Type, Value, verify};
+use abi::{Layout, Slot};
+use cranelift_codegen::ir::condcodes::{FloatCC, IntCC};
+use cranelift_codegen::ir::{self as clif, AbiParam, BlockArg, InstBuilder, MemFlagsData, types};
+use cranelift_codegen::isa::TargetIsa;
+use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
+use std::collections::{HashMap, HashSet};
+
+/// Numbers of a vector.
+pub const LANES: usize = 2;
+/// Bytes of a vector.
+const BYTES: usize = 8 * LANES;
+const SIGN: u64 = 1 << 63;
+
+/// Writes the step for `vectors` vectors into the empty `target`; gives the numbers it needs behind the blocks.
+///
+/// # Errors
+/// If the function has a ring.
+pub fn emit(
+    func: &Func,
+    layout: &Layout,
+    vectors: usize,
+    target: &mut clif::Function,
+    context: &mut FunctionBuilderContext,
+    isa: &dyn TargetIsa,
+) -> Result<usize, Unsupported> {
+    if !func.writes.is_empty() || func.ops.iter().any(|op| matches!(op, Op::Ring { .. })) {
+        return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
+    }
+    let plan = Plan::new(func, layout, vectors);
+    target.signature = signature(isa);
+    target.signature.params.push(AbiParam::new(types::I64));
+    let mut b = FunctionBuilder::new(target, context);
+    let [entry, constants, prepare, top, fast, next, last, nothing] = [(); 8].map(|()| b.create_block());
+    b.append_block_params_for_function_params(entry);
+    b.switch_to_block(entry);
+    let &[block, pool, count, statuses] = b.block_params(entry) else { unreachable!("four parameters") };
+    b.ins().brif(count, constants, &[], nothing, &[]);
+    b.switch_to_block(nothing);
+    let zero = b.ins().iconst(types::I64, 0);
+    b.ins().return_(&[zero]);
+
+    let blend = isa.name() == "x64";
+    let values = HashMap::new();
+    let mut line = Line {
+        plan: &plan,
+        b,
+        block,
+        pool,
+        before: block,
+        after: block,
+        statuses,
+        blend,
+        values,
+        constants: Vec::new(),
+    };
+    line.b.switch_to_block(prepare);
+    line.write(&plan.before, &[], |value| plan.once_place(value).into_iter().collect());
+    for index in 0..plan.carried.len() {
+        for k in 0..vectors {
+            let number = line.load(types::F64X2, Place::Block(plan.carried[index].0), k);
+            line.store(number, Place::Area(0, index), k);
+        }
+    }
+    let areas = [0, 1].map(|area| line.b.ins().iadd_imm_s(block, plan.areas[area] as i64));
+    let last_one = line.b.ins().iadd_imm_s(count, -1);
+    let none = line.b.ins().iconst(types::I64, 0);
+    let [first, second] = areas;
+    match plan.carried.is_empty() {
+        true => line.b.ins().jump(last, &[first, last_one].map(BlockArg::Value)),
+        false => line.b.ins().jump(top, &[first, second, none].map(BlockArg::Value)),
+    };
+
+    let [before, after, done] = [(); 3].map(|()| line.b.append_block_param(top, types::I64));
+    line.b.switch_to_block(top);
+    let is_last = line.b.ins().icmp(IntCC::UnsignedGreaterThanOrEqual, done, last_one);
+    let to_last = [BlockArg::Value(before), BlockArg::Value(done)];
+    line.b.ins().brif(is_last, last, &to_last, fast, &[]);
+    line.b.switch_to_block(fast);
+    line.values.clear();
+    (line.before, line.after) = (before, after);
+    let carried: Vec<Value> = plan.carried.iter().map(|(_, value)| *value).collect();
+    line.write(&plan.fast, &carried, |value| {
+        let of = plan.carried.iter().enumerate().filter(|(_, (_, next))| *next == value);
+        of.map(|(index, _)| Place::After(index)).collect()
+    });
+    match plan.failed {
+        None => line.b.ins().jump(next, &[]),
+        Some(failed) => {
+            let mut any = line.get(failed, 0);
+            for k in 1..vectors {
+                let more = line.get(failed, k);
+                any = line.b.ins().bor(any, more);
+            }
+            let any = line.b.ins().vany_true(any);
+            line.b.ins().brif(any, last, &to_last, next, &[])
+        }
+    };
+    line.b.switch_to_block(next);
+    let more = line.b.ins().iadd_imm_s(done, 1);
+    line.b.ins().jump(top, &[after, before, more].map(BlockArg::Value));
+
+    let [before, done] = [(); 2].map(|()| line.b.append_block_param(last, types::I64));
+    line.b.switch_to_block(last);
+    line.before = before;
+    line.values.clear();
+    let rest: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
+    line.write(&plan.full, &rest, |value| {
+        let stores = func.stores.iter().filter(|(_, stored)| *stored == value);
+        let mut places: Vec<Place> = stores.map(|(slot, _)| Place::Block(*slot)).collect();
+        places.extend((func.status == Some(value)).then_some(Place::Statuses));
+        places
+    });
+    let done = line.b.ins().iadd_imm_s(done, 1);
+    line.b.ins().return_(&[done]);
+
+    // All constants are known now.
+    line.b.switch_to_block(constants);
+    for (number, bits) in line.constants.clone().into_iter().enumerate() {
+        let constant = line.constant(types::I64X2, bits);
+        line.store(constant, Place::Constant(number), 0);
+    }
+    line.b.ins().jump(prepare, &[]);
+    let size = plan.constants_at + line.constants.len() * BYTES;
+    line.b.seal_all_blocks();
+    line.b.finalize(isa.frontend_config());
+    if size > i32::MAX as usize {
+        return Err(Unsupported(format!("`{}` is too large for lanes: {} operations", func.name, func.ops.len())));
+    }
+    Ok(size / 8 - layout.size() * vectors * LANES)
+}
+
+/// A group of vectors in memory.
+#[derive(Clone, Copy)]
+enum Place {
+    Block(Slot),
+    /// What one step hands to the next: in the first or second area, in the one it is read from, in the one it goes to.
+    Area(usize, usize),
+    Before(usize),
+    After(usize),
+    /// What no step changes.
+    Once(usize),
+    /// One vector.
+    Constant(usize),
+    Statuses,
+}
+
+/// What is computed when, and what lies where.
+struct Plan<'a> {
+    func: &'a Func,
+    types: Vec<Type>,
+    vectors: usize,
+    carried: Vec<(Slot, Value)>,
+    failed: Option<Value>,
+    once: Vec<Value>,
+    before: Vec<Value>,
+    fast: Vec<Value>,
+    full: Vec<Value>,
+    /// In bytes from the beginning of the block.
+    areas: [usize; 2],
+    once_at: usize,
+    constants_at: usize,
+}
+
+impl<'a> Plan<'a> {
+    fn new(func: &'a Func, layout: &Layout, vectors: usize) -> Plan<'a> {
+        let loaded: HashSet<Slot> = func.loads().into_iter().collect();
+        let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
+        let carried: Vec<(Slot, Value)> =
+            func.stores.iter().copied().filter(|(slot, _)| loaded.contains(slot)).collect();
+        let failed = func.status.map(|status| match func.failure() {
+            Some((when, true, _)) => when,
+            _ => status,
+        });
+        // A step that hands nothing on is done once, and nothing before it.
+        let mut varies = vec![carried.is_empty(); func.ops.len()];
+        for (i, op) in func.ops.iter().enumerate() {
+            varies[i] |= matches!(op, Op::Load(slot) if stored.contains(slot));
+            op.each_operand(|operand| varies[i] |= varies[operand.index()]);
+        }
+        let roots: Vec<Value> = carried.iter().map(|(_, value)| *value).chain(failed).collect();
+        let fast = order(func, &roots, &varies);
+        let roots: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
+        let full = order(func, &roots, &varies);
+        let read = fast.iter().chain(&full).flat_map(|value| operands(func, *value));
+        let left = func.stores.iter().map(|(_, value)| *value).chain(func.status).chain(failed);
+        let mut seen = HashSet::new();
+        let once: Vec<Value> = read
+            .chain(left)
+            .filter(|value| !varies[value.index()] && !is_leaf(func.op(*value)) && seen.insert(*value))
+            .collect();
+        let before = order(func, &once, &varies.iter().map(|varies| !varies).collect::<Vec<_>>());
+        let vector = vectors * BYTES;
+        let areas = [0, 1].map(|area| (layout.size() + area * carried.len()) * vector);
+        let once_at = areas[1] + carried.len() * vector;
+        let constants_at = once_at + once.len() * vector;
+        let types = verify::types(func).expect("the function is sound");
+        Plan { func, types, vectors, carried, failed, once, before, fast, full, areas, once_at, constants_at }
+    }
+
+    fn once_place(&self, value: Value) -> Option<Place> {
+        self.once.iter().position(|known| *known == value).map(Place::Once)
+    }
+}
+
+/// What is read from memory where it is used.
+fn is_leaf(op: Op) -> bool {
+    matches!(op, Op::Load(_) | Op::Real(_) | Op::Int(_) | Op::Bool(_))
+}
+
+/// Whether an operation chooses the less or the greater of two reals.
+fn is_extreme(func: &Func, op: Op) -> bool {
+    let Op::Select(when, a, b) = op else { return false };
+    matches!(func.op(when), Op::Less(x, y) if (x, y) == (a, b) || (x, y) == (b, a))
+}
+
+/// What the instruction for an operation reads: a sign belongs to the fused product that it enters, a comparison to the
+/// choice of the less or the greater.
+fn operands(func: &Func, value: Value) -> Vec<Value> {
+    if let op @ Op::Select(_, a, b) = func.op(value)
+        && is_extreme(func, op)
+    {
+        return vec![a, b];
+    }
+    let mut operands = Vec::with_capacity(3);
+    let fused = matches!(func.op(value), Op::Fma(..));
+    func.op(value).each_operand(|operand| {
+        operands.push(match func.op(operand) {
+            Op::Neg(plain) if fused => plain,
+            _ => operand,
+        });
+    });
+    operands
+}
+
+/// What roots need of the operations that are wanted: each root's own in one piece, operands first, so that what is computed
+/// is soon used.
+fn order(func: &Func, roots: &[Value], wanted: &[bool]) -> Vec<Value> {
+    let is_read = |value: Value| !wanted[value.index()] || is_leaf(func.op(value));
+    topological_order(roots, func.ops.len(), Value::index, is_read, |value| operands(func, value))
+}
+
+/// A straight line being written.
+struct Line<'a> {
+    plan: &'a Plan<'a>,
+    b: FunctionBuilder<'a>,
+    block: clif::Value,
+    pool: clif::Value,
+    before: clif::Value,
+    after: clif::Value,
+    statuses: clif::Value,
+    /// Whether there is an instruction that chooses by the first bit of a mask.
+    blend: bool,
+    /// What has been computed, vector by vector.
+    values: HashMap<Value, Vec<clif::Value>>,
+    /// Constants of a step that is repeated, by their bits, in the order of their first use.
+    constants: Vec<u64>,
+}
+
+fn vector_of(of: Type) -> clif::Type {
+    match of {
+        Type::Real => types::F64X2,
+        // A truth is a mask of all ones or zeros a lane.
+        Type::Int | Type::Bool => types::I64X2,
+    }
+}
+
+impl Line<'_> {
+    /// Writes operations; `places` says where a value goes as soon as it is there. Values of `rest` that are not computed
+    /// here go there at the end.
+    fn write(&mut self, order: &[Value], rest: &[Value], places: impl Fn(Value) -> Vec<Place>) {
+        for value in order {
+            for k in 0..self.plan.vectors {
+                let result = self.operation(*value, k);
+                self.values.entry(*value).or_default().push(result);
+                for place in places(*value) {
+                    self.store(result, place, k);
+                }
+            }
+        }
+        let mut seen: HashSet<Value> = order.iter().copied().collect();
+        for value in rest {
+            if seen.insert(*value) {
+                for k in 0..self.plan.vectors {
+                    let result = self.get(*value, k);
+                    places(*value).into_iter().for_each(|place| self.store(result, place, k));
+                }
+            }
+        }
+    }
+
+    /// Base and distance of a vector.
+    fn address(&self, place: Place, k: usize) -> (clif::Value, i32) {
+        let group = |index: usize| (index * self.plan.vectors + k) * BYTES;
+        let (base, distance) = match place {
+            Place::Block(slot) => (self.block, group(slot.index())),
+            Place::Area(area, index) => (self.block, self.plan.areas[area] + group(index)),
+            Place::Before(index) => (self.before, group(index)),
+            Place::After(index) => (self.after, group(index)),
+            Place::Once(index) => (self.block, self.plan.once_at + group(index)),
+            Place::Constant(number) => (self.block, self.plan.constants_at + number * BYTES),
+            Place::Statuses => (self.statuses, group(0)),
+        };
+        // What is too large is refused in the end.
+        (base, distance as i32)
+    }
+
+    fn load(&mut self, of: clif::Type, place: Place, k: usize) -> clif::Value {
+        let (base, distance) = self.address(place, k);
+        self.b.ins().load(of, MemFlagsData::trusted(), base, distance)
+    }
+
+    fn store(&mut self, value: clif::Value, place: Place, k: usize) {
+        let (base, distance) = self.address(place, k);
+        self.b.ins().store(MemFlagsData::trusted(), value, base, distance);
+    }
+
+    /// A constant in both lanes, made here.
+    fn constant(&mut self, of: clif::Type, bits: u64) -> clif::Value {
+        let bytes: Vec<u8> = [bits; LANES].into_iter().flat_map(u64::to_le_bytes).collect();
+        let constant = self.b.func.dfg.constants.insert(bytes.into());
+        self.b.ins().vconst(of, constant)
+    }
+
+    /// A constant in both lanes: of a step that is repeated it lies in memory, from where an instruction can take it.
+    fn number(&mut self, of: clif::Type, bits: u64) -> clif::Value {
+        if self.plan.carried.is_empty() {
+            return self.constant(of, bits);
+        }
+        let known = self.constants.iter().position(|known| *known == bits);
+        let number = known.unwrap_or_else(|| {
+            self.constants.push(bits);
+            self.constants.len() - 1
+        });
+        self.load(of, Place::Constant(number), 0)
+    }
+
+    fn get(&mut self, value: Value, k: usize) -> clif::Value {
+        let of = vector_of(self.plan.types[value.index()]);
+        if let Some(known) = self.values.get(&value).and_then(|vectors| vectors.get(k)) {
+            return *known;
+        }
+        match self.plan.func.op(value) {
+            Op::Real(bits) => self.number(of, bits),
+            Op::Int(n) => self.number(of, n as u64),
+            Op::Bool(truth) => self.number(of, if truth { u64::MAX } else { 0 }),
+            Op::Load(slot) => {
+                let carried = self.plan.carried.iter().position(|(known, _)| *known == slot);
+                self.load(of, carried.map_or(Place::Block(slot), Place::Before), k)
+            }
+            op => {
+                let place = self.plan.once_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));
+                self.load(of, place, k)
+            }
+        }
+    }
+
+    fn as_bits(&mut self, x: clif::Value) -> clif::Value {
+        self.cast(types::I64X2, x)
+    }
+
+    fn cast(&mut self, to: clif::Type, x: clif::Value) -> clif::Value {
+        if self.b.func.dfg.value_type(x) == to { x } else { self.b.ins().bitcast(to, MemFlagsData::new(), x) }
+    }
+
+    /// The same of each lane.
+    fn by_lane(&mut self, to: clif::Type, mut lane: impl FnMut(&mut Self, u8) -> clif::Value) -> clif::Value {
+        let [first, second] = [0, 1].map(|number| lane(self, number));
+        let vector = self.b.ins().scalar_to_vector(to, first);
+        self.b.ins().insertlane(vector, second, 1)
+    }
+
+    fn operation(&mut self, value: Value, k: usize) -> clif::Value {
+        let op = self.plan.func.op(value);
+        let mut x = operands(self.plan.func, value).into_iter().map(|operand| self.get(operand, k)).collect::<Vec<_>>();
+        let of = vector_of(self.plan.types[value.index()]);
+        match op {
+            Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => unreachable!("they lie in memory"),
+            Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
+            Op::Ring { .. } => unreachable!("refused"),
+            Op::Pool { base, len, index } => {
+                let inside = self.inside(index, len);
+                self.by_lane(of, |line, lane| {
+                    let mut index = line.b.ins().extractlane(x[0], lane);
+                    if !inside {
+                        let last = line.b.ins().iconst(types::I64, i64::from(len) - 1);
+                        index = line.b.ins().umin(index, last);
+                    }
+                    let bytes = line.b.ins().ishl_imm_u(index, 3);
+                    let address = line.b.ins().iadd(line.pool, bytes);
+                    let offset = i32::try_from(8 * base).expect("pools are smaller than 2 GiB");
+                    line.b.ins().load(types::F64, MemFlagsData::trusted(), address, offset)
+                })
+            }
+            Op::Add(..) => self.b.ins().fadd(x[0], x[1]),
+            Op::Sub(..) => self.b.ins().fsub(x[0], x[1]),
+            Op::Mul(..) => self.b.ins().fmul(x[0], x[1]),
+            Op::Div(..) => self.b.ins().fdiv(x[0], x[1]),
+            Op::Sqrt(_) => self.b.ins().sqrt(x[0]),
+            Op::Floor(_) => self.b.ins().floor(x[0]),
+            Op::Nearest(_) => self.b.ins().nearest(x[0]),
+            Op::Neg(_) => {
+                let sign = self.number(types::F64X2, SIGN);
+                self.b.ins().bxor(x[0], sign)
+            }
+            Op::Abs(_) => {
+                let rest = self.number(types::F64X2, !SIGN);
+                self.b.ins().band(x[0], rest)
+            }
+            Op::Fma(a, b, c) => {
+                for (x, operand) in x.iter_mut().zip([a, b, c]) {
+                    if let Op::Neg(_) = self.plan.func.op(operand) {
+                        *x = self.b.ins().fneg(*x);
+                    }
+                }
+                self.b.ins().fma(x[0], x[1], x[2])
+            }
+            Op::Less(..) => self.b.ins().fcmp(FloatCC::LessThan, x[0], x[1]),
+            Op::LessEqual(..) => self.b.ins().fcmp(FloatCC::LessThanOrEqual, x[0], x[1]),
+            Op::Equal(..) => self.b.ins().fcmp(FloatCC::Equal, x[0], x[1]),
+            Op::And(..) | Op::IntAnd(..) => self.b.ins().band(x[0], x[1]),
+            Op::Or(..) | Op::IntOr(..) => self.b.ins().bor(x[0], x[1]),
+            Op::Not(_) => {
+                let ones = self.number(of, u64::MAX);
+                self.b.ins().bxor(x[0], ones)
+            }
+            // One instruction, of NaN and zeros too, where there is one.
+            Op::Select(when, a, _) if is_extreme(self.plan.func, op) => {
+                let Op::Less(first, _) = self.plan.func.op(when) else { unreachable!("it compares") };
+                let (low, high) = if first == a { (x[0], x[1]) } else { (x[1], x[0]) };
+                let mask = self.b.ins().fcmp(FloatCC::LessThan, low, high);
+                let mask = self.cast(of, mask);
+                self.b.ins().bitselect(mask, x[0], x[1])
+            }
+            Op::Select(..) if self.blend => {
+                let [a, b] = [x[1], x[2]].map(|x| self.as_bits(x));
+                let chosen = self.b.ins().blendv(x[0], a, b);
+                self.cast(of, chosen)
+            }
+            Op::Select(..) => {
+                let mask = self.cast(of, x[0]);
+                self.b.ins().bitselect(mask, x[1], x[2])
+            }
+            Op::IntAdd(..) => self.b.ins().iadd(x[0], x[1]),
+            Op::IntSub(..) => self.b.ins().isub(x[0], x[1]),
+            Op::IntMul(..) => self.b.ins().imul(x[0], x[1]),
+            Op::IntXor(..) => self.b.ins().bxor(x[0], x[1]),
+            Op::ShiftLeft(_, n) => self.b.ins().ishl_imm_u(x[0], i64::from(n)),
+            Op::ShiftRight(_, n) => self.b.ins().ushr_imm_u(x[0], i64::from(n)),
+            Op::ShiftRightSigned(_, n) => self.b.ins().sshr_imm_u(x[0], i64::from(n)),
+            Op::IntLess(..) => self.b.ins().icmp(IntCC::SignedLessThan, x[0], x[1]),
+            Op::IntEqual(..) => self.b.ins().icmp(IntCC::Equal, x[0], x[1]),
+            Op::ToBits(_) | Op::FromBits(_) => self.cast(of, x[0]),
+            Op::ToInt(_) => self.by_lane(of, |line, lane| {
+                let number = line.b.ins().extractlane(x[0], lane);
+                line.b.ins().fcvt_to_sint_sat(types::I64, number)
+            }),
+            Op::ToReal(_) => self.b.ins().fcvt_from_sint(of, x[0]),
+        }
+    }
+
+    /// Whether an index cannot leave a table.
+    fn inside(&self, index: Value, len: u32) -> bool {
+        let masked = |value: Value| match self.plan.func.op(value) {
+            Op::Int(mask) => (0..i64::from(len)).contains(&mask),
+            _ => false,
+        };
+        match self.plan.func.op(index) {
+            Op::IntAnd(a, b) => masked(a) || masked(b),
+            _ => masked(index),
+        }
+    }
+}

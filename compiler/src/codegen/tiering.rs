@@ -1,0 +1,257 @@
+//! Runnable code of a program: what a method needs of it, made at once or when it is first called.
+//!
+//! In: a [`Program`] and how it is stepped. Out: [`Code`]. Whatever makes it, the bits are the same, so *when* a
+//! function becomes machine code can be told from the clock alone.
+
+use crate::codegen::lanes::{self, Width};
+use crate::codegen::{jit, target};
+use crate::ir::Func;
+use crate::ir::interpret::Interpreter;
+use crate::ir::program::Program;
+use crate::math;
+use crate::numerics::{autodiff, fixed_step, rosenbrock};
+use crate::opt::contract::contract;
+use crate::opt::guard_reduction::reduce_guards;
+use crate::opt::limiter_tests::drop_limiter_tests;
+use crate::opt::reassociate::reassociate;
+use abi::lanes::Lanes;
+use abi::plan::Method;
+use abi::table::{Code, Interpret, Machine};
+use abi::{Description, Function, Layout};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
+
+/// The functions that a method needs, expanded to arithmetic.
+pub fn functions(program: &Program, method: Method) -> Vec<(Function, Func)> {
+    Function::ALL.into_iter().filter_map(|which| Some((which, function(program, method, which)?))).collect()
+}
+
+/// One function, expanded to arithmetic, if the method needs it.
+fn function(program: &Program, method: Method, which: Function) -> Option<Func> {
+    if !needs(program, method, which) {
+        return None;
+    }
+    let expanded = |func: &Option<Func>| func.as_ref().map(math::expand);
+    match which {
+        Function::Start => Some(math::expand(&program.start)),
+        Function::Outputs => Some(math::expand(&program.outputs)),
+        Function::Transitions => expanded(&program.transitions),
+        Function::Derivatives => Some(math::expand(&program.derivatives)),
+        Function::Jacobian => Some(math::expand(&autodiff::jacobian(program))),
+        Function::Roots => expanded(&program.roots),
+        Function::Tick => expanded(&program.tick),
+        Function::Step => Some(math::expand(&step(program, method))),
+        Function::Rosenbrock => rosenbrock::rosenbrock(program).map(|step| rosenbrock::pooled(&math::expand(&step))),
+    }
+}
+
+/// A fixed step before elementary functions are expanded: what lanes are made of.
+///
+/// # Panics
+/// For the adaptive method, which is no fixed step.
+pub fn step(program: &Program, method: Method) -> Func {
+    reduce_guards(&drop_limiter_tests(&contract(
+        &reassociate(&fixed_step::step(program, method), program.balanced),
+        &program.description.layout,
+    )))
+}
+
+/// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;
+/// none if it has none, or the model no such function: then each instance runs for itself, with the same bits.
+pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
+    // The many operations of an adaptive step leave fewer registers to more vectors.
+    let vectors = |width: Width| match (method, width) {
+        (Method::Adaptive, Width::Pairs | Width::Avx512) => 2,
+        (Method::Adaptive, Width::Avx | Width::Avx2) => 3,
+        (Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit, _) => width.vectors(),
+    };
+    Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
+}
+
+/// The function that makes a method's steps before elementary functions are expanded: what lanes are made of.
+pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
+    match method {
+        Method::Adaptive => Some((Function::Rosenbrock, rosenbrock::rosenbrock(program)?)),
+        _ => Some((Function::Step, step(program, method))),
+    }
+}
+
+/// The same in so many vectors of this width.
+pub fn lanes_of(program: &Program, method: Method, width: Width, vectors: usize) -> Option<Lanes> {
+    let (_, func) = of_lanes(program, method)?;
+    lanes::compile(&func, &program.description.layout, program.description.pool.len(), width, vectors).ok()
+}
+
+/// Whether a method needs a function, if there can be such.
+fn needs(program: &Program, method: Method, which: Function) -> bool {
+    let adaptive = method == Method::Adaptive;
+    match which {
+        Function::Start | Function::Outputs => true,
+        Function::Transitions => program.transitions.is_some(),
+        Function::Step => !adaptive,
+        Function::Derivatives | Function::Rosenbrock => adaptive,
+        Function::Jacobian => adaptive && program.description.layout.jacobian.len > 0,
+        Function::Tick => adaptive && program.tick.is_some(),
+        Function::Roots => adaptive && program.roots.is_some(),
+    }
+}
+
+/// Machine code of functions, or the interpreter where there can be none, which is noted.
+pub fn code(functions: &[(Function, Func)], description: &Description, interpret: bool) -> (Code, Vec<String>) {
+    let (layout, pool) = (&description.layout, description.pool.len());
+    let interpreted = || Code::Interpreted(Arc::new(Interpreter::new(functions, layout, pool)));
+    if interpret {
+        return (interpreted(), Vec::new());
+    }
+    match jit::compile_prepared(functions, layout, pool) {
+        Ok((machine, _)) => (Code::Machine(machine), Vec::new()),
+        Err(why) => (interpreted(), vec![format!("runs interpreted, some fifty times slower: {why}")]),
+    }
+}
+
+/// Code for runs that nobody waits for in real time: each function is made when it is first called, and compiled once
+/// it has been called often enough to pay. So a text is at its first step before any machine code is made, and what
+/// runs once, as the start does, never costs its compiling.
+pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
+    let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
+    match target::here() {
+        // What may be too large for machine code is made at once, so that it is told at once.
+        Ok(_) if !interpret && size <= LARGE => (on_demand(program, method, false), Vec::new()),
+        _ => code(&functions(program, method), &program.description, interpret),
+    }
+}
+
+/// As [`late`], of any size: for runs that are made at most on request. Where there can be no machine code it is interpreted.
+pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
+    let interpret = interpret || target::here().is_err();
+    Code::Interpreted(Arc::new(Tiered { program: program.clone(), method, interpret, made: Default::default() }))
+}
+
+/// Operations of a program, before elementary functions are expanded, that surely become machine code.
+const LARGE: usize = 5_000;
+
+/// Runs of a function that cost about as much as to compile it: an operation is interpreted in some 10 ns and compiled
+/// in some 2 µs.
+const TIER_UP_CALLS: u64 = 200;
+
+/// The code of a program, function by function.
+struct Tiered {
+    program: Program,
+    method: Method,
+    /// Whether none becomes machine code.
+    interpret: bool,
+    made: [Made; Function::ALL.len()],
+}
+
+/// What there is of a function.
+#[derive(Default)]
+struct Made {
+    func: OnceLock<Option<(Function, Func)>>,
+    interpreter: OnceLock<Interpreter>,
+    /// None: too large.
+    machine: OnceLock<Option<Machine>>,
+    /// Runs so far.
+    runs: AtomicU64,
+}
+
+impl Tiered {
+    /// The function as arithmetic.
+    fn func(&self, which: Function) -> Option<&(Function, Func)> {
+        let make = || Some((which, function(&self.program, self.method, which)?));
+        self.made[which as usize].func.get_or_init(make).as_ref()
+    }
+
+    /// What a back end makes of one function.
+    fn make<T>(&self, which: Function, back_end: impl FnOnce(&[(Function, Func)], &Layout, usize) -> T) -> T {
+        let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
+        back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
+    }
+}
+
+impl Interpret for Tiered {
+    fn call(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
+        let made = &self.made[which as usize];
+        let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
+        let compiled = || self.make(which, make);
+        let pays = || made.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > TIER_UP_CALLS;
+        if !self.interpret
+            && (made.machine.get().is_some() || pays())
+            && let Some(machine) = made.machine.get_or_init(compiled)
+        {
+            return machine.call(which, block, pool, count);
+        }
+        made.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
+    }
+
+    fn made(&self, which: Function) -> Option<&Machine> {
+        self.made[which as usize].machine.get()?.as_ref()
+    }
+
+    fn has(&self, which: Function) -> bool {
+        needs(&self.program, self.method, which) && (which != Function::Rosenbrock || self.func(which).is_some())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use abi::Instance;
+
+    const TEXT: &str = "model Contact {
+  param m = 1 kg
+  state x [m] = 0
+  state v [m/s] = 0
+  let F = tanh(v / 1 mm/s) * 1 N
+  dx/dt = v
+  dv/dt = (2 N * sin(t / 1 s) - F) / m
+  output power [W] = F * v
+}";
+
+    fn program() -> Program {
+        let mut loaded = crate::load("contact.fric", TEXT, &crate::NoSources);
+        let (changes, mut warnings) = (crate::Changes::default(), Vec::new());
+        let built = crate::build(&mut loaded, &crate::NoSources, "Contact", &changes, &mut warnings);
+        built.map_err(|found| format!("{found:?}")).expect("it compiles").program
+    }
+
+    /// Blocks after each of some calls.
+    fn course(code: Code, program: &Program) -> Vec<Vec<u64>> {
+        let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
+        assert_eq!(instance.start(1e-3), 0);
+        let counts = (0..2 * TIER_UP_CALLS).map(|_| 1).chain([TIER_UP_CALLS + 1, 3]);
+        let bits = |instance: &Instance| instance.block().iter().map(|x| x.to_bits()).collect();
+        counts
+            .enumerate()
+            .map(|(k, count)| {
+                // Now and then a parameter changes, before the code is there and behind.
+                if k % 7 == 3 {
+                    instance.set(program.description.layout.params.slot(0), 1.0 + 0.1 * k as f64);
+                }
+                assert_eq!(instance.advance(count), 0);
+                instance.call(Function::Outputs);
+                bits(&instance)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn nobody_can_tell_when_a_function_was_compiled() {
+        let program = program();
+        let (interpreted, _) = late(&program, Method::Expo, true);
+        let expected = course(interpreted, &program);
+        assert_eq!(course(late(&program, Method::Expo, false).0, &program), expected);
+        assert_eq!(course(code(&functions(&program, Method::Expo), &program.description, false).0, &program), expected);
+    }
+
+    #[test]
+    fn a_function_is_there_before_it_is_made() {
+        let program = program();
+        for method in [Method::Adaptive, Method::Expo] {
+            let at_once = code(&functions(&program, method), &program.description, false).0;
+            let made_late = late(&program, method, false).0;
+            for function in Function::ALL {
+                assert_eq!(made_late.has(function), at_once.has(function), "{}", function.name());
+            }
+        }
+    }
+}

@@ -1,0 +1,1483 @@
+//! Reads an experiment: what to run, how, what to show and what must hold.
+//!
+//! In: an experiment's tree and changes from outside. Out: for each combination of its sweeps a flat system with a plan
+//! that holds slots only.
+
+pub mod start_values;
+pub mod vary;
+
+use crate::analysis::linearise::{Opened, PortSlots, Ports, open};
+use crate::analysis::{domains, parameter_checks};
+use crate::codegen::elementary::Alone;
+use crate::frontend::flatten::{Instance, Override, OverrideValue, Request, flatten};
+use crate::frontend::resolve::Loaded;
+use crate::frontend::source::Sources;
+use crate::frontend::system::*;
+use crate::frontend::tables::columns as columns_of;
+use crate::frontend::units::{self, Types};
+use crate::frontend::{causality, delays};
+use crate::ir::{Binary, Unary};
+use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
+use crate::rig::{self, Prepared};
+use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
+use abi::unit::{Dimension, Unit};
+use grammar::ast::{self, BinaryOp, ExperimentStatement, Expr, SweepOver};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+use std::sync::Arc;
+
+/// Changes from outside to an experiment.
+#[derive(Clone, Debug, Default)]
+pub struct Changes {
+    /// `fr.Fs = 2 N`, as text.
+    pub set: Vec<String>,
+    /// Another method.
+    pub method: Option<Method>,
+    /// Another fixed step, in s.
+    pub step: Option<f64>,
+    /// Another tolerance.
+    pub tol: Option<f64>,
+    /// Another duration, in s.
+    pub duration: Option<f64>,
+    /// Paths of parameters, and of states for their start values, that will change from run to run without compiling
+    /// again.
+    pub vary: Vec<String>,
+    /// What is needed besides to linearise.
+    pub ports: Option<Ports>,
+    /// Statements that the experiment gets besides its own, as text: `expect max(x) < 1 mm`.
+    pub also: Vec<String>,
+    /// Leaves the experiment's own expectations out: a question at the prompt judges nothing, and a window of one may lie
+    /// beyond the time for which it is compiled.
+    pub unjudged: bool,
+}
+
+/// A number of a plan that was computed from an expression.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Place {
+    /// Simulated time.
+    Duration,
+    /// Fixed step.
+    Step,
+    /// Tolerance of an adaptive run.
+    Tolerance,
+    /// Start of the window of this expectation.
+    After(usize),
+    /// End of the window of this expectation.
+    Before(usize),
+    /// Second argument of this measure of this expectation.
+    Second(usize, usize),
+    /// Start of the window of this measure of this expectation.
+    MeasureAfter(usize, usize),
+    /// End of it.
+    MeasureBefore(usize, usize),
+}
+
+/// One combination of an experiment's sweeps, lowered.
+pub struct Variant {
+    /// `fr = LuGre()`; empty without a sweep.
+    pub label: String,
+    /// The system.
+    pub system: System,
+    /// Its types.
+    pub types: Types,
+    /// The program.
+    pub program: crate::ir::program::Program,
+    /// Of an experiment with fixed steps, the same for adaptive runs, where these are possible.
+    pub adaptive: Option<crate::ir::program::Program>,
+    /// What to run.
+    pub experiment: plan::Experiment,
+    /// Numbers of the plan that follow from expressions.
+    pub places: Vec<(Place, ExprId)>,
+    /// Inputs of a linearisation, each with the slot along which it moves; and its outputs.
+    pub ports: PortSlots,
+    /// A dry run: the plan of the rig, and the crossed-out part.
+    pub rig: Option<(abi::rig::Rig, crate::ir::program::Program)>,
+}
+
+/// The default of an adaptive run.
+pub const DEFAULT_TOL: f64 = 1e-6;
+/// The step of a fixed method that was chosen without one, in s.
+pub const DEFAULT_STEP: f64 = 1e-5;
+/// Most fixed steps of a run.
+const MOST_STEPS: f64 = 1e12;
+/// Most combinations of the sweeps of one experiment.
+pub const MOST_VARIANTS: usize = 100_000;
+
+/// The parts of an experiment's tree.
+struct Parts<'a> {
+    span: Span,
+    run: &'a ast::Run,
+    solver: Option<&'a ast::Solver>,
+    sweeps: Vec<&'a ast::Sweep>,
+    data: Option<&'a ast::Data>,
+    plots: Vec<&'a ast::Plot>,
+    expects: Vec<&'a ast::Expect>,
+    /// `allow discretisation`
+    stepped: bool,
+}
+
+/// Where the value of a sweep or a change comes from.
+#[derive(Clone, Copy)]
+struct Change<'a> {
+    path: &'a ast::Path,
+    value: OverrideValue<'a>,
+}
+
+/// Reads and lowers an experiment.
+///
+/// # Errors
+/// Everything that is wrong, at least one error among it.
+pub fn read(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    changes: &Changes,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Vec<Variant>, Vec<Diagnostic>> {
+    let mut diagnostics = Vec::new();
+    let given = Given::read(loaded, changes, &mut diagnostics);
+    let also = also(loaded, &changes.also, &mut diagnostics);
+    let root = loaded.root();
+    let prepared = rig_of(loaded, sources, name, &given, &mut diagnostics)?;
+    let loaded = &*loaded;
+    let file = loaded.files.get(root);
+    let found = file.ast.items.iter().find_map(|item| match item {
+        ast::Item::Experiment(experiment) if experiment.name.text == name => Some(experiment),
+        _ => None,
+    });
+    let Some(experiment) = found else {
+        let error = Diagnostic::error("E0201", format!("there is no experiment `{name}`"));
+        return Err(vec![error.label(Span::new(root, 0, 0), "in this file")]);
+    };
+    let misread = loaded.misread(experiment.span);
+    let mut experiment = std::borrow::Cow::Borrowed(experiment);
+    if changes.unjudged {
+        experiment.to_mut().body.retain(|statement| !matches!(statement, ExperimentStatement::Expect(_)));
+    }
+    if !also.is_empty() {
+        experiment.to_mut().body.extend(also);
+    }
+    let experiment = &*experiment;
+    // A word that is reported once may be what its `run` lacks.
+    let Some(mut parts) = parts(experiment, misread || loaded.has_errors(), &mut diagnostics) else {
+        return Err(diagnostics);
+    };
+    // What is said from outside counts: a value that is given, or varied there, is not swept here.
+    let plain = |text: &str| text.split_whitespace().collect::<String>();
+    let path = |path: &ast::Path| plain(loaded.files.slice(path.span));
+    let said: Vec<String> =
+        given.set.iter().map(|set| path(&set.path)).chain(given.vary.iter().map(|p| plain(p))).collect();
+    parts.sweeps.retain(|sweep| !said.contains(&path(&sweep.path)));
+    let data = parts.data.map_or(Some(Vec::new()), |data| recording(loaded, sources, root, data, &mut diagnostics));
+    let Some(data) = data else { return Err(diagnostics) };
+    let grids = grids(loaded, &parts, &mut diagnostics);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    let combinations = combinations(&parts, &grids);
+    if combinations.is_empty() || combinations.len() > MOST_VARIANTS {
+        let span = parts.sweeps.first().map_or(experiment.span, |sweep| sweep.span);
+        let message = match combinations.len() {
+            0 => "this sweep is empty".to_string(),
+            n => format!("{n} combinations are too many"),
+        };
+        let error = Diagnostic::error("E0902", message).label(span, "swept here");
+        return Err(vec![error.help(format!("between 1 and {MOST_VARIANTS} combinations can be run"))]);
+    }
+    // Arguments of a rig are changes of the system that it runs.
+    let path = |bind: &ast::Bind| ast::Path {
+        segments: vec![ast::Segment { name: bind.name.clone(), index: None }],
+        span: bind.span,
+    };
+    let args = prepared.as_ref().map_or(&[][..], |_| &parts.run.instance.args);
+    let arg_paths: Vec<ast::Path> = args.iter().map(path).collect();
+    let mut variants = Vec::new();
+    for combination in combinations {
+        let label = label(loaded, &combination);
+        let changes = combination.iter().map(|(change, _)| *change).chain(given.set.iter().map(Given::change));
+        let written = arg_paths.iter().zip(args).map(|(path, bind)| {
+            let value = match &bind.value {
+                ast::BindValue::Expr(expr) => OverrideValue::Expr(expr),
+                ast::BindValue::Instance(instance) => OverrideValue::Instance(instance),
+            };
+            Change { path, value }
+        });
+        let changes = written.chain(changes);
+        let overrides = changes.map(|c| Override { path: c.path, value: c.value, file: root }).collect();
+        match variant(
+            loaded,
+            sources,
+            name,
+            &parts,
+            prepared.as_ref(),
+            &data,
+            overrides,
+            &given,
+            label,
+            warnings,
+            on_stage,
+        ) {
+            Ok(variant) => variants.push(variant),
+            Err(errors) => return Err(errors),
+        }
+    }
+    Ok(variants)
+}
+
+/// Further statements of an experiment, each with its own text.
+fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>) -> Vec<ExperimentStatement> {
+    let mut out = Vec::new();
+    for text in texts {
+        let id = loaded.add_text("--also", text);
+        let (statements, errors) = grammar::parse::parse_statements(id, text);
+        out.extend(statements);
+        diagnostics.extend(errors);
+    }
+    out
+}
+
+/// Texts given on the command line, read.
+struct Given {
+    set: Vec<Set>,
+    method: Option<Method>,
+    step: Option<f64>,
+    tol: Option<f64>,
+    duration: Option<f64>,
+    vary: Vec<String>,
+    ports: Option<Ports>,
+}
+
+/// `PATH = VALUE`
+struct Set {
+    path: ast::Path,
+    expr: Option<Expr>,
+    instance: Option<ast::Instance>,
+}
+
+/// Changes of values from outside, read.
+pub struct Overrides(Vec<Set>);
+
+impl Overrides {
+    /// One by one.
+    pub fn iter(&self) -> impl Iterator<Item = ChangeOf<'_>> {
+        self.0.iter().map(|set| ChangeOf(Given::change(set)))
+    }
+}
+
+/// One of them.
+pub struct ChangeOf<'a>(Change<'a>);
+
+impl<'a> ChangeOf<'a> {
+    /// As flattening takes it; its value is read in the scope of this file.
+    pub fn override_in(&self, file: FileId) -> Override<'a> {
+        Override { path: self.0.path, value: self.0.value, file }
+    }
+}
+
+/// Reads changes of values from outside.
+pub fn overrides(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Overrides {
+    Overrides(Given::read(loaded, changes, diagnostics).set)
+}
+
+impl Given {
+    fn read(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Given {
+        let mut set = Vec::new();
+        for text in &changes.set {
+            let id = loaded.add_text("--set", text);
+            match text.split_once('=') {
+                Some((path, value)) if looks_like_instance(value) => {
+                    // Read with blanks in place of the path, so that places stay true.
+                    let (found, errors) = grammar::parse::parse_path(id, path);
+                    diagnostics.extend(errors);
+                    let blanks = " ".repeat(path.len() + 1);
+                    let (instance, errors) = grammar::parse::parse_instance(id, &format!("{blanks}{value}"));
+                    diagnostics.extend(errors);
+                    if let (Some(path), Some(instance)) = (found, instance) {
+                        set.push(Set { path, expr: None, instance: Some(instance) });
+                    }
+                }
+                _ => {
+                    let (setting, errors) = grammar::parse::parse_setting(id, text);
+                    diagnostics.extend(errors);
+                    if let Some((path, expr)) = setting {
+                        set.push(Set { path, expr: Some(expr), instance: None });
+                    }
+                }
+            }
+        }
+        let Changes { method, step, tol, duration, vary, ports, .. } = changes.clone();
+        Given { set, method, step, tol, duration, vary, ports }
+    }
+
+    fn change(set: &Set) -> Change<'_> {
+        let value = match (&set.expr, &set.instance) {
+            (_, Some(instance)) => OverrideValue::Instance(instance),
+            (Some(expr), None) => OverrideValue::Expr(expr),
+            (None, None) => unreachable!("a setting has a value"),
+        };
+        Change { path: &set.path, value }
+    }
+}
+
+fn looks_like_instance(value: &str) -> bool {
+    let value = value.trim_start().trim_start_matches("rotary ").trim_start();
+    let name = value.trim_start_matches(|c: char| c.is_ascii_alphanumeric() || c == '_');
+    value.starts_with(|c: char| c.is_ascii_uppercase()) && name.trim_start().starts_with('(')
+}
+
+fn parts<'a>(experiment: &'a ast::Experiment, misread: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Parts<'a>> {
+    let mut run: Option<&ast::Run> = None;
+    let mut parts = (None, Vec::new(), None, Vec::new(), Vec::new());
+    let mut stepped = false;
+    let mut twice = |what: &str, span: Span, first: Span| {
+        let error = Diagnostic::error("E0301", format!("an experiment has one `{what}`"))
+            .label(span, "again here")
+            .label(first, "first here");
+        diagnostics.push(error.help("remove one, or write another experiment"));
+    };
+    for statement in &experiment.body {
+        match statement {
+            ExperimentStatement::Run(one) => match run {
+                Some(first) => twice("run", one.span, first.span),
+                None => run = Some(one),
+            },
+            ExperimentStatement::Solver(one) => match parts.0 {
+                Some(first) => twice("solver", one.span, std::convert::identity::<&ast::Solver>(first).span),
+                None => parts.0 = Some(one),
+            },
+            ExperimentStatement::Sweep(one) => parts.1.push(one),
+            ExperimentStatement::Data(one) => match parts.2 {
+                Some(first) => twice("data", one.span, std::convert::identity::<&ast::Data>(first).span),
+                None => parts.2 = Some(one),
+            },
+            ExperimentStatement::Plot(one) => parts.3.push(one),
+            ExperimentStatement::Expect(one) => parts.4.push(one),
+            ExperimentStatement::Allow(allow) => stepped |= allow.lint.text == "discretisation",
+        }
+    }
+    let Some(run) = run else {
+        if misread {
+            return None;
+        }
+        let error = Diagnostic::error("E0902", format!("experiment `{}` runs nothing", experiment.name.text))
+            .label(experiment.name.span, "there is no `run` in it");
+        diagnostics.push(error.help("add `run Model(…) for 10 s`"));
+        return None;
+    };
+    let (solver, sweeps, data, plots, expects) = parts;
+    Some(Parts { span: experiment.span, run, solver, sweeps, data, plots, expects, stepped })
+}
+
+/// Columns of a recording as tables over time.
+fn recording(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    root: FileId,
+    data: &ast::Data,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Vec<(String, Table, Unit)>> {
+    let Some(time) = data.columns.iter().position(|column| column.name.text == "t") else {
+        let error = Diagnostic::error("E0903", "a recording needs a column `t`").label(data.span, "no column is time");
+        diagnostics.push(error.help("name the columns in the order of the file, as in `(t [s], x [mm])`"));
+        return None;
+    };
+    let mut out = Vec::new();
+    let mut unit = |column: &ast::Argument| match column.unit.as_ref().map(|text| (text, Unit::parse(&text.text))) {
+        None => Some(Unit::none()),
+        Some((_, Ok(unit))) => Some(unit),
+        Some((text, Err(part))) => {
+            diagnostics
+                .push(Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known"));
+            None
+        }
+    };
+    let mut units = Vec::new();
+    let mut columns = Vec::new();
+    for (k, column) in data.columns.iter().enumerate() {
+        if column.name.text == "_" {
+            units.push(None);
+            continue;
+        }
+        let unit = unit(column)?;
+        units.push(Some(unit.clone()));
+        columns.push((k, column, unit));
+    }
+    let mut values = columns_of(loaded, sources, root, &data.file, &units, diagnostics)?;
+    let t = std::mem::take(&mut values[time]);
+    values[time].clone_from(&t);
+    if let Some(row) = (1..t.len()).find(|&row| t[row].partial_cmp(&t[row - 1]) != Some(std::cmp::Ordering::Greater)) {
+        let error = Diagnostic::error("E0903", "the times of a recording must increase")
+            .label(data.file.span, format!("row {} is not after the one before", row + 1));
+        diagnostics.push(error);
+        return None;
+    }
+    for (k, column, unit) in columns {
+        let table = Table {
+            name: format!("data.{}", column.name.text),
+            x_dimension: Dimension::of([0, 0, 1, 0, 0]),
+            y_dimension: unit.dimension,
+            smooth: false,
+            x: t.clone(),
+            y: values[k].clone(),
+        };
+        out.push((column.name.text.clone(), table, unit));
+    }
+    Some(out)
+}
+
+/// Values of `first .. last by step` as expressions, one list for each sweep.
+fn grids(loaded: &Loaded, parts: &Parts, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
+    let mut out = Vec::new();
+    for sweep in &parts.sweeps {
+        let mut values = Vec::new();
+        if let SweepOver::Grid { first, last, step } = &sweep.over {
+            match (quantity(first), quantity(last), quantity(step)) {
+                (Some((a, unit, text)), Some((b, other, _)), Some((h, third, _)))
+                    if unit.dimension == other.dimension && unit.dimension == third.dimension && h > 0.0 =>
+                {
+                    let count = ((b - a) / h + 1e-9).floor();
+                    for k in 0..=(count.clamp(-1.0, MOST_VARIANTS as f64) as i64) {
+                        let value = unit.from_si(a + k as f64 * h);
+                        let kind = ast::ExprKind::Number { value: rounded(value), unit: text.clone() };
+                        values.push(Expr { kind, span: first.span });
+                    }
+                }
+                _ => {
+                    let error = Diagnostic::error("E0902", "a sweep goes from a number to a number by a positive step")
+                        .label(sweep.span, loaded.files.slice(sweep.span).lines().next().unwrap_or_default())
+                        .help("all three in units of one kind: `sweep fr.Fs = 1 N .. 2 N by 0.25 N`");
+                    diagnostics.push(error);
+                }
+            }
+        }
+        out.push(values);
+    }
+    out
+}
+
+/// A number without the noise of `a + k·h`: twelve digits.
+fn rounded(x: f64) -> f64 {
+    format!("{x:.11e}").parse().unwrap_or(x)
+}
+
+/// A literal in SI with its unit.
+fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
+    match &expr.kind {
+        ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
+        ast::ExprKind::Number { value, unit: Some(text) } => {
+            let unit = Unit::parse(&text.text).ok()?;
+            Some((unit.to_si(*value), unit, Some(text.clone())))
+        }
+        ast::ExprKind::Unary(ast::UnaryOp::Negate, a) => quantity(a).map(|(value, unit, text)| (-value, unit, text)),
+        _ => None,
+    }
+}
+
+/// All combinations of the sweeps, the last one fastest; each with the text of its value.
+fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Change<'a>, Option<String>)>> {
+    let mut out: Vec<Vec<(Change<'a>, Option<String>)>> = vec![Vec::new()];
+    for (sweep, grid) in parts.sweeps.iter().zip(grids) {
+        let path = &sweep.path;
+        let values: Vec<(Change<'a>, Option<String>)> = match &sweep.over {
+            SweepOver::Instances(all) => {
+                all.iter().map(|one| (Change { path, value: OverrideValue::Instance(one) }, None)).collect()
+            }
+            SweepOver::Values(all) => {
+                all.iter().map(|one| (Change { path, value: OverrideValue::Expr(one) }, None)).collect()
+            }
+            SweepOver::Grid { .. } => grid
+                .iter()
+                .map(|one| {
+                    let text = match &one.kind {
+                        ast::ExprKind::Number { value, unit: Some(unit) } => format!("{value} {}", unit.text),
+                        ast::ExprKind::Number { value, unit: None } => format!("{value}"),
+                        _ => unreachable!("a grid holds numbers"),
+                    };
+                    (Change { path, value: OverrideValue::Expr(one) }, Some(text))
+                })
+                .collect(),
+        };
+        if out.len().saturating_mul(values.len()) > MOST_VARIANTS {
+            return vec![Vec::new(); MOST_VARIANTS + 1];
+        }
+        out = out
+            .iter()
+            .flat_map(|before| {
+                values
+                    .iter()
+                    .map(|value| before.iter().cloned().chain([value.clone()]).collect::<Vec<_>>())
+                    .collect::<Vec<_>>()
+            })
+            .collect();
+    }
+    out
+}
+
+/// `fr = LuGre(), k = 2 N/m`
+fn label(loaded: &Loaded, combination: &[(Change, Option<String>)]) -> String {
+    let one = |(change, text): &(Change, Option<String>)| {
+        let value = text.clone().unwrap_or_else(|| match change.value {
+            OverrideValue::Expr(expr) => loaded.files.slice(expr.span).to_string(),
+            OverrideValue::Instance(instance) => one_line(loaded.files.slice(instance.span)),
+        });
+        format!("{} = {value}", loaded.files.slice(change.path.span))
+    };
+    combination.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+/// The text on one line.
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Positions of an expectation's expressions among the observed ones.
+struct ExpectAt {
+    value: usize,
+    near: Option<(usize, usize)>,
+    after: Option<usize>,
+    before: Option<usize>,
+}
+
+#[allow(clippy::too_many_arguments)]
+fn variant(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    name: &str,
+    parts: &Parts,
+    prepared: Option<&Prepared>,
+    data: &[(String, Table, Unit)],
+    overrides: Vec<Override>,
+    given: &Given,
+    label: String,
+    warnings: &mut Vec<Diagnostic>,
+    on_stage: &mut dyn FnMut(&'static str),
+) -> Result<Variant, Vec<Diagnostic>> {
+    let root = loaded.root();
+    // Every expression of the experiment is read as one of the instance; then each is picked out again.
+    let mut observed: Vec<&Expr> = Vec::new();
+    let mut add = |expr| {
+        observed.push(expr);
+        observed.len() - 1
+    };
+    let duration = parts.run.duration.as_ref().map(&mut add);
+    let step = parts.solver.and_then(|s| s.step.as_ref()).map(&mut add);
+    let tol = parts.solver.and_then(|solver| solver.tol.as_ref()).map(&mut add);
+    let plots: Vec<(Vec<usize>, Option<usize>)> = parts
+        .plots
+        .iter()
+        .map(|plot| {
+            let shows = plot.shows.iter().map(|show| add(&show.value)).collect();
+            (shows, plot.against.as_ref().map(|show| add(&show.value)))
+        })
+        .collect();
+    let expects: Vec<ExpectAt> = parts
+        .expects
+        .iter()
+        .map(|expect| ExpectAt {
+            value: add(&expect.value),
+            near: expect.near.as_ref().map(|(target, tolerance)| (add(target), add(tolerance))),
+            after: expect.after.as_ref().map(&mut add),
+            before: expect.before.as_ref().map(&mut add),
+        })
+        .collect();
+    on_stage("flatten");
+    let mut diagnostics = Vec::new();
+    let (system, types, nodes, ports, cut) = match prepared {
+        Some(prepared) => {
+            let cut = rig::read(loaded, sources, prepared, overrides, observed, data.to_vec(), &mut diagnostics);
+            on_stage("check");
+            let Some(mut cut) = cut else { return Err(diagnostics) };
+            let system = std::mem::take(&mut cut.control);
+            let types = std::mem::take(&mut cut.control_types);
+            // What deserves a look is said of the rig, not of each of its experiments.
+            diagnostics.retain(Diagnostic::is_error);
+            (system, types, std::mem::take(&mut cut.observed), Opened::default(), Some(cut))
+        }
+        None => {
+            let instance = Instance::Written(&parts.run.instance, root);
+            let request = Request { instance, overrides, observed, data: data.to_vec(), frame: None };
+            let flat = flatten(loaded, sources, &request);
+            let mut system = flat.system;
+            diagnostics = flat.diagnostics;
+            start_values::open(&mut system, &given.vary);
+            let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
+            on_stage("check");
+            let types = units::check(&system, &loaded.files, &mut diagnostics);
+            if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
+                causality::check(&system, &loaded.files, &mut diagnostics);
+            }
+            if !diagnostics.iter().any(Diagnostic::is_error) {
+                parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
+                domains::check_given(&system, &types, &loaded.files, parts.run.instance.span, &mut diagnostics);
+            }
+            (system, types, flat.observed, ports.unwrap_or_default(), None)
+        }
+    };
+    // What rests on a declaration that could not be read has been reported with that.
+    let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
+    if lost && (cut.is_some() || nodes.is_empty() || system.nodes.iter().any(|node| matches!(node, Node::Error))) {
+        diagnostics.retain(Diagnostic::is_error);
+        return Err(diagnostics);
+    }
+    // What is wrong with the experiment alone does not hide what else is wrong with it.
+    if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
+        || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
+    {
+        return Err(diagnostics);
+    }
+    diagnostics.retain(|d| d.is_error() || !outside_of(parts.span, d));
+    let (places, vary) = (Vec::new(), &start_values::params(&system, &given.vary)[..]);
+    let mut reader =
+        Reader { loaded, system: &system, types: &types, diagnostics, wanted: Vec::new(), places, vary, expect: 0 };
+    if let Some(cut) = &cut {
+        reader.wanted = cut.wanted(&system);
+    }
+    let own = reader.wanted.len();
+
+    let corners = evaluate(&system, &types, &system.corners);
+    let duration = match (given.duration, duration) {
+        (Some(duration), _) => duration,
+        (None, Some(at)) => {
+            reader.places.push((Place::Duration, nodes[at]));
+            reader.time(nodes[at], "the duration")
+        }
+        (None, None) => match data.first().and_then(|(_, table, _)| table.x.last()) {
+            Some(end) => *end,
+            None => {
+                let error = Diagnostic::error("E0902", "how long does it run?")
+                    .label(parts.run.span, "no duration")
+                    .help("add `for 10 s`");
+                reader.diagnostics.push(error);
+                1.0
+            }
+        },
+    };
+    let solver = reader.solver(parts, given, step.map(|at| nodes[at]), tol.map(|at| nodes[at]));
+    let solver = match &cut {
+        Some(cut) => reader.between_ticks(parts, given, cut.period(), solver),
+        None => solver,
+    };
+    if cut.is_none() && solver.method != Method::Adaptive {
+        let at = step.map(|at| system.span(nodes[at]));
+        parameter_checks::whole_periods(&system, &types, solver.step, at, &mut reader.diagnostics);
+        delays::fits(&system, solver.step, at, &mut reader.diagnostics);
+        if duration / solver.step > MOST_STEPS {
+            let steps = units::three_digits(duration / solver.step);
+            let error = Diagnostic::error("E0902", format!("{steps} steps are too many"))
+                .label(parts.run.span, "so long a run with such short steps");
+            reader
+                .diagnostics
+                .push(error.help("run a shorter time or take longer steps: a trillion of them is the limit"));
+        }
+    }
+    let mut series_at: Vec<(Vec<usize>, Option<usize>)> = Vec::new();
+    for (plot, (shows, against)) in parts.plots.iter().zip(&plots) {
+        let shows = plot.shows.iter().zip(shows).map(|(show, at)| reader.show(show, nodes[*at])).collect();
+        let against = plot.against.as_ref().zip(*against).map(|(show, at)| reader.show(show, nodes[at]));
+        series_at.push((shows, against));
+    }
+    let mut expects_at = Vec::new();
+    for (k, (expect, at)) in parts.expects.iter().zip(&expects).enumerate() {
+        reader.expect = k;
+        expects_at.push(reader.expect(expect, at, &nodes, duration));
+    }
+    let ports_at: Vec<usize> = ports.outputs.iter().map(|(_, node)| reader.want(*node, None)).collect();
+    let (wanted, diagnostics) = (std::mem::take(&mut reader.wanted), std::mem::take(&mut reader.diagnostics));
+    let places = std::mem::take(&mut reader.places);
+    if diagnostics.iter().any(Diagnostic::is_error) {
+        return Err(diagnostics);
+    }
+    if loaded.has_errors() {
+        return Err(Vec::new()); // What could not be read has been reported, and left gaps.
+    }
+    warnings.extend(diagnostics);
+    on_stage("lower");
+    let lowered = lower(&system, &types, &wanted);
+    let description = &lowered.program.description;
+    let states = description.layout.states.len as usize;
+    let is_too_dense = states > MOST_DENSE && description.coupling.is_empty();
+    if cut.is_none() && solver.method == Method::Adaptive && is_too_dense {
+        let message =
+            format!("{states} states, of which each depends on many others, are too many for an adaptive run");
+        let error = Diagnostic::error("E0902", message).label(parts.run.span, "with so many states");
+        return Err(vec![error.help(format!(
+            "fixed steps take any number, for example `solver expo step 0.1 ms`; up to {MOST_DENSE} go adaptively"
+        ))]);
+    }
+    let mut rig = cut.map(|cut| cut.with_plant(&lowered, own));
+    let Lowered { mut program, observed: slots } = lowered;
+    program.description.name = one_line(loaded.files.slice(parts.run.instance.span));
+    for root in &mut program.description.roots {
+        root.text = surface_text(loaded, &root.text);
+    }
+    let mut adaptive = None;
+    match &mut rig {
+        Some((rig, plant)) => {
+            program.size_rings(rig.period_ns as f64 * 1e-9 / f64::from(rig.steps));
+            plant.size_rings(solver.step);
+        }
+        None if solver.method != Method::Adaptive => {
+            adaptive = (!is_too_dense).then(|| program.clone());
+            program.size_rings(solver.step);
+        }
+        None => {}
+    }
+    let series = |at: usize| plan::Series {
+        label: wanted[at].text.clone(),
+        slot: slots[at],
+        unit: wanted[at].unit.clone().unwrap_or_default(),
+        boolean: types.boolean[wanted[at].expr.0 as usize],
+    };
+    let plots = series_at
+        .iter()
+        .map(|(shows, against)| plan::Plot {
+            series: shows.iter().map(|at| series(*at)).collect(),
+            against: against.map(series),
+        })
+        .collect();
+    let expects = expects_at
+        .into_iter()
+        .flatten()
+        .map(|mut expect| {
+            for measure in &mut expect.measures {
+                let place = |slot: &mut abi::Slot| *slot = slots[slot.index()];
+                place(&mut measure.slot);
+                for edge in [&mut measure.window.after, &mut measure.window.before] {
+                    if let plan::Edge::First(slot) = edge {
+                        place(slot);
+                    }
+                }
+                if let MeasureKind::AtMoment(
+                    plan::Moment::First(slot)
+                    | plan::Moment::Rises(slot)
+                    | plan::Moment::Least(slot)
+                    | plan::Moment::Greatest(slot),
+                ) = &mut measure.kind
+                {
+                    place(slot);
+                }
+            }
+            expect
+        })
+        .collect();
+    let mut corners: Vec<f64> = corners.into_iter().filter(|t| *t > 0.0 && *t < duration).collect();
+    corners.sort_by(f64::total_cmp);
+    corners.dedup();
+    let stepped = parts.stepped;
+    let experiment =
+        plan::Experiment { name: name.to_string(), duration, solver, bench: None, plots, expects, corners, stepped };
+    let inputs = ports.inputs.iter().filter_map(|(path, moved)| {
+        let quantity = program.description.quantity(moved)?;
+        Some((path.clone(), quantity.slot))
+    });
+    let outputs = ports.outputs.iter().zip(ports_at).map(|((path, _), at)| (path.clone(), slots[at]));
+    let ports = (inputs.collect(), outputs.collect());
+    Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig })
+}
+
+/// The rig that an experiment runs, with its descriptions; none if it runs a model.
+fn rig_of(
+    loaded: &mut Loaded,
+    sources: &dyn Sources,
+    experiment: &str,
+    given: &Given,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Result<Option<Prepared>, Vec<Diagnostic>> {
+    let root = loaded.root();
+    let ast = loaded.files.get(root).ast.clone();
+    let run = ast.items.iter().find_map(|item| match item {
+        ast::Item::Experiment(one) if one.name.text == experiment => {
+            one.body.iter().find_map(|statement| match statement {
+                ExperimentStatement::Run(run) => Some(run),
+                _ => None,
+            })
+        }
+        _ => None,
+    });
+    let Some(run) = run.filter(|run| !run.instance.model.text.starts_with(|c: char| c.is_ascii_uppercase())) else {
+        return Ok(None);
+    };
+    let item = rig::find(loaded, root, &run.instance.model).map_err(|error| vec![error])?;
+    if run.instance.rotary {
+        let error =
+            Diagnostic::error("E0108", "a rig is what it is: `rotary` stands before the system in its own `run`")
+                .label(run.instance.span, "a rig");
+        diagnostics.push(error.help(format!("write `run {}()`", run.instance.model.text)));
+    }
+    if !given.vary.is_empty() || given.ports.is_some() {
+        let what = if given.ports.is_some() {
+            "a rig cannot be linearised as a whole yet"
+        } else {
+            "a rig cannot be varied yet"
+        };
+        let error = Diagnostic::error("E0905", what).label(run.instance.span, "a rig");
+        return Err(vec![error.help("for a few values write a `sweep` in the experiment")]);
+    }
+    Ok(Some(rig::prepare(loaded, sources, item)))
+}
+
+/// Whether what is said concerns something outside of a place.
+fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
+    let span = diagnostic.span();
+    span.file != place.file || span.start < place.start || span.end > place.end
+}
+
+/// The text of a surface from the place that stands for it.
+fn surface_text(loaded: &Loaded, place: &str) -> String {
+    let parse = || {
+        let (file, range) = place.split_once(':')?;
+        let (start, end) = range.split_once("..")?;
+        let file = FileId(file.parse().ok()?);
+        let span = Span::new(file, start.parse().ok()?, end.parse().ok()?);
+        Some(one_line(loaded.files.slice(span)))
+    };
+    parse().unwrap_or_else(|| place.to_string())
+}
+
+struct Reader<'a> {
+    loaded: &'a Loaded,
+    system: &'a System,
+    types: &'a Types,
+    diagnostics: Vec<Diagnostic>,
+    wanted: Vec<Wanted>,
+    places: Vec<(Place, ExprId)>,
+    /// Parameters that will change.
+    vary: &'a [String],
+    /// Number of the expectation that is read.
+    expect: usize,
+}
+
+impl Reader<'_> {
+    /// Whether the value changes with a parameter that does.
+    fn varies(&self, expr: ExprId) -> bool {
+        !self.vary.is_empty() && depends(self.system, expr, &|var| self.vary.contains(&var.path))
+    }
+
+    fn constant(&self, expr: ExprId) -> f64 {
+        self.system.literal(expr).unwrap_or_else(|| evaluate(self.system, self.types, &[expr])[0])
+    }
+
+    fn dimension(&self, expr: ExprId) -> Dimension {
+        self.types.nodes[expr.0 as usize].unwrap_or(Dimension::NONE)
+    }
+
+    /// A positive time known before the run.
+    fn time(&mut self, expr: ExprId, what: &str) -> f64 {
+        let value = self.constant(expr);
+        let seconds = Dimension::of([0, 0, 1, 0, 0]);
+        let span = self.system.span(expr);
+        if self.dimension(expr) != seconds && value != 0.0 {
+            let text = self.loaded.files.slice(span);
+            let error = match self.dimension(expr).is_none() {
+                true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                    .label(span, "a pure number")
+                    .help(format!("write `{text} s`")),
+                false => {
+                    Diagnostic::error("E0101", format!("{what} is a time, not {}", self.dimension(expr).describe()))
+                        .label(span, Unit::si(self.dimension(expr)).to_string())
+                }
+            };
+            self.diagnostics.push(error);
+            return 1.0;
+        }
+        if !(value.is_finite() && value > 0.0) {
+            let error = Diagnostic::error("E0902", format!("{what} must be positive and known before the run"))
+                .label(span, if value.is_nan() { "not constant".to_string() } else { format!("{value} s") });
+            self.diagnostics.push(error.help("write a time, such as `10 s`"));
+            return 1.0;
+        }
+        value
+    }
+
+    fn solver(&mut self, parts: &Parts, given: &Given, step: Option<ExprId>, tol: Option<ExprId>) -> Solver {
+        let written = parts.solver.and_then(|solver| {
+            let method = Method::named(&solver.method.text);
+            if method.is_none() {
+                let names: Vec<&str> = Method::ALL.iter().map(|method| method.name()).collect();
+                let error = Diagnostic::error("E0201", format!("there is no solver `{}`", solver.method.text))
+                    .label(solver.method.span, "not known");
+                self.diagnostics.push(error.help(format!("solvers are {}", names.join(", "))));
+            }
+            method
+        });
+        let method = given.method.or(written).unwrap_or(Method::Adaptive);
+        if let (None, Some(step)) = (given.step, step) {
+            self.places.push((Place::Step, step));
+        }
+        let step = given.step.or_else(|| step.map(|step| self.time(step, "the step")));
+        if let (None, Some(tol)) = (given.tol, tol) {
+            self.places.push((Place::Tolerance, tol));
+        }
+        let tol = given.tol.or_else(|| tol.map(|tol| self.constant(tol))).unwrap_or(DEFAULT_TOL);
+        if !(tol > 0.0 && tol < 1.0) {
+            let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+            let error =
+                Diagnostic::error("E0502", format!("a tolerance of {tol} is out of range")).label(span, "tolerance");
+            self.diagnostics.push(error.help("it lies between 0 and 1, such as `tol 1e-8`"));
+        }
+        match method {
+            Method::Adaptive => Solver { method, step: 0.0, tol, parts: PARTS },
+            _ => Solver { method, step: step.unwrap_or(DEFAULT_STEP), tol, parts: PARTS },
+        }
+    }
+
+    /// How the crossed-out part of a rig is stepped between ticks: by a fixed method whose step divides the period.
+    fn between_ticks(&mut self, parts: &Parts, given: &Given, period: f64, solver: Solver) -> Solver {
+        let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), ..solver };
+        if given.method.is_none() && parts.solver.is_none() {
+            return match given.step {
+                Some(step) => self.divides(parts, period, Solver { step, ..usual }),
+                None => usual,
+            };
+        }
+        let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+        match solver.method {
+            Method::Adaptive => {
+                let error = Diagnostic::error("E0905", "between the ticks of a rig, steps have a fixed length")
+                    .label(span, "takes as many as it needs");
+                self.diagnostics
+                    .push(error.help("write `solver rk4 step 10 us`, or leave it out for 50 steps of `expo`"));
+                usual
+            }
+            _ => self.divides(parts, period, solver),
+        }
+    }
+
+    fn divides(&mut self, parts: &Parts, period: f64, solver: Solver) -> Solver {
+        let ratio = period / solver.step;
+        if (ratio - ratio.round()).abs() > 1e-9 * ratio || !(1.0..=1e5).contains(&ratio.round()) {
+            let span = parts.solver.map_or(parts.run.span, |solver| solver.span);
+            let error = Diagnostic::error("E0701", "the step between ticks does not divide the period of the rig")
+                .label(span, format!("{} steps in {} s", units::three_digits(ratio), period));
+            self.diagnostics.push(error.help("take a step that divides it, such as `step 20 us` of 1 ms"));
+        }
+        solver
+    }
+
+    /// Wants an expression; returns its number.
+    fn want(&mut self, expr: ExprId, unit: Option<Unit>) -> usize {
+        let text = one_line(self.loaded.files.slice(self.system.span(expr)));
+        let unit = unit.or_else(|| Some(self.own_unit(expr)));
+        self.wanted.push(Wanted { expr, text, unit });
+        self.wanted.len() - 1
+    }
+
+    /// The unit in which an expression is shown if nobody says: that of a plain quantity, else SI.
+    fn own_unit(&self, expr: ExprId) -> Unit {
+        match self.system.node(expr) {
+            Node::Var(id) => self.types.units[id.0 as usize].clone(),
+            Node::Time => Unit::parse("s").expect("the second is known"),
+            Node::Call(Builtin::Abs, args) => self.own_unit(args[0]),
+            Node::Negate(a) => self.own_unit(*a),
+            Node::Table(table, _) => Unit::si(self.system.tables[*table as usize].y_dimension),
+            Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
+                let (a, b) = (self.own_unit(*a), self.own_unit(*b));
+                if a == b { a } else { Unit::si(self.dimension(expr)) }
+            }
+            _ if self.types.boolean[expr.0 as usize] => Unit::none(),
+            _ => Unit::si(self.dimension(expr)),
+        }
+    }
+
+    /// The unit that is written for what is shown, if it suits.
+    fn unit_for(&mut self, expr: ExprId, text: &ast::UnitText) -> Option<Unit> {
+        match Unit::parse(&text.text) {
+            Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
+            Ok(unit) => {
+                let message = format!("this is {}, it cannot be shown in {unit}", self.dimension(expr).describe());
+                let error = Diagnostic::error("E0101", message)
+                    .label(text.span, unit.dimension.describe())
+                    .label(self.system.span(expr), Unit::si(self.dimension(expr)).to_string());
+                self.diagnostics.push(error.help("give it a unit of its own kind"));
+                None
+            }
+            Err(part) => {
+                let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                self.diagnostics.push(error);
+                None
+            }
+        }
+    }
+
+    /// The unit of a side of a comparison: that of the measure that it is made of, else SI.
+    fn side_unit(&self, id: ExprId) -> Unit {
+        let boolean = self.types.boolean[id.0 as usize];
+        let otherwise = || if boolean { Unit::none() } else { Unit::si(self.dimension(id)) };
+        self.unit_of_measures(id).unwrap_or_else(otherwise)
+    }
+
+    /// The unit of a measure, of its multiples, and of sums of measures in one unit.
+    fn unit_of_measures(&self, id: ExprId) -> Option<Unit> {
+        let number =
+            |id: &ExprId| matches!(self.system.node(*id), Node::Number { .. }) && self.dimension(*id).is_none();
+        match self.system.node(id) {
+            Node::Measure(name, value, ..) => Some(self.measure_unit(*name, id, *value)),
+            Node::Negate(a) => self.unit_of_measures(*a),
+            Node::Call(Builtin::Abs, args) => self.unit_of_measures(args[0]),
+            Node::Binary(BinaryOp::Multiply, a, b) if number(a) => self.unit_of_measures(*b),
+            Node::Binary(BinaryOp::Multiply | BinaryOp::Divide, a, b) if number(b) => self.unit_of_measures(*a),
+            Node::Binary(BinaryOp::Add | BinaryOp::Subtract, a, b) => {
+                self.unit_of_measures(*a).filter(|unit| self.unit_of_measures(*b).as_ref() == Some(unit))
+            }
+            _ => None,
+        }
+    }
+
+    fn show(&mut self, show: &ast::Show, expr: ExprId) -> usize {
+        let unit = show.unit.as_ref().and_then(|text| self.unit_for(expr, text));
+        if let Node::Measure(..) = self.system.node(expr) {
+            let error = Diagnostic::error("E0901", "a measure belongs in `expect`, not in `plot`")
+                .label(self.system.span(expr), "one number for the whole run");
+            self.diagnostics.push(error);
+        }
+        self.want(expr, unit)
+    }
+
+    fn expect(&mut self, expect: &ast::Expect, at: &ExpectAt, nodes: &[ExprId], duration: f64) -> Option<plan::Expect> {
+        let text = self.loaded.files.slice(expect.span);
+        let text = one_line(text.strip_prefix("expect").or(text.strip_prefix("show")).unwrap_or(text));
+        let mut measures = Vec::new();
+        let value = self.formula(nodes[at.value], &mut measures)?;
+        let condition = match at.near {
+            None if expect.shows.is_some() => {
+                let unit = expect.shows.as_ref().and_then(Option::as_ref);
+                let unit = match unit {
+                    Some(text) => self.unit_for(nodes[at.value], text)?,
+                    None => self.side_unit(nodes[at.value]),
+                };
+                Formula::Shown(unit, Box::new(value))
+            }
+            None => {
+                if !self.types.boolean[nodes[at.value].0 as usize] {
+                    let error = Diagnostic::error("E0901", "an expectation is a condition")
+                        .label(self.system.span(nodes[at.value]), "neither true nor false");
+                    let window = self.window_first(expect);
+                    self.diagnostics.push(match window {
+                        Some(help) => error.help(help),
+                        None => error.help("compare it: `expect max(F) < 2 N`, `expect final(x) ~= 1 m +- 1 %`"),
+                    });
+                    return None;
+                }
+                value
+            }
+            Some((target, tolerance)) => {
+                let (value_node, target_node, tolerance_node) = (nodes[at.value], nodes[target], nodes[tolerance]);
+                let relative = self.loaded.files.slice(self.system.span(tolerance_node)).trim_end().ends_with('%');
+                let any = |node: ExprId| matches!(self.system.node(node), Node::Number { dimension: None, .. });
+                for (node, skip) in [(target_node, false), (tolerance_node, relative)] {
+                    if !skip && !any(node) && self.dimension(node) != self.dimension(value_node) {
+                        let (found, wanted) = (self.dimension(node), self.dimension(value_node));
+                        let text = self.loaded.files.slice(self.system.span(node));
+                        let error = match found.is_none() {
+                            true => Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                                .label(self.system.span(node), "a pure number")
+                                .help(format!("write `{text} {}`", Unit::si(wanted))),
+                            false => {
+                                let message = format!("cannot compare {} with {}", wanted.describe(), found.describe());
+                                Diagnostic::error("E0101", message)
+                                    .label(self.system.span(node), Unit::si(found).to_string())
+                                    .label(self.system.span(value_node), Unit::si(wanted).to_string())
+                            }
+                        };
+                        self.diagnostics.push(error);
+                        return None;
+                    }
+                }
+                let target = self.formula(target_node, &mut measures)?;
+                let tolerance = self.formula(tolerance_node, &mut measures)?;
+                let (value, target, tolerance) = (Box::new(value), Box::new(target), Box::new(tolerance));
+                self.shown_in(value_node, target_node, Formula::Near { value, target, tolerance, relative })
+            }
+        };
+        for (at, place) in [(at.after, Place::After(self.expect)), (at.before, Place::Before(self.expect))] {
+            self.places.extend(at.map(|at| (place, nodes[at])));
+        }
+        let mut edge = |at: Option<usize>, default: f64| match at {
+            Some(at) if self.constant(nodes[at]) == 0.0 => 0.0,
+            Some(at) => self.time(nodes[at], "a window"),
+            None => default,
+        };
+        let (after, before) = (edge(at.after, 0.0), edge(at.before, duration).min(duration));
+        if after > before || (after == before && after > 0.0 && at.after.is_some() && after > duration) {
+            let error = Diagnostic::error("E0902", "the window of this expectation is empty")
+                .label(expect.span, format!("from {after} s to {before} s"))
+                .help(format!("the run takes {duration} s"));
+            self.diagnostics.push(error);
+            return None;
+        }
+        Some(plan::Expect { text, measures, condition, after, before })
+    }
+
+    /// `expect max(x) after 5 s < 1 m`: the window comes before the comparison. The expectation as it should be.
+    fn window_first(&mut self, expect: &ast::Expect) -> Option<String> {
+        let compares =
+            |op| matches!(op, BinaryOp::Less | BinaryOp::LessEqual | BinaryOp::Greater | BinaryOp::GreaterEqual);
+        let compared = |edge: &&Expr| matches!(&edge.kind, ast::ExprKind::Binary(op, ..) if compares(*op));
+        let (word, edge) = match (expect.after.as_ref().filter(compared), expect.before.as_ref().filter(compared)) {
+            (Some(edge), _) => ("after", edge),
+            (None, Some(edge)) => ("before", edge),
+            (None, None) => return None,
+        };
+        let ast::ExprKind::Binary(op, _, time, limit) = &edge.kind else { return None };
+        // That a time is compared with something else is the same mistake.
+        let edge = edge.span;
+        self.diagnostics.retain(|d| d.span().start < edge.start || d.span().end > edge.end);
+        let [value, time, limit] = [expect.value.span, time.span, limit.span].map(|span| self.loaded.files.slice(span));
+        Some(format!("the window comes after the comparison: `expect {value} {} {limit} {word} {time}`", op.text()))
+    }
+
+    /// Arithmetic over measures. The slot of a measure is the number of what it measures among the wanted ones.
+    fn formula(&mut self, id: ExprId, measures: &mut Vec<plan::Measure>) -> Option<Formula> {
+        let node = self.system.node(id).clone();
+        if !self.measured(id) {
+            if self.types.boolean[id.0 as usize] {
+                if let Node::Binary(op, a, b) = node
+                    && !matches!(op, BinaryOp::And | BinaryOp::Or)
+                {
+                    let (a, b) = (self.formula(a, measures)?, self.formula(b, measures)?);
+                    return Some(compare(op, a, b));
+                }
+                // A condition without a measure is its value at the end.
+                return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
+            }
+            if let Some(value) = self.system.literal(id) {
+                return Some(Formula::Number(value));
+            }
+            if self.varies(id) {
+                // It is constant in a run, but not the same in each.
+                return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
+            }
+            let value = self.constant(id);
+            if !value.is_nan() {
+                return Some(Formula::Number(value));
+            }
+            let text = one_line(self.loaded.files.slice(self.system.span(id)));
+            let error = Diagnostic::error("E0901", format!("`{text}` changes during the run: which value is meant?"))
+                .label(self.system.span(id), "not a measure")
+                .help(format!("write `final({text})`, `max({text})`, `at({text}, 1 s)` or another measure"));
+            self.diagnostics.push(error);
+            return None;
+        }
+        let pair = |reader: &mut Self, a, b, measures: &mut Vec<plan::Measure>| {
+            Some((Box::new(reader.formula(a, measures)?), Box::new(reader.formula(b, measures)?)))
+        };
+        match node {
+            Node::Measure(name, value, second, window) => {
+                let moment = match second {
+                    Some(second) if self.measured(second) => Some(self.moment(second)?),
+                    _ => None,
+                };
+                if let Some(second) = second.filter(|_| moment.is_none()) {
+                    self.places.push((Place::Second(self.expect, measures.len()), second));
+                }
+                let second = second.map(|second| if moment.is_some() { f64::NAN } else { self.constant(second) });
+                if second.is_some_and(f64::is_nan) && moment.is_none() {
+                    return self.unknown_before(id);
+                }
+                let after = window.after.map(|edge| self.edge(edge, Place::MeasureAfter(self.expect, measures.len())));
+                let before = window.before.map(|e| self.edge(e, Place::MeasureBefore(self.expect, measures.len())));
+                let open = || Some(plan::Edge::Open);
+                let window = plan::Window { after: after.unwrap_or_else(open)?, before: before.unwrap_or_else(open)? };
+                if name == MeasureName::Time {
+                    return match *self.system.node(value) {
+                        Node::Measure(MeasureName::Peak, of, Some(number), inner) if inner == Window::default() => {
+                            self.places.push((Place::Second(self.expect, measures.len()), number));
+                            let kind = MeasureKind::TimeOfPeak(self.number_of_peak(number)?);
+                            Some(self.measure(id, of, kind, window, measures))
+                        }
+                        Node::Measure(MeasureName::Max, of, None, inner) if inner == Window::default() => {
+                            Some(self.measure(id, of, MeasureKind::TimeOfGreatest, window, measures))
+                        }
+                        Node::Measure(MeasureName::Min, of, None, inner) if inner == Window::default() => {
+                            Some(self.measure(id, of, MeasureKind::TimeOfLeast, window, measures))
+                        }
+                        _ => {
+                            let error = Diagnostic::error(
+                                "E0901",
+                                "`time` is of an extremum: `time(max(x))`, `time(min(x))`, `time(peak(x, 2))`",
+                            )
+                            .label(self.system.span(value), "happens at no one instant");
+                            let help = "a window stands in `time` itself: `time(max(x) after 1 s)`; when a condition first holds is `first(x > 0)`";
+                            self.diagnostics.push(error.help(help));
+                            None
+                        }
+                    };
+                }
+                let kind = match name {
+                    MeasureName::Min => MeasureKind::Min,
+                    MeasureName::Max => MeasureKind::Max,
+                    MeasureName::Mean => MeasureKind::Mean,
+                    MeasureName::Rms => MeasureKind::Rms,
+                    MeasureName::Integral => MeasureKind::Integral,
+                    MeasureName::Final => MeasureKind::Final,
+                    MeasureName::PeakToPeak => MeasureKind::PeakToPeak,
+                    MeasureName::Crossings => MeasureKind::Crossings,
+                    MeasureName::Period => MeasureKind::Period,
+                    MeasureName::First => MeasureKind::First,
+                    MeasureName::Rises => MeasureKind::Rises,
+                    MeasureName::Turns => MeasureKind::Turns,
+                    MeasureName::Time => unreachable!("it is of a measure"),
+                    MeasureName::Count => MeasureKind::Count,
+                    MeasureName::CountRises => MeasureKind::CountRises,
+                    MeasureName::CountTurns => MeasureKind::CountTurns,
+                    MeasureName::Duration => MeasureKind::Duration,
+                    MeasureName::Peaks => MeasureKind::Peaks,
+                    MeasureName::Peak if moment.is_some() => return self.unknown_before(id),
+                    MeasureName::Peak => {
+                        let Node::Measure(_, _, Some(number), _) = *self.system.node(id) else { unreachable!() };
+                        MeasureKind::Peak(self.number_of_peak(number)?)
+                    }
+                    MeasureName::At if moment.is_some() => MeasureKind::AtMoment(moment?),
+                    MeasureName::At => MeasureKind::At(second.expect("`at` has two arguments")),
+                    MeasureName::Settling => MeasureKind::Settling(second.expect("`settling` has two arguments")),
+                };
+                if self.measured(value) {
+                    let error = Diagnostic::error("E0901", "a measure of a measure")
+                        .label(self.system.span(id), "the inner one is a single number already");
+                    self.diagnostics.push(error);
+                    return None;
+                }
+                Some(self.measure(id, value, kind, window, measures))
+            }
+            Node::Negate(a) => Some(Formula::Negate(Box::new(self.formula(a, measures)?))),
+            Node::Not(a) => Some(Formula::Not(Box::new(self.formula(a, measures)?))),
+            Node::Binary(op, left, right) => {
+                let (a, b) = pair(self, left, right, measures)?;
+                Some(match op {
+                    BinaryOp::Add => Formula::Add(a, b),
+                    BinaryOp::Subtract => Formula::Subtract(a, b),
+                    BinaryOp::Multiply => Formula::Multiply(a, b),
+                    BinaryOp::Divide => Formula::Divide(a, b),
+                    BinaryOp::And => Formula::And(a, b),
+                    BinaryOp::Or => Formula::Or(a, b),
+                    BinaryOp::Power => {
+                        let alone = Alone::binary(Binary::Pow);
+                        let at = Arc::new(move |x: f64, y: f64| alone.of_both(x, y));
+                        Formula::Function(plan::Elementary { name: "^", at }, vec![*a, *b])
+                    }
+                    op => self.shown_in(left, right, compare(op, *a, *b)),
+                })
+            }
+            Node::Call(Builtin::Abs, args) => Some(Formula::Abs(Box::new(self.formula(args[0], measures)?))),
+            Node::Call(Builtin::Sqrt, args) => Some(Formula::Sqrt(Box::new(self.formula(args[0], measures)?))),
+            Node::Call(builtin, args) if elementary(builtin).is_some() => {
+                let (name, function) = elementary(builtin)?;
+                let alone = Alone::unary(function);
+                let at = Arc::new(move |x: f64, _: f64| alone.at(x));
+                Some(Formula::Function(plan::Elementary { name, at }, vec![self.formula(args[0], measures)?]))
+            }
+            Node::Call(Builtin::Min, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Min(a, b)),
+            Node::Call(Builtin::Max, args) => pair(self, args[0], args[1], measures).map(|(a, b)| Formula::Max(a, b)),
+            _ => {
+                let error = Diagnostic::error("E0901", "this cannot be computed from measures")
+                    .label(self.system.span(id), "not arithmetic")
+                    .help("use + - * / ^ abs sqrt min max exp log sin cos tan and the like, and comparisons, around measures");
+                self.diagnostics.push(error);
+                None
+            }
+        }
+    }
+
+    fn measure(
+        &mut self,
+        whole: ExprId,
+        value: ExprId,
+        kind: MeasureKind,
+        window: plan::Window,
+        measures: &mut Vec<plan::Measure>,
+    ) -> Formula {
+        let text = one_line(self.loaded.files.slice(self.system.span(whole)));
+        let unit = match self.system.node(whole) {
+            Node::Measure(name, ..) => self.measure_unit(*name, whole, value),
+            // A condition that is measured at the end.
+            _ => self.own_unit(value),
+        };
+        let at = self.want(value, None);
+        measures.push(plan::Measure { text, kind, slot: abi::Slot(at as u32), unit, window });
+        Formula::Measure(measures.len() - 1)
+    }
+
+    /// An instant that only the run shows, for `at(x, …)`.
+    fn moment(&mut self, id: ExprId) -> Option<plan::Moment> {
+        let node = self.system.node(id).clone();
+        let inner = match node {
+            Node::Measure(MeasureName::Time, of, None, Window { after: None, before: None }) => {
+                self.system.node(of).clone()
+            }
+            ref other => other.clone(),
+        };
+        let is_time = matches!(node, Node::Measure(MeasureName::Time, ..));
+        match inner {
+            Node::Measure(name, of, None, Window { after: None, before: None }) if !self.measured(of) => {
+                let make = match (name, is_time) {
+                    (MeasureName::First, false) => plan::Moment::First,
+                    (MeasureName::Rises, false) => plan::Moment::Rises,
+                    (MeasureName::Max, true) => plan::Moment::Greatest,
+                    (MeasureName::Min, true) => plan::Moment::Least,
+                    _ => return self.unknown_before(id),
+                };
+                Some(make(abi::Slot(self.want(of, None) as u32)))
+            }
+            _ => self.unknown_before(id),
+        }
+    }
+
+    /// An end of a measure's window: a time, or the first instant of a condition.
+    fn edge(&mut self, id: ExprId, place: Place) -> Option<plan::Edge> {
+        match *self.system.node(id) {
+            Node::Measure(MeasureName::First, of, None, Window { after: None, before: None }) if !self.measured(of) => {
+                Some(plan::Edge::First(abi::Slot(self.want(of, None) as u32)))
+            }
+            _ if self.measured(id) => self.unknown_before(id),
+            _ => {
+                self.places.push((place, id));
+                let time = if self.constant(id) == 0.0 { 0.0 } else { self.time(id, "a window") };
+                Some(plan::Edge::At(time))
+            }
+        }
+    }
+
+    /// Which peak is meant.
+    fn number_of_peak(&mut self, id: ExprId) -> Option<f64> {
+        let number = self.constant(id);
+        if is_number_of_peak(number) {
+            return Some(number);
+        }
+        let error = Diagnostic::error("E0901", "peaks have the numbers 1, 2, 3 and so on")
+            .label(self.system.span(id), if number.is_nan() { "not constant".to_string() } else { format!("{number}") })
+            .help("write `peak(x, 1)` for the first one; `peaks(x)` is how many there are");
+        self.diagnostics.push(error);
+        None
+    }
+
+    fn unknown_before<T>(&mut self, id: ExprId) -> Option<T> {
+        let error = Diagnostic::error("E0901", "this instant or window is not known before the run")
+            .label(self.system.span(id), "follows from the run");
+        let help =
+            "a time such as `1 s`, `first(v > 0)` or, in `at`, `time(max(x))` can stand here, each without a window";
+        self.diagnostics.push(error.help(help));
+        None
+    }
+
+    /// A comparison, to be shown in the unit of a quantity written on one of its sides, else in that of a measure that is a
+    /// whole side, else in SI.
+    fn shown_in(&self, left: ExprId, right: ExprId, comparison: Formula) -> Formula {
+        let dimension = self.dimension(left);
+        let written = |id: ExprId| {
+            let text = self.loaded.files.slice(self.system.span(id));
+            let unit = text.trim_start_matches(|c: char| c.is_ascii_digit() || "+-. ".contains(c));
+            // `5e-4 m`: what the exponent leaves is no unit, and the unit stands after the last blank.
+            let unit = if unit.starts_with(['e', 'E']) { unit.rsplit(' ').next().unwrap_or(unit) } else { unit };
+            let number = matches!(self.system.node(id), Node::Number { .. } | Node::Negate(_));
+            Unit::parse(unit.trim()).ok().filter(|unit| number && !unit.text.is_empty() && unit.dimension == dimension)
+        };
+        let measure = |id: ExprId| self.unit_of_measures(id);
+        let unit = written(right).or(written(left)).or(measure(left)).or(measure(right));
+        let boolean = self.types.boolean[left.0 as usize];
+        let unit = unit.unwrap_or_else(|| if boolean { Unit::none() } else { Unit::si(dimension) });
+        Formula::In(unit, Box::new(comparison))
+    }
+
+    /// The unit in which a measure is shown.
+    fn measure_unit(&self, name: MeasureName, whole: ExprId, value: ExprId) -> Unit {
+        match name {
+            // An energy and no torque, which has the same dimension.
+            MeasureName::Integral if Unit::si(self.dimension(value)).text == "W" => {
+                Unit::parse("J").expect("the joule is known")
+            }
+            MeasureName::Integral => Unit::si(self.dimension(whole)),
+            MeasureName::Crossings
+            | MeasureName::Count
+            | MeasureName::CountRises
+            | MeasureName::CountTurns
+            | MeasureName::Peaks => Unit::none(),
+            MeasureName::Duration
+            | MeasureName::Period
+            | MeasureName::Settling
+            | MeasureName::First
+            | MeasureName::Rises
+            | MeasureName::Turns
+            | MeasureName::Time => Unit::parse("s").expect("the second is known"),
+            MeasureName::Min
+            | MeasureName::Max
+            | MeasureName::Mean
+            | MeasureName::Rms
+            | MeasureName::Final
+            | MeasureName::At
+            | MeasureName::Peak
+            | MeasureName::PeakToPeak => self.own_unit(value),
+        }
+    }
+
+    fn measured(&self, id: ExprId) -> bool {
+        let node = self.system.node(id);
+        matches!(node, Node::Measure(..)) || node.operands().any(|operand| self.measured(operand))
+    }
+}
+
+/// Whether a peak can have this number.
+pub fn is_number_of_peak(number: f64) -> bool {
+    number >= 1.0 && number.fract() == 0.0 && number < 1e9
+}
+
+/// Whether an expression depends on a quantity for which `of` is true.
+pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool {
+    let mut seen = std::collections::HashSet::new();
+    let mut stack = vec![expr];
+    while let Some(id) = stack.pop() {
+        if !seen.insert(id) {
+            continue;
+        }
+        if let Node::Var(var) = system.node(id) {
+            let var = system.var(*var);
+            if of(var) {
+                return true;
+            }
+            match var.definition {
+                Definition::Value(value, _) | Definition::Held { value, .. } => stack.push(value),
+                Definition::Continuous { initial, rate, .. } => stack.extend([initial, rate]),
+                Definition::Sampled { initial, next, .. } => stack.extend([initial, next]),
+                Definition::Missing | Definition::Free => {}
+            }
+        }
+        stack.extend(system.node(id).operands());
+    }
+    false
+}
+
+/// The elementary function of one number that a built-in one is, with its name.
+fn elementary(builtin: Builtin) -> Option<(&'static str, Unary)> {
+    Some(match builtin {
+        Builtin::Exp => ("exp", Unary::Exp),
+        Builtin::Expm1 => ("expm1", Unary::Expm1),
+        Builtin::Log => ("log", Unary::Log),
+        Builtin::Log1p => ("log1p", Unary::Log1p),
+        Builtin::Sin => ("sin", Unary::Sin),
+        Builtin::Cos => ("cos", Unary::Cos),
+        Builtin::Tan => ("tan", Unary::Tan),
+        Builtin::Asin => ("asin", Unary::Asin),
+        Builtin::Acos => ("acos", Unary::Acos),
+        Builtin::Atan => ("atan", Unary::Atan),
+        Builtin::Sinh => ("sinh", Unary::Sinh),
+        Builtin::Cosh => ("cosh", Unary::Cosh),
+        Builtin::Tanh => ("tanh", Unary::Tanh),
+        _ => return None,
+    })
+}
+
+fn compare(op: BinaryOp, a: Formula, b: Formula) -> Formula {
+    let (a, b) = (Box::new(a), Box::new(b));
+    match op {
+        BinaryOp::Less => Formula::Less(a, b),
+        BinaryOp::LessEqual => Formula::LessEqual(a, b),
+        BinaryOp::Greater => Formula::Greater(a, b),
+        BinaryOp::GreaterEqual => Formula::GreaterEqual(a, b),
+        BinaryOp::NotEqual => Formula::Not(Box::new(equal(a, b))),
+        _ => equal(a, b),
+    }
+}
+
+fn equal(a: Box<Formula>, b: Box<Formula>) -> Formula {
+    Formula::Near { value: a, target: b, tolerance: Box::new(Formula::Number(0.0)), relative: false }
+}

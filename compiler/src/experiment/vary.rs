@@ -1,0 +1,390 @@
+//! Runs of one compiled experiment under other parameters.
+//!
+//! In: an experiment that was read with the paths of the parameters that will change. Out: for given values an instance
+//! and a plan, or what the values break. What of a plan follows from parameters is computed anew: duration, windows,
+//! corners, declared ranges and whatever `require` demands. Only code is made once.
+
+use crate::experiment::start_values;
+use crate::experiment::{Place, Variant, depends, is_number_of_peak};
+use crate::frontend::source::Files;
+use crate::frontend::system::*;
+use crate::ir::Func;
+use crate::ir::interpret::run_once;
+use crate::lower::formulas;
+use crate::ranges::reach::{greatest, least};
+use abi::description::{Guard, Kind, Quantity};
+use abi::lanes::Lanes;
+use abi::live::is_multiple;
+use abi::plan::{Edge, Expect, Experiment, Formula, Measure, MeasureKind, Method, Plot, Window};
+use abi::table::Code;
+use abi::unit::Unit;
+use abi::{Description, Instance, Slot};
+use grammar::diagnostic::Diagnostic;
+use std::sync::Arc;
+
+/// A compiled experiment with parameters that change from run to run.
+pub struct Varying {
+    /// What sets this combination of the experiment's own sweeps apart.
+    pub label: String,
+    /// The plan with the parameters as written.
+    pub experiment: Experiment,
+    /// What the experiment shows.
+    pub plots: Vec<Plot>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+    description: Arc<Description>,
+    params: Vec<f64>,
+    code: Code,
+    lanes: Option<Lanes>,
+    adaptive: Option<Arc<Instance>>,
+    formulas: Func,
+    size: usize,
+    /// What the values of the formulas are for, in their order.
+    uses: Vec<Use>,
+    /// Expectations of the experiment; those behind them watch ranges.
+    expects: usize,
+}
+
+/// What a value is for.
+enum Use {
+    Plan(Place),
+    Corner,
+    /// A bound of a quantity: its number in the description; upper or not.
+    Bound(usize, bool),
+    /// A parameter with its bounds, which are the next values: path, unit, lower and upper, strict or not.
+    Range {
+        path: String,
+        unit: Unit,
+        low: Option<bool>,
+        high: Option<bool>,
+    },
+    /// What a range consists of.
+    Limit,
+    /// What must not be 0, and what to say if it is.
+    Require(String),
+    /// A period in s.
+    Period,
+}
+
+/// What was compiled of an experiment.
+pub struct Runnable {
+    /// Its code.
+    pub code: Code,
+    /// The same for many runs at once, if there is such.
+    pub lanes: Option<Lanes>,
+    /// Of fixed steps the same program for adaptive runs, if there is such.
+    pub adaptive: Option<Arc<Instance>>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// What a run needs.
+pub struct Fitted {
+    /// With its parameters.
+    pub instance: Instance,
+    /// Its plan.
+    pub experiment: Experiment,
+}
+
+impl Varying {
+    /// From what was read, and its code.
+    pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
+        let Runnable { code, lanes, adaptive, notes } = runnable;
+        let Variant { label, system, types, program, mut experiment, places, .. } = variant;
+        let varies = |expr: ExprId| depends(&system, expr, &|var| vary.contains(&var.path));
+        let (mut exprs, mut uses) = (Vec::new(), Vec::new());
+        for (place, expr) in places {
+            if varies(expr) {
+                exprs.push(expr);
+                uses.push(Use::Plan(place));
+            }
+        }
+        if system.corners.iter().any(|corner| varies(*corner)) {
+            exprs.extend(&system.corners);
+            uses.extend(system.corners.iter().map(|_| Use::Corner));
+        }
+        for (k, quantity) in program.description.quantities.iter().enumerate() {
+            let Some(var) = system.vars.iter().find(|var| var.path == quantity.path) else { continue };
+            for (bound, high) in [(var.range.low, false), (var.range.high, true)] {
+                if let Some((bound, _)) = bound.filter(|(bound, _)| varies(*bound)) {
+                    exprs.push(bound);
+                    uses.push(Use::Bound(k, high));
+                }
+            }
+        }
+        for (var, unit) in system.vars.iter().zip(&types.units) {
+            let value = match (&var.definition, var.kind) {
+                (Definition::Value(value, _), VarKind::Param) => *value,
+                (Definition::Continuous { initial, .. } | Definition::Sampled { initial, .. }, _) => *initial,
+                _ => continue,
+            };
+            let bounds = [var.range.low, var.range.high];
+            let touched = vary.contains(&var.path) || varies(value);
+            if bounds.iter().all(Option::is_none) || !(touched || bounds.iter().flatten().any(|(b, _)| varies(*b))) {
+                continue;
+            }
+            exprs.push(value);
+            let [low, high] = bounds.map(|bound| bound.map(|(_, strict)| strict));
+            uses.push(Use::Range { path: var.path.clone(), unit: unit.clone(), low, high });
+            for (bound, _) in bounds.into_iter().flatten() {
+                exprs.push(bound);
+                uses.push(Use::Limit);
+            }
+        }
+        for require in system.requires.iter().filter(|require| varies(require.condition)) {
+            exprs.push(require.condition);
+            let owner = &system.instance(require.instance).path;
+            let owner = if owner.is_empty() { String::new() } else { format!("{owner}: ") };
+            let condition = || format!("requires {}", files.slice(require.span));
+            uses.push(Use::Require(format!("{owner}{}", require.message.clone().unwrap_or_else(condition))));
+        }
+        let fixed = experiment.solver.method != Method::Adaptive;
+        let step_varies = uses.iter().any(|one| matches!(one, Use::Plan(Place::Step)));
+        for block in system.blocks.iter().filter(|block| varies(block.period) || fixed && step_varies) {
+            exprs.push(block.period);
+            uses.push(Use::Period);
+        }
+        let (formulas, size) = formulas(&system, &types, &exprs);
+        let expects = experiment.expects.len();
+        let plots = std::mem::take(&mut experiment.plots);
+        if experiment.solver.method != Method::Adaptive {
+            // The code of a fixed step holds ranges as they are written: `in_code` took out those that change.
+            let guarded = uses.iter().filter_map(|one| match one {
+                Use::Bound(k, _) => Some(&program.description.quantities[*k]),
+                _ => None,
+            });
+            let mut watched: Vec<&Quantity> = guarded.filter(|quantity| quantity.kind != Kind::Param).collect();
+            watched.dedup_by_key(|quantity| quantity.slot);
+            experiment.expects.extend(watched.into_iter().map(|quantity| extremes(quantity, experiment.duration)));
+        }
+        Varying {
+            label,
+            experiment,
+            plots,
+            notes,
+            description: Arc::new(program.description),
+            params: program.params,
+            code,
+            lanes,
+            adaptive,
+            formulas,
+            size,
+            uses,
+            expects,
+        }
+    }
+
+    /// The code that makes steps of many runs at once, if there is such.
+    pub fn lanes(&self) -> Option<&Lanes> {
+        self.lanes.as_ref()
+    }
+
+    /// The parameter of this path, or that from which the state of this path starts, if a run can be given another value
+    /// for it.
+    pub fn param(&self, path: &str) -> Option<&Quantity> {
+        let start = self.description.quantity(&start_values::path(path));
+        let found = start.or_else(|| self.description.quantity(path))?;
+        (found.kind == Kind::Param && self.description.layout.params.contains(found.slot)).then_some(found)
+    }
+
+    /// Number of expectations of the experiment; verdicts behind these are of ranges, see [`Varying::left`].
+    pub fn expects(&self) -> usize {
+        self.expects
+    }
+
+    /// An instance and a plan with these values in SI.
+    ///
+    /// # Errors
+    /// What the values break, in words.
+    pub fn fit(&self, values: &[(Slot, f64)]) -> Result<Fitted, String> {
+        let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
+        if let Some(adaptive) = &self.adaptive {
+            instance = instance.with_adaptive(adaptive.clone());
+        }
+        for (slot, value) in values {
+            instance.set(*slot, *value);
+        }
+        let mut experiment = self.experiment.clone();
+        if self.uses.is_empty() {
+            return Ok(Fitted { instance, experiment });
+        }
+        let mut block = vec![0.0; self.size];
+        let params = self.description.layout.params.range();
+        block[params.clone()].copy_from_slice(&instance.block()[params]);
+        run_once(&self.formulas, &mut block, &self.description.pool);
+        let numbers = &block[self.size - self.uses.len()..];
+        let duration = experiment.duration;
+        let fixed = experiment.solver.method != Method::Adaptive;
+        let mut corners: Option<Vec<f64>> = None;
+        let mut description: Option<Description> = None;
+        for (k, (one, number)) in self.uses.iter().zip(numbers).enumerate() {
+            let number = *number;
+            match one {
+                Use::Plan(place) => set(&mut experiment, *place, number)?,
+                Use::Corner => corners.get_or_insert_default().push(number),
+                Use::Bound(k, high) => {
+                    let description = description.get_or_insert_with(|| (*self.description).clone());
+                    let quantity = &mut description.quantities[*k];
+                    if *high {
+                        quantity.range.1 = number
+                    } else {
+                        quantity.range.0 = number
+                    }
+                    let (slot, range) = (quantity.slot, quantity.range);
+                    let guard = description.guards.iter_mut().find(|guard| guard.slot == slot);
+                    if let Some(guard) = guard {
+                        guard.range = range;
+                    }
+                }
+                Use::Range { path, unit, low, high } => {
+                    // The formula of a parameter that has no other quantity in its value is the number as written.
+                    let number = self.param(path).map_or(number, |param| instance.get(param.slot));
+                    let shown = |x: f64| {
+                        let shown = format!("{}", unit.from_si(x));
+                        if unit.text.is_empty() { shown } else { format!("{shown} {unit}") }
+                    };
+                    let below = low.map(|strict| (numbers[k + 1], strict));
+                    let above = high.map(|strict| (numbers[k + 1 + usize::from(low.is_some())], strict));
+                    if let Some((bound, strict)) = below.filter(|(b, strict)| number < least(*b, *strict)) {
+                        let word = if strict { "above" } else { "at least" };
+                        return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
+                    }
+                    if let Some((bound, strict)) = above.filter(|(b, strict)| number > greatest(*b, *strict)) {
+                        let word = if strict { "below" } else { "at most" };
+                        return Err(format!("`{path}` must be {word} {}, not {}", shown(bound), shown(number)));
+                    }
+                }
+                Use::Limit => {}
+                Use::Require(text) if number == 0.0 => return Err(text.clone()),
+                Use::Require(_) => {}
+                Use::Period if !(number > 0.0 && number.is_finite()) => {
+                    return Err(format!("a period must be positive, not {number} s"));
+                }
+                Use::Period if fixed && !is_multiple(number, experiment.solver.step) => {
+                    let step = experiment.solver.step;
+                    return Err(format!("a period of {number} s is no multiple of the step of {step} s"));
+                }
+                Use::Period => {}
+            }
+        }
+        if experiment.duration != duration {
+            // What was open at the end stays open; no window goes beyond the run.
+            for expect in &mut experiment.expects {
+                let open = expect.before == duration;
+                expect.before = if open { experiment.duration } else { expect.before.min(experiment.duration) };
+            }
+        }
+        if let Some(mut corners) = corners {
+            corners.retain(|t| *t > 0.0 && *t < experiment.duration);
+            corners.sort_by(f64::total_cmp);
+            corners.dedup();
+            experiment.corners = corners;
+        }
+        if let Some(description) = description {
+            let block = instance.block()[self.description.layout.params.range()].to_vec();
+            // The adaptive program would watch other ranges.
+            instance = Instance::new(Arc::new(description), self.code.clone(), &block);
+        }
+        Ok(Fitted { instance, experiment })
+    }
+
+    /// Of a run with fixed steps: the range that was left, from the readings of the expectations behind those of the
+    /// experiment, in words.
+    pub fn left(&self, fitted: &Arc<Description>, readings: &[(f64, f64)]) -> Option<String> {
+        let watched = &self.experiment.expects[self.expects..];
+        watched.iter().zip(readings).find_map(|(expect, (least, most))| {
+            let quantity = fitted.quantities.iter().find(|quantity| quantity.path == expect.text)?;
+            let (low, high) = quantity.range;
+            let slack = 1e-6 * if (high - low).is_finite() { high - low } else { low.abs().min(high.abs()) };
+            let shown = |x: f64| format!("{} {}", quantity.unit.from_si(x), quantity.unit);
+            let value = if *least < low - slack { *least } else { *most };
+            let out = *least < low - slack || *most > high + slack;
+            out.then(|| {
+                format!("`{}` left its range {} .. {}: {}", quantity.path, shown(low), shown(high), shown(value))
+            })
+        })
+    }
+}
+
+/// Why a parameter cannot change from run to run of one program: it decides what is compiled.
+pub fn built_in(variant: &Variant, vary: &[String]) -> Option<Diagnostic> {
+    let system = &variant.system;
+    let varied = |expr: ExprId| vary.iter().find(|path| depends(system, expr, &|var| var.path == **path));
+    let repeats = system.counts.iter().find_map(|expr| Some((*expr, varied(*expr)?)));
+    if let Some((expr, path)) = repeats {
+        let error = Diagnostic::error("E0905", format!("`{path}` cannot be varied in one program"))
+            .label(system.span(expr), "decides how many parts there are");
+        return Some(error.help(format!(
+            "let the experiment sweep it, `sweep {path} = …`, which compiles each, or run it with `--set {path}=…`"
+        )));
+    }
+    if system.delays.is_empty() {
+        return None;
+    }
+    let steps = variant.places.iter().filter(|(place, _)| *place == Place::Step);
+    let (expr, path) = steps.into_iter().find_map(|(_, expr)| Some((*expr, varied(*expr)?)))?;
+    let error = Diagnostic::error("E0905", format!("`{path}` cannot be varied in one program"))
+        .label(system.span(expr), "decides how much of the past `delay` keeps");
+    Some(error.help(format!(
+        "let the experiment sweep it, `sweep {path} = …`, which compiles each, or run it with `--set {path}=…`"
+    )))
+}
+
+/// The guards as the code of a fixed step may know them: those whose range changes watch only that numbers are finite.
+pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
+    let system = &variant.system;
+    let varies = |bound: Option<(ExprId, bool)>| {
+        bound.is_some_and(|(bound, _)| depends(system, bound, &|var| vary.contains(&var.path)))
+    };
+    let known = |guard: &Guard| {
+        let var = system.vars.iter().find(|var| var.path == guard.path);
+        let changes = var.is_some_and(|var| varies(var.range.low) || varies(var.range.high));
+        let range = if changes { (f64::NEG_INFINITY, f64::INFINITY) } else { guard.range };
+        Guard { range, ..guard.clone() }
+    };
+    variant.program.description.guards.iter().map(known).collect()
+}
+
+/// An expectation that only reads the least and the greatest value.
+fn extremes(quantity: &Quantity, duration: f64) -> Expect {
+    let measure = |kind| Measure {
+        text: quantity.path.clone(),
+        kind,
+        slot: quantity.slot,
+        unit: quantity.unit.clone(),
+        window: Window::default(),
+    };
+    Expect {
+        text: quantity.path.clone(),
+        measures: vec![measure(MeasureKind::Min), measure(MeasureKind::Max)],
+        condition: Formula::Number(1.0),
+        after: 0.0,
+        before: duration,
+    }
+}
+
+fn set(experiment: &mut Experiment, place: Place, number: f64) -> Result<(), String> {
+    let positive = |what: &str| match number > 0.0 && number.is_finite() {
+        true => Ok(number),
+        false => Err(format!("{what} must be positive, not {number} s")),
+    };
+    match place {
+        Place::Duration => experiment.duration = positive("the duration")?,
+        Place::Step => experiment.solver.step = positive("the step")?,
+        Place::Tolerance if number > 0.0 && number < 1.0 => experiment.solver.tol = number,
+        Place::Tolerance => return Err(format!("a tolerance lies between 0 and 1: {number} does not")),
+        Place::After(k) => experiment.expects[k].after = number,
+        Place::Before(k) => experiment.expects[k].before = number.min(experiment.duration),
+        Place::MeasureAfter(k, j) => experiment.expects[k].measures[j].window.after = Edge::At(number),
+        Place::MeasureBefore(k, j) => experiment.expects[k].measures[j].window.before = Edge::At(number),
+        Place::Second(k, j) => match &mut experiment.expects[k].measures[j].kind {
+            MeasureKind::At(second) | MeasureKind::Settling(second) => *second = number,
+            MeasureKind::Peak(_) | MeasureKind::TimeOfPeak(_) if !is_number_of_peak(number) => {
+                return Err(format!("peaks have the numbers 1, 2, 3 and so on, not {number}"));
+            }
+            MeasureKind::Peak(second) | MeasureKind::TimeOfPeak(second) => *second = number,
+            kind => unreachable!("{kind:?} has no second argument"),
+        },
+    }
+    Ok(())
+}

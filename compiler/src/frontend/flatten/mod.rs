@@ -1,0 +1,496 @@
+//! Makes one flat [`System`] of an instance with all its parts.
+//!
+//! First every name of the whole tree is declared, then every expression is read, so that order never matters.
+//! Checks what concerns names: unknown ones, arguments, slots, and that each quantity is defined exactly once.
+
+mod equations;
+mod expressions;
+mod frame;
+mod instances;
+mod slopes;
+
+use crate::frontend::names::nearest;
+use crate::frontend::resolve::{ItemRef, Loaded, Lookup, RESERVED, Space, declared_twice, reserved};
+use crate::frontend::source::Sources;
+use crate::frontend::system::*;
+use abi::unit::{Angle, Dimension, Unit};
+use grammar::ast::{self, BinaryOp, DeclarationKind, Expr, ExprKind, Item, Name, Statement, Target, UnaryOp};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+use std::collections::HashMap;
+use std::rc::Rc;
+
+pub use frame::{Frame, Framed, Node as BusNode, Scope};
+
+/// Most quantities of one instance with all its parts.
+pub const MOST_VARS: usize = 200_000;
+/// Most operations of one instance with all its parts.
+pub const MOST_NODES: usize = 2_000_000;
+/// Most operations of a function on its own.
+const MOST_NODES_OF_ITEM: usize = 100_000;
+/// For so many unknown names a suggestion is looked for; the rest is hardly read.
+const MOST_SUGGESTIONS: usize = 50;
+/// With so many mistakes nothing more is made.
+const MOST_MISTAKES: usize = 1000;
+/// Deepest nesting of parts in parts, and of functions in functions.
+const DEEPEST: usize = 64;
+
+/// What is made from: a model with arguments, as an experiment or a check asks for it.
+pub struct Request<'a> {
+    /// The model, or nothing for a model on its own with its inputs free.
+    pub instance: Instance<'a>,
+    /// Changes from outside, by path: they win over what the text says.
+    pub overrides: Vec<Override<'a>>,
+    /// Expressions over the names of the instance that are wanted as quantities: plots and expectations.
+    pub observed: Vec<&'a Expr>,
+    /// Recordings that may be read as `data.NAME`: the number of the table.
+    pub data: Vec<(String, Table, Unit)>,
+    /// The rig around the instance.
+    pub frame: Option<Frame<'a>>,
+}
+
+/// The instance of a [`Request`].
+pub enum Instance<'a> {
+    /// As written in a `run`; arguments are read in the scope of the file.
+    Written(&'a ast::Instance, FileId),
+    /// A model on its own: inputs come from outside, parameters without a default stay open.
+    Alone(&'a ast::Model, FileId),
+    /// A model on its own, whose inputs have their defaults.
+    WithDefaults(&'a ast::Model, FileId),
+}
+
+/// A change from outside: `fr.Fs = 2 N`, `fr = LuGre()`.
+#[derive(Clone)]
+pub struct Override<'a> {
+    /// The path.
+    pub path: &'a ast::Path,
+    /// The value, read in the scope of the file.
+    pub value: OverrideValue<'a>,
+    /// The file.
+    pub file: FileId,
+}
+
+/// The value of an [`Override`].
+#[derive(Clone, Copy)]
+pub enum OverrideValue<'a> {
+    /// A value.
+    Expr(&'a Expr),
+    /// A model for a slot.
+    Instance(&'a ast::Instance),
+}
+
+/// The flat system, the observed expressions in it, and what is wrong.
+pub struct Flat {
+    /// The system; complete only if there are no errors.
+    pub system: System,
+    /// One node for each observed expression.
+    pub observed: Vec<ExprId>,
+    /// Where the rig came to lie.
+    pub framed: Option<Framed>,
+    /// What is wrong.
+    pub diagnostics: Vec<Diagnostic>,
+}
+
+/// Flattens an instance.
+pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Flat {
+    let mut f = Flattener::new(loaded, sources);
+    for (name, table, unit) in &request.data {
+        let number = f.system.tables.len() as u32;
+        f.system.tables.push(table.clone());
+        f.data.insert(name.clone(), (number, unit.clone()));
+    }
+    let overrides: Vec<Change> = request
+        .overrides
+        .iter()
+        .map(|o| Change { path: &o.path.segments, span: o.path.span, value: o.value, env: Env::file(o.file) })
+        .collect();
+    // A change of a drive or of a part of the rig is none of the instance.
+    let of_frame = |change: &Change| {
+        let head = &change.path[0].name.text;
+        request.frame.as_ref().is_some_and(|frame| {
+            frame.nodes.iter().any(|node| node.name.text == *head)
+                || frame.parts.iter().any(|part| part.name.text == *head)
+        })
+    };
+    let (around, overrides): (Vec<Change>, Vec<Change>) = overrides.into_iter().partition(of_frame);
+    match &request.instance {
+        Instance::Written(instance, file) => {
+            let env = Env::file(*file);
+            f.written(instance, &env, overrides);
+        }
+        Instance::Alone(model, file) | Instance::WithDefaults(model, file) => {
+            let made =
+                Making { path: String::new(), rotary: false, span: model.name.span, args: Vec::new(), overrides };
+            f.instantiate(model, *file, made, true);
+            if let (Instance::WithDefaults(..), Some(top)) = (&request.instance, f.instances.first_mut()) {
+                top.defaults = true;
+            }
+        }
+    }
+    let mut framed = match (&request.frame, f.instances.is_empty()) {
+        (Some(frame), false) => Some(f.surround(frame, &around)),
+        _ => None,
+    };
+    for index in 0..f.instances.len() {
+        if !f.instances[index].scope {
+            f.define(InstanceId(index as u32));
+        }
+    }
+    if let (Some(frame), Some(framed)) = (&request.frame, &mut framed) {
+        f.framed(frame, framed);
+    }
+    for arg in std::mem::take(&mut f.dropped) {
+        if let ArgValue::Expr(expr) = arg.value {
+            f.expr(expr, &arg.env);
+        }
+    }
+    let observed = match f.instances.first().map(|top| top.file) {
+        Some(_) => {
+            let file = match &request.instance {
+                Instance::Written(_, file) | Instance::Alone(_, file) | Instance::WithDefaults(_, file) => *file,
+            };
+            let instance = framed.as_ref().map_or(InstanceId(0), |framed| framed.rig);
+            let env = Env { instance: Some(instance), outside: true, ..Env::file(file) };
+            request.observed.iter().map(|expr| f.expr(expr, &env)).collect()
+        }
+        None => Vec::new(),
+    };
+    if f.too_large {
+        // Nobody looks at what is refused.
+        f.system = System::default();
+    }
+    Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
+}
+
+/// Reads a function, constant or table on its own: a function's arguments come from outside.
+pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
+    let mut f = Flattener { most_nodes: MOST_NODES_OF_ITEM, ..Flattener::new(loaded, sources) };
+    let env = Env::file(file);
+    let observed = match item {
+        Item::Function(function) => {
+            let mut locals = Vec::new();
+            let mut first: HashMap<&str, Span> = HashMap::new();
+            for arg in &function.args {
+                if !f.new_name(&arg.name, &mut first) {
+                    continue;
+                }
+                let unit = match &arg.unit {
+                    None => Some(Unit::none()),
+                    Some(unit) => f.unit(unit, false, None),
+                };
+                let Some(unit) = unit else { continue };
+                let argument = Node::Number { value: f64::NAN, dimension: Some(unit.dimension), angle: unit.angle };
+                locals.push((arg.name.text.clone(), f.system.push(argument, arg.name.span)));
+            }
+            if let Lookup::Found(item, _) = loaded.find(file, Space::Function, &function.name.text) {
+                f.functions.push(item);
+            }
+            let value = f.expr(&function.body, &Env { locals: Rc::new(locals), ..env });
+            match function.unit.as_ref().and_then(|unit| f.unit(unit, false, None)) {
+                Some(unit) => {
+                    let role = Role::Result { function: function.name.text.clone() };
+                    vec![f.system.push(Node::Fits { value, dimension: unit.dimension, role }, function.body.span)]
+                }
+                None => vec![value],
+            }
+        }
+        Item::Const(constant) => f.constant(&constant.name, &env).into_iter().collect(),
+        Item::Table(table) => {
+            crate::frontend::tables::read(loaded, sources, file, table, &mut f.diagnostics);
+            Vec::new()
+        }
+        _ => Vec::new(),
+    };
+    if f.too_large {
+        f.system = System::default();
+    }
+    Flat { system: f.system, observed, framed: None, diagnostics: f.diagnostics }
+}
+
+struct Flattener<'a> {
+    loaded: &'a Loaded,
+    sources: &'a dyn Sources,
+    system: System,
+    diagnostics: Vec<Diagnostic>,
+    /// Runs along with `system.instances`.
+    instances: Vec<Tree<'a>>,
+    /// Expansions by function, arguments and place, so that the same call of the same values is made once.
+    expansions: HashMap<(ItemRef, Vec<ExprId>, bool, bool), ExprId>,
+    /// Functions being expanded: to find circles.
+    functions: Vec<ItemRef>,
+    /// By item and whether it is the rotary twin.
+    tables: HashMap<(ItemRef, bool), Option<u32>>,
+    consts: HashMap<(ItemRef, bool), ExprId>,
+    open_consts: Vec<ItemRef>,
+    /// Models being instantiated: to find circles.
+    models: Vec<ItemRef>,
+    /// Unknown names reported so far: suggestions are made for the first of them only.
+    unknowns: usize,
+    /// The lower halves of what was read as a derivative that there is not, which has been reported.
+    derivatives_read: Vec<Span>,
+    /// Wiring of slots that the present model has no port for: another model may read it.
+    dropped: Vec<Arg<'a>>,
+    /// Most operations, and whether it has been reported that there are more.
+    most_nodes: usize,
+    too_large: bool,
+    /// Parts whose name is taken, and reported.
+    refused_parts: Vec<Span>,
+    /// Quantities whose definition was refused, and reported.
+    refused: Vec<VarId>,
+    data: HashMap<String, (u32, Unit)>,
+}
+
+/// What is known of an instance besides [`InstanceInfo`].
+struct Tree<'a> {
+    model: &'a ast::Model,
+    file: FileId,
+    names: HashMap<&'a str, Binding>,
+    args: Vec<Arg<'a>>,
+    alone: bool,
+    /// Alone, but inputs with a default have it.
+    defaults: bool,
+    /// A drive or device: inputs come from the bus.
+    on_bus: bool,
+    /// A rig, which only lends its names.
+    scope: bool,
+    locals: Locals,
+}
+
+/// What a name of an instance means.
+#[derive(Clone)]
+enum Binding {
+    Var(VarId),
+    Part(InstanceId),
+    Parts(Rc<Vec<InstanceId>>, i64),
+    Regime(AutomatonId, u32),
+    /// Declared, but not usable: reported.
+    Broken,
+}
+
+type Locals = Rc<Vec<(String, ExprId)>>;
+
+/// Where an expression is read.
+#[derive(Clone)]
+struct Env {
+    file: FileId,
+    instance: Option<InstanceId>,
+    rotary: bool,
+    locals: Locals,
+    /// Read from outside the model, by an experiment: lets are visible, measures are allowed.
+    outside: bool,
+    /// In an equation rather than a declaration: E0109 looks there.
+    equation: bool,
+    /// In the condition of a transition or event: crossings may stand there.
+    instants: bool,
+}
+
+impl Env {
+    fn file(file: FileId) -> Env {
+        Env {
+            file,
+            instance: None,
+            rotary: false,
+            locals: Rc::default(),
+            outside: false,
+            equation: false,
+            instants: false,
+        }
+    }
+}
+
+/// An argument of an instance.
+#[derive(Clone)]
+struct Arg<'a> {
+    name: &'a str,
+    span: Span,
+    value: ArgValue<'a>,
+    env: Env,
+    overriding: bool,
+}
+
+#[derive(Clone, Copy)]
+enum ArgValue<'a> {
+    Expr(&'a Expr),
+    Instance(&'a ast::Instance),
+}
+
+/// A change from outside on its way down the tree.
+#[derive(Clone)]
+struct Change<'a> {
+    path: &'a [ast::Segment],
+    span: Span,
+    value: OverrideValue<'a>,
+    env: Env,
+}
+
+/// How an instance is made.
+struct Making<'a> {
+    path: String,
+    rotary: bool,
+    span: Span,
+    args: Vec<Arg<'a>>,
+    overrides: Vec<Change<'a>>,
+}
+
+impl<'a> Flattener<'a> {
+    fn new(loaded: &'a Loaded, sources: &'a dyn Sources) -> Flattener<'a> {
+        Flattener {
+            loaded,
+            sources,
+            system: System::default(),
+            diagnostics: Vec::new(),
+            instances: Vec::new(),
+            expansions: HashMap::new(),
+            functions: Vec::new(),
+            tables: HashMap::new(),
+            consts: HashMap::new(),
+            open_consts: Vec::new(),
+            models: Vec::new(),
+            refused: Vec::new(),
+            unknowns: 0,
+            derivatives_read: Vec::new(),
+            most_nodes: MOST_NODES,
+            too_large: false,
+            refused_parts: Vec::new(),
+            dropped: Vec::new(),
+            data: HashMap::new(),
+        }
+    }
+
+    fn report(&mut self, diagnostic: Diagnostic) {
+        self.diagnostics.push(diagnostic);
+    }
+
+    /// Whether the program has grown too large to go on: reported once, at a place where it grows.
+    fn full(&mut self, span: Span) -> bool {
+        if self.diagnostics.len() >= MOST_MISTAKES {
+            return true; // Thousands of parts with the same mistake say no more than some.
+        }
+        let made = self.system.vars.len() + self.system.instances.len();
+        let (most, what) = match () {
+            () if made > MOST_VARS => (MOST_VARS, "quantities and parts"),
+            () if self.system.nodes.len() > self.most_nodes => (self.most_nodes, "operations"),
+            () => return false,
+        };
+        if !std::mem::replace(&mut self.too_large, true) {
+            let error = Diagnostic::error("E0502", format!("more than {most} {what}"))
+                .label(span, "it is still growing here")
+                .help("a program of this size is refused: use fewer parts, or let each do more");
+            self.report(error);
+        }
+        true
+    }
+}
+
+/// The beginning of an equation: enough to know it by, `F = clamp` of `F = clamp(F_ext, -Fs, Fs)`.
+fn head(equation: &ast::Equation) -> Span {
+    let mut first = &equation.value;
+    while let ExprKind::Binary(_, _, left, _) = &first.kind {
+        first = left;
+    }
+    let end = match &first.kind {
+        ExprKind::Call { function, .. } => function.span,
+        _ => first.span,
+    };
+    equation.target.span().to(end)
+}
+
+/// How an equation gives its quantity a value.
+enum Wanted {
+    Value,
+    Rate { along: Along },
+    Next,
+}
+
+/// What a derivative is taken along: time, or a state named at a place.
+type Along = Option<(VarId, Span)>;
+
+/// The right side of a derivative equation.
+struct Rate {
+    value: ExprId,
+    along: Along,
+    span: Span,
+}
+
+fn zero() -> Node {
+    Node::Number { value: 0.0, dimension: None, angle: Angle::Silent }
+}
+
+fn joined(path: &str, name: &str) -> String {
+    if path.is_empty() { name.to_string() } else { format!("{path}.{name}") }
+}
+
+fn article(word: &str) -> &'static str {
+    if word.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" }
+}
+
+fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
+    let known = [
+        "m", "mm", "um", "kg", "g", "s", "ms", "N", "J", "W", "rad", "deg", "rev", "rpm", "Hz", "min", "h", "K", "A",
+        "V",
+    ];
+    let error =
+        Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
+    // Units that people have and SI has not: what one of them is.
+    const OTHERS: [(&[&str], &str); 13] = [
+        (&["degC", "°C", "celsius", "Celsius", "C"], "temperatures are in K: 20 degC is `293.15 K`"),
+        (&["bar"], "1 bar is `1e5 Pa`"),
+        (&["psi"], "1 psi is `6894.76 Pa`"),
+        (&["atm"], "1 atm is `101325 Pa`"),
+        (&["in", "inch"], "1 inch is `25.4 mm`"),
+        (&["ft", "foot", "feet"], "1 foot is `304.8 mm`"),
+        (&["lb", "lbs"], "1 pound is `0.453592 kg`"),
+        (&["lbf"], "1 pound of force is `4.44822 N`"),
+        (&["kgf", "kp"], "1 kgf is `9.80665 N`"),
+        (&["hp", "PS"], "1 hp is `745.7 W`"),
+        (&["sec", "secs", "seconds"], "seconds are `s`"),
+        (&["meter", "meters", "metre", "metres"], "metres are `m`"),
+        (&["newton", "newtons", "Newton"], "newtons are `N`"),
+    ];
+    if let Some((_, what)) = OTHERS.iter().find(|(names, _)| names.contains(&part)) {
+        return error.help(*what);
+    }
+    // Of so short words only the nearest is near.
+    let near = |known: &&str| known.eq_ignore_ascii_case(part) || part.len() > 2 && known.len() > 1;
+    match nearest(part, known.into_iter().filter(near)).filter(|near| near.len() + 1 >= part.len()) {
+        Some(near) => error.help(format!("did you mean `{near}`?")),
+        None => error
+            .help("units are m g s min h A K N J W Pa V Ohm Hz rad deg rev rpm bit %, with G M k m u n before them"),
+    }
+}
+
+fn args_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Arg<'a>> {
+    let arg = |bind: &'a ast::Bind| Arg {
+        name: &bind.name.text,
+        span: bind.span,
+        value: match &bind.value {
+            ast::BindValue::Expr(expr) => ArgValue::Expr(expr),
+            ast::BindValue::Instance(instance) => ArgValue::Instance(instance),
+        },
+        env: env.clone(),
+        overriding: false,
+    };
+    args.iter().map(arg).collect()
+}
+
+/// All declarations of a model, those inside `every` included.
+fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
+    model.body.iter().flat_map(|statement| {
+        let (one, many): (Option<&ast::Declaration>, &[ast::EveryStatement]) = match statement {
+            Statement::Declaration(declaration) => (Some(declaration), &[]),
+            Statement::Every(every) => (None, &every.body),
+            _ => (None, &[]),
+        };
+        one.into_iter().chain(many.iter().filter_map(|statement| match statement {
+            ast::EveryStatement::Declaration(declaration) => Some(declaration),
+            ast::EveryStatement::Equation(_) => None,
+        }))
+    })
+}
+
+fn modes(model: &ast::Model) -> impl Iterator<Item = &ast::Mode> {
+    model.body.iter().filter_map(|statement| match statement {
+        Statement::Mode(mode) => Some(mode),
+        _ => None,
+    })
+}

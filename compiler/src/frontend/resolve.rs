@@ -1,0 +1,405 @@
+//! Reads a text with all that it imports, and says what each name at the top of a file means.
+//!
+//! In: a text and [`Sources`]. Out: [`Loaded`], always, with what is wrong. Knows nothing inside items.
+
+use crate::frontend::names::nearest;
+use crate::frontend::source::{Files, SourceFile, Sources};
+use grammar::ast::{self, Item, Name};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+use std::cell::RefCell;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+/// Texts that belong together, with their names resolved.
+#[derive(Clone, Debug, Default)]
+pub struct Loaded {
+    /// The texts; the first is the one that was asked for.
+    pub files: Files,
+    /// What is wrong with syntax, imports and names at the top of files.
+    pub diagnostics: Vec<Diagnostic>,
+    scopes: Vec<Scope>,
+}
+
+/// Names at the top of one file.
+#[derive(Clone, Debug, Default)]
+struct Scope {
+    own: HashMap<(Space, String), ItemRef>,
+    imported: HashMap<(Space, String), Vec<ItemRef>>,
+}
+
+/// Name spaces at the top of a file.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Space {
+    /// Models, interfaces, devices.
+    Type,
+    /// Functions and tables.
+    Function,
+    /// Constants.
+    Const,
+    /// Experiments and fits.
+    Experiment,
+    /// Rigs.
+    Rig,
+}
+
+/// An item of a file.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct ItemRef {
+    /// The file.
+    pub file: FileId,
+    /// Index of the item in the file's tree.
+    pub index: u32,
+}
+
+/// Result of looking a name up.
+pub enum Lookup<'a> {
+    /// The item.
+    Found(ItemRef, &'a Item),
+    /// Defined by two imports.
+    Ambiguous(ItemRef, ItemRef),
+    /// Not there.
+    Missing,
+}
+
+/// An experiment of the asked-for file.
+#[derive(Clone, PartialEq, Debug)]
+pub struct ExperimentInfo {
+    /// Its name.
+    pub name: String,
+    /// Where the name stands.
+    pub span: Span,
+    /// Whether it expects anything.
+    pub has_expect: bool,
+}
+
+impl Loaded {
+    /// The item.
+    pub fn item(&self, item: ItemRef) -> &Item {
+        &self.files.get(item.file).ast.items[item.index as usize]
+    }
+
+    /// What `name` means in `file`: its own item first, else what exactly one import gives.
+    pub fn find(&self, file: FileId, space: Space, name: &str) -> Lookup<'_> {
+        let scope = &self.scopes[file.0 as usize];
+        let key = (space, name.to_string());
+        if let Some(&item) = scope.own.get(&key) {
+            return Lookup::Found(item, self.item(item));
+        }
+        match scope.imported.get(&key).map(Vec::as_slice) {
+            None | Some([]) => Lookup::Missing,
+            Some([item]) => Lookup::Found(*item, self.item(*item)),
+            Some([a, b, ..]) => Lookup::Ambiguous(*a, *b),
+        }
+    }
+
+    /// All names of a name space visible in `file`, sorted.
+    pub fn visible(&self, file: FileId, space: Space) -> Vec<&str> {
+        let scope = &self.scopes[file.0 as usize];
+        let mut names: Vec<&str> = scope
+            .own
+            .keys()
+            .chain(scope.imported.keys())
+            .filter(|key| key.0 == space)
+            .map(|key| key.1.as_str())
+            .collect();
+        names.sort_unstable();
+        names.dedup();
+        names
+    }
+
+    /// Adds a text from outside, such as a value of the command line: it has places, but no names of its own.
+    pub fn add_text(&mut self, name: &str, text: &str) -> FileId {
+        let id = FileId(self.files.0.len() as u32);
+        let file = SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false };
+        self.files.0.push(file);
+        self.scopes.push(Scope::default());
+        id
+    }
+
+    /// The file that was asked for.
+    pub fn root(&self) -> FileId {
+        FileId(0)
+    }
+
+    /// Whether something in this place could not be read.
+    pub fn misread(&self, place: Span) -> bool {
+        self.diagnostics.iter().any(|d| {
+            d.is_error() && place.file == d.span().file && place.start <= d.span().start && d.span().end <= place.end
+        })
+    }
+
+    /// Experiments of the asked-for file, in order.
+    pub fn experiments(&self) -> Vec<ExperimentInfo> {
+        let experiment = |item: &Item| match item {
+            Item::Experiment(e) => Some(ExperimentInfo {
+                name: e.name.text.clone(),
+                span: e.name.span,
+                has_expect: e
+                    .body
+                    .iter()
+                    .any(|s| matches!(s, ast::ExperimentStatement::Expect(e) if e.shows.is_none())),
+            }),
+            _ => None,
+        };
+        self.files.get(self.root()).ast.items.iter().filter_map(experiment).collect()
+    }
+
+    /// Rigs of the asked-for file, in order.
+    pub fn rigs(&self) -> Vec<&ast::Rig> {
+        let items = self.files.get(self.root()).ast.items.iter();
+        items
+            .filter_map(|item| match item {
+                Item::Rig(rig) => Some(rig),
+                _ => None,
+            })
+            .collect()
+    }
+
+    /// The model that a name stands for in the first text, its own or an imported one; and the file that it is in.
+    pub fn model_named(&self, name: &str) -> Option<(ast::Model, FileId)> {
+        match self.find(self.root(), Space::Type, name) {
+            Lookup::Found(item, Item::Model(model)) => Some((model.clone(), item.file)),
+            _ => None,
+        }
+    }
+
+    /// Models of the asked-for file, in order.
+    pub fn models(&self) -> Vec<&ast::Model> {
+        self.files
+            .get(self.root())
+            .ast
+            .items
+            .iter()
+            .filter_map(|item| match item {
+                Item::Model(model) => Some(model),
+                _ => None,
+            })
+            .collect()
+    }
+
+    /// Whether anything forbids compiling.
+    pub fn has_errors(&self) -> bool {
+        self.diagnostics.iter().any(Diagnostic::is_error)
+    }
+}
+
+/// The name space and name of an item; imports have none.
+fn named(item: &Item) -> Option<(Space, &Name)> {
+    Some(match item {
+        Item::Import(_) => return None,
+        Item::Const(c) => (Space::Const, &c.name),
+        Item::Function(f) => (Space::Function, &f.name),
+        Item::Table(t) => (Space::Function, &t.name),
+        Item::Interface(i) => (Space::Type, &i.name),
+        Item::Model(m) => (Space::Type, &m.name),
+        Item::Device(d) => (Space::Type, &d.name),
+        Item::Experiment(e) => (Space::Experiment, &e.name),
+        Item::Fit(f) => (Space::Experiment, &f.name),
+        Item::Rig(r) => (Space::Rig, &r.name),
+    })
+}
+
+/// Names that cannot be declared.
+pub const RESERVED: [&str; 5] = ["t", "pi", "inf", "true", "false"];
+
+/// Reads `text`, called `name`, and everything it imports.
+pub fn load(name: &str, text: &str, sources: &dyn Sources) -> Loaded {
+    let mut loader = Loader { loaded: Loaded::default(), sources, by_name: HashMap::new(), open: Vec::new() };
+    let root = loader.add(name.to_string(), text, false);
+    let mut loaded = loader.loaded;
+    if loaded.files.get(root).ast.items.is_empty() && loaded.diagnostics.is_empty() {
+        let error = Diagnostic::error("E0001", "there is nothing in this file").label(Span::new(root, 0, 0), "empty");
+        loaded.diagnostics.push(error.help("begin with a model: `model M { … }`, or let `fric new DIR` write one"));
+    }
+    loaded
+}
+
+struct Loader<'a> {
+    loaded: Loaded,
+    sources: &'a dyn Sources,
+    by_name: HashMap<String, FileId>,
+    /// Files whose imports are being read: to find circles.
+    open: Vec<FileId>,
+}
+
+impl Loader<'_> {
+    fn add(&mut self, name: String, text: &str, library: bool) -> FileId {
+        let id = FileId(self.loaded.files.0.len() as u32);
+        self.by_name.insert(name.clone(), id);
+        let (text, ast) = match library {
+            true => library_tree(id, &name, text, &mut self.loaded.diagnostics),
+            false => tree(id, text, &mut self.loaded.diagnostics),
+        };
+        self.loaded.files.0.push(SourceFile { name, text, ast: ast.clone(), library });
+        self.loaded.scopes.push(Scope::default());
+        self.declare(id, &ast);
+        self.open.push(id);
+        for item in &ast.items {
+            if let Item::Import(import) = item {
+                for file in self.import(id, import) {
+                    self.bring_in(id, file);
+                }
+            }
+        }
+        self.open.pop();
+        id
+    }
+
+    fn declare(&mut self, file: FileId, ast: &ast::File) {
+        for (index, item) in ast.items.iter().enumerate() {
+            let Some((space, name)) = named(item) else { continue };
+            if RESERVED.contains(&name.text.as_str()) && matches!(space, Space::Const | Space::Function) {
+                self.loaded.diagnostics.push(reserved(name));
+                continue;
+            }
+            let item = ItemRef { file, index: index as u32 };
+            let own = &mut self.loaded.scopes[file.0 as usize].own;
+            match own.get(&(space, name.text.clone())) {
+                None => {
+                    own.insert((space, name.text.clone()), item);
+                }
+                Some(&first) => {
+                    let first = named(self.loaded.item(first)).expect("only named items are declared").1.span;
+                    self.loaded.diagnostics.push(declared_twice(name, first));
+                }
+            }
+        }
+    }
+
+    /// The files that an import stands for.
+    fn import(&mut self, from: FileId, import: &ast::Import) -> Vec<FileId> {
+        match &import.source {
+            ast::ImportSource::Library(module) => {
+                let Some(files) = self.sources.library(&module.text) else {
+                    let modules = self.sources.modules();
+                    let mut error = Diagnostic::error("E0201", format!("there is no library module `{}`", module.text))
+                        .label(module.span, "not found");
+                    error = match nearest(&module.text, modules.iter().map(String::as_str)) {
+                        Some(near) => error.help(format!("did you mean `{near}`?")),
+                        None if modules.is_empty() => error,
+                        None => error.help(format!("the library has {}", modules.join(", "))),
+                    };
+                    self.loaded.diagnostics.push(error);
+                    return Vec::new();
+                };
+                files.into_iter().map(|(name, text)| self.once(name, &text, true)).collect()
+            }
+            ast::ImportSource::File(path) => {
+                let from_name = self.loaded.files.get(from).name.clone();
+                match self.sources.file(&from_name, &path.text) {
+                    Ok((name, text)) => {
+                        if let Some(id) = self.by_name.get(&name).copied().filter(|id| self.open.contains(id)) {
+                            let circle: Vec<&str> = self
+                                .open
+                                .iter()
+                                .skip_while(|open| **open != id)
+                                .map(|open| self.loaded.files.get(*open).name.as_str())
+                                .collect();
+                            let message = match circle.as_slice() {
+                                [_] => "this file imports itself".to_string(),
+                                circle => format!("imports in a circle: {} -> {name}", circle.join(" -> ")),
+                            };
+                            let error = Diagnostic::error("E0211", message).label(path.span, "closes the circle");
+                            self.loaded.diagnostics.push(error.help("move what both need into a file of its own"));
+                            return Vec::new();
+                        }
+                        vec![self.once(name, &text, false)]
+                    }
+                    Err(reason) => {
+                        let module = path.text.trim_end_matches(".fric");
+                        let library = self.sources.library(module).is_some_and(|files| !files.is_empty());
+                        let error = Diagnostic::error("E0201", format!("cannot import \"{}\"", path.text))
+                            .label(path.span, reason)
+                            .help(match library {
+                                true => format!("a module of the library stands without quotes: `import {module}`"),
+                                false => "the path is relative to the importing file".into(),
+                            });
+                        self.loaded.diagnostics.push(error);
+                        Vec::new()
+                    }
+                }
+            }
+        }
+    }
+
+    fn once(&mut self, name: String, text: &str, library: bool) -> FileId {
+        match self.by_name.get(&name) {
+            Some(&id) => id,
+            None => self.add(name, text, library),
+        }
+    }
+
+    fn bring_in(&mut self, into: FileId, from: FileId) {
+        if into == from {
+            return;
+        }
+        let mut items: Vec<(Space, String, ItemRef)> = self.loaded.scopes[from.0 as usize]
+            .own
+            .iter()
+            .map(|((space, name), item)| (*space, name.clone(), *item))
+            .collect();
+        items.sort_by_key(|(_, _, item)| item.index);
+        let scope = &mut self.loaded.scopes[into.0 as usize];
+        for (space, name, item) in items {
+            let known = scope.imported.entry((space, name)).or_default();
+            if !known.contains(&item) {
+                known.push(item);
+            }
+        }
+    }
+}
+
+/// Trees of library texts that are kept for the next text that imports them.
+const MOST_KEPT: usize = 1000;
+
+type Tree = (Arc<str>, Arc<ast::File>);
+
+thread_local! {
+    /// By their place among the texts of a compilation, which the tree mentions, and their name.
+    static KEPT: RefCell<HashMap<(FileId, String), Tree>> = RefCell::default();
+}
+
+fn tree(id: FileId, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+    let parsed = grammar::parse::parse(id, text);
+    diagnostics.extend(parsed.diagnostics);
+    (text.into(), Arc::new(parsed.file))
+}
+
+/// As [`tree`], of a text that many others import: read once, as long as it is the same.
+fn library_tree(id: FileId, name: &str, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
+    let key = (id, name.to_string());
+    let known = KEPT.with_borrow(|kept| kept.get(&key).filter(|(known, _)| **known == *text).cloned());
+    if let Some(known) = known {
+        return known;
+    }
+    let before = diagnostics.len();
+    let new = tree(id, text, diagnostics);
+    if diagnostics.len() == before {
+        KEPT.with_borrow_mut(|kept| {
+            if kept.len() >= MOST_KEPT {
+                kept.clear();
+            }
+            kept.insert(key, new.clone());
+        });
+    }
+    new
+}
+
+/// E0210
+pub fn reserved(name: &Name) -> Diagnostic {
+    Diagnostic::error("E0210", format!("`{}` has a fixed meaning and cannot be declared", name.text))
+        .label(name.span, "declared here")
+        .help(match name.text.as_str() {
+            "t" => "`t` is time; give this another name, such as `t1`".to_string(),
+            other => format!("give this another name, such as `{other}_0`"),
+        })
+}
+
+/// E0202 for two declarations in one scope.
+pub fn declared_twice(name: &Name, first: Span) -> Diagnostic {
+    Diagnostic::error("E0202", format!("`{}` is declared twice", name.text))
+        .label(name.span, "again here")
+        .label(first, "first here")
+        .help("remove one of them or give it another name")
+}

@@ -1,0 +1,171 @@
+//! Reads tables: listed points, or two columns of a file.
+
+use crate::frontend::columns;
+use crate::frontend::resolve::Loaded;
+use crate::frontend::source::Sources;
+use crate::frontend::system::Table;
+use abi::unit::{Dimension, Unit};
+use grammar::ast::{self, Expr, ExprKind, TablePoints, TableShape, UnaryOp};
+use grammar::diagnostic::Diagnostic;
+use grammar::span::{FileId, Span};
+
+/// The table of an item; nothing if something is wrong with it, which is reported.
+pub fn read(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    file: FileId,
+    table: &ast::Table,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Table> {
+    let mut unit = |unit: &Option<ast::UnitText>| match unit {
+        None => Some(Unit::none()),
+        Some(text) => match Unit::parse(&text.text) {
+            Ok(unit) => Some(unit),
+            Err(part) => {
+                let error = Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                diagnostics.push(error);
+                None
+            }
+        },
+    };
+    let (x_unit, y_unit) = (unit(&table.arg.unit)?, unit(&table.unit)?);
+    let mut x = Vec::new();
+    let mut y = Vec::new();
+    match &table.points {
+        TablePoints::Listed(points) => {
+            for (a, b) in points {
+                x.push(number(a, x_unit.dimension, diagnostics)?);
+                y.push(number(b, y_unit.dimension, diagnostics)?);
+                check_order(&x, a.span, diagnostics)?;
+            }
+        }
+        TablePoints::File(path) => {
+            let units = [Some(x_unit.clone()), Some(y_unit.clone())];
+            let columns = columns(loaded, sources, file, path, &units, diagnostics)?;
+            x.extend(&columns[0]);
+            y.extend(&columns[1]);
+            for k in 0..x.len() {
+                check_order(&x[..=k], path.span, diagnostics)?;
+            }
+        }
+    }
+    if x.is_empty() {
+        let error = Diagnostic::error("E0902", format!("table `{}` has no points", table.name.text));
+        diagnostics.push(error.label(table.name.span, "at least one is needed"));
+        return None;
+    }
+    Some(Table {
+        name: table.name.text.clone(),
+        x_dimension: x_unit.dimension,
+        y_dimension: y_unit.dimension,
+        smooth: table.shape == TableShape::Smooth,
+        x,
+        y,
+    })
+}
+
+/// The first columns of a file of numbers, one for each of `units`: in SI, and each with the unit of its numbers. That of
+/// the heading counts where it states one; it must fit. None is not wanted.
+pub fn columns(
+    loaded: &Loaded,
+    sources: &dyn Sources,
+    file: FileId,
+    path: &ast::Text,
+    units: &[Option<Unit>],
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Vec<Vec<f64>>> {
+    let from = &loaded.files.get(file).name;
+    let text = match sources.file(from, &path.text) {
+        Ok((_, text)) => text,
+        Err(reason) => {
+            let error = Diagnostic::error("E0903", format!("cannot read \"{}\"", path.text)).label(path.span, reason);
+            diagnostics.push(error.help("the path is relative to the file that names it"));
+            return None;
+        }
+    };
+    let wanted: Vec<bool> = units.iter().map(Option::is_some).collect();
+    let read = match columns::read(&text, &wanted) {
+        Ok(read) => read,
+        Err(what) => {
+            let error = Diagnostic::error("E0903", format!("\"{}\" does not fit", path.text)).label(path.span, what);
+            diagnostics.push(error);
+            return None;
+        }
+    };
+    let first = wanted.iter().position(|wanted| *wanted).unwrap_or(0);
+    if read.numbers[first].is_empty() {
+        let error = Diagnostic::error("E0902", format!("\"{}\" has no rows", path.text)).label(path.span, "empty");
+        diagnostics.push(error);
+        return None;
+    }
+    let mut out = Vec::new();
+    for (k, ((numbers, stated), unit)) in read.numbers.iter().zip(&read.units).zip(units).enumerate() {
+        let Some(unit) = unit else {
+            out.push(Vec::new());
+            continue;
+        };
+        if let Some(stated) = stated.as_ref().filter(|stated| stated.dimension != unit.dimension) {
+            let shown = |unit: &Unit| if unit.text.is_empty() { "a pure number".to_string() } else { unit.to_string() };
+            let message =
+                format!("column {} of \"{}\" is in {}, not in {}", k + 1, path.text, shown(stated), shown(unit));
+            let error = Diagnostic::error("E0903", message).label(path.span, "its heading says so");
+            diagnostics.push(error.help("change the unit here, the order of the columns, or the heading of the file"));
+            return None;
+        }
+        let unit = stated.as_ref().unwrap_or(unit);
+        out.push(numbers.iter().map(|number| unit.to_si(*number)).collect());
+    }
+    Some(out)
+}
+
+fn check_order(x: &[f64], span: Span, diagnostics: &mut Vec<Diagnostic>) -> Option<()> {
+    match x {
+        [.., a, b] if a.partial_cmp(b) != Some(std::cmp::Ordering::Less) => {
+            let error = Diagnostic::error("E0902", "the arguments of a table must increase")
+                .label(span, "not above the one before");
+            diagnostics.push(error.help("sort the points, and keep one for each argument"));
+            None
+        }
+        _ => Some(()),
+    }
+}
+
+/// A literal of this dimension, SI.
+fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) -> Option<f64> {
+    match &expr.kind {
+        ExprKind::Unary(UnaryOp::Negate, a) => Some(-number(a, dimension, diagnostics)?),
+        ExprKind::Number { value, unit } => {
+            let unit = match unit {
+                None => Unit::none(),
+                Some(text) => match Unit::parse(&text.text) {
+                    Ok(unit) => unit,
+                    Err(part) => {
+                        let error =
+                            Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(text.span, "not known");
+                        diagnostics.push(error);
+                        return None;
+                    }
+                },
+            };
+            if unit.dimension != dimension && *value != 0.0 {
+                let error = if unit.dimension.is_none() {
+                    let wanted = Unit::si(dimension);
+                    Diagnostic::error("E0103", "a point of a table needs its unit")
+                        .label(expr.span, "a pure number")
+                        .help(format!("write `{value} {wanted}`"))
+                } else {
+                    let message = format!("this is {}, {} is needed", unit.dimension.describe(), dimension.describe());
+                    Diagnostic::error("E0101", message).label(expr.span, unit.to_string())
+                };
+                diagnostics.push(error);
+                return None;
+            }
+            Some(unit.to_si(*value))
+        }
+        _ => {
+            let error = Diagnostic::error("E0902", "points of a table are numbers").label(expr.span, "not a number");
+            diagnostics.push(error.help("write a number with its unit; a formula belongs into a `fn`"));
+            None
+        }
+    }
+}

@@ -1,0 +1,1208 @@
+//! Gives every expression its dimension, and says where dimensions do not fit.
+//!
+//! In: a flat [`System`]. Out: [`Types`]. Quantities without a declared unit get one by unification: dimensions form a
+//! vector space over the rationals, so an equation between them is linear and one unknown of it can be eliminated.
+
+use crate::frontend::source::Files;
+use crate::frontend::system::*;
+pub use abi::unit::three_digits;
+use abi::unit::{Angle, Dimension, Ratio, Unit};
+use grammar::ast::BinaryOp;
+use grammar::diagnostic::Diagnostic;
+use grammar::span::Span;
+
+/// Dimensions and truth values of a system.
+#[derive(Clone, Debug, Default)]
+pub struct Types {
+    /// Per node; none where unknown.
+    pub nodes: Vec<Option<Dimension>>,
+    /// Per node: true or false rather than a quantity.
+    pub boolean: Vec<bool>,
+    /// Per quantity: the unit it is shown in.
+    pub units: Vec<Unit>,
+    /// Per quantity: true or false rather than a quantity.
+    pub boolean_vars: Vec<bool>,
+}
+
+const TIME: Dimension = Dimension::of([0, 0, 1, 0, 0]);
+const RATE: Dimension = Dimension::of([0, 0, -1, 0, 0]);
+const ENERGY: Dimension = Dimension::of([1, 2, -2, 0, 0]);
+
+/// Checks and infers the units of a system.
+pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) -> Types {
+    let mut found = Vec::new();
+    let (types, mut strangers) = walk(system, files, &system.strangers, &mut found);
+    if strangers.is_empty() {
+        diagnostics.extend(found);
+        return types;
+    }
+    // A straight model in a rotary place gets and gives wrong units everywhere: say the cause, not what follows.
+    strangers.extend(&system.strangers);
+    let mut again = Vec::new();
+    let (types, _) = walk(system, files, &strangers, &mut again);
+    diagnostics.extend(found.into_iter().filter(|diagnostic| diagnostic.code == "E0108"));
+    diagnostics.extend(again);
+    types
+}
+
+/// One pass; the quantities of `strangers` fit everything. Returns the instances found to be of the other kind of motion.
+fn walk(
+    system: &System,
+    files: &Files,
+    strangers: &[InstanceId],
+    diagnostics: &mut Vec<Diagnostic>,
+) -> (Types, Vec<InstanceId>) {
+    let mut checker = Checker {
+        system,
+        files,
+        strangers,
+        found: Vec::new(),
+        diagnostics,
+        unknowns: Vec::new(),
+        types: Vec::with_capacity(system.nodes.len()),
+        vars: Vec::new(),
+    };
+    checker.declare();
+    for index in 0..system.nodes.len() {
+        let found = checker.node(ExprId(index as u32));
+        let found = checker.within_reason(ExprId(index as u32), found);
+        checker.types.push(found);
+    }
+    checker.definitions();
+    checker.statements();
+    let found = std::mem::take(&mut checker.found);
+    (checker.finish(), found)
+}
+
+/// E0105 for exponents that cannot be told from others.
+fn too_large(message: &str, span: Span) -> Diagnostic {
+    let error = Diagnostic::error("E0105", message).label(span, "a quantity to this power");
+    error.help("make the base a pure number first: divide it by a quantity of its kind")
+}
+
+/// A dimension with unknowns in it: `base · Π unknown^exponent`.
+#[derive(Clone, PartialEq, Debug)]
+struct Term {
+    base: Dimension,
+    unknowns: Vec<(u32, Ratio)>,
+}
+
+impl Term {
+    fn known(base: Dimension) -> Term {
+        Term { base, unknowns: Vec::new() }
+    }
+
+    fn times(&self, other: &Term, exponent: Ratio) -> Term {
+        let mut out = Term { base: self.base.times(other.base.power(exponent)), unknowns: self.unknowns.clone() };
+        for (unknown, e) in &other.unknowns {
+            let e = *e * exponent;
+            match out.unknowns.iter_mut().find(|(known, _)| known == unknown) {
+                Some((_, sum)) => *sum = *sum + e,
+                None => out.unknowns.push((*unknown, e)),
+            }
+        }
+        out.unknowns.retain(|(_, e)| !e.is_zero());
+        out
+    }
+}
+
+/// The type of a node or quantity.
+#[derive(Clone, PartialEq, Debug)]
+enum Kind {
+    Boolean,
+    Real(Term),
+    /// Reported already; fits everything.
+    Unknown,
+}
+
+struct Checker<'a> {
+    system: &'a System,
+    files: &'a Files,
+    /// Instances whose quantities fit everything.
+    strangers: &'a [InstanceId],
+    /// Instances found to be straight in a rotary place, or the reverse.
+    found: Vec<InstanceId>,
+    diagnostics: &'a mut Vec<Diagnostic>,
+    /// What each unknown was found to be.
+    unknowns: Vec<Option<Term>>,
+    types: Vec<Kind>,
+    vars: Vec<Kind>,
+}
+
+impl Checker<'_> {
+    /// E0105 for an exponent that grew too large to be told from others.
+    fn within_reason(&mut self, id: ExprId, found: Kind) -> Kind {
+        let beyond = |term: &Term| term.base.is_beyond() || term.unknowns.iter().any(|(_, e)| e.is_beyond());
+        if !matches!(&found, Kind::Real(term) if beyond(term)) {
+            return found;
+        }
+        self.diagnostics.push(too_large("the exponents of the unit of this are beyond reason", self.system.span(id)));
+        Kind::Unknown
+    }
+
+    fn fresh(&mut self) -> Term {
+        self.unknowns.push(None);
+        Term { base: Dimension::NONE, unknowns: vec![(self.unknowns.len() as u32 - 1, Ratio::ONE)] }
+    }
+
+    fn resolved(&self, term: &Term) -> Term {
+        let mut term = term.clone();
+        while let Some((unknown, exponent)) =
+            term.unknowns.iter().copied().find(|(unknown, _)| self.unknowns[*unknown as usize].is_some())
+        {
+            term.unknowns.retain(|(other, _)| *other != unknown);
+            let found = self.unknowns[unknown as usize].clone().expect("just found");
+            term = term.times(&found, exponent);
+        }
+        term
+    }
+
+    /// Makes two terms equal; false if they cannot be.
+    fn unify(&mut self, a: &Term, b: &Term) -> bool {
+        if a.unknowns.is_empty() && b.unknowns.is_empty() {
+            return a.base == b.base;
+        }
+        let difference = self.resolved(&a.times(b, Ratio::whole(-1)));
+        match difference.unknowns.first().copied() {
+            None => difference.base.is_none(),
+            Some((unknown, exponent)) => {
+                let (num, den) = exponent.parts();
+                let mut rest = difference;
+                rest.unknowns.remove(0);
+                let nothing = Term::known(Dimension::NONE);
+                self.unknowns[unknown as usize] = Some(nothing.times(&rest, Ratio::new(-(den as i64), num as i64)));
+                true
+            }
+        }
+    }
+
+    fn kind(&self, id: ExprId) -> &Kind {
+        &self.types[id.0 as usize]
+    }
+
+    fn real(&mut self, id: ExprId) -> Option<Term> {
+        match self.kind(id).clone() {
+            Kind::Real(term) => Some(term),
+            Kind::Unknown => None,
+            Kind::Boolean => {
+                let error = Diagnostic::error("E0101", "a condition cannot be used as a quantity")
+                    .label(self.system.span(id), "true or false")
+                    .help("write `if … then 1 else 0`");
+                self.diagnostics.push(error);
+                None
+            }
+        }
+    }
+
+    fn shown(&self, term: &Term) -> String {
+        Unit::si(self.resolved(term).base).to_string()
+    }
+
+    fn described(&self, term: &Term) -> String {
+        self.resolved(term).base.describe()
+    }
+
+    fn text(&self, id: ExprId) -> &str {
+        self.files.slice(self.system.span(id))
+    }
+
+    /// `0.006 1/N·m`, which is (1/N)·m, where 1/(N·m) is needed: how it is read, and the number with the unit that fits.
+    fn left_to_right(&self, value: ExprId, wanted: &Term) -> Option<String> {
+        let (number, unit) = self.text(value).trim().split_once(' ')?;
+        let (above, below) = unit.trim().split_once('/')?;
+        let (first, rest) = below.split_once(['·', '*'])?;
+        let meant = format!("{above}/{}", below.replace(['·', '*'], "/"));
+        let wanted = self.resolved(wanted);
+        let fits = wanted.unknowns.is_empty() && Unit::parse(&meant).ok()?.dimension == wanted.base;
+        let unit = unit.trim();
+        fits.then(|| {
+            format!("a unit is read from left to right: `{unit}` is ({above}/{first})·{rest}; write `{number} {meant}`")
+        })
+    }
+
+    // ---- quantities
+
+    fn declare(&mut self) {
+        let boolean = boolean_vars(self.system);
+        for (var, boolean) in self.system.vars.iter().zip(boolean) {
+            let kind = match (&var.unit, var.kind) {
+                _ if var.unreadable || self.strangers.contains(&var.instance) => Kind::Unknown,
+                (Some((unit, _)), _) => Kind::Real(Term::known(unit.dimension)),
+                _ if boolean => Kind::Boolean,
+                (None, VarKind::Param) if var.shown.is_some() => {
+                    Kind::Real(Term::known(var.shown.as_ref().map_or(Dimension::NONE, |unit| unit.dimension)))
+                }
+                (None, VarKind::Input) => {
+                    let error = Diagnostic::error("E0106", format!("input `{}` does not say its unit", var.name))
+                        .label(var.span, "a port states its unit, so that errors stay local");
+                    self.diagnostics.push(error.help(format!(
+                        "write `input {0} [m/s]`, with the unit that is meant; `input {0} [1]` for a pure number",
+                        var.name
+                    )));
+                    Kind::Unknown
+                }
+                (None, _) => Kind::Real(self.fresh()),
+            };
+            self.vars.push(kind);
+        }
+    }
+
+    // ---- nodes
+
+    fn node(&mut self, id: ExprId) -> Kind {
+        let number = Kind::Real(Term::known(Dimension::NONE));
+        match self.system.node(id).clone() {
+            Node::Number { dimension: Some(dimension), .. } => Kind::Real(Term::known(dimension)),
+            Node::Number { dimension: None, .. } | Node::Hole => Kind::Real(self.fresh()),
+            Node::Bool(_) | Node::InRegime(..) => Kind::Boolean,
+            Node::Time => Kind::Real(Term::known(TIME)),
+            Node::Var(var) => self.vars[var.0 as usize].clone(),
+            Node::Rate(var) => match &self.vars[var.0 as usize] {
+                Kind::Real(term) => Kind::Real(term.times(&Term::known(RATE), Ratio::ONE)),
+                other => other.clone(),
+            },
+            Node::PathRate(var) => {
+                let Definition::Continuous { path: Some((_, path)), .. } = self.system.var(var).definition else {
+                    let name = &self.system.var(var).name;
+                    let error = Diagnostic::error("E0307", format!("`{name}` has no equation along a path"))
+                        .label(self.system.span(id), "no such derivative")
+                        .help(format!("write `d{name}/dt`"));
+                    self.diagnostics.push(error);
+                    return Kind::Unknown;
+                };
+                match (&self.vars[var.0 as usize], &self.vars[path.0 as usize]) {
+                    (Kind::Real(x), Kind::Real(s)) => Kind::Real(x.times(s, Ratio::whole(-1))),
+                    _ => Kind::Unknown,
+                }
+            }
+            Node::Negate(a) => self.real(a).map_or(Kind::Unknown, Kind::Real),
+            Node::Not(a) => {
+                self.condition(a, "`not`");
+                Kind::Boolean
+            }
+            Node::Binary(op, a, b) => self.binary(op, a, b),
+            Node::If(c, a, b) => {
+                self.condition(c, "`if`");
+                match (self.kind(a).clone(), self.kind(b).clone()) {
+                    (Kind::Boolean, Kind::Boolean) => Kind::Boolean,
+                    (Kind::Real(x), Kind::Real(y)) => {
+                        if !self.unify(&x, &y) {
+                            let message =
+                                format!("one branch is {}, the other {}", self.described(&x), self.described(&y));
+                            self.differ("E0101", message, a, &x, b, &y);
+                            return Kind::Unknown;
+                        }
+                        Kind::Real(if x.unknowns.is_empty() { x } else { y })
+                    }
+                    (Kind::Boolean, Kind::Real(_)) | (Kind::Real(_), Kind::Boolean) => {
+                        let error = Diagnostic::error("E0101", "one branch is a condition, the other a quantity")
+                            .label(self.system.span(a), "one")
+                            .label(self.system.span(b), "the other");
+                        self.diagnostics.push(error);
+                        Kind::Unknown
+                    }
+                    _ => Kind::Unknown,
+                }
+            }
+            Node::Call(builtin, args) => self.call(builtin, &args),
+            Node::Table(table, x) => {
+                let table = &self.system.tables[table as usize];
+                let (wanted, result) = (Term::known(table.x_dimension), Term::known(table.y_dimension));
+                if let Some(term) = self.real(x)
+                    && !self.unify(&term, &wanted)
+                {
+                    let message = format!(
+                        "`{}` is a table over {}, not {}",
+                        table.name,
+                        self.described(&wanted),
+                        self.described(&term)
+                    );
+                    let error = Diagnostic::error("E0101", message).label(self.system.span(x), self.shown(&term));
+                    self.diagnostics.push(error);
+                }
+                Kind::Real(result)
+            }
+            // Its difference is a node before this one and has been checked as a subtraction.
+            Node::Crossing(_) => Kind::Boolean,
+            Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
+            Node::Measure(measure, value, second, window) => {
+                for edge in [window.after, window.before].into_iter().flatten() {
+                    if let Some(given) = self.real(edge)
+                        && !self.unify(&given, &Term::known(TIME))
+                    {
+                        self.mismatch(edge, &given, &Term::known(TIME));
+                    }
+                }
+                let event = match measure {
+                    MeasureName::First | MeasureName::Rises | MeasureName::Turns => Some("`first`"),
+                    MeasureName::Count | MeasureName::CountRises | MeasureName::CountTurns => Some("`count`"),
+                    MeasureName::Duration => Some("`duration`"),
+                    _ => None,
+                };
+                let Some(term) = (match (event, self.kind(value).clone()) {
+                    (_, Kind::Boolean) | (Some(_), _) => {
+                        if let Some(event) = event {
+                            self.condition(value, event);
+                        }
+                        Some(Term::known(Dimension::NONE))
+                    }
+                    _ => self.real(value),
+                }) else {
+                    return Kind::Unknown;
+                };
+                if let Some(second) = second
+                    && let Some(given) = self.real(second)
+                {
+                    let wanted = match measure {
+                        MeasureName::At => Term::known(TIME),
+                        MeasureName::Peak => Term::known(Dimension::NONE),
+                        _ => term.clone(),
+                    };
+                    if !self.unify(&given, &wanted) {
+                        self.mismatch(second, &given, &wanted);
+                    }
+                }
+                match measure {
+                    MeasureName::Integral => Kind::Real(term.times(&Term::known(TIME), Ratio::ONE)),
+                    MeasureName::Crossings
+                    | MeasureName::Count
+                    | MeasureName::CountRises
+                    | MeasureName::CountTurns
+                    | MeasureName::Peaks => number,
+                    MeasureName::Duration
+                    | MeasureName::Period
+                    | MeasureName::Settling
+                    | MeasureName::First
+                    | MeasureName::Rises
+                    | MeasureName::Turns
+                    | MeasureName::Time => Kind::Real(Term::known(TIME)),
+                    _ => Kind::Real(term),
+                }
+            }
+            Node::Error => Kind::Unknown,
+        }
+    }
+
+    /// Two operands that should have one unit.
+    fn differ(&mut self, code: &'static str, message: String, a: ExprId, x: &Term, b: ExprId, y: &Term) {
+        // A bare number beside a quantity lacks a unit.
+        for (number, other, term) in [(a, b, y), (b, a, x)] {
+            if self.is_bare(number) {
+                let text = self.text(number).to_string();
+                let unit = self.shown(term);
+                let error = Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                    .label(self.system.span(number), "a pure number")
+                    .label(self.system.span(other), unit.clone())
+                    .help(format!("write `{text} {unit}`"));
+                self.diagnostics.push(error);
+                return;
+            }
+        }
+        let mut error = Diagnostic::error(code, message)
+            .label(self.system.span(a), self.shown(x))
+            .label(self.system.span(b), self.shown(y));
+        if let Some(help) = self.help(a, x, b, y) {
+            error = error.help(help);
+        }
+        self.diagnostics.push(error);
+    }
+
+    fn is_bare(&self, id: ExprId) -> bool {
+        match self.system.node(id) {
+            Node::Number { dimension: Some(dimension), .. } => {
+                dimension.is_none() && self.text(id).ends_with(|c: char| c.is_ascii_digit())
+            }
+            Node::Negate(a) => self.is_bare(*a),
+            _ => false,
+        }
+    }
+
+    /// What a sum of two different quantities may have meant: a coefficient that has the quotient as its unit.
+    fn help(&self, a: ExprId, x: &Term, b: ExprId, y: &Term) -> Option<String> {
+        let (x, y) = (self.resolved(x), self.resolved(y));
+        if !x.unknowns.is_empty() || !y.unknowns.is_empty() {
+            return None;
+        }
+        if x.base.rotary() == y.base || y.base.rotary() == x.base {
+            return Some("one is straight, the other rotary: `rotary` maps m to rad and kg to kg·m^2".into());
+        }
+        let wanted = x.base.over(y.base);
+        let unit = Unit::si(wanted);
+        let owner = self.owner(a).or_else(|| self.owner(b))?;
+        let fitting = self
+            .system
+            .vars
+            .iter()
+            .find(|var| var.instance == owner && var.kind == VarKind::Param && self.unit_of(var) == Some(wanted))?;
+        // `Fc + vs * sign(v)`: a velocity parameter stands where its coefficient belongs.
+        if let Node::Binary(BinaryOp::Multiply, p, s) = self.system.node(b)
+            && let (Node::Var(p), Node::Call(Builtin::Sign, args)) = (self.system.node(*p), self.system.node(*s))
+            && self.system.var(*p).kind == VarKind::Param
+        {
+            let p = self.system.var(*p);
+            let doc = p.doc.as_deref().map_or(String::new(), |doc| {
+                format!("`{}` is the {} (line {}). ", p.name, doc.trim(), self.files.line(p.span))
+            });
+            let v = self.text(args[0]);
+            return Some(format!(
+                "{doc}A coefficient in {unit} is missing;\n`{0}` is one. Did you mean `{1} * sign({v}) + {0} * {v}`?",
+                fitting.name,
+                self.text(a)
+            ));
+        }
+        Some(format!("a coefficient in {unit} is missing; `{0}` is one: `{0} * {1}`", fitting.name, self.text(b)))
+    }
+
+    /// What a side of an equation may lack: the unit of a number in it, or a param that has the quotient as its unit.
+    fn factor(&self, value: ExprId, found: &Term, wanted: &Term, owner: InstanceId) -> Option<String> {
+        let (found, wanted) = (self.resolved(found), self.resolved(wanted));
+        if !found.unknowns.is_empty() || !wanted.unknowns.is_empty() {
+            return None;
+        }
+        let missing = wanted.base.over(found.base);
+        let (mut stack, mut sum) = (vec![(value, true)], false);
+        while let Some((id, above)) = stack.pop() {
+            match self.system.node(id) {
+                Node::Binary(BinaryOp::Multiply, a, b) => stack.extend([(*b, above), (*a, above)]),
+                Node::Binary(BinaryOp::Divide, a, b) => stack.extend([(*b, !above), (*a, above)]),
+                Node::Negate(a) if !self.is_bare(id) => stack.push((*a, above)),
+                Node::Binary(BinaryOp::Add | BinaryOp::Subtract, ..) | Node::If(..) => sum = true,
+                _ if self.is_bare(id) => {
+                    let unit = Unit::si(if above { missing } else { found.base.over(wanted.base) });
+                    return Some(format!("a number has a unit too: `{0} {unit}` in place of `{0}`", self.text(id)));
+                }
+                _ => {}
+            }
+        }
+        let text = if sum { format!("({})", self.text(value)) } else { self.text(value).to_string() };
+        if text.len() > 60 || text.contains('\n') {
+            return None;
+        }
+        let param = |dimension: Dimension| {
+            let fits = |var: &&Var| var.kind == VarKind::Param && self.unit_of(var) == Some(dimension);
+            self.system.vars.iter().filter(|var| var.instance == owner).find(fits)
+        };
+        if let Some(factor) = param(missing) {
+            let (name, unit) = (&factor.name, Unit::si(missing));
+            return Some(format!("a factor in {unit} is missing; `{name}` is one: `{name} * {text}`"));
+        }
+        let divisor = param(found.base.over(wanted.base))?;
+        let (name, unit) = (&divisor.name, Unit::si(found.base.over(wanted.base)));
+        Some(format!("divide by something in {unit}; `{name}` is one: `{text} / {name}`"))
+    }
+
+    /// The instance that some quantity of the expression belongs to.
+    fn owner(&self, id: ExprId) -> Option<InstanceId> {
+        match self.system.node(id) {
+            Node::Var(var) | Node::Rate(var) => Some(self.system.var(*var).instance),
+            node => node.operands().find_map(|operand| self.owner(operand)),
+        }
+    }
+
+    fn unit_of(&self, var: &Var) -> Option<Dimension> {
+        match (&var.unit, &var.definition) {
+            (Some((unit, _)), _) => Some(unit.dimension),
+            (None, Definition::Value(value, _)) => match self.types.get(value.0 as usize) {
+                Some(Kind::Real(term)) => Some(self.resolved(term).base),
+                _ => match self.system.node(*value) {
+                    Node::Number { dimension, .. } => *dimension,
+                    _ => None,
+                },
+            },
+            _ => None,
+        }
+    }
+
+    fn mismatch(&mut self, id: ExprId, found: &Term, wanted: &Term) {
+        if self.is_bare(id) {
+            let (text, unit) = (self.text(id).to_string(), self.shown(wanted));
+            let error = Diagnostic::error("E0103", format!("`{text}` needs a unit"))
+                .label(self.system.span(id), "a pure number")
+                .help(format!("write `{text} {unit}`"));
+            self.diagnostics.push(error);
+            return;
+        }
+        let message = format!("this is {}, {} is needed", self.described(found), self.described(wanted));
+        let error = Diagnostic::error("E0101", message)
+            .label(self.system.span(id), format!("{}, not {}", self.shown(found), self.shown(wanted)));
+        self.diagnostics.push(match self.left_to_right(id, wanted) {
+            Some(help) => error.help(help),
+            None => error,
+        });
+    }
+
+    fn condition(&mut self, id: ExprId, what: &str) {
+        if let Kind::Real(term) = self.kind(id).clone() {
+            let error = Diagnostic::error("E0101", format!("{what} needs a condition, not {}", self.described(&term)))
+                .label(self.system.span(id), "neither true nor false")
+                .help("compare it with something: `a > b`");
+            self.diagnostics.push(error);
+        }
+    }
+
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId) -> Kind {
+        match op {
+            BinaryOp::And | BinaryOp::Or => {
+                let what = format!("`{}`", op.text());
+                self.condition(a, &what);
+                self.condition(b, &what);
+                return Kind::Boolean;
+            }
+            BinaryOp::Equal | BinaryOp::NotEqual
+                if *self.kind(a) == Kind::Boolean && *self.kind(b) == Kind::Boolean =>
+            {
+                return Kind::Boolean;
+            }
+            _ => {}
+        }
+        let (x, y) = (self.real(a), self.real(b));
+        let comparison =
+            !matches!(op, BinaryOp::Add | BinaryOp::Subtract | BinaryOp::Multiply | BinaryOp::Divide | BinaryOp::Power);
+        let (Some(x), Some(y)) = (x, y) else { return if comparison { Kind::Boolean } else { Kind::Unknown } };
+        match op {
+            BinaryOp::Multiply => Kind::Real(x.times(&y, Ratio::ONE)),
+            BinaryOp::Divide => Kind::Real(x.times(&y, Ratio::whole(-1))),
+            BinaryOp::Power => self.power(a, &x, b, &y),
+            BinaryOp::Add | BinaryOp::Subtract => {
+                if self.unify(&x, &y) {
+                    self.angles(a, b);
+                    return Kind::Real(if x.unknowns.is_empty() { x } else { y });
+                }
+                let message = if op == BinaryOp::Add {
+                    format!("cannot add {} and {}", self.described(&x), self.described(&y))
+                } else {
+                    format!("cannot subtract {} from {}", self.described(&y), self.described(&x))
+                };
+                self.differ("E0101", message, a, &x, b, &y);
+                Kind::Unknown
+            }
+            _ => {
+                if !self.unify(&x, &y) {
+                    let message = format!("cannot compare {} with {}", self.described(&x), self.described(&y));
+                    self.differ("E0101", message, a, &x, b, &y);
+                } else {
+                    self.angles(a, b);
+                }
+                Kind::Boolean
+            }
+        }
+    }
+
+    fn power(&mut self, a: ExprId, x: &Term, b: ExprId, y: &Term) -> Kind {
+        let none = Term::known(Dimension::NONE);
+        if !self.unify(y, &none) {
+            let error = Diagnostic::error("E0104", format!("an exponent is a pure number, not {}", self.described(y)))
+                .label(self.system.span(b), self.shown(y))
+                .help(format!("divide it by a quantity of its kind: `({} / 1 {})`", self.text(b), self.shown(y)));
+            self.diagnostics.push(error);
+            return Kind::Unknown;
+        }
+        if self.resolved(x) == none {
+            return Kind::Real(none);
+        }
+        match self.constant(b).and_then(Ratio::approximate) {
+            Some(exponent) => Kind::Real(none.times(x, exponent)),
+            None => {
+                let resolved = self.resolved(x);
+                if !resolved.unknowns.is_empty() {
+                    self.unify(x, &none);
+                    return Kind::Real(none);
+                }
+                let error =
+                    Diagnostic::error("E0105", format!("the exponent of {} must be a number", self.described(x)))
+                        .label(self.system.span(b), "not a number written here")
+                        .label(self.system.span(a), self.shown(x))
+                        .help(format!("make the base a pure number: `({} / 1 {}) ^ …`", self.text(a), self.shown(x)));
+                self.diagnostics.push(error);
+                Kind::Unknown
+            }
+        }
+    }
+
+    /// The value of a literal exponent.
+    fn constant(&self, id: ExprId) -> Option<f64> {
+        self.system.literal(id)
+    }
+
+    fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Kind {
+        let none = Term::known(Dimension::NONE);
+        let (time, rate) = (Term::known(TIME), Term::known(RATE));
+        let terms: Option<Vec<Term>> = {
+            let all: Vec<Option<Term>> = args.iter().map(|arg| self.real(*arg)).collect();
+            all.into_iter().collect()
+        };
+        let Some(terms) = terms else { return Kind::Unknown };
+        let need = |checker: &mut Self, k: usize, wanted: &Term| {
+            if !checker.unify(&terms[k], wanted) {
+                checker.mismatch(args[k], &terms[k], wanted);
+            }
+        };
+        match builtin {
+            Builtin::Abs => Kind::Real(terms[0].clone()),
+            Builtin::Floor => {
+                if !self.unify(&terms[0], &none) {
+                    // Rounding a quantity needs a unit to round to; SI would be a guess.
+                    let (unit, text) = (self.shown(&terms[0]), self.text(args[0]));
+                    let message = format!("`floor` needs a pure number, not {}", self.described(&terms[0]));
+                    let error = Diagnostic::error("E0104", message)
+                        .label(self.system.span(args[0]), format!("whole numbers of {unit}, or of what?"))
+                        .help(format!("say of what: `(1 {unit}) * floor({text} / (1 {unit}))`"));
+                    self.diagnostics.push(error);
+                    return Kind::Unknown;
+                }
+                Kind::Real(none)
+            }
+            Builtin::Sign => Kind::Real(none),
+            Builtin::Sqrt => Kind::Real(none.times(&terms[0], Ratio::new(1, 2))),
+            Builtin::Min | Builtin::Max | Builtin::Hypot | Builtin::Clamp | Builtin::Atan2 => {
+                for k in 1..args.len() {
+                    if !self.unify(&terms[0], &terms[k]) {
+                        let (x, y) = (self.described(&terms[0]), self.described(&terms[k]));
+                        let message = format!("`{}` compares {x} with {y}", builtin.name());
+                        self.differ("E0101", message, args[0], &terms[0], args[k], &terms[k]);
+                        return Kind::Unknown;
+                    }
+                }
+                let fitting = terms.iter().find(|term| term.unknowns.is_empty()).unwrap_or(&terms[0]);
+                Kind::Real(if builtin == Builtin::Atan2 { none } else { fitting.clone() })
+            }
+            Builtin::Exp
+            | Builtin::Expm1
+            | Builtin::Log
+            | Builtin::Log1p
+            | Builtin::Sin
+            | Builtin::Cos
+            | Builtin::Tan
+            | Builtin::Asin
+            | Builtin::Acos
+            | Builtin::Atan
+            | Builtin::Sinh
+            | Builtin::Cosh
+            | Builtin::Tanh
+            | Builtin::Random => {
+                for (arg, term) in args.iter().zip(&terms) {
+                    if !self.unify(term, &none) {
+                        let message = format!("`{}` needs a pure number, not {}", builtin.name(), self.described(term));
+                        let unit = self.shown(term);
+                        let error = Diagnostic::error("E0104", message)
+                            .label(self.system.span(*arg), unit.clone())
+                            .help(format!("divide by a quantity of the same kind: `{} / 1 {unit}`", self.text(*arg)));
+                        self.diagnostics.push(error);
+                    }
+                }
+                Kind::Real(none)
+            }
+            Builtin::Delay => {
+                need(self, 1, &time);
+                Kind::Real(terms[0].clone())
+            }
+            Builtin::Step => {
+                need(self, 0, &time);
+                Kind::Real(terms[1].clone())
+            }
+            Builtin::Ramp => {
+                need(self, 0, &time);
+                need(self, 2, &terms[1].times(&rate, Ratio::ONE));
+                Kind::Real(terms[1].clone())
+            }
+            Builtin::Pulse => {
+                need(self, 0, &time);
+                need(self, 1, &time);
+                Kind::Real(terms[2].clone())
+            }
+            Builtin::Sine | Builtin::Square => {
+                need(self, 1, &rate);
+                Kind::Real(terms[0].clone())
+            }
+            Builtin::Chirp => {
+                need(self, 1, &rate);
+                need(self, 2, &rate);
+                need(self, 3, &time);
+                Kind::Real(terms[0].clone())
+            }
+            Builtin::Noise => {
+                need(self, 1, &time);
+                need(self, 2, &none);
+                Kind::Real(terms[0].clone())
+            }
+        }
+    }
+
+    fn fits(&mut self, value: ExprId, dimension: Dimension, role: &Role) -> Kind {
+        let wanted = Term::known(dimension);
+        let Some(term) = self.real(value) else { return Kind::Real(wanted) };
+        if !self.unify(&term, &wanted) {
+            let (found, needed) = (self.described(&term), dimension.describe());
+            match role {
+                Role::Argument { function, .. } if dimension.is_none() => {
+                    let unit = self.shown(&term);
+                    let error = Diagnostic::error("E0104", format!("`{function}` needs a pure number, not {found}"))
+                        .label(self.system.span(value), unit.clone())
+                        .help(format!("divide by a quantity of the same kind: `{} / 1 {unit}`", self.text(value)));
+                    self.diagnostics.push(error);
+                }
+                Role::Argument { .. } if self.is_bare(value) => self.mismatch(value, &term, &wanted),
+                Role::Argument { function, name } => {
+                    let message = format!("`{name}` of `{function}` is {needed}, but gets {found}");
+                    let error = Diagnostic::error("E0101", message)
+                        .label(self.system.span(value), format!("{}, not {}", self.shown(&term), self.shown(&wanted)));
+                    self.diagnostics.push(error);
+                }
+                Role::Result { function } => {
+                    let message = format!("`{function}` is declared as {needed}, but gives {found}");
+                    let error = Diagnostic::error("E0101", message)
+                        .label(self.system.span(value), format!("{}, not {}", self.shown(&term), self.shown(&wanted)));
+                    self.diagnostics.push(error);
+                }
+            }
+        }
+        Kind::Real(wanted)
+    }
+
+    // ---- lint `angle`
+
+    fn angle(&self, id: ExprId) -> Angle {
+        match self.system.node(id) {
+            Node::Number { angle, .. } => *angle,
+            Node::Var(var) => self.system.var(*var).unit.as_ref().map_or(Angle::Silent, |(unit, _)| unit.angle),
+            Node::Negate(a) => self.angle(*a),
+            _ => Angle::Silent,
+        }
+    }
+
+    fn angles(&mut self, a: ExprId, b: ExprId) {
+        let (x, y) = (self.angle(a), self.angle(b));
+        if (x, y) == (Angle::Rate, Angle::Angle) || (x, y) == (Angle::Angle, Angle::Rate) {
+            let (rate, angle) = if x == Angle::Rate { (a, b) } else { (b, a) };
+            self.angle_met(rate, self.system.span(angle));
+        }
+    }
+
+    fn angle_met(&mut self, rate: ExprId, angle: Span) {
+        let text = self.text(rate).to_string();
+        let number = text.split(|c: char| c.is_ascii_alphabetic() || c == ' ').next().unwrap_or_default().to_string();
+        let warning = match self.system.node(rate) {
+            Node::Number { value, .. } if text.ends_with("Hz") => {
+                let exact = three_digits(value * 2.0 * std::f64::consts::PI);
+                Diagnostic::warning(
+                    "W0107",
+                    format!("{text} is {number} rad/s here, not {number} revolutions per second"),
+                )
+                .label(angle, "an angular velocity")
+                .label(self.system.span(rate), "a rate, without an angle")
+                .help(format!("write `{number} rev/s` ({exact} rad/s), or `{number} rad/s` if that is what you mean"))
+            }
+            _ => Diagnostic::warning("W0107", "a rate meets an angular velocity")
+                .label(angle, "an angular velocity")
+                .label(self.system.span(rate), "a rate, without an angle")
+                .help("if it counts revolutions, multiply by `2 * pi`, or write its unit as rev/s"),
+        };
+        self.diagnostics.push(warning);
+    }
+
+    // ---- definitions
+
+    fn definitions(&mut self) {
+        for id in self.system.var_ids() {
+            let var = self.system.var(id);
+            let kind = self.vars[id.0 as usize].clone();
+            match &var.definition {
+                Definition::Missing | Definition::Free => {}
+                Definition::Value(value, origin) | Definition::Held { value, origin, .. } => {
+                    self.defines(id, &kind, *value, *origin);
+                }
+                Definition::Continuous { initial, rate, .. } => {
+                    let rate = (*rate != *initial).then_some(*rate);
+                    self.state(id, &kind, *initial, rate);
+                }
+                Definition::Sampled { initial, next, .. } => {
+                    self.defines(id, &kind, *initial, self.system.start_origin(id));
+                    self.defines(id, &kind, *next, Origin::Equation(self.system.span(*next)));
+                }
+            }
+            for bound in [var.range.low, var.range.high].into_iter().flatten().map(|(bound, _)| bound) {
+                if let (Kind::Real(wanted), Kind::Real(found)) = (&kind, self.kind(bound).clone())
+                    && !self.unify(&found, wanted)
+                {
+                    self.mismatch(bound, &found, &wanted.clone());
+                }
+            }
+        }
+    }
+
+    fn defines(&mut self, id: VarId, kind: &Kind, value: ExprId, origin: Origin) {
+        let var = self.system.var(id);
+        let (wanted, found) = match (kind, self.kind(value).clone()) {
+            (Kind::Real(wanted), Kind::Real(found)) => (wanted.clone(), found),
+            (Kind::Boolean, Kind::Boolean) | (Kind::Unknown, _) | (_, Kind::Unknown) => return,
+            (Kind::Real(_), Kind::Boolean) => {
+                self.real(value);
+                return;
+            }
+            (Kind::Boolean, Kind::Real(_)) => {
+                self.condition(value, &format!("`{}`", var.name));
+                return;
+            }
+        };
+        if self.unify(&found, &wanted) {
+            let declared = var.unit.as_ref().map(|(unit, span)| (unit.angle, *span));
+            if let (Some((Angle::Angle, span)), Angle::Rate) = (declared, self.angle(value)) {
+                self.angle_met(value, span);
+            }
+            return;
+        }
+        let unit = var.unit.as_ref();
+        match origin {
+            _ if self.is_bare(value) => {
+                let text = self.text(value).to_string();
+                let written = unit.map_or(self.shown(&wanted), |(unit, _)| unit.text.clone());
+                let mut error = Diagnostic::error("E0103", format!("`{text}` needs a unit"));
+                let name = &var.name;
+                match (origin, unit) {
+                    (Origin::Default | Origin::Equation(_), Some((unit, span))) => {
+                        error = error
+                            .label(*span, format!("declared in {}", spelled(unit)))
+                            .label(self.system.span(value), "a pure number");
+                        error = error.help(match var.kind {
+                            VarKind::Param => format!("write `param {name} = {text} {written}`"),
+                            _ => format!("write `{text} {written}`"),
+                        });
+                    }
+                    (Origin::Argument { model, .. }, _) => {
+                        let expects = format!("expects {name} in {written}");
+                        error = error.label(self.system.span(value), "a pure number").label(model, expects);
+                        error = error.help(format!("write `{name} = {text} {written}`"));
+                    }
+                    _ => {
+                        error = error.label(self.system.span(value), "a pure number");
+                        error = error.help(format!("write `{text} {written}`"));
+                    }
+                }
+                self.diagnostics.push(error);
+            }
+            Origin::Argument { model, .. } => {
+                let (has, needs) = (self.resolved(&found).base, self.resolved(&wanted).base);
+                let name = &self.system.instance(var.instance).model;
+                let expects = format!("expects {} in {}", var.name, self.shown(&wanted));
+                let rotary = self.system.instance(var.instance).rotary;
+                let misread = self.left_to_right(value, &wanted);
+                if misread.is_none() && ((!rotary && needs.rotary() == has) || (rotary && has.rotary() == needs)) {
+                    self.found.push(var.instance);
+                }
+                let error = if let Some(help) = misread {
+                    let message = format!(
+                        "`{}` of {name} is in {}, but gets {}",
+                        var.name,
+                        self.shown(&wanted),
+                        self.shown(&found)
+                    );
+                    Diagnostic::error("E0101", message)
+                        .label(self.system.span(value), self.shown(&found))
+                        .label(model, expects)
+                        .help(help)
+                } else if !rotary && needs.rotary() == has {
+                    let message =
+                        format!("{name} is written for straight motion, but `{}` gets {}", var.name, angular(has));
+                    Diagnostic::error("E0108", message)
+                        .label(model, expects)
+                        .label(self.system.span(value), angular_unit(has))
+                        .help(format!(
+                            "write `rotary {name}(...)`: the same model with N -> N·m, m -> rad, kg -> kg·m^2"
+                        ))
+                } else if rotary && has.rotary() == needs {
+                    let message = format!("{name} is rotary here, but `{}` gets {}", var.name, has.describe());
+                    Diagnostic::error("E0108", message)
+                        .label(model, format!("expects {} in {}", var.name, angular_unit(needs)))
+                        .label(self.system.span(value), self.shown(&found))
+                        .help(format!("write `{name}(...)` without `rotary`, or give {}", angular(needs)))
+                } else {
+                    let message = format!(
+                        "`{}` of {name} is {}, but gets {}",
+                        var.name,
+                        self.described(&wanted),
+                        self.described(&found)
+                    );
+                    Diagnostic::error("E0101", message)
+                        .label(self.system.span(value), self.shown(&found))
+                        .label(model, expects)
+                };
+                self.diagnostics.push(error);
+            }
+            Origin::Equation(_) | Origin::Default | Origin::Override => {
+                let message =
+                    format!("`{}` is {}, but this is {}", var.name, self.described(&wanted), self.described(&found));
+                let mut error = Diagnostic::error("E0101", message).label(self.system.span(value), self.shown(&found));
+                error = match unit {
+                    Some((_, span)) => error.label(*span, "declared here"),
+                    None => error.label(var.span, format!("{} by its other uses", self.shown(&wanted))),
+                };
+                let help = self.left_to_right(value, &wanted);
+                if let Some(help) = help.or_else(|| self.factor(value, &found, &wanted, var.instance)) {
+                    error = error.help(help);
+                }
+                self.diagnostics.push(error);
+            }
+        }
+    }
+
+    fn state(&mut self, id: VarId, kind: &Kind, initial: ExprId, rate: Option<ExprId>) {
+        self.defines(id, kind, initial, self.system.start_origin(id));
+        let Some(rate) = rate else { return };
+        let (Kind::Real(state), Some(found)) = (kind, self.real(rate)) else { return };
+        let wanted = state.times(&Term::known(RATE), Ratio::ONE);
+        if self.unify(&found, &wanted) {
+            return;
+        }
+        let var = self.system.var(id);
+        let Definition::Continuous { path, span, .. } = &var.definition else { return };
+        let (value, wanted, found) = match path {
+            Some((value, along)) => match (self.kind(*value).clone(), &self.vars[along.0 as usize]) {
+                (Kind::Real(found), Kind::Real(s)) => (*value, state.times(s, Ratio::whole(-1)), found),
+                _ => return,
+            },
+            None => (rate, wanted, found),
+        };
+        let left = self.files.slice(*span).to_string();
+        if self.is_bare(value) {
+            self.mismatch(value, &found, &wanted);
+            return;
+        }
+        let message = format!("`{left}` is {}, but this is {}", self.described(&wanted), self.described(&found));
+        let mut error = Diagnostic::error("E0101", message)
+            .label(self.system.span(value), self.shown(&found))
+            .label(*span, format!("needs {}", self.shown(&wanted)));
+        let help = self.left_to_right(value, &wanted);
+        if let Some(help) = help.or_else(|| self.factor(value, &found, &wanted, var.instance)) {
+            error = error.help(help);
+        }
+        self.diagnostics.push(error);
+    }
+
+    fn statements(&mut self) {
+        for block in &self.system.blocks {
+            if let Some(term) = self.real(block.period)
+                && !self.unify(&term, &Term::known(TIME))
+            {
+                let rate = self.unify(&term, &Term::known(RATE));
+                self.mismatch(block.period, &term, &Term::known(TIME));
+                if let Some(error) = self.diagnostics.last_mut().filter(|_| rate) {
+                    error.help = Some("a period is a time: `every 1 ms` for 1 kHz".into());
+                }
+            }
+        }
+        for (_, energy) in &self.system.storages {
+            if let Some(term) = self.real(*energy)
+                && !self.unify(&term, &Term::known(ENERGY))
+            {
+                let message = format!("stored energy is in J, but this is {}", self.described(&term));
+                let error = Diagnostic::error("E0101", message).label(self.system.span(*energy), self.shown(&term));
+                self.diagnostics.push(error);
+            }
+        }
+        for require in &self.system.requires {
+            self.condition(require.condition, "`require`");
+        }
+        let transitions =
+            self.system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
+        type Resets<'r> = &'r [(VarId, ExprId)];
+        let conditions: Vec<(ExprId, Resets, &str)> = transitions
+            .map(|transition| (transition.condition, transition.resets.as_slice(), "`go`"))
+            .chain(self.system.events.iter().map(|event| (event.condition, event.resets.as_slice(), "`when`")))
+            .collect();
+        for (condition, resets, what) in conditions {
+            self.condition(condition, what);
+            for (var, value) in resets {
+                let kind = self.vars[var.0 as usize].clone();
+                self.defines(*var, &kind, *value, Origin::Equation(self.system.span(*value)));
+            }
+        }
+    }
+
+    fn finish(self) -> Types {
+        let base = |checker: &Self, kind: &Kind| match kind {
+            Kind::Real(term) => {
+                let term = checker.resolved(term);
+                Some((term.base, term.unknowns.is_empty()))
+            }
+            Kind::Boolean | Kind::Unknown => None,
+        };
+        let mut units = Vec::with_capacity(self.vars.len());
+        let mut lost: Vec<VarId> = Vec::new();
+        let mut beyond: Option<VarId> = None;
+        for (k, (var, kind)) in self.system.vars.iter().zip(&self.vars).enumerate() {
+            let unit = match (&var.unit, base(&self, kind)) {
+                (Some((unit, _)), _) => unit.clone(),
+                (None, Some((dimension, known))) => {
+                    let defined = match &var.definition {
+                        Definition::Missing | Definition::Free => false,
+                        Definition::Value(value, _) | Definition::Held { value, .. } => {
+                            *self.kind(*value) != Kind::Unknown
+                        }
+                        Definition::Continuous { rate, .. } => *self.kind(*rate) != Kind::Unknown,
+                        Definition::Sampled { next, .. } => *self.kind(*next) != Kind::Unknown,
+                    };
+                    if !known && defined && matches!(var.kind, VarKind::Output | VarKind::Let | VarKind::State) {
+                        lost.push(VarId(k as u32));
+                    }
+                    if dimension.is_beyond() {
+                        beyond = beyond.or(Some(VarId(k as u32)));
+                    }
+                    match &var.shown {
+                        Some(unit) if unit.dimension == dimension => unit.clone(),
+                        _ => Unit::si(dimension),
+                    }
+                }
+                (None, None) => Unit::none(),
+            };
+            units.push(unit);
+        }
+        // What follows from the first is no mistake of its own.
+        if let Some(id) = beyond {
+            self.diagnostics.push(too_large("the exponents of its unit are beyond reason", self.system.var(id).span));
+        }
+        let holes: Vec<(Span, Dimension)> = (0..self.system.nodes.len())
+            .filter(|&k| self.system.nodes[k] == Node::Hole)
+            .filter_map(|k| Some((self.system.spans[k], base(&self, &self.types[k])?.0)))
+            .collect();
+        let nodes: Vec<Option<Dimension>> =
+            self.types.iter().map(|kind| base(&self, kind).map(|(dimension, _)| dimension)).collect();
+        let boolean = self.types.iter().map(|kind| *kind == Kind::Boolean).collect();
+        let boolean_vars = self.vars.iter().map(|kind| *kind == Kind::Boolean).collect();
+        let quiet = !self.diagnostics.iter().any(Diagnostic::is_error);
+        for (span, dimension) in holes {
+            let fitting: Vec<String> = self
+                .system
+                .vars
+                .iter()
+                .zip(&units)
+                .filter(|(var, unit)| {
+                    var.span.file == span.file && unit.dimension == dimension && !var.path.contains('.')
+                })
+                .map(|(var, _)| format!("`{}`", var.path))
+                .collect();
+            let unit = Unit::si(dimension);
+            let error = Diagnostic::error("E0112", format!("here {} is needed, in {unit}", dimension.describe()))
+                .label(span, format!("{unit}"));
+            self.diagnostics.push(match fitting.is_empty() {
+                true => error.help("no visible name has this unit"),
+                false => error.help(format!("visible names with this unit: {}", fitting.join(", "))),
+            });
+        }
+        if quiet {
+            // A copy of a quantity without a unit has none for the same reason.
+            let copy = |id: &VarId| match self.system.var(*id).definition {
+                Definition::Value(value, _) => matches!(self.system.node(value), Node::Var(_)),
+                _ => false,
+            };
+            let originals = lost.iter().filter(|id| !copy(id)).count();
+            for id in lost.into_iter().filter(|id| originals == 0 || !copy(id)) {
+                let var = self.system.var(id);
+                let error = Diagnostic::error("E0106", format!("the unit of `{}` cannot be inferred", var.name))
+                    .label(var.span, "no equation says it")
+                    .help(format!(
+                        "write it: `{} {} [1]` for a pure number, or another unit",
+                        var.kind.word(),
+                        var.name
+                    ));
+                self.diagnostics.push(error);
+            }
+        }
+        Types { nodes, boolean, units, boolean_vars }
+    }
+}
+
+/// Which quantities are true or false: those defined by a condition.
+fn boolean_vars(system: &System) -> Vec<bool> {
+    #[derive(Clone, Copy, PartialEq)]
+    enum Mark {
+        Unseen,
+        Open,
+        Is(bool),
+    }
+    let mut marks = vec![Mark::Unseen; system.vars.len()];
+    for start in 0..system.vars.len() {
+        // Follow a chain of plain copies to what decides it.
+        let mut chain = Vec::new();
+        let mut at = start;
+        let answer = loop {
+            match marks[at] {
+                Mark::Is(answer) => break answer,
+                Mark::Open => break false,
+                Mark::Unseen => {}
+            }
+            marks[at] = Mark::Open;
+            chain.push(at);
+            let mut value = match system.vars[at].definition {
+                Definition::Value(value, _) | Definition::Held { value, .. } => value,
+                Definition::Sampled { initial, .. } | Definition::Continuous { initial, .. } => initial,
+                Definition::Free | Definition::Missing => break false,
+            };
+            let decided = loop {
+                match system.node(value) {
+                    Node::Bool(_) | Node::InRegime(..) | Node::Crossing(_) | Node::Not(_) => break Ok(true),
+                    Node::Binary(op, ..) => {
+                        break Ok(!matches!(
+                            op,
+                            BinaryOp::Add
+                                | BinaryOp::Subtract
+                                | BinaryOp::Multiply
+                                | BinaryOp::Divide
+                                | BinaryOp::Power
+                        ));
+                    }
+                    Node::If(_, a, _) => value = *a,
+                    Node::Var(var) => break Err(var.0 as usize),
+                    _ => break Ok(false),
+                }
+            };
+            match decided {
+                Ok(answer) => break answer,
+                Err(next) => at = next,
+            }
+        };
+        for index in chain {
+            marks[index] = Mark::Is(answer);
+        }
+    }
+    marks.into_iter().map(|mark| mark == Mark::Is(true)).collect()
+}
+
+/// A unit spelled out where it is a single word.
+fn spelled(unit: &Unit) -> String {
+    let name = match unit.text.as_str() {
+        "N" => "newton",
+        "m" => "metres",
+        "s" => "seconds",
+        "kg" => "kilograms",
+        "J" => "joules",
+        "W" => "watts",
+        "A" => "amperes",
+        "K" => "kelvins",
+        "rad" => "radians",
+        other => other,
+    };
+    name.to_string()
+}
+
+/// A rotary kind of quantity, named as such.
+fn angular(dimension: Dimension) -> String {
+    match angular_unit(dimension).as_str() {
+        "rad" => "an angle".into(),
+        "rad/s" => "an angular velocity".into(),
+        "rad/s^2" => "an angular acceleration".into(),
+        "N·m" => "a torque".into(),
+        _ => dimension.describe(),
+    }
+}
+
+fn angular_unit(dimension: Dimension) -> String {
+    if dimension.is_none() {
+        "rad".into()
+    } else if dimension == RATE {
+        "rad/s".into()
+    } else if dimension == RATE.times(RATE) {
+        "rad/s^2".into()
+    } else {
+        Unit::si(dimension).to_string()
+    }
+}

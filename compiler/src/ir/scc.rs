@@ -1,0 +1,92 @@
+//! Strongly connected components: what goes in circles, and in which order the rest may be done.
+//!
+//! In: a graph, by its edges. Out: its components. It does not know what the vertices are.
+
+/// The strongly connected components of the vertices 0..n, each after all that its edges lead to; the `k`-th edge of `v`
+/// leads to `edge(v, k)`, up to the first that is none (Tarjan, without recursion).
+pub fn components(n: usize, edge: impl Fn(usize, usize) -> Option<usize>) -> Vec<Vec<usize>> {
+    const NONE: u32 = u32::MAX;
+    let (mut number, mut low, mut on_stack) = (vec![NONE; n], vec![0u32; n], vec![false; n]);
+    let (mut stack, mut next, mut out) = (Vec::new(), 0u32, Vec::new());
+    for root in 0..n {
+        if number[root] != NONE {
+            continue;
+        }
+        let mut work = vec![(root, 0usize)];
+        while let Some((v, k)) = work.pop() {
+            if k == 0 {
+                number[v] = next;
+                low[v] = next;
+                next += 1;
+                stack.push(v);
+                on_stack[v] = true;
+            } else if let Some(done) = edge(v, k - 1).filter(|done| on_stack[*done]) {
+                low[v] = low[v].min(low[done]);
+            }
+            if let Some(w) = edge(v, k) {
+                work.push((v, k + 1));
+                if number[w] == NONE {
+                    work.push((w, 0));
+                }
+                continue;
+            }
+            if low[v] == number[v] {
+                let mut component = Vec::new();
+                loop {
+                    let w = stack.pop().expect("the component ends with its root");
+                    on_stack[w] = false;
+                    component.push(w);
+                    if w == v {
+                        break;
+                    }
+                }
+                component.sort_unstable();
+                out.push(component);
+            }
+        }
+    }
+    out
+}
+
+/// What roots need, each behind its operands and once, each root's own in one piece; `index` tells nodes apart, of which there
+/// are `count`, what `is_read` stands nowhere, and `operands` come in the order in which they are wanted.
+pub fn topological_order<N: Copy>(
+    roots: &[N],
+    count: usize,
+    index: impl Fn(N) -> usize,
+    is_read: impl Fn(N) -> bool,
+    operands: impl Fn(N) -> Vec<N>,
+) -> Vec<N> {
+    let mut done = vec![false; count];
+    let mut out = Vec::new();
+    for root in roots {
+        let mut open = vec![(*root, false)];
+        while let Some((node, ready)) = open.pop() {
+            if done[index(node)] || is_read(node) {
+                continue;
+            }
+            if ready {
+                done[index(node)] = true;
+                out.push(node);
+                continue;
+            }
+            open.push((node, true));
+            // The last pushed is done first.
+            open.extend(operands(node).into_iter().rev().map(|operand| (operand, false)));
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn circles_are_found_and_what_is_needed_comes_first() {
+        // 0 needs 1 and 4; 1, 2 and 3 need each other; 4 needs itself.
+        let edges: [&[usize]; 5] = [&[1, 4], &[2], &[3, 2], &[1], &[4]];
+        let found = components(5, |v, k| edges[v].get(k).copied());
+        assert_eq!(found, [vec![1, 2, 3], vec![4], vec![0]]);
+    }
+}

@@ -1,0 +1,439 @@
+//! Derivatives of functions, as functions: forward along directions, before elementary functions are expanded.
+//!
+//! In: a function and the slots along which to differentiate. Out: with its values, theirs. A direction that a value
+//! does not depend on is not there at all, so the sparsity of a Jacobian is found on the way and nothing is computed
+//! for its zeros. The derivative of abs, min, max, clamp and if is that of the branch taken; of sign and floor, of
+//! tables' indices and of whatever is an integer, it is 0.
+
+use crate::ir::build::{Build, Env};
+use crate::ir::expr::{Real, Shared};
+use crate::ir::program::Program;
+use crate::ir::{Binary, Func, Op, Unary, Value};
+use abi::Slot;
+use std::collections::HashMap;
+
+/// The derivatives of a value along the directions it depends on, in their order.
+pub type Gradient = Vec<(u32, Value)>;
+
+/// Inlines `func` on `env`, as [`Build::inline`] does, and gives for each slot it stores the derivatives of what it
+/// stores along `directions`: direction k is the slot `directions[k]`, all others being constant.
+pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -> HashMap<Slot, Gradient> {
+    inline_given(build, func, env, directions, &HashMap::new())
+}
+
+/// The same where some values of `func` are given, and constant.
+pub fn inline_given(
+    build: &Shared,
+    func: &Func,
+    env: &mut Env,
+    directions: &[Slot],
+    given: &HashMap<Value, Value>,
+) -> HashMap<Slot, Gradient> {
+    let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
+    let live = func.live();
+    let none = Value(u32::MAX);
+    let mut values = vec![none; func.ops.len()];
+    let mut gradients: Vec<Gradient> = vec![Gradient::new(); func.ops.len()];
+    let last = last_uses(func);
+    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+        if let Op::Load(slot) = op {
+            values[i] = build.borrow_mut().read(*slot, env);
+            if let Some(k) = direction.get(slot) {
+                gradients[i] = vec![(*k, build.borrow_mut().real(1.0))];
+            }
+            continue;
+        }
+        if let Some(value) = given.get(&Value(i as u32)) {
+            values[i] = *value;
+            continue;
+        }
+        let op = op.map(|operand| values[operand.index()]);
+        values[i] = build.borrow_mut().op(op);
+        let of = |k: usize| {
+            let mut operands = Vec::new();
+            func.ops[i].each_operand(|operand| operands.push(operand));
+            &gradients[operands[k].index()]
+        };
+        gradients[i] = gradient(build, op, values[i], &of);
+        // A sum over a thousand parts has half a million entries on its way.
+        func.ops[i].each_operand(|operand| {
+            if last[operand.index()] == i {
+                gradients[operand.index()] = Gradient::new();
+            }
+        });
+    }
+    let mut of_slots = HashMap::new();
+    for (slot, value) in &func.stores {
+        env.insert(*slot, values[value.index()]);
+        of_slots.insert(*slot, gradients[value.index()].clone());
+    }
+    of_slots
+}
+
+/// For each operation the last one that uses its value; the number of operations for what is stored.
+fn last_uses(func: &Func) -> Vec<usize> {
+    let mut last = vec![0; func.ops.len()];
+    for (i, op) in func.ops.iter().enumerate() {
+        op.each_operand(|operand| last[operand.index()] = i);
+    }
+    for (_, value) in &func.stores {
+        last[value.index()] = func.ops.len();
+    }
+    last
+}
+
+/// Which of what a function stores depends on which directions: (row, direction), where row r is the r-th of `rows`.
+/// None where there are more than `most`.
+pub fn coupling(func: &Func, rows: &[Slot], directions: &[Slot], most: usize) -> Option<Vec<(u32, u32)>> {
+    let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
+    let live = func.live();
+    let last = last_uses(func);
+    let mut depends: Vec<Vec<u32>> = vec![Vec::new(); func.ops.len()];
+    for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| live[*i]) {
+        let mut mine: Vec<u32> = Vec::new();
+        if let Op::Load(slot) = op {
+            mine.extend(direction.get(slot));
+        } else {
+            let mut operands = Vec::new();
+            op.each_operand(|operand| operands.push(operand.index()));
+            for operand in operands {
+                let taken = match last[operand] == i {
+                    true => std::mem::take(&mut depends[operand]),
+                    false => depends[operand].clone(),
+                };
+                mine = if mine.is_empty() { taken } else { union(&mine, &taken) };
+            }
+        }
+        depends[i] = mine;
+    }
+    let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
+    let mut entries = Vec::new();
+    for (row, slot) in rows.iter().enumerate() {
+        if let Some(value) = stored.get(slot) {
+            entries.extend(depends[value.index()].iter().map(|column| (row as u32, *column)));
+        }
+        if entries.len() > most {
+            return None;
+        }
+    }
+    Some(entries)
+}
+
+/// What is in either of two ascending lists, ascending.
+fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
+    let (mut i, mut j) = (0, 0);
+    let mut out = Vec::with_capacity(a.len() + b.len());
+    while i < a.len() && j < b.len() {
+        let (x, y) = (a[i], b[j]);
+        out.push(x.min(y));
+        i += usize::from(x <= y);
+        j += usize::from(y <= x);
+    }
+    out.extend_from_slice(&a[i..]);
+    out.extend_from_slice(&b[j..]);
+    out
+}
+
+/// The function that writes ∂f/∂x and ∂f/∂t of dx/dt = f(t, x) into the segment `jacobian`: all entries, or those of the
+/// coupling where the model has one.
+pub fn jacobian(program: &Program) -> Func {
+    let layout = &program.description.layout;
+    let coupling = &program.description.coupling;
+    let n = layout.states.len as usize;
+    let entries = if coupling.is_empty() { n * n } else { coupling.len() };
+    assert_eq!(layout.jacobian.len as usize, entries + n, "room for the Jacobian of {n} states");
+    let delays = &program.description.delays;
+    let states = (0..n).map(|j| layout.states.slot(j));
+    let directions: Vec<Slot> = states.chain([Slot::TIME]).chain(delays.iter().map(|delay| delay.past)).collect();
+    let build = Shared::new(Build::new("jacobian"));
+    let of_slots = inline(&build, &program.derivatives, &mut Env::new(), &directions);
+    let mut build = build.into_inner();
+    let mut next = 0;
+    for i in 0..n {
+        let gradient = of_slots.get(&layout.derivatives.slot(i));
+        let written = coupling[next.min(coupling.len())..].iter().take_while(|(row, _)| *row as usize == i);
+        let columns: Vec<usize> =
+            if coupling.is_empty() { (0..n).collect() } else { written.map(|(_, column)| *column as usize).collect() };
+        for j in columns.into_iter().chain([n]) {
+            let entry = gradient.and_then(|gradient| entry(gradient, j as u32));
+            let mut entry = entry.unwrap_or_else(|| build.real(0.0));
+            // What was before moves along time too.
+            for (k, delay) in delays.iter().enumerate().filter(|_| j == n) {
+                if let Some(d) = gradient.and_then(|gradient| self::entry(gradient, (n + 1 + k) as u32)) {
+                    let slope = build.load(delay.slope);
+                    let part = build.mul(d, slope);
+                    entry = build.add(entry, part);
+                }
+            }
+            let at = if j < n { next } else { entries + i };
+            next += usize::from(j < n);
+            build.store(layout.jacobian.slot(at), entry);
+        }
+    }
+    assert_eq!(next, entries, "every entry is written");
+    build.finish()
+}
+
+/// The derivative along one direction, if there is one.
+pub fn entry(gradient: &Gradient, direction: u32) -> Option<Value> {
+    gradient.binary_search_by_key(&direction, |(k, _)| *k).ok().map(|at| gradient[at].1)
+}
+
+/// The derivatives of the result `y` of `op`, from those of its operands.
+fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &'g Gradient) -> Gradient {
+    let at = |value| Real::new(build, value);
+    let y = at(y);
+    // y = y(a): dy = factor · da
+    let chain = |factor: &dyn Fn() -> Real<'a>| scale(build, of(0), factor);
+    // y = y(a, b): dy = factors.0 · da + factors.1 · db
+    let both = |of_a: &dyn Fn() -> Real<'a>, of_b: &dyn Fn() -> Real<'a>| {
+        let (a, b) = (scale(build, of(0), of_a), scale(build, of(1), of_b));
+        merge(&a, &b, |a, b| Some(sum(build, a, b)))
+    };
+    match op {
+        Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => Gradient::new(),
+        Op::Add(..) => merge(of(0), of(1), |a, b| Some(sum(build, a, b))),
+        Op::Sub(..) => merge(of(0), of(1), |a, b| {
+            let a = a.map(at);
+            let b = b.map(at);
+            Some(match (a, b) {
+                (Some(a), Some(b)) => (a - b).value,
+                (Some(a), None) => a.value,
+                (None, Some(b)) => (-b).value,
+                (None, None) => return None,
+            })
+        }),
+        // 0 · x is 0 wherever x is a number.
+        Op::Mul(a, b) if [a, b].iter().any(|v| build.borrow().constant(*v) == Some(0.0)) => Gradient::new(),
+        Op::Mul(a, b) => both(&|| at(b), &|| at(a)),
+        Op::Div(_, b) => {
+            let rest = scale(build, of(1), &|| -y);
+            let numerator = merge(of(0), &rest, |a, b| Some(sum(build, a, b)));
+            numerator.into_iter().map(|(k, d)| (k, (at(d) / at(b)).value)).collect()
+        }
+        Op::Neg(_) => of(0).iter().map(|(k, d)| (*k, (-at(*d)).value)).collect(),
+        Op::Abs(a) => of(0).iter().map(|(k, d)| (*k, at(a).below(0.0).choose(-at(*d), at(*d)).value)).collect(),
+        // At 0 the slope is infinite: 0, so that nothing but numbers travels on.
+        Op::Sqrt(_) => chain(&|| y.above(0.0).choose(0.5 / y, 0.0)),
+        Op::Fma(a, b, _) => {
+            let product = both(&|| at(b), &|| at(a));
+            merge(&product, of(2), |a, b| Some(sum(build, a, b)))
+        }
+        Op::Floor(_) | Op::Nearest(_) => Gradient::new(),
+        Op::Unary(function, a) => {
+            let a = at(a);
+            let call = |function: Unary| at(build.borrow_mut().unary(function, a.value));
+            chain(&|| match function {
+                Unary::Exp => y,
+                Unary::Expm1 => y + 1.0,
+                Unary::Log => 1.0 / a,
+                Unary::Log1p => 1.0 / (1.0 + a),
+                Unary::Sin => call(Unary::Cos),
+                Unary::Cos => -call(Unary::Sin),
+                Unary::Tan => y.fma(y, 1.0),
+                Unary::Asin => 1.0 / ((1.0 - a) * (1.0 + a)).sqrt(),
+                Unary::Acos => -1.0 / ((1.0 - a) * (1.0 + a)).sqrt(),
+                Unary::Atan => 1.0 / a.fma(a, 1.0),
+                Unary::Sinh => call(Unary::Cosh),
+                Unary::Cosh => call(Unary::Sinh),
+                Unary::Tanh => (1.0 - y) * (1.0 + y),
+            })
+        }
+        Op::Binary(function, a, b) => {
+            let (a, b) = (at(a), at(b));
+            match function {
+                // of y and x: (x dy − y dx)/(x² + y²)
+                Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
+                // a^b: b a^b/a da + a^b log a db. For b = 1 the first is 1; at a = 0 it is else 0, also where it is
+                // infinite, and the second is 0: nothing but numbers travels on.
+                Binary::Pow => {
+                    let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
+                    let slope = || b.is(1.0).choose(1.0, a.is(0.0).choose(0.0, b * (y / a)));
+                    both(&slope, &|| a.above(0.0).choose(y * log(), 0.0))
+                }
+                // At the origin the direction is undefined: 0.
+                Binary::Hypot => {
+                    let share = |x: Real<'a>| y.above(0.0).choose(x / y, 0.0);
+                    both(&|| share(a), &|| share(b))
+                }
+            }
+        }
+        Op::Select(condition, ..) => merge(of(1), of(2), |a, b| {
+            let mut build = build.borrow_mut();
+            let zero = build.real(0.0);
+            Some(build.select(condition, a.unwrap_or(zero), b.unwrap_or(zero)))
+        }),
+        Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) | Op::And(..) | Op::Or(..) | Op::Not(_) => Gradient::new(),
+        Op::IntAdd(..) | Op::IntSub(..) | Op::IntMul(..) | Op::IntAnd(..) | Op::IntOr(..) | Op::IntXor(..) => {
+            Gradient::new()
+        }
+        Op::ShiftLeft(..) | Op::ShiftRight(..) | Op::ShiftRightSigned(..) => Gradient::new(),
+        Op::IntLess(..) | Op::IntEqual(..) => Gradient::new(),
+        Op::ToBits(_) | Op::FromBits(_) | Op::ToInt(_) | Op::ToReal(_) => Gradient::new(),
+    }
+}
+
+/// Each derivative times a factor, which is asked for only if there is one.
+fn scale<'a>(build: &'a Shared, gradient: &Gradient, factor: &dyn Fn() -> Real<'a>) -> Gradient {
+    if gradient.is_empty() {
+        return Gradient::new();
+    }
+    let factor = factor();
+    gradient.iter().map(|(k, d)| (*k, (factor * Real::new(build, *d)).value)).collect()
+}
+
+fn sum(build: &Shared, a: Option<Value>, b: Option<Value>) -> Value {
+    match (a, b) {
+        (Some(a), Some(b)) => build.borrow_mut().add(a, b),
+        (Some(one), None) | (None, Some(one)) => one,
+        (None, None) => unreachable!("a direction of neither"),
+    }
+}
+
+/// Joins two gradients direction by direction.
+fn merge(a: &Gradient, b: &Gradient, mut join: impl FnMut(Option<Value>, Option<Value>) -> Option<Value>) -> Gradient {
+    let (mut i, mut j) = (0, 0);
+    let mut merged = Gradient::with_capacity(a.len().max(b.len()));
+    while i < a.len() || j < b.len() {
+        let direction = a.get(i).map_or(u32::MAX, |(k, _)| *k).min(b.get(j).map_or(u32::MAX, |(k, _)| *k));
+        let take = |list: &Gradient, at: &mut usize| {
+            let (k, value) = list.get(*at)?;
+            (*k == direction).then(|| {
+                *at += 1;
+                *value
+            })
+        };
+        let (of_a, of_b) = (take(a, &mut i), take(b, &mut j));
+        merged.extend(join(of_a, of_b).map(|value| (direction, value)));
+    }
+    merged
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::interpret::run_once;
+    use crate::ir::random::Random;
+    use crate::math::{POOL, expand};
+    use abi::{Description, Layout};
+
+    /// dx/dt = f(t, x) of n states, with its Jacobian.
+    fn program(n: u32, f: impl FnOnce(&mut Build, &Layout)) -> Program {
+        let layout = Layout::new([0, 0, n, 0, 0, 0, n, 0, n * n + n, 0]);
+        let mut build = Build::new("derivatives");
+        f(&mut build, &layout);
+        let description = Description { layout, ..Description::default() };
+        Program { description, derivatives: build.finish(), ..Program::default() }
+    }
+
+    /// Compares every entry with central differences at random points between the two bounds.
+    #[track_caller]
+    fn check(program: &Program, bounds: (f64, f64), tolerance: f64) {
+        let layout = &program.description.layout;
+        let n = layout.states.len as usize;
+        let (f, df) = (expand(&program.derivatives), expand(&jacobian(program)));
+        let mut random = Random(11);
+        for _ in 0..200 {
+            let mut block = vec![0.0; layout.size()];
+            block[0] = random.within(bounds.0, bounds.1);
+            for slot in layout.states.range() {
+                block[slot] = random.within(bounds.0, bounds.1);
+            }
+            let mut at = block.clone();
+            run_once(&df, &mut at, &POOL);
+            for (j, slot) in layout.states.range().chain([0]).enumerate() {
+                let h = 1e-5;
+                let [plus, minus] = [h, -h].map(|h| {
+                    let mut moved = block.clone();
+                    moved[slot] += h;
+                    run_once(&f, &mut moved, &POOL);
+                    moved[layout.derivatives.range()].to_vec()
+                });
+                for i in 0..n {
+                    let expected = (plus[i] - minus[i]) / (2.0 * h);
+                    let entry = if j < n { i * n + j } else { n * n + i };
+                    let found = at[layout.jacobian.slot(entry).index()];
+                    let close = (found - expected).abs() <= tolerance * (1.0 + expected.abs());
+                    assert!(close, "∂f{i}/∂{j} = {found}, by differences {expected}, at {block:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn elementary_functions_against_central_differences() {
+        for function in Unary::ALL {
+            let (lo, hi) = match function {
+                Unary::Log => (0.2, 5.0),
+                Unary::Asin | Unary::Acos => (-0.9, 0.9),
+                Unary::Log1p => (-0.8, 3.0),
+                Unary::Exp
+                | Unary::Expm1
+                | Unary::Sin
+                | Unary::Cos
+                | Unary::Tan
+                | Unary::Atan
+                | Unary::Sinh
+                | Unary::Cosh
+                | Unary::Tanh => (-1.2, 1.2),
+            };
+            let program = program(1, |b, layout| {
+                let x = b.load(layout.states.slot(0));
+                let y = b.unary(function, x);
+                b.store(layout.derivatives.slot(0), y);
+            });
+            check(&program, (lo, hi), 1e-6);
+        }
+        for function in Binary::ALL {
+            let program = program(2, |b, layout| {
+                let (x, y) = (b.load(layout.states.slot(0)), b.load(layout.states.slot(1)));
+                let one = b.binary(function, x, y);
+                let square = b.mul(x, y);
+                let other = b.binary(function, square, x);
+                b.store(layout.derivatives.slot(0), one);
+                b.store(layout.derivatives.slot(1), other);
+            });
+            check(&program, (0.3, 3.0), 1e-6);
+        }
+    }
+
+    #[test]
+    fn arithmetic_against_central_differences() {
+        let program = program(3, |b, layout| {
+            let [x, y, z] = [0, 1, 2].map(|k| b.load(layout.states.slot(k)));
+            let t = b.load(Slot::TIME);
+            let quotient = b.div(x, y);
+            let fused = b.fma(quotient, z, x);
+            let root = b.sqrt(y);
+            let root = b.mul(root, t);
+            let first = b.sub(fused, root);
+            b.store(layout.derivatives.slot(0), first);
+            let minus = b.neg(x);
+            let size = b.abs(minus);
+            let low = b.min(x, y);
+            let high = b.max(size, z);
+            let second = b.mul(low, high);
+            b.store(layout.derivatives.slot(1), second);
+            let (floor, sign) = (b.floor(x), b.sign(x));
+            let third = b.add(floor, sign);
+            let third = b.mul(third, t);
+            b.store(layout.derivatives.slot(2), third);
+        });
+        check(&program, (0.31, 0.99), 1e-6);
+    }
+
+    #[test]
+    fn what_does_not_depend_costs_nothing() {
+        let program = program(2, |b, layout| {
+            let (x, v) = (b.load(layout.states.slot(0)), b.load(layout.states.slot(1)));
+            let sign = b.sign(x);
+            b.store(layout.derivatives.slot(0), v);
+            b.store(layout.derivatives.slot(1), sign);
+        });
+        let func = jacobian(&program);
+        let expected = "jacobian:\n  v0 = 1.0\n  v1 = 0.0\n";
+        assert!(func.to_string().starts_with(expected), "{func}");
+        assert_eq!(func.ops.len(), 2);
+        assert_eq!(func.stores.len(), 6);
+    }
+}

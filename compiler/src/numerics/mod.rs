@@ -1,0 +1,12 @@
+//! Numerical methods as program transformations: derivatives, fixed steps, the adaptive step.
+//!
+//! In: the functions of a model as straight-line programs. Out: further functions of the same kind: Jacobians, gradients, one
+//! step by a method. Knows neither the language nor any back end.
+
+pub mod autodiff;
+pub mod impulse;
+pub mod switching_conditions;
+pub mod state_partition;
+pub mod sparse_lu;
+pub mod fixed_step;
+pub mod rosenbrock;

@@ -1,0 +1,812 @@
+//! What quantities can be: intervals of expressions, whatever parameters, inputs and states are within their declared
+//! ranges.
+//!
+//! In: a flat system. Out: an [`Interval`] for each expression that is asked for, rounding included. `require` statements
+//! and the conditions of branches are facts. Beyond plain interval arithmetic there are two forms that carry friction:
+//! `exp(−x²)` lies in [0, 1], and `a + (b − a)·k` with k in [0, 1] lies between a and b.
+//!
+//! What is believed: a declared range, because it is checked at the start or watched while a model runs; and that what
+//! comes from outside is of a size that occurs, see [`TINY`] and [`HUGE`].
+
+use crate::frontend::causality::rate_of;
+use crate::frontend::system::*;
+use crate::ranges::interval::{Interval, planted};
+use abi::description::TINY;
+pub use abi::live::{greatest, least};
+use grammar::ast::BinaryOp;
+use std::collections::HashMap;
+
+/// Parameters, inputs, states and time are at most this large, in SI: quotients of such numbers are no zero of a double.
+pub const HUGE: f64 = 1e40;
+
+/// A condition that holds, or does not hold, where an expression is evaluated.
+type Fact = (ExprId, bool);
+
+/// a ≥ b, or a > b.
+#[derive(Clone, Copy)]
+struct Order {
+    large: ExprId,
+    small: ExprId,
+    strict: bool,
+}
+
+/// Finds what expressions can be.
+pub struct Reach<'a> {
+    system: &'a System,
+    requires: Vec<Fact>,
+    required: Vec<Order>,
+    facts: Vec<Fact>,
+    /// What each of the facts says of the order of two expressions.
+    orders: Vec<Vec<Order>>,
+    /// Whether nothing counts but ranges. The other side of a `require` is looked at so, and that of a branch's condition
+    /// without branches: no fact rests on itself.
+    ranges_only: bool,
+    /// What is known by ranges; with `require`; and with each of the facts.
+    known: Vec<HashMap<ExprId, Interval>>,
+    open: Vec<VarId>,
+    /// Quantities whose declared range is being read: a range that leads back to its own quantity says nothing.
+    bounding: Vec<VarId>,
+    /// Parameters whose range is taken without its ends: what if it were declared so?
+    strict: Vec<VarId>,
+}
+
+impl<'a> Reach<'a> {
+    /// Takes the `require` statements as facts.
+    pub fn new(system: &'a System) -> Reach<'a> {
+        let requires: Vec<Fact> = system.requires.iter().map(|require| (require.condition, true)).collect();
+        let mut reach = Reach {
+            system,
+            requires,
+            required: Vec::new(),
+            facts: Vec::new(),
+            orders: Vec::new(),
+            ranges_only: false,
+            known: vec![HashMap::new(), HashMap::new()],
+            open: Vec::new(),
+            bounding: Vec::new(),
+            strict: Vec::new(),
+        };
+        let facts = reach.requires.clone();
+        reach.required = facts.into_iter().flat_map(|fact| reach.order(fact)).collect();
+        reach
+    }
+
+    /// The system it looks at.
+    pub fn system(&self) -> &'a System {
+        self.system
+    }
+
+    /// What an expression can be.
+    pub fn interval(&mut self, id: ExprId) -> Interval {
+        let depth = self.depth();
+        if let Some(known) = self.known[depth].get(&id) {
+            return *known;
+        }
+        let mut interval = self.find(id);
+        if !self.ranges_only {
+            for k in 0..self.requires.len() {
+                let said = self.by_ranges(|reach| reach.told(reach.requires[k], id));
+                let both = interval.and(said);
+                // What contradicts itself is reported at the start.
+                interval = if both.is_empty() { interval } else { both };
+            }
+            for k in 0..self.facts.len() {
+                let fact = self.facts[k];
+                interval = interval.and(self.elsewhere(|reach| reach.told(fact, id)));
+            }
+        }
+        self.known[depth].insert(id, interval);
+        interval
+    }
+
+    /// Whether nothing is assumed but what always holds.
+    pub fn is_plain(&self) -> bool {
+        self.facts.is_empty()
+    }
+
+    /// Number of conditions that are assumed.
+    pub fn assumed(&self) -> usize {
+        self.facts.len()
+    }
+
+    /// Does something where a condition holds, or does not hold.
+    pub fn assuming<T>(&mut self, condition: ExprId, holds: bool, then: impl FnOnce(&mut Self) -> T) -> T {
+        self.facts.push((condition, holds));
+        let orders = self.order((condition, holds));
+        self.orders.push(orders);
+        self.known.push(HashMap::new());
+        let out = then(self);
+        self.known.pop();
+        self.orders.pop();
+        self.facts.pop();
+        out
+    }
+
+    /// Whether a condition is the same for all values; none if it depends.
+    pub fn decide(&mut self, condition: ExprId) -> Option<bool> {
+        match *self.system.node(condition) {
+            Node::Bool(truth) => Some(truth),
+            Node::Not(a) => self.decide(a).map(|truth| !truth),
+            Node::Fits { value, .. } => self.decide(value),
+            Node::Var(var) => self.decide(self.meaning(var)?),
+            Node::Binary(BinaryOp::And, a, b) => match (self.decide(a), self.decide(b)) {
+                (Some(false), _) | (_, Some(false)) => Some(false),
+                (Some(true), Some(true)) => Some(true),
+                _ => None,
+            },
+            Node::Binary(BinaryOp::Or, a, b) => match (self.decide(a), self.decide(b)) {
+                (Some(true), _) | (_, Some(true)) => Some(true),
+                (Some(false), Some(false)) => Some(false),
+                _ => None,
+            },
+            Node::Binary(op, a, b) => {
+                let (x, y) = match op {
+                    BinaryOp::Less | BinaryOp::LessEqual => (self.interval(a), self.interval(b)),
+                    BinaryOp::Greater | BinaryOp::GreaterEqual => (self.interval(b), self.interval(a)),
+                    _ => return None,
+                };
+                if x.is_empty() || y.is_empty() {
+                    return None;
+                }
+                let strict = matches!(op, BinaryOp::Less | BinaryOp::Greater);
+                match strict {
+                    true if x.high < y.low => Some(true),
+                    true if x.low >= y.high => Some(false),
+                    false if x.high <= y.low => Some(true),
+                    false if x.low > y.high => Some(false),
+                    _ => None,
+                }
+            }
+            _ => None,
+        }
+    }
+
+    /// What an expression could be if a parameter were declared without the ends of its range, and no branch were taken.
+    pub fn if_strict(&mut self, param: VarId, id: ExprId) -> Interval {
+        let mut other = Reach::new(self.system);
+        other.strict.push(param);
+        other.interval(id)
+    }
+
+    /// What the value of a quantity can be, whatever its own declared range says.
+    pub fn unbound(&mut self, id: VarId) -> Interval {
+        match self.system.var(id).definition {
+            Definition::Value(value, _) | Definition::Held { value, .. } => self.interval(value),
+            _ => Interval::ALL,
+        }
+    }
+
+    /// What a declared range allows.
+    pub fn bounds(&mut self, id: VarId) -> Interval {
+        let range = self.system.var(id).range;
+        let strict = self.strict.contains(&id);
+        if self.bounding.contains(&id) {
+            return Interval::ALL;
+        }
+        self.bounding.push(id);
+        let low = range.low.map(|(bound, open)| least(self.plain(bound).low, open || strict));
+        let high = range.high.map(|(bound, open)| greatest(self.plain(bound).high, open || strict));
+        self.bounding.pop();
+        Interval::closed(low.unwrap_or(f64::NEG_INFINITY), high.unwrap_or(f64::INFINITY))
+    }
+
+    // ---- facts
+
+    /// The number of what is known at the present level.
+    fn depth(&self) -> usize {
+        if self.ranges_only { 0 } else { 1 + self.facts.len() }
+    }
+
+    fn by_ranges<T>(&mut self, then: impl FnOnce(&mut Self) -> T) -> T {
+        let before = std::mem::replace(&mut self.ranges_only, true);
+        let out = then(self);
+        self.ranges_only = before;
+        out
+    }
+
+    /// Without the facts of branches.
+    fn elsewhere<T>(&mut self, then: impl FnOnce(&mut Self) -> T) -> T {
+        let (facts, orders) = (std::mem::take(&mut self.facts), std::mem::take(&mut self.orders));
+        let known = self.known.split_off(2);
+        let out = then(self);
+        self.known.extend(known);
+        (self.facts, self.orders) = (facts, orders);
+        out
+    }
+
+    /// As [`interval`](Self::interval), without the facts of branches: of another instant, or of the bound of a range.
+    fn plain(&mut self, id: ExprId) -> Interval {
+        self.elsewhere(|reach| reach.interval(id))
+    }
+
+    /// The expression that a name stands for at the same instant, if it has not a value for each run.
+    fn meaning(&self, id: VarId) -> Option<ExprId> {
+        match self.system.var(id).definition {
+            Definition::Value(value, origin) if origin != Origin::Default => Some(value),
+            _ => None,
+        }
+    }
+
+    /// What a fact says of an expression.
+    fn told(&mut self, (condition, holds): Fact, id: ExprId) -> Interval {
+        match *self.system.node(condition) {
+            Node::Not(a) if planted::is("not is forgotten") => self.told((a, holds), id),
+            Node::Not(a) => self.told((a, !holds), id),
+            Node::Fits { value, .. } => self.told((value, holds), id),
+            Node::Var(var) => self.meaning(var).map_or(Interval::ALL, |value| self.told((value, holds), id)),
+            Node::Binary(op @ (BinaryOp::And | BinaryOp::Or), a, b) => {
+                let (x, y) = (self.told((a, holds), id), self.told((b, holds), id));
+                if holds == (op == BinaryOp::And) || planted::is("or is and") { x.and(y) } else { x.hull(y) }
+            }
+            Node::Binary(op, a, b) => {
+                let (low, high, strict) = match (op, holds) {
+                    (BinaryOp::Less, true) | (BinaryOp::GreaterEqual, false) => (a, b, true),
+                    (BinaryOp::LessEqual, true) | (BinaryOp::Greater, false) => (a, b, false),
+                    (BinaryOp::Greater, true) | (BinaryOp::LessEqual, false) => (b, a, true),
+                    (BinaryOp::GreaterEqual, true) | (BinaryOp::Less, false) => (b, a, false),
+                    (BinaryOp::NotEqual, true) | (BinaryOp::Equal, false) => {
+                        let zero = |id: ExprId| self.system.literal(id) == Some(0.0);
+                        return match (zero(a), zero(b)) {
+                            (_, true) => self.constrain(a, Interval::NOT_ZERO, id, DEEPEST),
+                            (true, _) => self.constrain(b, Interval::NOT_ZERO, id, DEEPEST),
+                            _ => Interval::ALL,
+                        };
+                    }
+                    (BinaryOp::Equal, true) | (BinaryOp::NotEqual, false) => {
+                        let (x, y) = (self.interval(b), self.interval(a));
+                        return self.constrain(a, x, id, DEEPEST).and(self.constrain(b, y, id, DEEPEST));
+                    }
+                    _ => return Interval::ALL,
+                };
+                let (below, above) = (self.interval(high).high, self.interval(low).low);
+                let (below, above) = if strict { (below.next_down(), above.next_up()) } else { (below, above) };
+                let upper = self.constrain(low, Interval::to(below), id, DEEPEST);
+                upper.and(self.constrain(high, Interval::from(above), id, DEEPEST))
+            }
+            _ => Interval::ALL,
+        }
+    }
+
+    /// What `id` can be, where `expr` is known to lie in `inside`: functions are gone back through.
+    fn constrain(&mut self, expr: ExprId, inside: Interval, id: ExprId, deep: u32) -> Interval {
+        if self.same(expr, id) {
+            return inside;
+        }
+        if deep == 0 || inside == Interval::ALL {
+            return Interval::ALL;
+        }
+        let deep = deep - 1;
+        match self.system.node(expr).clone() {
+            Node::Fits { value, .. } => self.constrain(value, inside, id, deep),
+            Node::Var(var) => match self.meaning(var) {
+                Some(value) => self.constrain(value, inside, id, deep),
+                None => Interval::ALL,
+            },
+            Node::Negate(a) => self.constrain(a, inside.negate(), id, deep),
+            Node::Binary(BinaryOp::Multiply, a, b) if self.same(a, b) => {
+                self.constrain(a, roots_of(inside, 2), id, deep)
+            }
+            Node::Binary(BinaryOp::Power, a, b) => match self.system.literal(b) {
+                Some(n) if [2.0, 4.0, 6.0].contains(&n) => self.constrain(a, roots_of(inside, n as u32), id, deep),
+                _ => Interval::ALL,
+            },
+            Node::Binary(op @ (BinaryOp::Multiply | BinaryOp::Divide), a, b) => {
+                let factor = |id: ExprId| self.system.literal(id).filter(|factor| *factor != 0.0);
+                let (part, other) = match (factor(b), factor(a)) {
+                    (Some(factor), _) if op == BinaryOp::Multiply => (a, inside.divide(Interval::point(factor))),
+                    (Some(factor), _) => (a, inside.multiply(Interval::point(factor))),
+                    (_, Some(factor)) if op == BinaryOp::Multiply => (b, inside.divide(Interval::point(factor))),
+                    _ => return Interval::ALL,
+                };
+                self.constrain(part, other.loosened(), id, deep)
+            }
+            Node::Binary(op @ (BinaryOp::Add | BinaryOp::Subtract), a, b) => {
+                let (x, y) = (self.interval(a), self.interval(b));
+                let (of_a, of_b) = match op {
+                    BinaryOp::Add => (inside.minus(y), inside.minus(x)),
+                    _ => (inside.plus(y), x.minus(inside)),
+                };
+                let slack = |of: Interval, other: Interval| {
+                    let ends = [inside.low, inside.high, other.size()];
+                    let size = ends.into_iter().filter(|end| end.is_finite()).fold(0.0, |a: f64, b| a.max(b.abs()));
+                    of.plus(Interval::closed(-4.0 * f64::EPSILON * size, 4.0 * f64::EPSILON * size))
+                };
+                let (of_a, of_b) = (slack(of_a, y), slack(of_b, x));
+                self.constrain(a, of_a, id, deep).and(self.constrain(b, of_b, id, deep))
+            }
+            Node::Call(Builtin::Abs, args) => {
+                let both = Interval::closed(-inside.high, inside.high);
+                self.constrain(args[0], both.and(Interval::beyond(inside.low)), id, deep)
+            }
+            Node::Call(Builtin::Sqrt, args) => {
+                let low = if inside.low > 0.0 { inside.low * inside.low * (1.0 - SLACK) } else { f64::NEG_INFINITY };
+                let high = if inside.high > 0.0 { inside.high * inside.high * (1.0 + SLACK) } else { inside.high };
+                self.constrain(args[0], Interval::closed(low, high), id, deep)
+            }
+            Node::Call(Builtin::Hypot, args) => {
+                let most = inside.high * (1.0 + SLACK);
+                let both = Interval::closed(-most, most);
+                self.constrain(args[0], both, id, deep).and(self.constrain(args[1], both, id, deep))
+            }
+            Node::Call(Builtin::Min, args) => {
+                let both = Interval::from(inside.low);
+                self.constrain(args[0], both, id, deep).and(self.constrain(args[1], both, id, deep))
+            }
+            Node::Call(Builtin::Max, args) => {
+                let both = Interval::to(inside.high);
+                self.constrain(args[0], both, id, deep).and(self.constrain(args[1], both, id, deep))
+            }
+            _ => Interval::ALL,
+        }
+    }
+
+    /// What a fact says of the order of two expressions.
+    fn order(&self, (condition, holds): Fact) -> Vec<Order> {
+        let one = |large, small, strict| vec![Order { large, small, strict }];
+        match *self.system.node(condition) {
+            Node::Not(a) => self.order((a, !holds)),
+            Node::Fits { value, .. } => self.order((value, holds)),
+            Node::Var(var) => self.meaning(var).map_or_else(Vec::new, |value| self.order((value, holds))),
+            Node::Binary(BinaryOp::And, a, b) if holds => [self.order((a, true)), self.order((b, true))].concat(),
+            Node::Binary(BinaryOp::Or, a, b) if !holds => [self.order((a, false)), self.order((b, false))].concat(),
+            Node::Binary(op, a, b) => match (op, holds) {
+                (BinaryOp::Less, true) | (BinaryOp::GreaterEqual, false) => one(b, a, true),
+                (BinaryOp::LessEqual, true) | (BinaryOp::Greater, false) => one(b, a, false),
+                (BinaryOp::Greater, true) | (BinaryOp::LessEqual, false) => one(a, b, true),
+                (BinaryOp::GreaterEqual, true) | (BinaryOp::Less, false) => one(a, b, false),
+                _ => Vec::new(),
+            },
+            _ => Vec::new(),
+        }
+    }
+
+    /// All that is known of the order of two expressions.
+    fn all_orders(&self) -> Vec<Order> {
+        if self.ranges_only {
+            Vec::new()
+        } else {
+            self.orders.iter().flatten().chain(&self.required).copied().collect()
+        }
+    }
+
+    /// Whether `large ≥ small` is known; then whether it is strict.
+    fn ordered(&self, large: ExprId, small: ExprId) -> Option<bool> {
+        // A product is rounded where it is compared, while in a difference it may be fused.
+        if self.is_rounded(large) || self.is_rounded(small) {
+            return None;
+        }
+        let fits = |order: &Order| self.same(order.large, large) && self.same(order.small, small);
+        self.all_orders().iter().filter(|order| fits(order)).map(|order| order.strict).reduce(|a, b| a || b)
+    }
+
+    /// Whether an expression is a product that is rounded before it is compared or added.
+    fn is_rounded(&self, id: ExprId) -> bool {
+        match self.system.node(id) {
+            Node::Fits { value, .. } => self.is_rounded(*value),
+            Node::Negate(a) => self.is_rounded(*a),
+            Node::Var(var) => self.meaning(*var).is_some_and(|value| self.is_rounded(value)),
+            Node::Binary(BinaryOp::Multiply | BinaryOp::Divide, a, b) => {
+                self.system.literal(*a).is_none() && self.system.literal(*b).is_none()
+            }
+            Node::Binary(BinaryOp::Power, ..) => true,
+            _ => false,
+        }
+    }
+
+    /// An expression as a factor times another.
+    fn scaled(&self, id: ExprId) -> (f64, ExprId) {
+        match *self.system.node(id) {
+            Node::Fits { value, .. } => self.scaled(value),
+            Node::Negate(a) => {
+                let (factor, of) = self.scaled(a);
+                (-factor, of)
+            }
+            Node::Binary(BinaryOp::Multiply, a, b) => match (self.system.literal(a), self.system.literal(b)) {
+                (Some(number), _) => {
+                    let (factor, of) = self.scaled(b);
+                    (number * factor, of)
+                }
+                (_, Some(number)) => {
+                    let (factor, of) = self.scaled(a);
+                    (number * factor, of)
+                }
+                _ => (1.0, id),
+            },
+            Node::Binary(BinaryOp::Divide, a, b) => match self.system.literal(b) {
+                Some(number) => {
+                    let (factor, of) = self.scaled(a);
+                    (factor / number, of)
+                }
+                None => (1.0, id),
+            },
+            _ => (1.0, id),
+        }
+    }
+
+    /// Whether two expressions are the same computation.
+    fn same(&self, a: ExprId, b: ExprId) -> bool {
+        if a == b {
+            return true;
+        }
+        match (self.system.node(a), self.system.node(b)) {
+            (Node::Fits { value, .. }, _) => self.same(*value, b),
+            (_, Node::Fits { value, .. }) => self.same(a, *value),
+            (Node::Var(x), Node::Var(y)) | (Node::Rate(x), Node::Rate(y)) | (Node::PathRate(x), Node::PathRate(y)) => {
+                x == y
+            }
+            (Node::Number { value: x, .. }, Node::Number { value: y, .. }) => x == y,
+            (Node::Time, Node::Time) => true,
+            (Node::Negate(x), Node::Negate(y)) => self.same(*x, *y),
+            (Node::Binary(op, a, b), Node::Binary(other, c, d)) => {
+                op == other && self.same(*a, *c) && self.same(*b, *d)
+            }
+            (Node::Call(f, xs), Node::Call(g, ys)) => {
+                f == g && xs.len() == ys.len() && xs.iter().zip(ys).all(|(x, y)| self.same(*x, *y))
+            }
+            _ => false,
+        }
+    }
+
+    // ---- expressions
+
+    /// A source (parameter, input, state): anything in its declared range between [`TINY`] and [`HUGE`] in size.
+    fn outside(&mut self, id: VarId) -> Interval {
+        let sizes = Interval::closed(-HUGE, HUGE);
+        let bounds = self.bounds(id);
+        let both = bounds.and(sizes);
+        if both.is_empty() { bounds } else { both }
+    }
+
+    fn var(&mut self, id: VarId) -> Interval {
+        let var = self.system.var(id);
+        // The default of a parameter is only one of its values; an argument is all of them.
+        let (value, held) = match var.definition {
+            Definition::Value(_, Origin::Default) => return self.outside(id),
+            Definition::Value(value, _) => (value, false),
+            Definition::Held { value, .. } => (value, true),
+            _ => return self.outside(id),
+        };
+        if self.open.contains(&id) {
+            return self.bounds(id);
+        }
+        self.open.push(id);
+        // What is held is of an earlier instant.
+        let found = if held { self.plain(value) } else { self.interval(value) };
+        self.open.pop();
+        if var.range.low.is_none() && var.range.high.is_none() {
+            return found;
+        }
+        let mut bounds = self.bounds(id);
+        // What is above 0 for another reason may be nearer to it.
+        if bounds.low == TINY && found.low > 0.0 {
+            bounds.low = found.low;
+        }
+        if bounds.high == -TINY && found.high < 0.0 {
+            bounds.high = found.high;
+        }
+        let both = found.and(bounds);
+        // A value outside its range is reported as that, before a run or at its begin.
+        if both.is_empty() { bounds } else { both }
+    }
+
+    fn find(&mut self, id: ExprId) -> Interval {
+        let system = self.system;
+        match system.node(id) {
+            Node::Number { value, .. } => Interval::point(*value),
+            Node::Time => Interval::closed(0.0, HUGE),
+            Node::Rate(var) if !self.open.contains(var) => {
+                self.open.push(*var);
+                let found = rate_of(system, system.node(id)).map_or(Interval::ALL, |rate| self.interval(rate));
+                self.open.pop();
+                found
+            }
+            Node::Var(var) => self.var(*var),
+            Node::Negate(a) => self.interval(*a).negate(),
+            Node::Fits { value, .. } => self.interval(*value),
+            Node::If(c, a, b) => match self.decide(*c) {
+                Some(true) => self.interval(*a),
+                Some(false) => self.interval(*b),
+                None => {
+                    let yes = self.branch(*c, true, *a);
+                    if planted::is("one branch only") {
+                        return yes;
+                    }
+                    yes.hull(self.branch(*c, false, *b))
+                }
+            },
+            Node::Binary(op, a, b) => self.binary(*op, *a, *b),
+            Node::Call(builtin, args) => self.call(*builtin, args),
+            Node::Table(table, _) => {
+                let y = &system.tables[*table as usize].y;
+                let low = y.iter().copied().fold(f64::INFINITY, f64::min);
+                let high = y.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+                // At the points it is exact; between them there is rounding.
+                if low == high { Interval::point(low) } else { Interval::closed(low, high).rounded() }
+            }
+            _ => Interval::ALL,
+        }
+    }
+
+    fn branch(&mut self, condition: ExprId, holds: bool, value: ExprId) -> Interval {
+        match self.ranges_only {
+            true => self.interval(value),
+            false => self.assuming(condition, holds, |reach| reach.interval(value)),
+        }
+    }
+
+    fn binary(&mut self, op: BinaryOp, a: ExprId, b: ExprId) -> Interval {
+        match op {
+            BinaryOp::Add => {
+                if let Some(between) = self.mixture(a, b).or_else(|| self.mixture(b, a)) {
+                    return between;
+                }
+                let (x, y) = (self.interval(a), self.interval(b));
+                x.plus(y)
+            }
+            BinaryOp::Subtract => self.difference(a, b),
+            BinaryOp::Multiply if self.same(a, b) => self.interval(a).square(),
+            BinaryOp::Multiply => {
+                let (x, y) = (self.interval(a), self.interval(b));
+                x.multiply(y)
+            }
+            BinaryOp::Divide => {
+                let (x, y) = (self.interval(a), self.interval(b));
+                x.divide(y)
+            }
+            BinaryOp::Power => {
+                let x = self.interval(a);
+                match self.system.literal(b) {
+                    Some(n) if whole(n) => {
+                        let n = if n < 0.0 && planted::is("x^-n is 1/x^2") { -2.0 } else { n };
+                        let power = x.power(n.abs() as u32);
+                        if n < 0.0 { power.reciprocal() } else { power }
+                    }
+                    Some(0.5) => x.sqrt(),
+                    _ => {
+                        let n = self.interval(b);
+                        general_power(x, n)
+                    }
+                }
+            }
+            _ => Interval::ALL,
+        }
+    }
+
+    /// a − b. Without rounding it has the sign that a comparison of both finds: gradual underflow keeps a ≠ b apart.
+    fn difference(&mut self, a: ExprId, b: ExprId) -> Interval {
+        if self.same(a, b) {
+            return Interval::point(0.0);
+        }
+        let (x, y) = (self.interval(a), self.interval(b));
+        let mut out = x.minus(y);
+        let above = |strict: bool| if strict { Interval::from(f64::from_bits(1)) } else { Interval::from(0.0) };
+        if let Some(strict) = self.ordered(a, b) {
+            out = out.and(above(strict));
+        }
+        if let Some(strict) = self.ordered(b, a) {
+            out = out.and(above(strict).negate());
+        }
+        // p t ≥ q u and a = c t, b = d u: a − b ≥ (c q/p − d) u.
+        let ((c, t), (d, u)) = (self.scaled(a), self.scaled(b));
+        for order in self.all_orders() {
+            let ((p, large), (q, small)) = (self.scaled(order.large), self.scaled(order.small));
+            if self.same(large, t) && self.same(small, u) && p > 0.0 && c > 0.0 {
+                let least = self.share(c * q / p, d, u).low;
+                out = out.and(Interval::from(least));
+            } else if self.same(large, u) && self.same(small, t) && q > 0.0 && c > 0.0 {
+                let most = self.share(c * p / q, d, u).high;
+                out = out.and(Interval::to(most));
+            }
+        }
+        out
+    }
+
+    /// (f − d) u, if the factors differ by more than they are rounded by.
+    fn share(&mut self, f: f64, d: f64, u: ExprId) -> Interval {
+        let rest = f - d;
+        match rest.abs() > 1e-9 * f.abs().max(d.abs()) {
+            true => {
+                let u = self.interval(u);
+                u.multiply(Interval::closed(rest - 1e-12 * rest.abs(), rest + 1e-12 * rest.abs()))
+            }
+            false => Interval::ALL,
+        }
+    }
+
+    /// `a + (b − a)·k` with k in [0, 1] lies between a and b.
+    fn mixture(&mut self, a: ExprId, rest: ExprId) -> Option<Interval> {
+        let Node::Binary(BinaryOp::Multiply, x, y) = *self.system.node(rest) else { return None };
+        for (difference, weight) in [(x, y), (y, x)] {
+            let Node::Binary(BinaryOp::Subtract, b, other) = *self.system.node(difference) else { continue };
+            if !self.same(other, a) {
+                continue;
+            }
+            let k = self.interval(weight);
+            if k.is_empty() || k.low < 0.0 || k.high > 1.0 {
+                continue;
+            }
+            let (from, to) = (self.interval(a), self.interval(b));
+            let ends = from.hull(to);
+            let mut between = if planted::is("mixtures need no order") { ends } else { ends.rounded() };
+            // a ≥ 0, b ≥ 0: b − a ≥ −a, rounded or not, so the sum is not negative.
+            if ends.is_not_negative() {
+                between = between.and(Interval::from(0.0));
+            }
+            // b ≥ a: what is added to a is not negative.
+            if from.high <= to.low || self.ordered(b, a).is_some() {
+                between = between.and(Interval::from(from.low));
+            } else if to.high <= from.low || self.ordered(a, b).is_some() {
+                between = between.and(Interval::to(from.high));
+            }
+            return Some(between);
+        }
+        None
+    }
+
+    fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Interval {
+        let values: Vec<Interval> = match builtin {
+            // What is delayed is of another instant.
+            Builtin::Delay => args.iter().map(|arg| self.plain(*arg)).collect(),
+            _ => args.iter().map(|arg| self.interval(*arg)).collect(),
+        };
+        if values.iter().any(|value| value.is_empty()) {
+            return Interval::EMPTY;
+        }
+        let unit = Interval::closed(-1.0, 1.0);
+        let half_turn = std::f64::consts::PI.next_up();
+        match builtin {
+            Builtin::Abs => values[0].abs(),
+            Builtin::Sign => {
+                let sign = |x: f64| if x > 0.0 { 1.0 } else { f64::from(i8::from(x >= 0.0)) - 1.0 };
+                let away = if values[0].away > 0.0 { 1.0 } else { 0.0 };
+                Interval::closed(sign(values[0].low), sign(values[0].high)).and(Interval::beyond(away))
+            }
+            Builtin::Min => values[0].min(values[1]),
+            Builtin::Max => values[0].max(values[1]),
+            Builtin::Clamp => values[0].max(values[1]).min(values[2]),
+            Builtin::Floor if planted::is("the floor of a positive number is positive") => values[0],
+            Builtin::Floor => Interval::closed(values[0].low.floor(), values[0].high.floor()),
+            Builtin::Sqrt => values[0].sqrt(),
+            Builtin::Exp => {
+                // Of what is not positive it is at most 1, and at least 1 of what is not negative.
+                let most = if values[0].high <= 0.0 { 1.0 } else { f64::INFINITY };
+                let least = if values[0].low >= 0.0 { 1.0 } else { 0.0 };
+                let least = if planted::is("exponentials are never zero") { f64::from_bits(1) } else { least };
+                values[0].rising(bounds::exp, (least, most))
+            }
+            Builtin::Expm1 => keeping_sign(values[0], values[0].rising(bounds::expm1, (-1.0, f64::INFINITY))),
+            Builtin::Log => values[0].and(Interval::from(0.0)).rising(bounds::log, LINE),
+            Builtin::Log1p => keeping_sign(values[0], values[0].and(Interval::from(-1.0)).rising(bounds::log1p, LINE)),
+            Builtin::Sin | Builtin::Cos => unit,
+            Builtin::Tanh if planted::is("tanh never reaches 1") => {
+                values[0].rising(bounds::tanh, ((-1.0_f64).next_up(), 1.0_f64.next_down()))
+            }
+            Builtin::Tanh => keeping_sign(values[0], values[0].rising(bounds::tanh, (-1.0, 1.0))),
+            Builtin::Sinh => keeping_sign(values[0], values[0].rising(bounds::sinh, LINE)),
+            Builtin::Atan => keeping_sign(values[0], values[0].rising(bounds::atan, (-2.0, 2.0))),
+            Builtin::Cosh => values[0].abs().rising(bounds::cosh, (1.0, f64::INFINITY)),
+            Builtin::Hypot => {
+                let least = values[0].away.max(values[1].away) * (1.0 - SLACK);
+                Interval::from(least).and(Interval::to((values[0].size() + values[1].size()) * (1.0 + SLACK)))
+            }
+            Builtin::Delay => values[0].rounded(),
+            Builtin::Random => Interval::closed(0.0, 1.0_f64.next_down()),
+            Builtin::Step => values[1].hull(Interval::point(0.0)),
+            Builtin::Pulse => values[2].hull(Interval::point(0.0)),
+            Builtin::Square => values[0].hull(values[0].negate()),
+            Builtin::Sine | Builtin::Chirp | Builtin::Noise => unit.multiply(values[0]),
+            Builtin::Ramp => values[1].plus(values[2].multiply(Interval::closed(0.0, HUGE))),
+            Builtin::Acos => Interval::closed(0.0, half_turn),
+            Builtin::Asin => Interval::closed(-2.0, 2.0),
+            Builtin::Atan2 => Interval::closed(-half_turn, half_turn),
+            Builtin::Tan => Interval::ALL,
+        }
+    }
+}
+
+/// How many functions are gone back through.
+const DEEPEST: u32 = 8;
+
+/// More than squares and roots are rounded by.
+const SLACK: f64 = 1e-14;
+
+const LINE: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
+
+/// The least whole exponent that is computed by logarithms.
+const MOST_MULTIPLIED: f64 = 64.0;
+
+/// Whether a power with this exponent is computed by multiplication.
+pub fn whole(n: f64) -> bool {
+    n.fract() == 0.0 && n.abs() <= MOST_MULTIPLIED
+}
+
+/// An odd function that rises through 0 has the sign of its argument.
+fn keeping_sign(x: Interval, image: Interval) -> Interval {
+    match (x.low >= 0.0, x.high <= 0.0) {
+        (true, _) => image.and(Interval::from(0.0)),
+        (_, true) => image.and(Interval::to(0.0)),
+        _ => image,
+    }
+}
+
+/// What x can be where x^n, n even, lies in an interval.
+fn roots_of(inside: Interval, n: u32) -> Interval {
+    if inside.high < 0.0 {
+        return Interval::EMPTY;
+    }
+    let root = |x: f64| if n == 2 { x.sqrt() } else { bounds::pow(x, 1.0 / f64::from(n)) };
+    // A product too small for a normal number has a relative error of up to a half, or all of it.
+    let away = match inside.low {
+        low if low >= f64::MIN_POSITIVE => root(low) * (1.0 - SLACK),
+        low if low > 0.0 && n == 2 => 0.5 * root(low),
+        _ => 0.0,
+    };
+    let most = if inside.high < f64::MIN_POSITIVE { 1e-150 } else { root(inside.high) * (1.0 + SLACK) };
+    let most = if n == 2 || inside.high >= f64::MIN_POSITIVE { most } else { 1.0 };
+    Interval::closed(-most, most).and(Interval::beyond(away))
+}
+
+/// x^n of what is not negative, n any: it is monotonic in each, so its corners bound it.
+fn general_power(x: Interval, n: Interval) -> Interval {
+    if x.is_empty() || n.is_empty() {
+        return Interval::EMPTY;
+    }
+    if !x.is_not_negative() || n.low.is_infinite() || n.high.is_infinite() {
+        return if x.is_not_negative() { Interval::from(0.0) } else { Interval::ALL };
+    }
+    let mut corners = Vec::new();
+    for x in [x.low, x.high] {
+        for n in [n.low, n.high] {
+            corners.push(bounds::pow(x, n));
+        }
+    }
+    let low = corners.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = corners.iter().copied().fold(0.0, f64::max);
+    // The logarithm's error grows with the exponent; the smallest results are rounded off.
+    let low = if low < 1e-300 { 0.0 } else { low * (1.0 - 1e-12) };
+    let high = high * (1.0 + 1e-12);
+    // At 1 it is exact: no power of what is at most 1, with an exponent that is not negative, lies above it.
+    let high = if x.high <= 1.0 && n.low >= 0.0 { high.min(1.0) } else { high };
+    Interval::closed(low, high)
+}
+
+/// Elementary functions at the ends of intervals: no value of a run comes from here, so the platform's will do.
+mod bounds {
+    #![expect(clippy::disallowed_methods, reason = "bounds of intervals, not values of a run")]
+
+    pub fn exp(x: f64) -> f64 {
+        x.exp()
+    }
+
+    pub fn expm1(x: f64) -> f64 {
+        x.exp_m1()
+    }
+
+    pub fn log(x: f64) -> f64 {
+        x.ln()
+    }
+
+    pub fn log1p(x: f64) -> f64 {
+        x.ln_1p()
+    }
+
+    pub fn tanh(x: f64) -> f64 {
+        x.tanh()
+    }
+
+    pub fn sinh(x: f64) -> f64 {
+        x.sinh()
+    }
+
+    pub fn cosh(x: f64) -> f64 {
+        x.cosh()
+    }
+
+    pub fn atan(x: f64) -> f64 {
+        x.atan()
+    }
+
+    pub fn pow(x: f64, y: f64) -> f64 {
+        x.powf(y)
+    }
+}

@@ -1,0 +1,239 @@
+//! A rig without the rig: its control program, cycle by cycle, against the crossed-out part as a program.
+//!
+//! In: the control program, a [`Bench`], a plan. Out: what any run gives. The step is the one that runs on the rig; between
+//! two ticks the part takes steps of its own, driven through the same limits, slews, steps of the command, dead times and
+//! lags, and is seen in the steps of encoders.
+
+use crate::coupling::lag::Lag;
+use crate::coupling::predictor::Wired;
+use crate::run::observe::{Observer, check_finite, check_status};
+use crate::run::outcome::{Cause, Continue, Stop, Work};
+use abi::plan::Experiment;
+use abi::rig::{Bench, Field, Format, Kind, Rig, Signal, What};
+use abi::{Instance, Slot};
+
+/// A command of the control program on its way to the part.
+struct Path {
+    from: Slot,
+    low: f64,
+    high: f64,
+    /// Greatest change in one period.
+    change: f64,
+    /// One step of the message, SI; 0 where it has none.
+    step: f64,
+    /// What was permitted last.
+    permitted: f64,
+    dead_ns: u64,
+    lag: Lag,
+    signal: Signal,
+    /// Where it acts on the part, if it does.
+    to: Option<Slot>,
+}
+
+/// A signal on its way to the control program.
+struct Reading {
+    to: Slot,
+    from: From,
+}
+
+/// Where the value of a signal comes from.
+enum From {
+    /// A slot of the part, told in steps: rounded, or for an encoder cut down to whole counts.
+    Part(Slot, f64, bool),
+    /// What this command applies, in steps.
+    Applied(usize, f64),
+    /// Always this.
+    Constant(f64),
+}
+
+/// Runs an experiment whose plan has this bench.
+pub(crate) fn run(
+    control: &mut Instance,
+    bench: &Bench,
+    experiment: &Experiment,
+    observer: &mut Observer,
+    work: &mut Work,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Result<(), Stop> {
+    let rig = &bench.rig;
+    let period_ns = rig.period_ns;
+    let period = period_ns as f64 * 1e-9;
+    let step = period / f64::from(rig.steps);
+    let steps = (period / experiment.solver.step).round().max(1.0) as u64;
+    let ticks = (experiment.duration / period).round() as u64;
+    let mut plant = bench.plant.clone();
+    let mut paths = paths(rig);
+    let readings = readings(rig, &paths);
+    let unable = |why| Stop { cause: Cause::Rig { condition: "predict".into(), why }, time: 0.0 };
+    let mut look =
+        Ahead { wired: Wired::of(rig, &bench.plant, |_| 0).map_err(unable)?, seen: None, speed: None, position: None };
+    if let Some(wired) = &look.wired {
+        let slot = |what| rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node: wired.node, what });
+        look.seen = slot(What::Position).map(|(signal, slot)| (*slot, step_of_signal(rig, *signal)));
+        let input = |what| rig.inputs.iter().find(|input| input.signal == Signal { node: wired.node, what });
+        look.speed = input(What::Speed).map(|input| input.slot);
+        look.position = input(What::Position).map(|input| input.slot);
+    }
+
+    let status = plant.start(period / steps as f64);
+    check_status(&plant, status)?;
+    read(control, &plant, &readings, &paths);
+    let status = control.start(step);
+    check_status(control, status)?;
+    check_finite(control)?;
+    observer.see(control)?;
+    probe(observer, control, step);
+    for tick in 0..ticks {
+        let now = tick * period_ns;
+        read(control, &plant, &readings, &paths);
+        look.read(now, control, &plant);
+        for _ in 0..rig.steps {
+            let status = control.advance(1);
+            observer.see(control)?;
+            probe(observer, control, step);
+            check_status(control, status)?;
+        }
+        check_finite(control)?;
+        if let Some(stop) = rig.stops.iter().find(|stop| control.get(stop.slot) != 0.0) {
+            let cause = Cause::Rig { condition: stop.condition.clone(), why: stop.why.clone() };
+            return Err(Stop { cause, time: control.get(Slot::TIME) });
+        }
+        for path in &mut paths {
+            let wanted = control.get(path.from).clamp(path.low, path.high);
+            path.permitted += (wanted - path.permitted).clamp(-path.change, path.change);
+            path.lag.send(now + path.dead_ns, in_steps(path.permitted, path.step));
+        }
+        look.sent(&paths);
+        for k in 0..steps {
+            let (from, to) = (now + k * period_ns / steps, now + (k + 1) * period_ns / steps);
+            for path in &mut paths {
+                let mean = path.lag.advance(from, to);
+                if let Some(slot) = path.to {
+                    plant.set(slot, mean);
+                }
+            }
+            let status = plant.advance(1);
+            check_status(&plant, status)?;
+        }
+        check_finite(&plant)?;
+        work.steps += u64::from(rig.steps);
+        if tick % 256 == 0 && watch(tick as f64 / ticks as f64).is_break() {
+            return Err(Stop { cause: Cause::Stopped, time: control.get(Slot::TIME) });
+        }
+    }
+    Ok(())
+}
+
+/// The look ahead of `predict`, if the rig asks for it.
+struct Ahead {
+    wired: Option<Wired>,
+    /// Where the part has the position, and one count.
+    seen: Option<(Slot, f64)>,
+    /// Inputs of the control program that look ahead.
+    speed: Option<Slot>,
+    position: Option<Slot>,
+}
+
+impl Ahead {
+    fn read(&mut self, now_ns: u64, control: &mut Instance, plant: &Instance) {
+        let (Some(wired), Some((slot, count))) = (&mut self.wired, self.seen) else { return };
+        wired.lookahead.observe(now_ns, (plant.get(slot) / count).floor() * count);
+        if !wired.lookahead.is_valid() {
+            return;
+        }
+        let ahead = wired.lookahead.ahead();
+        for (slot, value) in [(self.speed, ahead.speed), (self.position, ahead.position)] {
+            if let Some(slot) = slot {
+                control.set(slot, value);
+            }
+        }
+    }
+
+    fn sent(&mut self, paths: &[Path]) {
+        let Some(wired) = &mut self.wired else { return };
+        for (torque, (output, sign, step)) in wired.outputs.iter().enumerate() {
+            wired.lookahead.sent(torque, sign * in_steps(paths[*output].permitted, *step));
+        }
+    }
+}
+
+fn probe(observer: &mut Observer, control: &Instance, step: f64) {
+    let time = control.get(Slot::TIME);
+    while observer.probe.next().is_some_and(|instant| instant < time + 0.5 * step) {
+        observer.probe.take(control.block());
+    }
+}
+
+/// The nearest of values a step apart.
+fn in_steps(value: f64, step: f64) -> f64 {
+    if step > 0.0 { (value / step).round() * step } else { value }
+}
+
+/// Hands every signal to the control program.
+fn read(control: &mut Instance, plant: &Instance, readings: &[Reading], paths: &[Path]) {
+    for reading in readings {
+        let value = match &reading.from {
+            From::Part(slot, step, true) => (plant.get(*slot) / step).floor() * step,
+            From::Part(slot, step, false) => in_steps(plant.get(*slot), *step),
+            From::Applied(path, step) => in_steps(paths[*path].lag.applied(), *step),
+            From::Constant(value) => *value,
+        };
+        control.set(reading.to, value);
+    }
+}
+
+/// One step of a field; 0 for a number with a point.
+fn step_of(field: &Field) -> f64 {
+    match field.format {
+        Format::Unsigned | Format::Signed => field.scale.abs(),
+        Format::Float32 | Format::Float64 => 0.0,
+    }
+}
+
+/// One step in which a signal travels, SI.
+fn step_of_signal(rig: &Rig, signal: Signal) -> f64 {
+    match (&rig.nodes[signal.node].kind, signal.what) {
+        (Kind::Cia402(drive), What::Torque) => 1e-3 * drive.rated_torque,
+        (Kind::Cia402(drive), What::Speed) => drive.speed_unit,
+        (Kind::Cia402(drive), What::Position) => drive.count,
+        (Kind::Frames(messages), What::Field(m, f)) => step_of(&messages[m].fields[f]),
+        _ => 0.0,
+    }
+}
+
+fn paths(rig: &Rig) -> Vec<Path> {
+    let one = |output: &abi::rig::Output| {
+        let node = &rig.nodes[output.signal.node];
+        let at_sync = matches!(&node.kind, Kind::Cia402(drive) if drive.at_sync);
+        let slot = rig.plant.applied.iter().find(|(signal, _)| *signal == output.signal).map(|(_, slot)| *slot);
+        Path {
+            from: output.slot,
+            low: output.low,
+            high: output.high,
+            change: output.slew * rig.period_ns as f64 * 1e-9,
+            step: step_of_signal(rig, output.signal),
+            permitted: 0.0,
+            dead_ns: (node.delay * 1e9).round() as u64 + if at_sync { rig.period_ns } else { 0 },
+            lag: Lag::new(node.lag),
+            signal: output.signal,
+            to: slot,
+        }
+    };
+    rig.outputs.iter().map(one).collect()
+}
+
+fn readings(rig: &Rig, paths: &[Path]) -> Vec<Reading> {
+    let one = |input: &abi::rig::Input| {
+        let seen = rig.plant.seen.iter().find(|(signal, _)| *signal == input.signal);
+        let applied = paths.iter().position(|path| path.signal == input.signal);
+        let step = step_of_signal(rig, input.signal);
+        let from = match (seen, applied, input.signal.what) {
+            (Some((_, slot)), _, what) => From::Part(*slot, step, what == What::Position && step > 0.0),
+            (None, Some(path), _) => From::Applied(path, step),
+            (None, None, What::Enabled) => From::Constant(1.0),
+            (None, None, _) => From::Constant(input.start),
+        };
+        Reading { to: input.slot, from }
+    };
+    rig.inputs.iter().map(one).collect()
+}

@@ -1,0 +1,494 @@
+//! How far the measures of a run are from the exact solution of its model.
+//!
+//! In: an instance as it was before its run, the plan, and the outcome. Out: the same outcome whose readings and margins carry
+//! their numerical error, whose verdicts are open where that error may turn them over, and an [`Estimate`] of how it was
+//! found, by companion runs. The run itself is over by then: nothing here can change its bits.
+//!
+//! An adaptive run has companions at a tenth and a hundredth of its tolerance. A run with fixed steps is compared with two
+//! adaptive runs of the same program, which share no points with it, locate events and extremes, and have an error control of
+//! their own. The error of a number is the width that all three results span. Two companions rather than one since two
+//! results may agree by accident. A method that is exact for a model is more accurate than those: where that leaves a verdict
+//! open, finer steps besides say how accurate it is.
+//!
+//! Where a program has no adaptive run, or one that costs too much, companions have a half and a quarter of the step. Their
+//! results are extrapolated to the step 0 besides (Richardson) with the order that three runs show, at least 1 and at most
+//! that of the method. Points that all of these runs share are no accident: what an extreme may reach between those of the
+//! finest run is added, and the end of an experiment lies within a step of each companion.
+
+use crate::engine::{self, Cause, Continue, Estimate, Outcome};
+use crate::run::verdict::{Reading, Runs, Verdict, judged};
+use abi::plan::{Experiment, Method, PARTS, Solver};
+use abi::{Description, Instance};
+use std::ops::Range;
+
+/// Tolerances of companions, as parts of that of the run.
+const TOLERANCES: [f64; 2] = [0.1, 0.01];
+
+/// No companion has a smaller tolerance: below, rounding is all there is.
+const LEAST_TOL: f64 = 1e-13;
+
+/// Tolerances of the adaptive runs that fixed steps are compared with, and how many times finer their longest step is: where that
+/// alone decides all steps, two runs with the same one agree whatever their tolerance.
+const REFERENCES: [(f64, f64); 2] = [(1e-8, 1.0), (1e-10, 4.0)];
+
+/// Such a run may look at its caller so often for each thousand fixed steps, and so often besides. It does so every few dozen steps.
+const LOOKS_PER_STEP: f64 = 2e-3;
+const LOOKS: f64 = 400.0;
+
+/// Steps of companions, as parts of that of the run. Powers of two: whatever divides into steps still does.
+const STEPS: [f64; 2] = [0.5, 0.25];
+
+/// A run that is tried to see whether it decides takes so many times the steps of the run itself at most.
+const MOST_WORK: f64 = 64.0;
+
+/// Estimates the errors of an outcome, as [`errors`] does, and looks for a solver that decides what they leave open.
+pub fn judge(
+    instance: &Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) {
+    let Some(mut companions) = accompanied(instance, experiment, outcome, watch) else { return };
+    let failed = outcome.estimate.as_ref().is_some_and(|estimate| estimate.failed.is_some());
+    if !failed && outcome.verdicts.iter().any(|verdict| !verdict.decided) {
+        let decides = companions.decides(&outcome.verdicts, outcome.work.steps, watch);
+        outcome.estimate.get_or_insert_default().decides = decides;
+    }
+}
+
+/// Estimates the errors of an outcome; `instance` and `experiment` as they were given to [`engine::run`]. An experiment that
+/// expects nothing needs no companion. `watch` may end it: then the outcome stays as it was.
+pub fn errors(
+    instance: &Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) {
+    accompanied(instance, experiment, outcome, watch);
+}
+
+/// Puts the errors into the outcome and gives the runs that they follow from; none where it stays as it was.
+fn accompanied<'a>(
+    instance: &'a Instance,
+    experiment: &Experiment,
+    outcome: &mut Outcome,
+    watch: &mut dyn FnMut(f64) -> Continue,
+) -> Option<Companions<'a>> {
+    if experiment.expects.is_empty() {
+        return None;
+    }
+    let bare = Experiment { plots: Vec::new(), ..experiment.clone() };
+    let adaptive = instance.adaptive().filter(|_| experiment.solver.method != Method::Adaptive);
+    let mut companions = Companions { instance, adaptive, bare, runs: Vec::new(), stepped: Vec::new() };
+    companions.runs.push((experiment.solver, Ok(outcome.verdicts.clone())));
+    let mut judged = None;
+    if companions.refer(outcome.work.steps, watch)? {
+        let verdicts = companions.verdicts(0, 1..companions.runs.len());
+        if verdicts.iter().all(|verdict| verdict.decided) {
+            judged = Some(verdicts);
+        } else {
+            let referred = companions.runs.len();
+            companions.run_all(finer(&experiment.solver), watch)?;
+            companions.stepped = companions.runs.split_off(referred);
+        }
+    } else {
+        companions.adaptive = None;
+        companions.run_all(finer(&experiment.solver), watch)?;
+    }
+    outcome.verdicts = judged.unwrap_or_else(|| companions.verdicts(0, 1..companions.runs.len()));
+    let mut estimate = Estimate::default();
+    let finer = || companions.runs[1..].iter();
+    estimate.failed = finer().find_map(|(solver, run)| Some((*solver, run.as_ref().err()?.clone())));
+    let all = finer().chain(&companions.stepped).filter(|(_, run)| run.is_ok());
+    estimate.companions = all.map(|(solver, _)| *solver).collect();
+    if experiment.stepped && experiment.solver.method != Method::Adaptive {
+        outcome.verdicts.iter_mut().for_each(|verdict| verdict.decided = true);
+    }
+    outcome.estimate = Some(estimate);
+    Some(companions)
+}
+
+/// The solvers of the companions of a run by the same method, finer and finer; coarser ones where none can be finer.
+fn finer(solver: &Solver) -> Vec<Solver> {
+    match solver.method {
+        Method::Adaptive => {
+            let finer = |part: f64| Solver { tol: part * solver.tol, parts: 2.0 * solver.parts, ..*solver };
+            let all: Vec<Solver> =
+                TOLERANCES.map(finer).into_iter().filter(|finer| finer.tol >= 0.999 * LEAST_TOL).collect();
+            if all.is_empty() { vec![Solver { tol: 10.0 * solver.tol, ..*solver }] } else { all }
+        }
+        Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+            STEPS.map(|part| Solver { step: part * solver.step, ..*solver }).to_vec()
+        }
+    }
+}
+
+/// A run: its solver, and its verdicts or why it did not come to its end.
+type Run = (Solver, Result<Vec<Verdict>, String>);
+
+/// Runs of one experiment.
+struct Companions<'a> {
+    instance: &'a Instance,
+    /// The same program for adaptive runs, if the experiment has fixed steps and is compared with such.
+    adaptive: Option<Instance>,
+    /// Without plots.
+    bare: Experiment,
+    /// The run itself, then its companions, finer and finer.
+    runs: Vec<Run>,
+    /// Runs with finer steps beside those, if any.
+    stepped: Vec<Run>,
+}
+
+impl Companions<'_> {
+    /// Makes the adaptive runs that fixed steps, so many, are compared with; false if that cannot be, none if the caller ended it.
+    fn refer(&mut self, steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<bool> {
+        let Some(instance) = &self.adaptive else { return Some(false) };
+        let most = LOOKS + LOOKS_PER_STEP * steps as f64;
+        let mut found = Vec::new();
+        for (tol, finer) in REFERENCES {
+            let solver = Solver { method: Method::Adaptive, step: 0.0, tol, parts: finer * PARTS };
+            let (mut looks, mut stopped) = (0.0, false);
+            let mut within = |fraction: f64| {
+                looks += 1.0;
+                stopped = watch(fraction).is_break();
+                if stopped || looks > most { Continue::Break(()) } else { Continue::Continue(()) }
+            };
+            let ended = engine::run(instance.clone(), &Experiment { solver, ..self.bare.clone() }, &mut within);
+            if stopped {
+                return None;
+            }
+            let Ok(outcome) = ended else { return Some(false) };
+            found.push((solver, Ok(outcome.verdicts)));
+        }
+        self.runs.extend(found);
+        Some(true)
+    }
+
+    /// Makes these runs; none if the caller ended one.
+    fn run_all(&mut self, solvers: Vec<Solver>, watch: &mut dyn FnMut(f64) -> Continue) -> Option<()> {
+        solvers.into_iter().all(|solver| self.run(solver, watch)).then_some(())
+    }
+
+    /// Makes one more run; false if the caller ended it.
+    fn run(&mut self, solver: Solver, watch: &mut dyn FnMut(f64) -> Continue) -> bool {
+        let plant = self.bare.bench.as_ref().map(|bench| &bench.plant);
+        let stepped = plant.unwrap_or(self.instance).description();
+        let (mut going, mut result) = (true, Err("its delays reach back over more steps than are kept".into()));
+        if solver.method == Method::Adaptive || has_room(stepped, solver.step) {
+            let duration = covering(&self.bare, &solver);
+            let mut experiment = Experiment { solver, duration, ..self.bare.clone() };
+            if duration > self.bare.duration {
+                // No window reaches beyond the experiment.
+                experiment.expects.iter_mut().for_each(|expect| expect.before = expect.before.min(self.bare.duration));
+            }
+            let ended = engine::run(self.instance.clone(), &experiment, watch);
+            going = !ended.as_ref().is_err_and(|failure| failure.cause == Cause::Stopped);
+            result = ended.map(|outcome| outcome.verdicts).map_err(|failure| failure.to_string());
+        }
+        self.runs.push((solver, result));
+        going
+    }
+
+    /// The verdicts of a run, judged by finer ones.
+    fn verdicts(&self, of: usize, finer: Range<usize>) -> Vec<Verdict> {
+        let (solver, Ok(own)) = &self.runs[of] else { return Vec::new() };
+        let finer = &self.runs[finer];
+        let failed = finer.iter().any(|(_, run)| run.is_err());
+        let error = |values: &[f64]| {
+            Some(match self.adaptive.is_some() {
+                _ if failed => f64::INFINITY,
+                true => compared(solver.method, values),
+                false => error(solver.method, values),
+            })
+        };
+        let judge = |(k, expect): (usize, &abi::plan::Expect)| {
+            let own = &own[k];
+            if own.problem.is_some() {
+                return own.clone();
+            }
+            let mut readings: Vec<&[Reading]> = vec![&own.readings];
+            let mut doubt = false;
+            let stepped = self.stepped.iter().filter(|_| of == 0);
+            let stepped = stepped.map(|(_, run)| run.as_ref().ok().map(|verdicts| &verdicts[k]));
+            let stepped: Option<Vec<&Verdict>> = stepped.map(|one| one.filter(|one| one.problem.is_none())).collect();
+            readings.extend(stepped.iter().flatten().map(|verdict| verdict.readings.as_slice()));
+            for (_, run) in finer {
+                match run.as_ref().map(|verdicts| &verdicts[k]) {
+                    Ok(verdict) if verdict.problem.is_none() => readings.push(&verdict.readings),
+                    // What cannot be measured in a finer run is not known of this one.
+                    Ok(_) | Err(_) => doubt = true,
+                }
+            }
+            let unknown = |_: &[f64]| Some(f64::INFINITY);
+            let error: &dyn Fn(&[f64]) -> Option<f64> = if doubt { &unknown } else { &error };
+            judged(expect, &Runs { readings: &readings, error })
+        };
+        self.bare.expects.iter().enumerate().map(judge).collect()
+    }
+
+    /// The coarsest solver found under which all is decided; `open` are the verdicts of the first run, which took so many
+    /// steps.
+    fn decides(&mut self, open: &[Verdict], steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<Solver> {
+        let decided = |verdicts: &[Verdict]| !verdicts.is_empty() && verdicts.iter().all(|verdict| verdict.decided);
+        let (own, references) = (self.runs[0].0, 1..self.runs.len());
+        let adaptive = own.method == Method::Adaptive;
+        if self.adaptive.is_none() {
+            // The companions are judged by those after them.
+            for of in 1..self.runs.len() - 1 {
+                if decided(&self.verdicts(of, of + 1..self.runs.len())) {
+                    return Some(self.runs[of].0);
+                }
+            }
+        }
+        // Then as the order of the method foretells; less than a factor of 4 is no news of companions that were tried.
+        let excess = open.iter().filter(|verdict| !verdict.decided).filter_map(|verdict| {
+            let margin = verdict.margin.as_ref()?;
+            Some(margin.error? / margin.amount.abs())
+        });
+        let excess = excess.fold(if self.adaptive.is_some() { 1.0 } else { 4.0 }, f64::max);
+        let safeties: &[f64] = if self.adaptive.is_some() { &[1.0, 4.0, 64.0] } else { &[4.0, 64.0] };
+        for safety in safeties {
+            let solver = match own.method {
+                Method::Adaptive => {
+                    let tol = power_of_ten_below(own.tol / (safety * excess));
+                    Solver { tol, parts: 2.0 * own.parts, ..own }
+                }
+                Method::Euler | Method::Rk4 | Method::Expo | Method::Implicit => {
+                    let mut part = 0.5;
+                    while power(1.0 / part, order(own.method).min(2)) < safety * excess {
+                        part *= 0.5;
+                        if part < 1e-6 {
+                            return None;
+                        }
+                    }
+                    Solver { step: part * own.step, ..own }
+                }
+            };
+            let work = if adaptive { power_of_fifth(own.tol / solver.tol) } else { own.step / solver.step };
+            if work > MOST_WORK || work * steps as f64 > 2e7 || adaptive && solver.tol < 1e-12 {
+                return None;
+            }
+            let at = self.runs.len();
+            if !self.run(solver, watch) {
+                return None;
+            }
+            let judges = if self.adaptive.is_some() {
+                references.clone()
+            } else {
+                if !self.run(Solver { step: 0.5 * solver.step, tol: 0.1 * solver.tol, ..solver }, watch) {
+                    return None;
+                }
+                at + 1..at + 2
+            };
+            if decided(&self.verdicts(at, judges)) {
+                return Some(solver);
+            }
+        }
+        None
+    }
+}
+
+/// The duration of a companion in s. Fixed steps that do not divide that of the experiment would all end at the same instant
+/// beside it, and agree: a companion goes on to the end of the step in which the experiment ends, and its windows are cut there.
+fn covering(experiment: &Experiment, solver: &Solver) -> f64 {
+    let duration = experiment.duration;
+    if solver.method == Method::Adaptive || experiment.bench.is_some() {
+        return duration;
+    }
+    let steps = duration / solver.step;
+    if (steps.round() * solver.step - duration).abs() <= 1e-9 * duration {
+        duration
+    } else {
+        steps.ceil() * solver.step
+    }
+}
+
+/// Whether what is delayed has room in steps of so many s.
+fn has_room(description: &Description, step: f64) -> bool {
+    description.delays.iter().all(|delay| (delay.range.1 / step).ceil() + 2.0 <= f64::from(delay.ring.len))
+}
+
+/// The error of the first of the results of finer and finer runs.
+fn error(method: Method, values: &[f64]) -> f64 {
+    if values.iter().all(|value| *value == values[0]) {
+        return 0.0;
+    }
+    if values.iter().any(|value| !value.is_finite()) {
+        return f64::INFINITY;
+    }
+    let most = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let span = most - values.iter().copied().fold(f64::INFINITY, f64::min);
+    match (method, values) {
+        (Method::Adaptive, _) => span,
+        // Of two steps alone the order is not known: 1 is the least.
+        (_, [coarse, fine]) => 2.0 * (coarse - fine).abs(),
+        (_, [coarse, fine, finest, ..]) => {
+            let (first, second) = (coarse - fine, fine - finest);
+            // 2^p, where the steps are short enough for the order p to show.
+            let ratio = (first / second).clamp(2.0, power(2.0, order(method)));
+            let ratio = if ratio.is_nan() { 2.0 } else { ratio };
+            let limit = finest - second / (ratio - 1.0);
+            span.max((coarse - limit).abs())
+        }
+        (_, _) => 0.0,
+    }
+}
+
+/// The error of the first of these results of fixed steps: of the run, of finer steps if there are such, and of two adaptive runs.
+/// Where it is as near to the second adaptive run as the first one is, they are not more accurate, and finer steps tell more.
+fn compared(method: Method, values: &[f64]) -> f64 {
+    let [own, stepped @ .., first, second] = values else { return f64::INFINITY };
+    let span = error(Method::Adaptive, &[*own, *first, *second]);
+    if stepped.is_empty() || (own - second).abs() > (first - second).abs() {
+        return span;
+    }
+    error(method, &values[..values.len() - 2]).min(span)
+}
+
+/// The order of a fixed method.
+fn order(method: Method) -> u32 {
+    match method {
+        Method::Euler => 1,
+        Method::Rk4 => 4,
+        Method::Expo | Method::Implicit | Method::Adaptive => 2,
+    }
+}
+
+fn power(base: f64, exponent: u32) -> f64 {
+    (0..exponent).fold(1.0, |product, _| product * base)
+}
+
+/// The fifth root of what is at least 1, to a factor of 10 ^ 0.2: how many times the steps a smaller tolerance takes.
+fn power_of_fifth(ratio: f64) -> f64 {
+    let (mut rest, mut root) = (ratio, 1.0);
+    while rest > 1.0 {
+        rest *= 0.1;
+        root *= 1.5848931924611136;
+    }
+    root
+}
+
+/// The greatest power of ten that is not above.
+fn power_of_ten_below(value: f64) -> f64 {
+    let text = format!("{value:e}");
+    let exponent = text.split_once('e').map_or("0", |(_, exponent)| exponent);
+    format!("1e{exponent}").parse().unwrap_or(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::models::{self, adaptive, fixed, reading};
+    use abi::plan::{Formula, MeasureKind};
+
+    fn judged(instance: &Instance, experiment: &Experiment) -> Outcome {
+        let mut go_on = |_| Continue::Continue(());
+        let mut outcome = engine::run(instance.clone(), experiment, &mut go_on).unwrap();
+        let before = outcome.clone();
+        judge(instance, experiment, &mut outcome, &mut go_on);
+        assert_eq!((&before.finals, before.work), (&outcome.finals, outcome.work));
+        for (a, b) in before.verdicts.iter().zip(&outcome.verdicts) {
+            assert!(a.readings.iter().zip(&b.readings).all(|(a, b)| a.value.to_bits() == b.value.to_bits()));
+        }
+        outcome
+    }
+
+    /// The error of x = e^-t at 1 s, and its estimate.
+    fn decay(mut experiment: Experiment) -> (f64, f64) {
+        let instance = models::decay();
+        experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
+        let reading = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+        ((reading.value - (-1f64).exp()).abs(), reading.error.unwrap())
+    }
+
+    #[test]
+    fn a_decay_is_as_far_off_as_is_said() {
+        for experiment in [adaptive(1.0, 1e-3), adaptive(1.0, 1e-5), fixed(1.0, 0.1), fixed(1.0, 0.01)] {
+            let (error, estimate) = decay(experiment.clone());
+            let fits = error > 0.0 && error <= 3.0 * estimate && estimate <= 10.0 * error + 1e-15;
+            assert!(fits, "{:?}: {error:e}, {estimate:e}", experiment.solver);
+        }
+    }
+
+    #[test]
+    fn a_run_that_ends_beside_its_duration_is_judged_there() {
+        // Exact but for where it ends: at 1 s and at 1.1 s, with half and a quarter of the step too.
+        let instance = models::decay();
+        for (duration, kind) in [(1.004, MeasureKind::Final), (1.096, MeasureKind::Final), (1.004, MeasureKind::Min)] {
+            let mut experiment = fixed(duration, 0.1);
+            experiment.solver.method = Method::Rk4;
+            experiment.expects.push(reading(&instance, kind, "x"));
+            let reading = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+            let (error, estimate) = ((reading.value - (-duration).exp()).abs(), reading.error.unwrap());
+            assert!(error > 1e-3 && error <= 1.5 * estimate && estimate <= 3.0 * error, "{error:e}, {estimate:e}");
+        }
+    }
+
+    /// sin t has its maximum of 1 at π/2: at many steps a point that all three runs share is the nearest one to it.
+    #[test]
+    fn an_extreme_between_points_that_all_runs_share_is_judged() {
+        let instance = models::oscillator();
+        let mut shared = 0;
+        for k in 0..200 {
+            let step = 0.01 + 0.0007 * f64::from(k);
+            let mut experiment = fixed((2.0 / step).ceil() * step, step);
+            experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
+            let found = judged(&instance, &experiment).verdicts[0].readings[0].clone();
+            let (error, estimate) = (1.0 - found.value, found.error.unwrap());
+            assert!(error.abs() <= 1.5 * estimate + 1e-9, "step {step}: off by {error:e}, estimated {estimate:e}");
+            // The nearest point is a shared one if it is nearest by less than half of the finest step.
+            let from_peak = std::f64::consts::FRAC_PI_2 / step - (std::f64::consts::FRAC_PI_2 / step).round();
+            shared += u32::from(from_peak.abs() < 0.125);
+        }
+        assert!(shared > 30, "{shared} steps of 200 have it at a shared point");
+    }
+
+    #[test]
+    fn the_tightest_tolerance_is_judged_by_a_looser_one() {
+        let (error, estimate) = decay(adaptive(1.0, 1e-13));
+        assert!(error <= 3.0 * estimate + 1e-15, "{error:e}, {estimate:e}");
+    }
+
+    #[test]
+    fn an_open_verdict_names_what_decides() {
+        let instance = models::decay();
+        // Ten seconds: with the fifty steps of one second the error of this decay is rounding, whatever the tolerance.
+        for mut experiment in [fixed(1.0, 0.1), adaptive(10.0, 1e-3)] {
+            let solver = experiment.solver;
+            let mut expect = reading(&instance, MeasureKind::Final, "x");
+            // Between the truth and what the run gives, nearer to the truth: what decides is on the other side of the limit.
+            let truth = (-experiment.duration).exp();
+            experiment.expects.push(expect.clone());
+            let found = judged(&instance, &experiment).verdicts[0].readings[0].value;
+            experiment.expects.clear();
+            let (measure, limit) =
+                (Box::new(Formula::Measure(0)), Box::new(Formula::Number(truth + 0.2 * (found - truth))));
+            expect.condition =
+                if found > truth { Formula::Less(measure, limit) } else { Formula::Greater(measure, limit) };
+            experiment.expects.push(expect);
+            let outcome = judged(&instance, &experiment);
+            assert!(!outcome.verdicts[0].decided && !outcome.passed(), "{solver:?}");
+            let decides = outcome.estimate.unwrap().decides.unwrap_or_else(|| panic!("{solver:?} has no remedy"));
+            let better = judged(&instance, &Experiment { solver: decides, ..experiment.clone() });
+            assert!(better.passed(), "{decides:?}");
+            experiment.stepped = true;
+            let on_purpose = judged(&instance, &experiment);
+            assert_eq!(on_purpose.verdicts[0].decided, solver.method != Method::Adaptive);
+        }
+    }
+
+    #[test]
+    fn three_results_show_their_order_and_two_do_not() {
+        let at = |order: u32| [1.0, 0.5, 0.25].map(|h| 7.0 + power(h, order));
+        assert!((error(Method::Euler, &at(1)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Expo, &at(2)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Rk4, &at(4)) - 1.0).abs() < 1e-12);
+        assert!((error(Method::Rk4, &at(4)[..2]) - 1.875).abs() < 1e-12);
+        // Two that agree by accident do not make a small error.
+        assert!(error(Method::Expo, &[1.0, 1.0, 1.5]) >= 0.5);
+        assert!(error(Method::Adaptive, &[1.0, 1.0, 1.5]) >= 0.5);
+        assert_eq!(error(Method::Adaptive, &[f64::INFINITY; 3]), 0.0);
+        assert_eq!(error(Method::Adaptive, &[f64::INFINITY, 1.0, 1.0]), f64::INFINITY);
+        assert_eq!(error(Method::Rk4, &[2.0; 3]), 0.0);
+    }
+}

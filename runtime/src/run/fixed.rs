@@ -1,0 +1,175 @@
+//! A run by a whole number of fixed steps, which are the model's own code.
+
+use crate::format;
+use crate::run::observe::{Observer, check_finite, check_status};
+use crate::run::outcome::{Cause, Continue, Stop};
+use crate::run::stepper::{Rest, Stepper};
+use abi::plan::Experiment;
+use abi::table::keep_time;
+use abi::{Function, Instance, Slot};
+use std::ops::Range;
+
+/// Steps between two looks at the caller and at the whole block.
+const BATCH: u64 = 4096;
+
+/// Such a run under way.
+pub(crate) struct Fixed {
+    rest: Rest,
+    /// In s.
+    step: f64,
+    /// Number of steps.
+    total: u64,
+    /// Whether somebody looks at every step.
+    each: bool,
+    /// The block at the beginning of the batch, the number of its steps, and how many are done.
+    saved: Vec<f64>,
+    batch: u64,
+    done: u64,
+    /// Slots that are looked at.
+    seen: Vec<Range<usize>>,
+}
+
+impl Fixed {
+    pub(crate) fn start(
+        instance: Instance,
+        experiment: &Experiment,
+        observer: Observer,
+        begin: &mut dyn FnMut(&mut Instance),
+    ) -> Result<Fixed, Box<(Rest, Stop)>> {
+        let step = experiment.solver.step;
+        assert!(step > 0.0 && step.is_finite(), "a step of {step} s");
+        let total = (experiment.duration / step).round() as u64;
+        let end = total as f64 * step;
+        let mut rest = Rest::of(instance, observer);
+        if (end - experiment.duration).abs() > 1e-9 * experiment.duration {
+            rest.notes.push(format!("The run ends at {}, after a whole number of steps.", format::time(end)));
+        }
+        let one = |slot: &Slot| slot.index()..slot.index() + 1;
+        let slots = rest.observer.slots().iter().chain(rest.observer.probe.slots());
+        let mut run = Fixed {
+            step,
+            total,
+            each: !rest.observer.only_last() || rest.observer.probe.next().is_some(),
+            saved: rest.instance.block().to_vec(),
+            batch: 0,
+            done: 0,
+            seen: [Slot::COUNT].iter().chain(slots).map(one).collect(),
+            rest,
+        };
+        match run.begin(begin) {
+            Ok(()) => Ok(run),
+            Err(stop) => Err(Box::new((run.rest, stop))),
+        }
+    }
+
+    fn begin(&mut self, begin: &mut dyn FnMut(&mut Instance)) -> Result<(), Stop> {
+        let Rest { instance, observer, .. } = &mut self.rest;
+        let status = instance.start(self.step);
+        begin(instance);
+        check_status(instance, status)?;
+        check_finite(instance)?;
+        observer.see(instance)?;
+        self.probe();
+        self.open();
+        Ok(())
+    }
+
+    /// Begins a batch.
+    fn open(&mut self) {
+        self.saved.copy_from_slice(self.rest.instance.block());
+        (self.batch, self.done) = (BATCH.min(self.total - self.rest.work.steps), 0);
+    }
+
+    /// Keeps what is wanted at an instant that this step is nearest to.
+    fn probe(&mut self) {
+        let Rest { instance, observer, .. } = &mut self.rest;
+        let time = instance.get(Slot::TIME);
+        while observer.probe.next().is_some_and(|instant| instant < time + 0.5 * self.step) {
+            observer.probe.take(instance.block());
+        }
+    }
+
+    /// Repeats the batch step by step up to where a state or output is not finite.
+    fn first_not_finite(&mut self) -> Stop {
+        let instance = &mut self.rest.instance;
+        instance.block_mut().copy_from_slice(&self.saved);
+        for _ in 0..self.batch {
+            instance.advance(1);
+            if let Err(stop) = check_finite(instance) {
+                return stop;
+            }
+        }
+        unreachable!("the same {} steps gave a value that is not finite before", self.batch)
+    }
+}
+
+impl Stepper for Fixed {
+    fn function(&self) -> Function {
+        Function::Step
+    }
+
+    fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop> {
+        let Rest { instance, observer, work, .. } = &mut self.rest;
+        if self.done < self.batch {
+            return Ok(Some(if self.each { 1 } else { self.batch - self.done }));
+        }
+        work.steps += self.done;
+        if work.steps > 0 && watch(work.steps as f64 / self.total as f64).is_break() {
+            return Err(Stop { cause: Cause::Stopped, time: instance.get(Slot::TIME) });
+        }
+        if work.steps < self.total {
+            self.open();
+            return self.next(watch);
+        }
+        if !self.each {
+            observer.see(instance)?;
+        }
+        Ok(None)
+    }
+
+    fn take(&mut self, done: u64, status: u64) -> Result<(), Stop> {
+        if self.each {
+            self.rest.observer.see(&self.rest.instance)?;
+            self.probe();
+        }
+        self.done += done;
+        if self.done < self.batch && status == 0 {
+            return Ok(());
+        }
+        // In a batch, what was not finite may have become so many steps ago, and may be why a guard fired.
+        if check_finite(&self.rest.instance).is_err() {
+            return Err(self.first_not_finite());
+        }
+        if status != 0 && !self.each {
+            // The step that went too far is worth seeing.
+            self.rest.observer.see(&self.rest.instance)?;
+        }
+        check_status(&self.rest.instance, status)
+    }
+
+    fn instance(&mut self) -> &mut Instance {
+        &mut self.rest.instance
+    }
+
+    fn fetch(&mut self, done: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64])) {
+        let block = self.rest.instance.block_mut();
+        let mut whole = status != 0 || self.done + done == self.batch;
+        if !whole {
+            for range in &self.seen {
+                from(range.clone(), block);
+                // Why it is not finite, other slots may tell.
+                whole |= !block[range.start].is_finite();
+            }
+        }
+        if whole {
+            from(0..block.len(), block);
+        }
+        keep_time(block);
+    }
+
+    fn bring(&self, _: &mut dyn FnMut(Range<usize>, &[f64])) {}
+
+    fn rest(self: Box<Self>) -> Rest {
+        self.rest
+    }
+}

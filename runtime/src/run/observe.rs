@@ -1,0 +1,158 @@
+//! Looks at the points of a run: measures, recordings, and whether every number is one.
+//!
+//! In: instances after a step, or on one side of an event. Out: what [`measure`](crate::run::measure) and
+//! [`record`](crate::record) make of them, or the reason to stop. Knows no solver.
+
+use crate::record::Recorder;
+use crate::run::measure::Expectations;
+use crate::run::outcome::{Cause, Stop};
+use abi::description::Kind;
+use abi::plan::Experiment;
+use abi::{Instance, Slot};
+
+/// Everything that looks at the points of a run.
+pub(crate) struct Observer {
+    pub(crate) expectations: Expectations,
+    pub(crate) recorder: Recorder,
+    /// Slots that are read; each must be finite.
+    slots: Vec<Slot>,
+    /// Values that are wanted at given instants.
+    pub(crate) probe: Probe,
+}
+
+/// Values of some slots at given instants, ascending.
+#[derive(Default)]
+pub(crate) struct Probe {
+    instants: Vec<f64>,
+    slots: Vec<Slot>,
+    /// Row by row, one for each instant passed.
+    values: Vec<f64>,
+}
+
+impl Probe {
+    pub(crate) fn new(instants: &[f64], slots: &[Slot]) -> Probe {
+        Probe { instants: instants.to_vec(), slots: slots.to_vec(), values: Vec::new() }
+    }
+
+    /// The slots that are wanted.
+    pub(crate) fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+
+    /// The next instant, in s.
+    pub(crate) fn next(&self) -> Option<f64> {
+        let row = if self.slots.is_empty() { return None } else { self.values.len() / self.slots.len() };
+        self.instants.get(row).copied()
+    }
+
+    /// The values at that instant.
+    pub(crate) fn take(&mut self, block: &[f64]) {
+        self.values.extend(self.slots.iter().map(|slot| block[slot.index()]));
+    }
+
+    pub(crate) fn values(self) -> Vec<f64> {
+        self.values
+    }
+}
+
+impl Observer {
+    pub(crate) fn new(experiment: &Experiment) -> Observer {
+        let mut expects = experiment.expects.clone();
+        // A window to the end is open: the last step may end a rounding error beside the duration.
+        for expect in expects.iter_mut().filter(|expect| expect.before >= experiment.duration) {
+            expect.before = f64::INFINITY;
+        }
+        let mut expectations = Expectations::new(&expects);
+        expectations.jumps_at(&experiment.corners);
+        let recorder = Recorder::new(&experiment.plots);
+        let mut slots: Vec<Slot> = expectations.slots().chain(recorder.slots()).collect();
+        slots.sort();
+        slots.dedup();
+        Observer { expectations, recorder, slots, probe: Probe::default() }
+    }
+
+    /// Whether only the last point of a run matters.
+    pub(crate) fn only_last(&self) -> bool {
+        self.recorder.is_empty() && self.expectations.only_last()
+    }
+
+    /// The slots that are read, ascending.
+    pub(crate) fn slots(&self) -> &[Slot] {
+        &self.slots
+    }
+
+    /// One point of the run: the block after a step, or on one side of an event.
+    pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
+        let block = instance.block();
+        // Zero times a value is zero unless it is infinite or not a number.
+        let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
+        if doubt != 0.0 {
+            self.check(instance)?;
+        }
+        self.show(block[Slot::TIME.index()], block);
+        Ok(())
+    }
+
+    /// One point whose values are known to be finite.
+    pub(crate) fn show(&mut self, time: f64, block: &[f64]) {
+        self.expectations.see(time, block);
+        self.recorder.see(time, block);
+    }
+
+    /// Names what is read and not finite. A state that went wrong explains the expression that was asked for.
+    pub(crate) fn check(&self, instance: &Instance) -> Result<(), Stop> {
+        check_finite(instance)?;
+        match self.slots.iter().find(|slot| !instance.get(**slot).is_finite()) {
+            Some(bad) => Err(not_finite(instance, *bad)),
+            None => Ok(()),
+        }
+    }
+}
+
+/// States and outputs must be finite; private quantities may be infinite in a branch that is not taken.
+pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
+    let layout = &instance.description().layout;
+    let finite = |slot: &usize| instance.block()[*slot].is_finite();
+    if let Some(bad) = layout.states.range().find(|slot| !finite(slot)) {
+        return Err(not_finite(instance, Slot(bad as u32)));
+    }
+    let watched = |kind| matches!(kind, Kind::SampledState | Kind::Output);
+    let outputs = instance.description().quantities.iter().filter(|quantity| watched(quantity.kind));
+    match outputs.map(|quantity| quantity.slot).find(|slot| !finite(&slot.index())) {
+        Some(bad) => Err(not_finite(instance, bad)),
+        None => Ok(()),
+    }
+}
+
+/// What is not finite, or the quantity whose range was left at the same instant: results rest on ranges, so that is the cause.
+fn not_finite(instance: &Instance, slot: Slot) -> Stop {
+    let time = instance.get(Slot::TIME);
+    let left = instance.description().guards.iter().find_map(|guard| {
+        let (value, (low, high)) = (instance.get(guard.slot), guard.range);
+        (value.is_finite() && !(low..=high).contains(&value)).then_some((guard, value))
+    });
+    if let Some((guard, value)) = left {
+        return Stop { cause: Cause::Guard { guard: Box::new(guard.clone()), value }, time };
+    }
+    let named = instance.description().quantities.iter().find(|quantity| quantity.slot == slot);
+    let path = named.map_or_else(|| format!("slot {}", slot.0), |quantity| quantity.path.clone());
+    Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time }
+}
+
+/// What a status that is not 0 means.
+pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop> {
+    if status == 0 {
+        return Ok(());
+    }
+    let guards = &instance.description().guards;
+    let guard = guards
+        .get(status as usize - 1)
+        .unwrap_or_else(|| panic!("status {status} of a model with {} guards", guards.len()));
+    let value = instance.get(guard.slot);
+    let cause = if value.is_finite() {
+        Cause::Guard { guard: Box::new(guard.clone()), value }
+    } else {
+        Cause::NotFinite { path: guard.path.clone(), value }
+    };
+    Err(Stop { cause, time: instance.get(Slot::TIME) })
+}

@@ -1,0 +1,242 @@
+//! How a run ends: what it gives, or why it stopped.
+
+use crate::format;
+use crate::record::Recording;
+use crate::run::verdict::Verdict;
+use abi::description::Guard;
+use abi::plan::Solver;
+use abi::unit::Unit;
+use std::fmt;
+use std::ops::ControlFlow;
+
+/// Whether to go on.
+pub type Continue = ControlFlow<()>;
+
+/// How an experiment ended that ran to its end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Outcome {
+    /// One for each expectation, in order.
+    pub verdicts: Vec<Verdict>,
+    /// What is drawn and written.
+    pub recording: Recording,
+    /// Outputs at the end, in the order of the description.
+    pub finals: Vec<Final>,
+    /// Time at the end in s.
+    pub time: f64,
+    /// What it took.
+    pub work: Work,
+    /// What the reader should know besides: in words, a sentence each.
+    pub notes: Vec<String>,
+    /// How the errors of the readings were found; none where nobody asked.
+    pub estimate: Option<Estimate>,
+}
+
+/// How the errors of an outcome were found.
+#[derive(Clone, PartialEq, Debug, Default)]
+pub struct Estimate {
+    /// Runs of the same by a finer solver that came to their end.
+    pub companions: Vec<Solver>,
+    /// One that did not, and why, in words: then no error is known.
+    pub failed: Option<(Solver, String)>,
+    /// Where verdicts are open: a solver that decides all of them, tried.
+    pub decides: Option<Solver>,
+}
+
+impl Outcome {
+    /// Whether every expectation held, without a doubt where errors were estimated.
+    pub fn passed(&self) -> bool {
+        self.verdicts.iter().all(Verdict::passed)
+    }
+}
+
+/// The value of an output at the end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Final {
+    /// Dotted path.
+    pub path: String,
+    /// In SI.
+    pub value: f64,
+    /// The unit it is shown in.
+    pub unit: Unit,
+    /// True (1) or false (0) rather than a quantity.
+    pub boolean: bool,
+}
+
+/// What a run took.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Work {
+    /// Steps that count, of any kind.
+    pub steps: u64,
+    /// Of these, in an adaptive run, steps of the stiff method; the others were explicit.
+    pub stiff_steps: u64,
+    /// Steps of an adaptive run that were tried and found too long.
+    pub rejected: u64,
+    /// Evaluations of the derivatives in an adaptive run.
+    pub evaluations: u64,
+    /// Jacobians of an adaptive run.
+    pub jacobians: u64,
+    /// Events at which a step of an adaptive run ended.
+    pub events: u64,
+    /// Instants at which an adaptive run met sampled blocks.
+    pub ticks: u64,
+}
+
+impl fmt::Display for Work {
+    /// `1685 steps (1621 stiff, 64 explicit), 248 tried again, 3 events`; of a fixed step `2000 steps`.
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{} steps", self.steps)?;
+        if self.evaluations == 0 {
+            return Ok(());
+        }
+        match (self.stiff_steps, self.steps - self.stiff_steps) {
+            (_, 0) => write!(f, " (stiff)")?,
+            (0, _) => write!(f, " (explicit)")?,
+            (stiff, explicit) => write!(f, " ({stiff} stiff, {explicit} explicit)")?,
+        }
+        write!(f, ", {} tried again", self.rejected)?;
+        match self.events {
+            0 => Ok(()),
+            1 => write!(f, ", 1 event"),
+            events => write!(f, ", {events} events"),
+        }
+    }
+}
+
+/// Why a run stopped before its end.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Failure {
+    /// The reason.
+    pub cause: Cause,
+    /// When, in s.
+    pub time: f64,
+    /// The run up to there.
+    pub recording: Recording,
+}
+
+/// The reason of a [`Failure`].
+#[derive(Clone, PartialEq, Debug)]
+pub enum Cause {
+    /// A watched quantity left its range.
+    Guard {
+        /// The quantity and its range.
+        guard: Box<Guard>,
+        /// Its value in SI.
+        value: f64,
+    },
+    /// A quantity became infinite or not a number.
+    NotFinite {
+        /// Dotted path, or the expression as written.
+        path: String,
+        /// Its value.
+        value: f64,
+    },
+    /// The model changes regime or branch without end, so that time does not go on.
+    Chatter(Box<Chatter>),
+    /// No step was short enough for the tolerance.
+    StepTooShort {
+        /// Length of the last in s.
+        step: f64,
+        /// The state with the largest error.
+        path: String,
+    },
+    /// The run needs more steps than are worth waiting for.
+    TooManySteps {
+        /// Steps tried.
+        steps: u64,
+        /// The state with the largest error in the last one.
+        path: String,
+    },
+    /// The model offers no derivatives, so there is nothing to solve adaptively.
+    NoDerivatives,
+    /// A `stop` of the rig.
+    Rig {
+        /// As written.
+        condition: String,
+        /// What the operator is told.
+        why: String,
+    },
+    /// The caller said to stop.
+    Stopped,
+}
+
+/// What a model did that chattered.
+#[derive(Clone, PartialEq, Debug)]
+pub struct Chatter {
+    /// The regime of each automaton, with its part: `fr.stick`.
+    pub regimes: Vec<String>,
+    /// The conditions that turned, as written: `fr: v < 0`.
+    pub conditions: Vec<String>,
+    /// How often at least.
+    pub times: usize,
+    /// Over which time in s; 0 if at one instant.
+    pub within: f64,
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let time = format::time(self.time);
+        match &self.cause {
+            Cause::Guard { guard, value } => {
+                let Guard { path, unit, .. } = &**guard;
+                let value = format::quantity(*value, unit);
+                let (low, _) = guard.bounds(|bound| format::plain(unit.from_si(bound)));
+                let (_, high) = guard.bounds(|bound| format::quantity(bound, unit));
+                write!(f, "`{path}` left its range {low} .. {high}: it is {value} at {time}")
+            }
+            Cause::NotFinite { path, value } if value.is_nan() => {
+                write!(f, "`{path}` is not a number at {time}")
+            }
+            Cause::NotFinite { path, .. } => write!(f, "`{path}` is infinite at {time}"),
+            Cause::Chatter(chatter) => write!(f, "chatters at {time}: {chatter}"),
+            Cause::StepTooShort { step, path } => {
+                let step = format::time(*step);
+                write!(
+                    f,
+                    "steps of {step} at {time} are still too long for the tolerance: `{path}` jumps, or the tolerance is too tight"
+                )
+            }
+            Cause::TooManySteps { steps, path } => write!(
+                f,
+                "{steps} steps were tried and the run is only at {time}: `{path}` keeps them short; another `tol` may suit it better, or a fixed step"
+            ),
+            Cause::NoDerivatives => write!(f, "the model offers no derivatives: give a `solver` with a step"),
+            Cause::Rig { condition, why } => write!(f, "the rig stops at {time}: {why} (`{condition}`)"),
+            Cause::Stopped => write!(f, "stopped at {time}"),
+        }
+    }
+}
+
+impl fmt::Display for Chatter {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let conditions: Vec<String> = self.conditions.iter().map(|text| format!("`{text}`")).collect();
+        let what = if conditions.is_empty() { "its regimes".into() } else { conditions.join(" and ") };
+        let within = format::time(self.within);
+        if self.within > 0.0 && self.times > 1 {
+            write!(f, "{what} turned more than {} times within {within}", self.times)?;
+        } else if self.within > 0.0 {
+            write!(f, "{what} turns again and again, in steps of {within}")?;
+        } else {
+            write!(f, "{what} turned more often than there are regimes, at one instant")?;
+        }
+        if !self.regimes.is_empty() {
+            write!(f, ", last in {}", self.regimes.join(", "))?;
+        }
+        write!(f, "; let the model hold (a stick regime, a bristle, a smooth sign), or take a fixed step")
+    }
+}
+
+impl std::error::Error for Failure {}
+
+/// A reason to stop, and when.
+pub(crate) struct Stop {
+    pub(crate) cause: Cause,
+    pub(crate) time: f64,
+}
+
+#[test]
+fn work_is_told_in_a_line() {
+    let fixed = Work { steps: 2000, ..Work::default() };
+    assert_eq!(fixed.to_string(), "2000 steps");
+    let adaptive = Work { steps: 100, stiff_steps: 60, rejected: 7, evaluations: 1000, events: 1, ..fixed };
+    assert_eq!(adaptive.to_string(), "100 steps (60 stiff, 40 explicit), 7 tried again, 1 event");
+}

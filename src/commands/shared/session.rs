@@ -1,0 +1,106 @@
+//! What a session at the prompt and a text that is watched share: Ctrl-C, and what is said of a run.
+
+use crate::plot::{self, Figure};
+use crate::repl::{Fault, Ran, Value, plain};
+use crate::terminal::{Style, Terminal};
+use crate::{figure, quantity, report, results};
+use abi::Slot;
+use abi::unit::Unit;
+use runtime::engine::Continue;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Set by Ctrl-C, taken back before each line.
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Whether Ctrl-C was pressed since the line began.
+pub(in crate::commands) fn interrupted() -> bool {
+    INTERRUPTED.load(Ordering::Relaxed)
+}
+
+/// Takes back what was pressed before.
+pub(in crate::commands) fn forget_interrupt() {
+    INTERRUPTED.store(false, Ordering::Relaxed);
+}
+
+/// Lets Ctrl-C stop what runs instead of the process.
+pub(in crate::commands) fn catch_interrupts() {
+    forget_interrupt();
+    // Set once for the process; a second call has nothing to add.
+    crate::interrupt::on_interrupt(|| INTERRUPTED.store(true, Ordering::Relaxed));
+}
+
+/// Stops a run once Ctrl-C was pressed.
+pub(in crate::commands) fn stop_on_interrupt(_: f64) -> Continue {
+    if interrupted() { Continue::Break(()) } else { Continue::Continue(()) }
+}
+
+/// Says what is wrong.
+pub(in crate::commands) fn tell_fault(fault: &Fault, terminal: &Terminal) {
+    match fault {
+        Fault::Found(files, diagnostics) => {
+            terminal.report(&report::full(files, diagnostics, terminal.error_colour()));
+        }
+        Fault::Words(words) => terminal.error(words),
+        Fault::Stopped(failure) => terminal.error(&failure.to_string()),
+    }
+}
+
+/// Says what a run did, draws its plots, judges its expectations; returns whether they hold.
+pub(in crate::commands) fn show_run(ran: &Ran, draw: bool, terminal: &mut Terminal) -> bool {
+    if let Some(warnings) = &ran.warnings {
+        tell_fault(warnings, terminal);
+    }
+    let Some(first) = ran.cases.first() else { return true };
+    let outcomes: Vec<_> = ran.results.iter().filter_map(|result| result.as_ref().ok()).collect();
+    let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
+    let cases = if ran.cases.len() > 1 { format!(", {} cases", ran.cases.len()) } else { String::new() };
+    let second = Unit::parse("s").expect("the second is known");
+    terminal.line(&format!(
+        "{}: {}{cases}, {} steps for {}",
+        terminal.styled(Style::Bold, &ran.name),
+        results::solver(&first.experiment.solver),
+        quantity::count(steps),
+        quantity::show(first.experiment.duration, &second, 6),
+    ));
+    for note in first.notes.iter().chain(outcomes.iter().flat_map(|outcome| &outcome.notes)) {
+        terminal.line(&format!("  note: {note}"));
+    }
+    if let Some(drawn) = run_figure(ran, false).filter(|_| draw) {
+        terminal.print(&plot::terminal(&drawn, terminal.width(), terminal.colour()));
+    } else if let ([outcome], true) = (outcomes.as_slice(), draw) {
+        let width = outcome.finals.iter().map(|end| end.path.chars().count()).max().unwrap_or(0);
+        for end in &outcome.finals {
+            let value = Value { si: end.value, unit: end.unit.clone(), boolean: end.boolean };
+            terminal.line(&format!("  {:width$}  {} at the end", end.path, plain(&value)));
+        }
+    }
+    let mut held = true;
+    for (case, result) in ran.cases.iter().zip(&ran.results) {
+        let Ok(outcome) = result else { continue };
+        if !case.label.is_empty() && !outcome.verdicts.is_empty() {
+            terminal.line(&format!("  {}", case.label));
+        }
+        held &= outcome.passed();
+        let words = results::verdicts(terminal, &outcome.verdicts, outcome.estimate.as_ref(), None, "  ");
+        terminal.print(&words);
+    }
+    held
+}
+
+/// The plots of a run in one figure; `last`: only the plot that was added last.
+pub(in crate::commands) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
+    let first = ran.cases.first()?;
+    let plots = &first.experiment.plots;
+    let plots = if last { &plots[plots.len().saturating_sub(1)..] } else { &plots[..] };
+    if plots.is_empty() {
+        return None;
+    }
+    let cases = figure::recorded(&ran.cases, &ran.results);
+    let subtitle = results::solver(&first.experiment.solver);
+    Some(figure::figure(&ran.name, &subtitle, plots, &cases))
+}
+
+/// Time of an instance, for those who go on from it.
+pub(in crate::commands) fn time_of(instance: &abi::Instance) -> f64 {
+    instance.get(Slot::TIME)
+}
