@@ -36,6 +36,8 @@ pub enum Emit {
     C,
     /// The straight-line program
     Ir,
+    /// The passes from the text to machine code, with their times and what each did
+    Passes,
     /// The same as Cranelift has it
     Clif,
     /// Assembly
@@ -66,6 +68,7 @@ pub fn emit(
             let listings: Vec<String> = functions.iter().map(|(_, func)| func.to_string()).collect();
             format!("{}\n{}", places(description, method, 1), listings.join("\n"))
         }
+        Emit::Passes => passes(built, method),
         Emit::Clif | Emit::Asm => {
             let chosen = match (made_for, Target::here()) {
                 (Some(made_for), _) => Some(made_for),
@@ -100,6 +103,21 @@ pub fn emit(
         }
     };
     Ok(text.into_bytes())
+}
+
+/// A table of the passes: what each did with the step, and how long it took.
+fn passes(built: &Built, method: Method) -> String {
+    let mut out = format!("; {}, by {}\n", built.program.description.name, method.name());
+    out += &format!("{:<18} {:>6} {:>6} {:>9}\n", "pass", "before", "after", "time");
+    let mut begin = Instant::now();
+    compiler::codegen::passes::each(&built.program, method, &mut |ran| {
+        let time = crate::quantity::duration(begin.elapsed().as_secs_f64());
+        let [before, after] = ran.ops;
+        out += &format!("{:<18} {before:>6} {after:>6} {time:>9}  {}", ran.name, ran.does);
+        out += &ran.effect.map_or("\n".into(), |effect| format!(": {effect}\n"));
+        begin = Instant::now();
+    });
+    out
 }
 
 /// How what was built is stepped.

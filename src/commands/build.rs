@@ -22,8 +22,9 @@ pub fn build(args: &Build, terminal: &mut Terminal) -> End {
             return End::Misused;
         }
         (None, false) => {
-            terminal
-                .error("make what? --emit c, ir, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg");
+            terminal.error(
+                "make what? --emit c, ir, passes, clif, asm or blob; a rig becomes a package with --out NAME.fricpkg",
+            );
             return End::Misused;
         }
     };

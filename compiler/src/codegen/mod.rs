@@ -21,6 +21,7 @@ pub mod jit;
 pub mod image;
 pub mod c;
 pub mod tiering;
+pub mod passes;
 pub mod elementary;
 #[cfg(test)]
 mod agreement;

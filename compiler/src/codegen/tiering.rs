@@ -10,10 +10,7 @@ use crate::ir::interpret::Interpreter;
 use crate::ir::program::Program;
 use crate::math;
 use crate::numerics::{autodiff, fixed_step, rosenbrock};
-use crate::opt::contract::contract;
-use crate::opt::guard_reduction::reduce_guards;
-use crate::opt::limiter_tests::drop_limiter_tests;
-use crate::opt::reassociate::reassociate;
+use crate::opt::{self, Context};
 use abi::lanes::Lanes;
 use abi::plan::Method;
 use abi::table::{Code, Interpret, Machine};
@@ -50,10 +47,7 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 /// # Panics
 /// For the adaptive method, which is no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
-    reduce_guards(&drop_limiter_tests(&contract(
-        &reassociate(&fixed_step::step(program, method), program.balanced),
-        &program.description.layout,
-    )))
+    opt::optimise(fixed_step::step(program, method), Context::of(program))
 }
 
 /// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;

@@ -11,7 +11,8 @@ use crate::codegen::lanes::{self, Width};
 use crate::ir::Func;
 use abi::Layout;
 use abi::ahead::{Ahead, RestEntry};
-use split::{Distribution, split};
+use split::Distribution;
+pub use split::split;
 use std::sync::Arc;
 
 /// The parts of a step that is sound and expanded, if it is worth them.
