@@ -40,20 +40,6 @@ pub static LATE: [Late; 7] = [
         },
     },
     Late {
-        name: "outline",
-        does: "cuts functions of more than 2,000 operations into pieces; repeated parts become loops (reroll)",
-        effect: |func, _| {
-            let lengths = Lengths::USUAL;
-            let outlined =
-                if func.ops.len() > lengths.whole { cut(func, &Facts::of(func), lengths)? } else { return None };
-            Some(format!(
-                "{} pieces, {} rows of repeated operations",
-                outlined.pieces.len(),
-                outlined.repeats.rows.len()
-            ))
-        },
-    },
-    Late {
         name: "unswitch",
         does: "copies the step for each answer to a comparison that three automata or more test",
         effect: |func, _| unswitched(func).map(|_| "a copy for each answer".into()),
@@ -69,6 +55,15 @@ pub static LATE: [Late; 7] = [
         },
     },
     Late {
+        name: "sink",
+        does: "moves cheap operations on loads down to their first use, for lower register pressure",
+        effect: |func, _| {
+            let before = operations(func);
+            let moved = before.iter().zip(sunk(&func.ops, &before)).filter(|(a, b)| *a != b).count();
+            (moved > 0).then(|| format!("{moved} places in the order changed"))
+        },
+    },
+    Late {
         name: "select_to_branch",
         does: "turns selections with an expensive arm into branches that compute one arm",
         effect: |func, _| {
@@ -78,12 +73,17 @@ pub static LATE: [Late; 7] = [
         },
     },
     Late {
-        name: "sink",
-        does: "moves cheap operations on loads down to their first use, for lower register pressure",
+        name: "outline",
+        does: "cuts functions of more than 2,000 operations into pieces; repeated parts become loops (reroll)",
         effect: |func, _| {
-            let before = operations(func);
-            let moved = before.iter().zip(sunk(&func.ops, &before)).filter(|(a, b)| *a != b).count();
-            (moved > 0).then(|| format!("{moved} places in the order changed"))
+            let lengths = Lengths::USUAL;
+            let outlined =
+                if func.ops.len() > lengths.whole { cut(func, &Facts::of(func), lengths)? } else { return None };
+            Some(format!(
+                "{} pieces, {} rows of repeated operations",
+                outlined.pieces.len(),
+                outlined.repeats.rows.len()
+            ))
         },
     },
     Late {
