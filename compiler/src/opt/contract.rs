@@ -1,58 +1,63 @@
-//! Fuses products into the sums they are for: a · b + c with one rounding, in one instruction.
+//! FMA contraction: a · b + c becomes one fused multiply-add, which is rounded once.
 //!
-//! In: a step, regrouped, before elementary functions are expanded. Out: the same with fewer operations and a shorter
-//! chain. This rounds differently (once instead of twice), so it is part of what a step *is*: it stands before every
-//! back end. Left alone is
+//! In: a step function after reassociation, before elementary functions are expanded. Out: the same algebra with fewer
+//! operations and a shorter critical path. A fused result is rounded once instead of twice. The pass therefore runs
+//! before every back end, so that all of them compute the same bits. These products are not fused:
 //!
-//! - a product that something else uses too: it would be computed twice, and what is compared with it would differ from
-//!   what it enters;
-//! - a sum or difference of two products: forces k·a and −k·a cancel, and fused they would leave what k·a was rounded by.
-//!   Squares never do; and a product with a sign is not rounded, so that the same comes out;
-//! - a product that does not wait for the step before, in a sum that does and that the next step waits for, as of an
-//!   integrator and what enters it: the sum alone is sooner there than both.
+//! - A product that has a second use. It would be computed twice, and the rounded product that the other use sees would
+//!   differ from the exact product in the sum.
+//! - A product in a sum or difference of two products. The forces k·a and −k·a must cancel exactly; if one of them were
+//!   fused, the rounding error of k·a would remain. There are two exceptions: sums of two values that are never
+//!   negative (such as squares) cannot cancel, and a product with a sign (−1, 0 or 1) is exact, so fusing it changes no
+//!   bit.
+//! - A product that does not depend on the previous step, if the other addend does and the next step depends on the
+//!   sum. An integrator that adds its input is such a sum. The product is ready early, and an addition has a shorter
+//!   latency than a fused multiply-add.
 //!
-//! All look at one sum alone and on what it hangs, so mirror images of a contact are fused alike.
+//! Each decision depends only on one sum and its operands, so both sides of a symmetric contact are fused alike.
+//!
+//! Source: Muller et al., *Handbook of Floating-Point Arithmetic*, 2018.
 
 use crate::ir::build::Build;
 use crate::ir::{Func, Op, Value, is_not_negative, sign_of};
 use crate::opt::reassociate::carried;
 use abi::{Layout, Slot};
 
-/// Fuses what may be, in a function on blocks of this layout.
+/// Fuses every product that may be fused. `layout`: the block that the function works on.
 pub fn contract(func: &Func, layout: &Layout) -> Func {
-    let (uses, chain) = (uses(func), Chain::of(func, layout));
+    let (uses, chain) = (uses(func), Dependence::of(func, layout));
     let mut build = Build::new(&func.name);
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
-    // The factors of a product that only one operation uses.
+    // The factors of a product that has one use.
     let product = |value: Value| match func.op(value) {
         Op::Mul(a, b) if uses[value.index()] == 1 => Some((a, b)),
         _ => None,
     };
-    // A product or one with its sign turned, as in the mirror image.
+    // A product or a negated product: the other side of a symmetric contact has the opposite sign.
     let cancels = |other: Value| match func.op(other) {
         Op::Neg(plain) => matches!(func.op(plain), Op::Mul(..)),
         op => matches!(op, Op::Mul(..)),
     };
-    let grows = |x: Value, y: Value| [x, y].iter().all(|part| is_not_negative(*part, |value| func.op(value)));
+    let cannot_cancel = |x: Value, y: Value| [x, y].iter().all(|part| is_not_negative(*part, |value| func.op(value)));
     let is_sign = |value: Value| sign_of(func.op(value), |value| func.op(value)).is_some();
     let is_exact = |value: Value| matches!(func.op(value), Op::Mul(a, b) if is_sign(a) || is_sign(b));
     for (sum, op) in func.ops.iter().enumerate() {
         let at = |value: Value| values[value.index()];
-        let enters = |x: Value, y: Value| product(x).is_some() && !cancels(y) && chain.enters(x, y, sum);
-        let made = match *op {
-            Op::Add(x, y) | Op::Sub(x, y) if enters(x, y) || enters(y, x) => {
-                let part = if enters(x, y) { x } else { y };
+        let is_early = |x: Value, y: Value| product(x).is_some() && !cancels(y) && chain.is_early_addend(x, y, sum);
+        let value = match *op {
+            Op::Add(x, y) | Op::Sub(x, y) if is_early(x, y) || is_early(y, x) => {
+                let part = if is_early(x, y) { x } else { y };
                 let factors = chain.factors(part, &product).into_iter().map(at);
                 let whole = factors.reduce(|a, b| build.mul(a, b)).expect("it has two");
                 build.op(op.map(|operand| if operand == part { whole } else { at(operand) }))
             }
             Op::Add(x, y) | Op::Sub(x, y) => {
                 let adds = matches!(op, Op::Add(..));
-                let fits = |x: Value, y: Value| is_exact(x) || !cancels(y) || adds && grows(x, y);
-                match (product(x).filter(|_| fits(x, y)), product(y).filter(|_| fits(y, x))) {
+                let may_fuse = |x: Value, y: Value| is_exact(x) || !cancels(y) || adds && cannot_cancel(x, y);
+                match (product(x).filter(|_| may_fuse(x, y)), product(y).filter(|_| may_fuse(y, x))) {
                     (Some((a, b)), other) if is_exact(x) || other.is_none() || !is_exact(y) => {
-                        let rest = if adds { at(y) } else { build.neg(at(y)) };
-                        build.fma(at(a), at(b), rest)
+                        let addend = if adds { at(y) } else { build.neg(at(y)) };
+                        build.fma(at(a), at(b), addend)
                     }
                     (_, Some((a, b))) => {
                         let a = if adds { at(a) } else { build.neg(at(a)) };
@@ -63,60 +68,65 @@ pub fn contract(func: &Func, layout: &Layout) -> Func {
             }
             op => build.op(op.map(at)),
         };
-        values.push(made);
+        values.push(value);
     }
     build.finish_as(func, &values)
 }
 
-/// What a value hangs on.
+/// The most variable quantity that a value depends on.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum On {
-    /// These and constants.
+enum DependsOn {
+    /// Only parameters, the step length and constants.
     Parameters,
-    /// What is given from outside, and time.
+    /// Inputs, time or delayed samples, but no result of the previous step.
     Inputs,
-    /// What that leaves.
-    StepBefore,
+    /// Results of the previous step: the loop-carried slots.
+    PreviousStep,
 }
 
-/// How values hang on the step before, and the step behind on them. A choice is foreseen: nothing waits for what decides it.
-struct Chain {
-    /// Of each value.
-    on: Vec<On>,
-    /// Whether the step behind waits for it.
-    leads: Vec<bool>,
+/// How values depend on the previous step, and the next step on them. The condition of a select does not count: the
+/// analysis assumes that a branch predictor hides its latency.
+struct Dependence {
+    /// For each value, what it depends on.
+    depends_on: Vec<DependsOn>,
+    /// For each value, whether the next step depends on it.
+    is_on_chain: Vec<bool>,
 }
 
-impl Chain {
-    fn of(func: &Func, layout: &Layout) -> Chain {
+impl Dependence {
+    fn of(func: &Func, layout: &Layout) -> Dependence {
         let carried = carried(func);
-        let mut on: Vec<On> = Vec::with_capacity(func.ops.len());
+        let mut depends_on: Vec<DependsOn> = Vec::with_capacity(func.ops.len());
         for op in &func.ops {
-            on.push(match *op {
-                Op::Load(slot) if carried.contains(&slot) => On::StepBefore,
-                Op::Load(Slot::TIME | Slot::COUNT) | Op::Ring { .. } => On::Inputs,
-                Op::Load(slot) if layout.inputs.contains(slot) => On::Inputs,
-                op => parts(op).into_iter().map(|part| on[part.index()]).fold(On::Parameters, On::max),
+            depends_on.push(match *op {
+                Op::Load(slot) if carried.contains(&slot) => DependsOn::PreviousStep,
+                Op::Load(Slot::TIME | Slot::COUNT) | Op::Ring { .. } => DependsOn::Inputs,
+                Op::Load(slot) if layout.inputs.contains(slot) => DependsOn::Inputs,
+                op => data_operands(op)
+                    .into_iter()
+                    .map(|part| depends_on[part.index()])
+                    .fold(DependsOn::Parameters, DependsOn::max),
             });
         }
-        let mut leads = vec![false; func.ops.len()];
-        let handed = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
-        handed.for_each(|(_, value)| leads[value.index()] = true);
+        let mut is_on_chain = vec![false; func.ops.len()];
+        let stored = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
+        stored.for_each(|(_, value)| is_on_chain[value.index()] = true);
         for (value, op) in func.ops.iter().enumerate().rev() {
-            if leads[value] {
-                parts(*op).into_iter().for_each(|part| leads[part.index()] = true);
+            if is_on_chain[value] {
+                data_operands(*op).into_iter().for_each(|part| is_on_chain[part.index()] = true);
             }
         }
-        Chain { on, leads }
+        Dependence { depends_on, is_on_chain }
     }
 
-    /// Whether one part of a sum is there before the other, which waits for the step before, as the step behind does for the sum.
-    fn enters(&self, part: Value, other: Value, sum: usize) -> bool {
-        let waits = |value: Value| self.on[value.index()] == On::StepBefore;
-        self.leads[sum] && !waits(part) && waits(other)
+    /// Whether the sum is on the loop-carried chain, and only `other` depends on the previous step: `part` is ready
+    /// early.
+    fn is_early_addend(&self, part: Value, other: Value, sum: usize) -> bool {
+        let is_late = |value: Value| self.depends_on[value.index()] == DependsOn::PreviousStep;
+        self.is_on_chain[sum] && !is_late(part) && is_late(other)
     }
 
-    /// The factors of a product: those that wait for nothing first, for their product is computed once.
+    /// The factors of a product. Those that are the same in every step come first, because their product is hoisted.
     fn factors(&self, value: Value, product: &impl Fn(Value) -> Option<(Value, Value)>) -> Vec<Value> {
         let (mut open, mut factors) = (vec![value], Vec::new());
         while let Some(value) = open.pop() {
@@ -125,22 +135,22 @@ impl Chain {
                 None => factors.push(value),
             }
         }
-        factors.sort_by_key(|value| self.on[value.index()]);
+        factors.sort_by_key(|value| self.depends_on[value.index()]);
         factors
     }
 }
 
-/// Operands of an operation, but for what decides a choice.
-fn parts(op: Op) -> Vec<Value> {
-    let mut parts = Vec::new();
+/// The operands of an operation, without the condition of a select.
+fn data_operands(op: Op) -> Vec<Value> {
+    let mut operands = Vec::new();
     match op {
-        Op::Select(_, yes, no) => parts.extend([yes, no]),
-        op => op.each_operand(|operand| parts.push(operand)),
+        Op::Select(_, yes, no) => operands.extend([yes, no]),
+        op => op.each_operand(|operand| operands.push(operand)),
     }
-    parts
+    operands
 }
 
-/// How often each value is used, as an operand or a result.
+/// The number of uses of each value, as an operand or as a result.
 fn uses(func: &Func) -> Vec<u32> {
     let mut uses = vec![0; func.ops.len()];
     for op in &func.ops {
@@ -156,7 +166,7 @@ fn uses(func: &Func) -> Vec<u32> {
 mod tests {
     use super::*;
 
-    /// The operations of a function of four states that all become `f` of them.
+    /// Listing of the contracted function of four states, each of which becomes `f` of all four.
     fn contracted(f: impl Fn(&mut Build, [Value; 4]) -> Value) -> String {
         let layout = Layout::new([0, 0, 4, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("step");
@@ -171,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_product_enters_its_sum_in_one_operation() {
+    fn a_product_and_its_sum_become_one_operation() {
         let sum = contracted(|b, [x, y, z, _]| {
             let product = b.mul(x, y);
             b.add(z, product)
@@ -185,8 +195,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_there_before_the_state_it_enters_is_no_part_of_the_chain() {
-        // A parameter, an input, two states and an output.
+    fn an_early_product_stays_out_of_the_loop_carried_chain() {
+        // One parameter, one input, two states and one output.
         let layout = Layout::new([1, 1, 2, 0, 0, 1, 0, 0, 0, 0]);
         let mut build = Build::new("step");
         let [k, v, x, y] = [layout.params.slot(0), layout.inputs.slot(0), layout.states.slot(0), layout.states.slot(1)]
@@ -207,7 +217,7 @@ mod tests {
         let func = contract(&build.finish(), &layout);
         let listing = func.to_string();
         assert_eq!((count(&listing, "fma"), count(&listing, "add")), (2, 1), "{listing}");
-        // What is the same in every step is one factor: h k.
+        // The invariant factors are multiplied first: h k.
         let is_given = |value: Value| matches!(func.op(value), Op::Load(slot) if layout.inputs.contains(slot));
         let fixed = func.ops.iter().find_map(|op| match *op {
             Op::Mul(a, b) if is_given(a) || is_given(b) => Some(func.op(if is_given(a) { b } else { a })),
@@ -218,7 +228,7 @@ mod tests {
 
     #[test]
     fn mirror_images_are_fused_alike() {
-        // v − x z is not fused for v = w y; nor is −v − x z.
+        // With v = w y, neither v − x z nor −v − x z is fused.
         for turned in [false, true] {
             let listing = contracted(|b, [x, y, z, w]| {
                 let (speed, product) = (b.mul(w, y), b.mul(x, z));
@@ -238,7 +248,7 @@ mod tests {
             b.add(squares[0], squares[1])
         });
         assert_eq!((count(&norm, "fma"), count(&norm, "mul")), (1, 1), "{norm}");
-        // The product with a sign is the one that is fused, wherever it stands.
+        // The product with the sign is fused, whether it is the first or the second operand.
         for turned in [false, true] {
             for of_two in [Build::add, Build::sub] {
                 let force = contracted(|b, [v, y, z, _]| {
@@ -256,11 +266,11 @@ mod tests {
     }
 
     #[test]
-    fn what_cancels_still_does() {
+    fn products_that_may_cancel_are_not_fused() {
         for of_two in [Build::add, Build::sub] {
             let forces = contracted(|b, [x, y, z, w]| {
                 let (one, other) = (b.mul(x, y), b.mul(z, w));
-                // One of them is wanted for itself, too.
+                // One of the two products has a second use.
                 let total = of_two(b, one, other);
                 let ratio = b.div(one, total);
                 b.add(ratio, total)

@@ -1,17 +1,26 @@
-//! Takes numbers out of the sum by which a step tells whether what it watches is finite.
+//! Guard reduction: removes redundant addends from the sum with which a step tests its guarded values for finiteness.
 //!
-//! In: a step whose status hangs on one truth. Out: the same with fewer additions for that truth. It may then hold where nothing
-//! has failed, as a sum may overflow: the status tells.
+//! In: a step function whose status is selected by one condition. Out: the same function, in which that condition needs
+//! fewer additions. A guard fails if a value is infinite or NaN; one test of the sum of all guarded values covers all
+//! of them. A value may leave the sum if another guarded value can only be finite when this one is.
+//!
+//! The condition may also hold if no guard has failed, because a sum of finite values may overflow. That is harmless:
+//! the status itself comes from exact tests of each value, and they are evaluated when the condition holds.
+//!
+//! The method is ours; it is a case of redundant check elimination (Gupta, *Optimizing Array Bound Checks Using Flow
+//! Analysis*, 1993).
 
 use crate::ir::build::{Build, prune};
 use crate::ir::partial_eval::{partial_eval, slice};
 use crate::ir::{Func, Op, Value};
 use std::collections::HashSet;
 
-/// The same step, which asks of a sum of the fewest numbers whether it is finite.
+/// Rebuilds a step function so that its finiteness test has as few addends as possible.
 pub fn reduce_guards(func: &Func) -> Func {
     let (Some(status), Some((when, ..))) = (func.status, func.failure()) else { return func.clone() };
-    let Op::Select(_, yes, no) = func.op(status) else { unreachable!("it hangs on a truth") };
+    let Op::Select(_, yes, no) = func.op(status) else {
+        unreachable!("`failure` returned the condition of this select")
+    };
     let stored: Vec<Value> = func.stores.iter().map(|(_, value)| *value).collect();
     let mut build = Build::of(func);
     let fewer = with_fewer_addends(&mut build, when, &stored);
@@ -19,53 +28,58 @@ pub fn reduce_guards(func: &Func) -> Func {
     prune(&Func { ops: build.into_ops(), status: Some(status), ..func.clone() })
 }
 
-/// A truth that a step has failed with, with fewer numbers in the sum that is asked whether it is finite: none that shows in
-/// another one. What is stored is a number of its own in it.
+/// Returns the condition `failed` with a smaller sum in its finiteness test: without the addends whose finiteness
+/// follows from another addend. `stored`: values that the step stores; such a value is not split into its own addends.
 pub fn with_fewer_addends(build: &mut Build, failed: Value, stored: &[Value]) -> Value {
     let list = slice(build, &HashSet::new(), &[failed]);
-    let sum_asked = |value: &Value| match build.get(*value) {
+    let finiteness_test = |value: &Value| match build.get(*value) {
         Op::LessEqual(a, b) if a == b => match build.get(a) {
             Op::Sub(a, b) if a == b => Some((*value, a)),
             _ => None,
         },
         _ => None,
     };
-    let Some((asked, sum)) = list.iter().find_map(sum_asked) else { return failed };
-    let (mut watched, mut open) = (Vec::new(), vec![sum]);
+    // The test is d ≤ d with d = sum − sum: d is 0 for a finite sum, and NaN otherwise.
+    let Some((test, sum)) = list.iter().find_map(finiteness_test) else { return failed };
+    let (mut addends, mut open) = (Vec::new(), vec![sum]);
     while let Some(value) = open.pop() {
         match build.get(value) {
             Op::Add(a, b) if !stored.contains(&value) => open.extend([b, a]),
-            _ if !watched.contains(&value) => watched.push(value),
+            _ if !addends.contains(&value) => addends.push(value),
             _ => {}
         }
     }
-    let shown = implied_finite(build, &watched);
-    watched.retain(|value| !shown.contains(value));
-    let sum = watched.into_iter().reduce(|sum, value| build.add(sum, value)).expect("what shows the others is left");
-    let rest = build.sub(sum, sum);
-    let finite = build.less_equal(rest, rest);
-    partial_eval(build, &list, &[(asked, finite)], &[failed])[0]
+    let implied = implied_finite(build, &addends);
+    addends.retain(|value| !implied.contains(value));
+    let sum = addends
+        .into_iter()
+        .reduce(|sum, value| build.add(sum, value))
+        .expect("an addend that implies the others remains");
+    let difference = build.sub(sum, sum);
+    let finite = build.less_equal(difference, difference);
+    partial_eval(build, &list, &[(test, finite)], &[failed])[0]
 }
 
-/// What is finite wherever these are: of a sum and a product all that enters.
+/// The values that must be finite if all of `by` are: every operand of a sum or product, and the dividend of a
+/// quotient.
 fn implied_finite(build: &Build, by: &[Value]) -> HashSet<Value> {
-    let (mut shown, mut open) = (HashSet::new(), by.to_vec());
+    let (mut implied, mut open) = (HashSet::new(), by.to_vec());
     while let Some(value) = open.pop() {
         let op = build.get(value);
-        let mut enters = |operand: Value| {
-            if shown.insert(operand) {
+        let mut imply = |operand: Value| {
+            if implied.insert(operand) {
                 open.push(operand);
             }
         };
         match op {
             Op::Add(..) | Op::Sub(..) | Op::Mul(..) | Op::Fma(..) | Op::Neg(_) | Op::Abs(_) | Op::Sqrt(_) => {
-                op.each_operand(enters);
+                op.each_operand(imply);
             }
-            Op::Div(over, _) => enters(over),
+            Op::Div(dividend, _) => imply(dividend),
             _ => {}
         }
     }
-    shown
+    implied
 }
 
 #[cfg(test)]
@@ -75,7 +89,8 @@ mod tests {
     use abi::table::Interpret;
     use abi::{Function, Layout, Slot};
 
-    /// A step with two states, the first of which enters the output, all of them watched, and the layout.
+    /// A step with two states and one output, all of them guarded, and its layout. The output depends on the first
+    /// state.
     fn step() -> (Func, Layout) {
         let layout = Layout::new([1, 1, 2, 0, 0, 1, 0, 0, 0, 0]);
         let mut build = Build::new("step");
@@ -99,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shows_in_another_number_does_not_enter_the_sum() {
+    fn a_value_implied_finite_leaves_the_sum() {
         let (func, _) = step();
         let sums = |func: &Func| func.ops.iter().filter(|op| matches!(op, Op::Add(..))).count();
         let fewer = reduce_guards(&func);
@@ -107,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_failed_fails_still() {
+    fn every_failure_is_still_found() {
         let (func, layout) = step();
         let numbers = [0.0, -0.0, 1.0, -3.5, 1e308, f64::INFINITY, f64::NEG_INFINITY, f64::NAN];
         let status = |func: &Func, block: &[f64]| {

@@ -1,28 +1,37 @@
-//! Asks once a step, not twice, whether what is at its limit is driven further.
+//! Redundant test elimination for limited integrators: a limit is tested once per step instead of twice.
 //!
-//! In: a step behind `contract`. Out: the same, to the bit, where the step is above 0. An integrator with a limit,
-//! `dx/dt = if abs(x) > m and x * r > 0 then 0 else r`, is asked at the beginning of a step and again in its middle, at
-//! x + c s with c a share of the step and s the rate that the first answer chose. But if the first answer is yes, the
-//! second is yes at x + c r too: that lies no nearer to 0 on the same side, for rounding keeps order, and the product of
-//! what lies further out is no smaller. If it is no, s is r. So the second question is asked at x + c r at once, and
-//! nothing needs the first any more.
+//! In: a step function after `contract`. Out: the same function, equal to the bit for every step length above 0.
+//!
+//! An integrator with a limit is `dx/dt = if abs(x) > m and x * r > 0 then 0 else r`: at its limit, it stops if the rate
+//! r drives it further out. A step has two such tests. The first is at x, and selects s = 0 or s = r. The second is at the
+//! midpoint x + c s, where c is a positive fraction of the step length. The pass moves the second test to x + c r:
+//!
+//! - If the first test is false, s is r and nothing changes.
+//! - If the first test is true, s is 0, so the second test is true as well. At x + c r it is also true. This point has
+//!   the sign of x and is at least as far from 0, because rounding is monotonic; so its product with r is no smaller
+//!   either.
+//!
+//! Nothing uses the first test after that, and it is removed as dead code.
+//!
+//! The general pass is redundant test elimination by dominating conditions (Mueller, Whalley, *Avoiding Conditional
+//! Branches by Code Replication*, 1995); the argument above is ours.
 
 use crate::ir::build::Build;
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 
-/// Asks for the limits of a step once.
+/// Replaces the second limit test of each limited integrator by a test that does not depend on the first.
 pub fn drop_limiter_tests(func: &Func) -> Func {
     let mut build = Build::new(&func.name);
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
         let plain = build.op(op.map(|operand| values[operand.index()]));
-        values.push(second(&mut build, plain).unwrap_or(plain));
+        values.push(independent_second_test(&mut build, plain).unwrap_or(plain));
     }
     build.finish_as(func, &values)
 }
 
-/// Whether a number is beyond its limit and driven further: `limit < |x|` or `limit ≤ |x|`, and `0 < x r`.
+/// The test whether x is beyond its limit and driven further out: `limit < |x|` or `limit ≤ |x|`, and `0 < x · rate`.
 #[derive(PartialEq)]
 struct Beyond {
     limit: Value,
@@ -47,7 +56,7 @@ impl Beyond {
         })
     }
 
-    fn asked(&self, build: &mut Build) -> Value {
+    fn build(&self, build: &mut Build) -> Value {
         let (size, zero) = (build.abs(self.x), build.real(0.0));
         let beyond = if self.or_at { build.less_equal(self.limit, size) } else { build.less(self.limit, size) };
         let product = build.mul(self.x, self.rate);
@@ -56,25 +65,25 @@ impl Beyond {
     }
 }
 
-/// The second question without the first, if a truth is one.
-fn second(build: &mut Build, truth: Value) -> Option<Value> {
+/// If `truth` is the second test of a limited integrator, returns an equal test that does not depend on the first.
+fn independent_second_test(build: &mut Build, truth: Value) -> Option<Value> {
     let middle = Beyond::of(build, truth)?;
     let Op::Fma(a, b, x) = build.get(middle.x) else { return None };
     let (share, chosen) = if is_share_of_step(build, a) { (a, b) } else { (b, a) };
     let Op::Select(when, stopped, rate) = build.get(chosen) else { return None };
     let first = Beyond { x, ..middle };
-    let fits = is_share_of_step(build, share)
+    let matches = is_share_of_step(build, share)
         && rate == middle.rate
         && build.get(stopped) == Op::Real(0)
         && Beyond::of(build, when)? == first;
-    if !fits {
+    if !matches {
         return None;
     }
     let x = build.fma(share, rate, x);
-    Some(Beyond { x, ..middle }.asked(build))
+    Some(Beyond { x, ..middle }.build(build))
 }
 
-/// Whether a value is the length of the step, or that times a number above 0.
+/// Whether a value is the step length, or the step length times a positive constant.
 fn is_share_of_step(build: &Build, value: Value) -> bool {
     let is_step = |value: Value| build.get(value) == Op::Load(Slot::STEP);
     let is_above = |value: Value| build.constant(value).is_some_and(|x| x > 0.0 && x.is_finite());
@@ -92,13 +101,14 @@ mod tests {
     use abi::table::Interpret;
     use abi::{Function, Layout};
 
-    /// An integrator in slot 4 of the rate in slot 3, with a limit of 1, over half a step and then a whole one.
+    /// An integrator in slot 4 of the rate in slot 3, with the limit 1. With `twice`, the limit is tested at the
+    /// beginning of the step and at its midpoint, otherwise only at the midpoint.
     fn integrator(twice: bool) -> Func {
         let mut build = Build::new("step");
         let (rate, x, h) = (build.load(Slot(3)), build.load(Slot(4)), build.load(Slot::STEP));
         let [zero, half, limit] = [0.0, 0.5, 1.0].map(|number| build.real(number));
         let share = build.mul(h, half);
-        let ask = |build: &mut Build, x| Beyond { limit, or_at: true, x, rate }.asked(build);
+        let ask = |build: &mut Build, x| Beyond { limit, or_at: true, x, rate }.build(build);
         let mut chosen = rate;
         if twice {
             let first = ask(&mut build, x);
@@ -113,15 +123,15 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_is_asked_for_once() {
+    fn a_limit_is_tested_once() {
         assert_eq!(drop_limiter_tests(&integrator(true)), integrator(false));
         assert_eq!(drop_limiter_tests(&integrator(false)), integrator(false), "nothing else changes");
     }
 
     #[test]
-    fn a_question_of_another_rate_stays() {
+    fn a_test_of_another_rate_is_unchanged() {
         let mut func = integrator(true);
-        // The choice is between 0 and something else.
+        // The select now returns 0 or a value that is not the rate.
         let other = func.ops.iter().position(|op| matches!(op, Op::Load(Slot::STEP))).expect("it has a step");
         let chosen = func.ops.iter_mut().find(|op| matches!(op, Op::Select(..))).expect("it chooses");
         let Op::Select(when, zero, _) = *chosen else { unreachable!() };
@@ -130,14 +140,14 @@ mod tests {
     }
 
     #[test]
-    fn every_bit_stays() {
+    fn results_agree_to_the_bit() {
         let layout = Layout::new([0, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
         let [twice, once] = [integrator(true), drop_limiter_tests(&integrator(true))]
             .map(|func| Interpreter::new(&[(Function::Step, func)], &layout, 0));
         let mut random = Random(1);
         let mut stopped = 0;
         for k in 0..200_000 {
-            // Around the limit, or anything.
+            // Half of the cases are close to the limit, the others have arbitrary values.
             let [rate, x] = match k % 2 {
                 0 => [random.within(-4.0, 4.0), random.within(-1.0, 1.0).signum() * random.within(0.999, 1.001)],
                 _ => [random.real(), random.real()],

@@ -1,8 +1,9 @@
-//! The passes over a straight-line step, in their order.
+//! The passes over the straight-line function of a fixed step, in their order.
 //!
-//! In: a step as `numerics::fixed_step` composes it, with elementary functions still as operations. Out: an equivalent step on
-//! a shorter critical path. These passes may change rounding, so they run before every back end: all back ends agree to the
-//! bit. Passes that need control flow or know the processor are in `codegen`.
+//! In: a step as `numerics::fixed_step` composes it, with elementary functions still as operations. Out: an equivalent
+//! step with a shorter critical path and fewer operations. Reassociation and contraction change how results are
+//! rounded, so all of these passes run before every back end: the back ends then agree to the bit. Passes that need
+//! control flow or depend on the processor are in `codegen`.
 
 pub mod reassociate;
 pub mod contract;
@@ -13,17 +14,17 @@ use crate::ir::Func;
 use crate::ir::program::Program;
 use abi::Layout;
 
-/// What the passes know of a program besides the function.
+/// The facts about a program that the passes need besides the function.
 #[derive(Clone, Copy)]
 pub struct Context<'p> {
     /// The layout of the block.
     pub layout: &'p Layout,
-    /// Whether differences of equal forces must stay exactly 0: see [`reassociate::reassociate`].
+    /// Whether opposite forces of equal size must cancel to exactly 0: see [`reassociate::reassociate`].
     pub balanced: bool,
 }
 
 impl Context<'_> {
-    /// Of a program.
+    /// The context of a program.
     pub fn of(program: &Program) -> Context<'_> {
         Context { layout: &program.description.layout, balanced: program.balanced }
     }
@@ -40,13 +41,13 @@ pub struct Pass {
 
 /// The passes, in the order in which they run.
 pub static PASSES: [Pass; 4] = [
-    // First: it may split sums, and so decides which products and sums there are.
+    // First, because it decides how sums and products are grouped.
     Pass {
         name: "reassociate",
         does: "regroups sums and products for the shortest critical path from step to step",
         run: |func, context| reassociate::reassociate(func, context.balanced),
     },
-    // After the sums are grouped, since a product fuses with the sum that it then enters.
+    // After the grouping, because it fuses a product with the sum that the grouping has assigned it to.
     Pass {
         name: "contract",
         does: "fuses products and sums into one rounding (FMA) where no cancellation depends on the second",
@@ -57,7 +58,7 @@ pub static PASSES: [Pass; 4] = [
         does: "keeps one test of a limited integrator where beginning and middle of a step decide alike",
         run: |func, _| limiter_tests::drop_limiter_tests(func),
     },
-    // Last: which values show that others are finite depends on all operations before.
+    // Last, because it derives the finiteness of values from the final operations.
     Pass {
         name: "guard_reduction",
         does: "drops addends from the finiteness guard whose failure shows in another addend",
@@ -65,12 +66,12 @@ pub static PASSES: [Pass; 4] = [
     },
 ];
 
-/// A step after all passes.
+/// Runs all passes on a step.
 pub fn optimise(step: Func, context: Context) -> Func {
     optimise_observed(step, context, &mut |_, _, _| ())
 }
 
-/// The same; `ran` is called after each pass with the numbers of operations before and after it.
+/// Like [`optimise`]. `ran` is called after each pass, with the number of operations before and after it.
 pub fn optimise_observed(step: Func, context: Context, ran: &mut dyn FnMut(&'static Pass, usize, usize)) -> Func {
     PASSES.iter().fold(step, |func, pass| {
         let after = (pass.run)(&func, context);

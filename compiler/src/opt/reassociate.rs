@@ -1,63 +1,71 @@
-//! Regroups sums and products so that what is ready last enters last: one step is bound by latency.
+//! Reassociation: regroups sums and products to shorten the loop-carried critical path of a step.
 //!
-//! In: a step, before elementary functions are expanded. Out: the same algebra with the shortest chain from the states
-//! to the states of the next step. This rounds differently from the text's order, so it is part of what a step *is*:
-//! it stands before every back end. It touches only what the longest of these chains needs to get shorter, so sums that
-//! have time keep the text's order, and with it their exact cancellations:
+//! In: a step function, before elementary functions are expanded. Out: the same algebra, grouped such that the operand
+//! that is ready last enters last. One instance is bound by latency, not by throughput: the length of the dependency
+//! chain from the states of one step to the states of the next determines its speed. Regrouping changes how results are
+//! rounded. The pass therefore runs before every back end, so that all of them compute the same bits.
 //!
-//! - x / p → x · (1/p) for p that no iteration changes, where 1/p is computed once, or that depends on time alone, where it
-//!   is computed ahead.
-//! - Factors are multiplied in the order in which they are ready, constants of the loop first, divisors last:
-//!   `sigma0 * abs(v) / g * z` → `(sigma0 |v| z) / g`.
-//! - What is affine in a late value L is split: f(L) → f(0) + C L, with C a constant of the loop or of time alone:
-//!   v + h (u − (σ0 z + σ1 (w − L)))/m → [v + h (u − (σ0 z + σ1 w))/m] + (h σ1/m) L.
+//! Only chains longer than the shortest achievable critical path are regrouped. All other sums keep the order of the
+//! source text, and so keep their exact cancellations. There are three rewrites:
+//!
+//! - x / p → x · (1/p), if p is loop-invariant or depends on time alone. 1/p is then computed outside the loop.
+//! - Factors are multiplied in the order in which they are ready: invariants first, late factors last, and one division
+//!   by the product of the late divisors at the end. `sigma0 * abs(v) / g * z` → `(sigma0 |v| z) / g`.
+//! - An expression f that is affine in a late value L is split: f(L) → f(0) + C L, where C is invariant or depends on
+//!   time alone: v + h (u − (σ0 z + σ1 (w − L)))/m → [v + h (u − (σ0 z + σ1 w))/m] + (h σ1/m) L.
+//!
+//! Sources: Briggs, Cooper, *Effective Partial Redundancy Elimination*, 1994 (reassociation by rank); Golumbic,
+//! *Combinatorial Merging*, 1976 (operands that are ready first are combined first).
 
 use crate::ir::build::Build;
 use crate::ir::{Binary, Func, Op, Unary, Value};
 use abi::Slot;
 use std::collections::HashSet;
 
-/// When a value is ready, in processor cycles after the beginning of an iteration; none: it is constant in the loop.
+/// When a value is ready, in processor cycles after the start of an iteration. `None`: the value is loop-invariant.
 type Ready = Option<i32>;
 
-/// When time is ready: long before, for no state holds it back. What depends on time alone stays below 0, and keeps its order.
+/// When time is ready: long before the iteration, because it depends on no state. Values that depend on time alone are
+/// also ready before cycle 0, and keep their order.
 const EARLY: i32 = i32::MIN / 2;
 
-/// Cycles, of two sums, from which on it is worth to split a sum on the way to what is affine throughout.
-const WORTH: i32 = 6;
+/// Smallest gain, in cycles, for which a sum is split in the middle of an affine chain: the latency of two additions.
+const MIN_GAIN: i32 = 6;
 
-/// Regroups a function that is iterated. `balanced`: differences of equal forces must stay exactly 0, as a contact at rest
-/// needs it, so no sum is split.
+/// Regroups a function that runs in a loop. `balanced`: opposite forces of equal size must cancel to exactly 0, which a
+/// contact at rest needs; sums are then not split.
 pub fn reassociate(func: &Func, balanced: bool) -> Func {
     let carried = carried(func);
     let after = after(func, &carried);
-    // First everything, to learn how short the longest chain can be; then only what is needed for that.
-    let (_, shortest) = rebuilt(func, Pass::new(func, &carried, balanced), &after, 0);
-    rebuilt(func, Pass::new(func, &carried, balanced), &after, shortest).0
+    // The first pass regroups every chain and finds the shortest critical path; the second regroups only longer chains.
+    let (_, shortest) = rebuild(func, Pass::new(func, &carried, balanced), &after, 0);
+    rebuild(func, Pass::new(func, &carried, balanced), &after, shortest).0
 }
 
-/// Slots that an iteration takes over from the one before, time and the count of steps apart: no state holds them back.
+/// The loop-carried slots: an iteration loads what the previous one stored. Time and the step count are excluded,
+/// because they depend on no state.
 pub(super) fn carried(func: &Func) -> HashSet<Slot> {
     let stored: HashSet<Slot> = func.stores.iter().map(|(slot, _)| *slot).collect();
-    let waits = |slot: &Slot| stored.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
-    func.loads().into_iter().filter(waits).collect()
+    let is_carried = |slot: &Slot| stored.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
+    func.loads().into_iter().filter(is_carried).collect()
 }
 
-/// The function rebuilt so that chains longer than `enough` cycles get shorter, and its longest chain.
-fn rebuilt(func: &Func, mut pass: Pass, after: &[Ready], enough: i32) -> (Func, i32) {
+/// Rebuilds the function, regroups the chains longer than `critical_path` cycles, and returns it with its own critical
+/// path, in cycles.
+fn rebuild(func: &Func, mut pass: Pass, after: &[Ready], critical_path: i32) -> (Func, i32) {
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
     for (op, after) in func.ops.iter().zip(after) {
         let op = op.map(|operand| values[operand.index()]);
         let plain = pass.op(op);
-        let long = after.zip(pass.at(plain)).is_some_and(|(after, ready)| ready + after > enough);
-        values.push(if long { pass.sooner(plain) } else { plain });
+        let long = after.zip(pass.ready_at(plain)).is_some_and(|(after, ready)| ready + after > critical_path);
+        values.push(if long { pass.earlier(plain) } else { plain });
     }
-    let handed = func.stores.iter().filter(|(slot, _)| pass.carried.contains(slot));
-    let longest = handed.filter_map(|(_, value)| pass.at(values[value.index()])).fold(0, i32::max);
+    let stored = func.stores.iter().filter(|(slot, _)| pass.carried.contains(slot));
+    let longest = stored.filter_map(|(_, value)| pass.ready_at(values[value.index()])).fold(0, i32::max);
     (pass.build.finish_as(func, &values), longest)
 }
 
-/// For each operation, the cycles from its value to a result; none if no result needs it.
+/// For each operation, the latency in cycles from its value to a loop-carried result. `None`: no such result needs it.
 fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Ready> {
     let mut after = vec![None; func.ops.len()];
     for (slot, value) in &func.stores {
@@ -66,15 +74,15 @@ fn after(func: &Func, results: &HashSet<Slot>) -> Vec<Ready> {
         }
     }
     for i in (0..func.ops.len()).rev() {
-        if let Some(rest) = after[i] {
-            let through = Some(rest + latency(func.ops[i]));
+        if let Some(cycles) = after[i] {
+            let through = Some(cycles + latency(func.ops[i]));
             func.ops[i].each_operand(|operand| after[operand.index()] = after[operand.index()].max(through));
         }
     }
     after
 }
 
-/// Cycles of the longest chain from what an iteration takes over to what it hands on.
+/// Latency, in cycles, of the longest chain from a loop-carried load to a loop-carried store.
 pub fn critical_path(func: &Func) -> u32 {
     let carried = carried(func);
     let mut ready: Vec<Ready> = Vec::with_capacity(func.ops.len());
@@ -83,11 +91,11 @@ pub fn critical_path(func: &Func) -> u32 {
         op.each_operand(|operand| last = last.max(ready[operand.index()]));
         ready.push(last.map(|last| last + latency(*op)));
     }
-    let handed = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
-    handed.filter_map(|(_, value)| ready[value.index()]).fold(0, i32::max).cast_unsigned()
+    let stored = func.stores.iter().filter(|(slot, _)| carried.contains(slot));
+    stored.filter_map(|(_, value)| ready[value.index()]).fold(0, i32::max).cast_unsigned()
 }
 
-/// Latency in cycles, rounded from current processors; only its order of size matters.
+/// Approximate latency on current processors, in cycles. Only the order of magnitude matters.
 pub(super) fn latency(op: Op) -> i32 {
     match op {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
@@ -116,17 +124,17 @@ pub(super) fn latency(op: Op) -> i32 {
 
 struct Pass<'a> {
     build: Build,
-    /// Of every value of the builder.
+    /// For each value of the builder, when it is ready.
     ready: Vec<Ready>,
     carried: &'a HashSet<Slot>,
     balanced: bool,
 }
 
-/// A product of values over a product of values.
+/// A product of values divided by a product of values.
 #[derive(Default)]
 struct Product {
-    above: Vec<Value>,
-    below: Vec<Value>,
+    numerator: Vec<Value>,
+    denominator: Vec<Value>,
 }
 
 impl<'a> Pass<'a> {
@@ -136,12 +144,12 @@ impl<'a> Pass<'a> {
 
     fn op(&mut self, op: Op) -> Value {
         let value = self.build.op(op);
-        self.note();
+        self.record_ready();
         value
     }
 
-    /// Notes when the values that are new are ready.
-    fn note(&mut self) {
+    /// Records when the values added since the last call are ready.
+    fn record_ready(&mut self) {
         while self.ready.len() < self.build.len() {
             let op = self.build.get(Value(self.ready.len() as u32));
             let mut last = match op {
@@ -155,66 +163,66 @@ impl<'a> Pass<'a> {
         }
     }
 
-    fn at(&self, value: Value) -> Ready {
+    fn ready_at(&self, value: Value) -> Ready {
         self.ready[value.index()]
     }
 
-    /// Whether no state holds it back: it is constant in the loop or depends on time alone.
+    /// Whether the value depends on no state: it is loop-invariant or depends on time alone.
     fn is_early(&self, value: Value) -> bool {
-        self.at(value).is_none_or(|ready| ready < 0)
+        self.ready_at(value).is_none_or(|ready| ready < 0)
     }
 
-    /// The value, or the same computed earlier.
-    fn sooner(&mut self, plain: Value) -> Value {
+    /// Returns the value, or an equivalent one that is ready earlier.
+    fn earlier(&mut self, plain: Value) -> Value {
         let other = match self.build.get(plain) {
             Op::Mul(..) | Op::Div(..) => self.product(plain),
             Op::Add(..) | Op::Sub(..) if !self.balanced => self.split(plain),
             _ => plain,
         };
-        if self.at(other) < self.at(plain) { other } else { plain }
+        if self.ready_at(other) < self.ready_at(plain) { other } else { plain }
     }
 
-    /// A product with its factors in the order in which they are ready.
+    /// Rebuilds a product so that its factors are multiplied in the order in which they are ready.
     fn product(&mut self, value: Value) -> Value {
         let mut product = Product::default();
         self.factors(value, false, &mut product);
-        let above = self.multiplied(product.above);
-        match self.multiplied(product.below) {
-            None => above.expect("a product has a factor"),
-            Some(below) => {
-                let above = above.unwrap_or_else(|| self.op(Op::Real(1f64.to_bits())));
-                self.op(Op::Div(above, below))
+        let numerator = self.multiply(product.numerator);
+        match self.multiply(product.denominator) {
+            None => numerator.expect("a product has a factor"),
+            Some(denominator) => {
+                let numerator = numerator.unwrap_or_else(|| self.op(Op::Real(1f64.to_bits())));
+                self.op(Op::Div(numerator, denominator))
             }
         }
     }
 
-    /// Collects factors; divisors that no state holds back become factors.
+    /// Collects the factors of a product. Divisors that depend on no state become factors (their inverse).
     fn factors(&mut self, value: Value, inverted: bool, product: &mut Product) {
-        // Deep enough for physics, and bounded.
-        let full = product.above.len() + product.below.len() >= 8;
+        // Eight factors are enough for formulas of physics, and bound the recursion.
+        let full = product.numerator.len() + product.denominator.len() >= 8;
         match self.build.get(value) {
-            Op::Mul(a, b) if !full && self.at(value).is_some() => {
+            Op::Mul(a, b) if !full && self.ready_at(value).is_some() => {
                 self.factors(a, inverted, product);
                 self.factors(b, inverted, product);
             }
-            Op::Div(a, b) if !full && self.at(value).is_some() => {
+            Op::Div(a, b) if !full && self.ready_at(value).is_some() => {
                 self.factors(a, inverted, product);
                 self.factors(b, !inverted, product);
             }
             _ if inverted && self.is_early(value) => {
                 let one = self.op(Op::Real(1f64.to_bits()));
                 let inverse = self.op(Op::Div(one, value));
-                product.above.push(inverse);
+                product.numerator.push(inverse);
             }
-            _ if inverted => product.below.push(value),
-            _ => product.above.push(value),
+            _ if inverted => product.denominator.push(value),
+            _ => product.numerator.push(value),
         }
     }
 
-    /// The product of all: always of the two that are ready first.
-    fn multiplied(&mut self, mut factors: Vec<Value>) -> Option<Value> {
+    /// Multiplies all factors; each multiplication takes the two that are ready first.
+    fn multiply(&mut self, mut factors: Vec<Value>) -> Option<Value> {
         while factors.len() > 1 {
-            factors.sort_by_key(|value| std::cmp::Reverse((self.at(*value), *value)));
+            factors.sort_by_key(|value| std::cmp::Reverse((self.ready_at(*value), *value)));
             let (a, b) = (factors.pop().expect("two"), factors.pop().expect("two"));
             let product = self.op(Op::Mul(a, b));
             factors.push(product);
@@ -222,9 +230,9 @@ impl<'a> Pass<'a> {
         factors.pop()
     }
 
-    /// A sum that is affine in a late value L, as what it is without L, plus C · L.
+    /// Splits a sum that is affine in a late value L into the sum without L, plus C · L.
     fn split(&mut self, sum: Value) -> Value {
-        // Down the operand that is ready last, as long as the result is affine in it.
+        // Follow the operand that is ready last, as long as the result is affine in it.
         let mut links: Vec<(Op, Value)> = Vec::new();
         let mut late = sum;
         while links.len() < 16 {
@@ -232,7 +240,7 @@ impl<'a> Pass<'a> {
             late = match op {
                 Op::Neg(a) => a,
                 Op::Add(a, b) | Op::Sub(a, b) => {
-                    if self.at(a) > self.at(b) {
+                    if self.ready_at(a) > self.ready_at(b) {
                         a
                     } else {
                         b
@@ -248,53 +256,54 @@ impl<'a> Pass<'a> {
             }
         }
         let whole = self.split_at(sum, &links);
-        if self.at(whole) < self.at(sum) {
+        if self.ready_at(whole) < self.ready_at(sum) {
             return whole;
         }
-        // Where all is affine, what is on the way down is as late as the last. Some operations stand twice then, for what is
-        // split there is read elsewhere, too: it is to be worth them.
+        // Splitting at the end gains nothing if the addends on the way are as late as the last value; a chain that is
+        // affine throughout is such a case. A split in the middle may still gain. It duplicates operations, because the
+        // values on the way have other uses, so the gain must justify them.
         let parts: Vec<Value> = (1..links.len()).map(|length| self.split_at(sum, &links[..length])).collect();
-        let soonest = parts.into_iter().min_by_key(|part| self.at(*part)).unwrap_or(sum);
-        let spared = self.at(sum).zip(self.at(soonest)).map_or(0, |(sum, soonest)| sum - soonest);
-        if spared >= WORTH { soonest } else { sum }
+        let earliest = parts.into_iter().min_by_key(|part| self.ready_at(*part)).unwrap_or(sum);
+        let gain = self.ready_at(sum).zip(self.ready_at(earliest)).map_or(0, |(sum, earliest)| sum - earliest);
+        if gain >= MIN_GAIN { earliest } else { sum }
     }
 
-    /// A sum split at the last of these links, each an operation that is affine in its operand.
+    /// Splits a sum at the value of the last link. Each link is an operation and the operand in which it is affine.
     fn split_at(&mut self, sum: Value, links: &[(Op, Value)]) -> Value {
         let Some((_, late)) = links.last() else { return sum };
-        let (mut rest, mut factor, mut negative): (Option<Value>, Option<Value>, bool) = (None, None, false);
+        let (mut offset, mut factor, mut negated): (Option<Value>, Option<Value>, bool) = (None, None, false);
         for (op, operand) in links.iter().rev() {
             let operand = *operand;
             match *op {
                 Op::Neg(_) => {
-                    rest = rest.map(|rest| self.op(Op::Neg(rest)));
-                    negative = !negative;
+                    offset = offset.map(|offset| self.op(Op::Neg(offset)));
+                    negated = !negated;
                 }
                 Op::Add(a, b) => {
                     let other = if operand == a { b } else { a };
-                    rest = Some(rest.map_or(other, |rest| self.op(Op::Add(rest, other))));
+                    offset = Some(offset.map_or(other, |offset| self.op(Op::Add(offset, other))));
                 }
                 Op::Sub(a, b) if operand == a => {
-                    rest = Some(match rest {
-                        Some(rest) => self.op(Op::Sub(rest, b)),
+                    offset = Some(match offset {
+                        Some(offset) => self.op(Op::Sub(offset, b)),
                         None => self.op(Op::Neg(b)),
                     });
                 }
                 Op::Sub(a, _) => {
-                    rest = Some(rest.map_or(a, |rest| self.op(Op::Sub(a, rest))));
-                    negative = !negative;
+                    offset = Some(offset.map_or(a, |offset| self.op(Op::Sub(a, offset))));
+                    negated = !negated;
                 }
                 Op::Mul(a, b) => {
                     let constant = if operand == a { b } else { a };
-                    rest = rest.map(|rest| self.op(Op::Mul(constant, rest)));
+                    offset = offset.map(|offset| self.op(Op::Mul(constant, offset)));
                     factor = Some(factor.map_or(constant, |factor| self.op(Op::Mul(factor, constant))));
                 }
                 _ => unreachable!("links are affine"),
             }
         }
-        let Some(rest) = rest else { return sum };
+        let Some(offset) = offset else { return sum };
         let product = factor.map_or(*late, |factor| self.op(Op::Mul(factor, *late)));
-        self.op(if negative { Op::Sub(rest, product) } else { Op::Add(rest, product) })
+        self.op(if negated { Op::Sub(offset, product) } else { Op::Add(offset, product) })
     }
 }
 
@@ -305,7 +314,7 @@ mod tests {
     use crate::ir::random::Random;
     use abi::Layout;
 
-    /// Three parameters, two states.
+    /// A block with three parameters and two states.
     fn layout() -> Layout {
         Layout::new([3, 0, 2, 0, 0, 0, 0, 0, 0, 0])
     }
@@ -329,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_divisor_that_is_constant_becomes_a_factor() {
+    fn an_invariant_divisor_becomes_a_factor() {
         check(
             &built(|[p, ..], [x, y]| [x / p, y]),
             "v0 = load 3; v1 = load 6; v2 = 1.0; v3 = div v2 v0; v4 = mul v1 v3; store 6 = v4",
@@ -337,15 +346,15 @@ mod tests {
     }
 
     #[test]
-    fn what_has_time_keeps_its_order() {
-        // The second state is there long before the first: its division and its sum stay as they are.
+    fn chains_off_the_critical_path_keep_their_order() {
+        // The second state has a much shorter chain than the first, so its division and its sum are unchanged.
         let func = built(|[p, q, _], [x, y]| [(-(x * x).of(Unary::Exp)).of(Unary::Exp), y / p + q * (x * x - x)]);
         assert_eq!(reassociate(&func, false).to_string(), func.to_string());
     }
 
     #[test]
-    fn late_factors_come_last_and_the_late_divisor_after_them() {
-        // p · |x| / g · y with g from x: one division after g.
+    fn late_factors_come_last_and_the_late_divisor_follows_them() {
+        // p · |x| / g · y, where g depends on x: one division, after g.
         let func = built(|[p, q, _], [x, y]| {
             let g = q + (x * x).of(Unary::Exp);
             [p * x.abs() / g * y, y]
@@ -356,8 +365,8 @@ mod tests {
     }
 
     #[test]
-    fn what_is_affine_in_something_late_is_split() {
-        // x + p (y − q exp(x)): the exponential enters last, with p q before it.
+    fn a_sum_affine_in_a_late_value_is_split() {
+        // x + p (y − q exp(x)): the exponential enters last, and its factor p q is computed before.
         let func = built(|[p, q, _], [x, y]| [x + p * (y - q * x.of(Unary::Exp)), y]);
         let listing = reassociate(&func, false).to_string();
         let expected = "v0 = load 3; v1 = load 4; v2 = load 6; v3 = load 7; v4 = exp v2; v5 = mul v0 v3; \
@@ -367,8 +376,9 @@ mod tests {
     }
 
     #[test]
-    fn time_is_there_before_the_states() {
-        // z + h (v − p |v| / g z) with v and g of time: 1/g and z + h v are computed ahead, and one fused product is left.
+    fn time_is_ready_before_the_states() {
+        // z + h (v − p |v| / g z), where v and g depend on time: 1/g and z + h v are ready before the step, and the
+        // chain is one fused multiply-add.
         let layout = layout();
         let build = Shared::new(Build::new("step"));
         let load = |slot| Real::new(&build, build.borrow_mut().load(slot));
@@ -384,8 +394,9 @@ mod tests {
     }
 
     #[test]
-    fn where_all_is_affine_a_sum_is_split_on_the_way_down() {
-        // An observer of place and speed, both iterated: r = v + 2 p (q − X) + m (x − X), X' = x + h r, V' = v + h (q − X).
+    fn a_chain_that_is_affine_throughout_is_split_in_the_middle() {
+        // An observer of position and speed, iterated: r = v + 2 p (q − X) + m (x − X), X' = x + h r, V' = v + h (q −
+        // X).
         let func = built(|[p, q, m], [x, v]| {
             let (mut place, mut speed) = (x, v);
             for _ in 0..3 {
@@ -398,9 +409,9 @@ mod tests {
         assert!(regrouped + 9 <= plain, "{plain} cycles, {regrouped} regrouped");
     }
 
-    /// The same algebra: values agree up to rounding.
+    /// Both functions have the same algebra, so their results agree up to rounding.
     #[test]
-    fn values_stay_the_same_up_to_rounding() {
+    fn values_agree_up_to_rounding() {
         let func = built(|[p, q, m], [x, y]| {
             let g = 1.0 + p * (-(x * x)).of(Unary::Exp);
             let late = q * x.abs() / g * y;
