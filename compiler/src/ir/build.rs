@@ -1,7 +1,9 @@
-//! Builds functions: shares equal operations, folds constants, and applies the identities that keep every bit.
+//! Function builder: value numbering, constant folding, and algebraic identities that preserve every bit.
 //!
-//! In: operations in the order of their operands. Out: a [`Func`] without dead code. Constants fold with the same
-//! [`evaluate`] that defines the operations, so that folding changes no result.
+//! In: operations, each after its operands. Out: a [`Func`] without dead code. Folding uses [`evaluate`], which also
+//! defines the meaning of the operations, so it cannot change a result.
+//!
+//! Source: Aho et al., *Compilers*, 2007, 6.1.2 (value numbering) and 8.5 (algebraic identities, dead code).
 
 use super::eval::evaluate;
 use super::verify::{result, types};
@@ -11,10 +13,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::hash::{BuildHasherDefault, Hasher};
 use std::sync::Arc;
 
-/// What slots hold at a point of a composition; a slot that is not in it holds what it held at the beginning.
+/// The current value of each slot while functions are composed. A slot without an entry still has its initial value.
 pub type Env = HashMap<Slot, Value>;
 
-/// A function being built.
+/// A function under construction.
 #[derive(Clone, Default)]
 pub struct Build {
     name: String,
@@ -28,12 +30,12 @@ pub struct Build {
 }
 
 impl Build {
-    /// An empty function of this name.
+    /// An empty function with this name.
     pub fn new(name: &str) -> Build {
         Build { name: name.into(), ..Build::default() }
     }
 
-    /// What `func` computes, each operation at its number, to which more can be added; without its results.
+    /// A builder that contains the operations of `func` under their old numbers, but not its stores, writes and status.
     pub fn of(func: &Func) -> Build {
         let mut build = Build { ops: func.ops.clone(), ..Build::new(&func.name) };
         build.types = types(func).expect("the function is sound");
@@ -43,29 +45,30 @@ impl Build {
         build
     }
 
-    /// All operations, those that nothing needs included.
+    /// All operations, including unused ones.
     pub fn into_ops(self) -> Vec<Op> {
         self.ops
     }
 
-    /// The operations so far.
+    /// The operations so far, including unused ones.
     pub fn ops(&self) -> &[Op] {
         &self.ops
     }
 
-    /// Lets reads of the pool at a constant place fold: `pool` is a beginning of the pool the function will run with.
+    /// Enables folding of pool reads with a constant index. `pool`: a prefix of the pool that the function will run
+    /// with.
     pub fn with_pool(mut self, pool: Arc<[f64]>) -> Build {
         self.pool = pool;
         self
     }
 
-    /// Number of operations so far, those that nothing needs included.
+    /// Number of operations so far, including unused ones.
     #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.ops.len()
     }
 
-    /// The operation that gives a value.
+    /// The operation that defines a value.
     pub fn get(&self, value: Value) -> Op {
         self.ops[value.index()]
     }
@@ -75,12 +78,12 @@ impl Build {
         self.types[value.index()]
     }
 
-    /// The value if it is a real constant.
+    /// The number, if the value is a real constant.
     pub fn constant(&self, value: Value) -> Option<f64> {
         if let Op::Real(bits) = self.get(value) { Some(f64::from_bits(bits)) } else { None }
     }
 
-    /// The bits of a constant of any type.
+    /// The bits, if the value is a constant of any type.
     fn bits(&self, value: Value) -> Option<u64> {
         match self.get(value) {
             Op::Real(bits) => Some(bits),
@@ -90,10 +93,10 @@ impl Build {
         }
     }
 
-    /// Adds an operation, or finds the value that equals it.
+    /// Adds an operation and returns its value, or returns an equal value that exists.
     ///
     /// # Panics
-    /// If an operand has the wrong type: a mistake of the pass that builds.
+    /// If an operand has the wrong type: a bug in the calling pass.
     pub fn op(&mut self, op: Op) -> Value {
         match self.rewrite(op) {
             Rewrite::Value(value) => return value,
@@ -104,7 +107,7 @@ impl Build {
             }
             Rewrite::None => {}
         }
-        if let Some(value) = self.told_apart(op).or_else(|| self.turned(op)) {
+        if let Some(value) = self.equality_of_select(op).or_else(|| self.negated_quotient(op)) {
             return value;
         }
         let op = self.ordered(op);
@@ -114,8 +117,9 @@ impl Build {
         self.share(op)
     }
 
-    /// (if c then 1 else x) = 2 → not c and x = 2, and so on: which regime it is follows from what chose it.
-    fn told_apart(&mut self, op: Op) -> Option<Value> {
+    /// (if c then 1 else x) = 2 → not c and x = 2, and so on. A test for a mode thus becomes the condition that selects
+    /// the mode.
+    fn equality_of_select(&mut self, op: Op) -> Option<Value> {
         let Op::Equal(a, b) = op else { return None };
         let (choice, number) = if self.constant(b).is_some() { (a, b) } else { (b, a) };
         self.constant(number)?;
@@ -137,11 +141,11 @@ impl Build {
         }
     }
 
-    /// (−c) / x → −(c / x), where that is there.
-    fn turned(&mut self, op: Op) -> Option<Value> {
+    /// (−c) / x → −(c / x), if c / x exists already.
+    fn negated_quotient(&mut self, op: Op) -> Option<Value> {
         let Op::Div(a, b) = op else { return None };
-        let turned = self.known.get(&Op::Real((-self.constant(a)?).to_bits()))?;
-        let divided = *self.known.get(&Op::Div(*turned, b))?;
+        let negated = self.known.get(&Op::Real((-self.constant(a)?).to_bits()))?;
+        let divided = *self.known.get(&Op::Div(*negated, b))?;
         Some(self.op(Op::Neg(divided)))
     }
 
@@ -158,7 +162,7 @@ impl Build {
         value
     }
 
-    /// The constant that an operation on constants gives.
+    /// The constant result of an operation on constants.
     fn fold(&self, op: Op) -> Option<Op> {
         if let Op::Pool { base, len, index } = op {
             let index = self.bits(index)?.min(u64::from(len) - 1);
@@ -174,7 +178,7 @@ impl Build {
         }
         let bits = evaluate(op, |operand| self.bits(operand).expect("operands are constants"))?;
         Some(match result(op, |operand| self.type_of(operand)).ok()? {
-            // All NaN are one value: so one constant.
+            // All NaN count as one value, so they become one constant.
             Type::Real if f64::from_bits(bits).is_nan() => Op::Real(f64::NAN.to_bits()),
             Type::Real => Op::Real(bits),
             Type::Int => Op::Int(bits as i64),
@@ -182,7 +186,7 @@ impl Build {
         })
     }
 
-    /// Puts the operands of a commutative operation in one order, so that equal operations look equal.
+    /// Sorts the operands of a commutative operation, so that equal operations compare equal.
     fn ordered(&self, op: Op) -> Op {
         let sort = |a: Value, b: Value| if a <= b { (a, b) } else { (b, a) };
         macro_rules! sorted {
@@ -197,9 +201,9 @@ impl Build {
         sorted!(Add Mul Equal And Or IntAdd IntMul IntAnd IntOr IntXor IntEqual)
     }
 
-    /// Identities that hold to the last bit in IEEE 754 with round to nearest, all NaN counting as one value.
-    /// What is missing here is missing on purpose: x + 0 is not x for x = −0, x − x is not 0 for x = inf,
-    /// x · 0 is not 0 for x = −1, and sums and products are not associative.
+    /// Identities that hold to the bit in IEEE 754 with round to nearest, if all NaN count as one value. Some are
+    /// missing on purpose: x + 0 is not x for x = −0, x − x is not 0 for x = ∞, x · 0 is not 0 for x = −1, and sums and
+    /// products are not associative.
     fn rewrite(&self, op: Op) -> Rewrite {
         use Rewrite::{None, Value as Is};
         const MINUS_ZERO: f64 = -0.0;
@@ -209,18 +213,19 @@ impl Build {
         let truth = |value| if let Op::Bool(b) = self.get(value) { Some(b) } else { Option::None };
         let neg = |value| if let Op::Neg(a) = self.get(value) { Some(a) } else { Option::None };
         match op {
-            // x + (−0) → x, for x = ±0 too.
+            // x + (−0) → x, also for x = ±0.
             Op::Add(a, b) if is(b, MINUS_ZERO) => Is(a),
             Op::Add(a, b) if is(a, MINUS_ZERO) => Is(b),
-            // a + (−b) → a − b: the same real number, rounded once; both zero: +0 in both, or −0 in both.
+            // a + (−b) → a − b: the same real number, rounded once. If both are zero, both forms give +0 or both give
+            // −0.
             Op::Add(a, b) => match (neg(a), neg(b)) {
                 (_, Some(b)) => Rewrite::Op(Op::Sub(a, b)),
                 (Some(a), Option::None) => Rewrite::Op(Op::Sub(b, a)),
                 (Option::None, Option::None) => None,
             },
-            // x − (+0) → x, for x = ±0 too.
+            // x − (+0) → x, also for x = ±0.
             Op::Sub(a, b) if is(b, 0.0) => Is(a),
-            // (−0) − x → −x, for x = ±0 too. 0 − x is not −x for x = 0.
+            // (−0) − x → −x, also for x = ±0. 0 − x is not −x for x = 0.
             Op::Sub(a, b) if is(a, MINUS_ZERO) => Rewrite::Op(Op::Neg(b)),
             // a − (−b) → a + b
             Op::Sub(a, b) => neg(b).map_or(None, |b| Rewrite::Op(Op::Add(a, b))),
@@ -244,7 +249,7 @@ impl Build {
             },
             // −(−x) → x
             Op::Neg(a) => neg(a).map_or(None, Is),
-            // |−x| → |x|;  ||x|| → |x|;  |x · x| → x · x, as a square is no less than +0 or NaN.
+            // |−x| → |x|;  ||x|| → |x|;  |x · x| → x · x, because a square is at least +0, or NaN.
             Op::Abs(a) => match self.get(a) {
                 Op::Neg(a) => Rewrite::Op(Op::Abs(a)),
                 Op::Abs(_) => Is(a),
@@ -256,18 +261,18 @@ impl Build {
             Op::Fma(a, b, c) if is(a, 1.0) => Rewrite::Op(Op::Add(b, c)),
             Op::Fma(a, b, c) if is(b, -1.0) => Rewrite::Op(Op::Sub(c, a)),
             Op::Fma(a, b, c) if is(a, -1.0) => Rewrite::Op(Op::Sub(c, b)),
-            // fma(a, b, −0) → a · b, for a · b = ±0 too.
+            // fma(a, b, −0) → a · b, also for a · b = ±0.
             Op::Fma(a, b, c) if is(c, MINUS_ZERO) => Rewrite::Op(Op::Mul(a, b)),
             Op::Fma(a, b, c) => match (neg(a), neg(b)) {
                 (Some(a), Some(b)) => Rewrite::Op(Op::Fma(a, b, c)),
                 _ => None,
             },
-            // Whole numbers are whole.
+            // ⌊⌊x⌋⌋ → ⌊x⌋, and so on: the inner result is an integer.
             Op::Floor(a) | Op::Nearest(a) => match self.get(a) {
                 Op::Floor(_) | Op::Nearest(_) => Is(a),
                 _ => None,
             },
-            // x < x is false, for NaN too. x ≤ x and x = x are not constants: they ask for NaN.
+            // x < x is false, also for NaN. x ≤ x and x = x are not constant: they are false for NaN.
             Op::Less(a, b) if a == b => Rewrite::Op(Op::Bool(false)),
             Op::And(a, b) => match (truth(a), truth(b)) {
                 (Some(true), _) => Is(b),
@@ -303,7 +308,7 @@ impl Build {
                     _ => None,
                 },
             },
-            // Integers wrap: a ring, so these hold always.
+            // Integer arithmetic wraps (a ring in the algebraic sense), so these hold without conditions.
             Op::IntAdd(a, b) | Op::IntOr(a, b) | Op::IntXor(a, b) if int(a) == Some(0) => Is(b),
             Op::IntAdd(a, b) | Op::IntOr(a, b) | Op::IntXor(a, b) if int(b) == Some(0) => Is(a),
             Op::IntSub(a, b) if int(b) == Some(0) => Is(a),
@@ -338,13 +343,13 @@ impl Build {
         }
     }
 
-    /// Will write `value` to `slot` when the function ends; a later store to the same slot takes its place.
+    /// Writes `value` to `slot` at the end of the function. A later store to the same slot replaces this one.
     pub fn store(&mut self, slot: Slot, value: Value) {
         assert_eq!(self.type_of(value), Type::Real, "slot {} of {} holds a real", slot.0, self.name);
         self.stores.insert(slot, value);
     }
 
-    /// Writes to a ring when the function ends.
+    /// Writes to a ring buffer at the end of the function.
     pub fn write(&mut self, write: Write) {
         assert_eq!(self.type_of(write.index), Type::Int, "{} writes at an integer", self.name);
         assert_eq!(self.type_of(write.value), Type::Real, "a ring of {} holds reals", self.name);
@@ -358,19 +363,19 @@ impl Build {
         }
     }
 
-    /// Makes an integer the status.
+    /// Sets the status of the function to an integer value.
     pub fn status(&mut self, status: Value) {
         assert_eq!(self.type_of(status), Type::Int, "the status of {}", self.name);
         self.status = Some(status);
     }
 
-    /// What a slot holds in `env`.
+    /// The value of a slot in `env`; the initial value if `env` has no entry.
     pub fn read(&mut self, slot: Slot, env: &Env) -> Value {
         env.get(&slot).copied().unwrap_or_else(|| self.load(slot))
     }
 
-    /// Appends the operations of `func` on what the slots hold in `env`; its stores change `env`, nothing is stored.
-    /// Gives its status.
+    /// Inlines `func`: appends its operations and returns its status. Its loads read `env` and its stores change `env`;
+    /// nothing is stored to the block.
     pub fn inline(&mut self, func: &Func, env: &mut Env) -> Option<Value> {
         let live = func.live();
         let mut values = Vec::with_capacity(func.ops.len());
@@ -387,7 +392,8 @@ impl Build {
         func.status.map(|status| values[status.index()])
     }
 
-    /// The function with the results of another, whose values have become `values`.
+    /// Finishes with the stores, writes and status of `func`. `values`: for each value of `func`, its value in this
+    /// builder.
     pub fn finish_as(mut self, func: &Func, values: &[Value]) -> Func {
         let at = |value: Value| values[value.index()];
         func.stores.iter().for_each(|(slot, value)| self.store(*slot, at(*value)));
@@ -398,8 +404,8 @@ impl Build {
         self.finish()
     }
 
-    /// The function: stores in the order of their slots, no operation that nothing needs, and no store that writes
-    /// back what it read.
+    /// Finishes the function: stores sorted by slot, without dead code and without stores of a slot's own initial
+    /// value.
     pub fn finish(self) -> Func {
         let kept = |(slot, value): &(Slot, Value)| self.ops[value.index()] != Op::Load(*slot);
         let stores = self.stores.into_iter().filter(kept).collect();
@@ -408,7 +414,7 @@ impl Build {
     }
 }
 
-/// The same function without the operations that nothing needs.
+/// Dead code elimination: the same function without operations that no result needs.
 pub fn prune(func: &Func) -> Func {
     let live = func.live();
     let mut moved = vec![Value(u32::MAX); func.ops.len()];
@@ -433,7 +439,7 @@ enum Rewrite {
     Product(Value, f64),
 }
 
-/// 1/x where it is exact: of powers of two.
+/// 1/x if it is exact, which holds for powers of two.
 fn exact_inverse(x: f64) -> Option<f64> {
     let inverse = 1.0 / x;
     (x.to_bits() << 12 == 0 && x.is_normal() && inverse.is_normal()).then_some(inverse)
@@ -441,7 +447,7 @@ fn exact_inverse(x: f64) -> Option<f64> {
 
 macro_rules! operations {
     ($($(#[$doc:meta])* $name:ident($($operand:ident),*) = $op:expr;)*) => {
-        /// One method an operation.
+        /// One method for each operation.
         impl Build {
             $($(#[$doc])* pub fn $name(&mut self, $($operand: Value),*) -> Value { self.op($op) })*
         }
@@ -475,11 +481,11 @@ operations! {
     less_equal(a, b) = Op::LessEqual(a, b);
     /// a = b
     equal(a, b) = Op::Equal(a, b);
-    /// Both
+    /// Logical and
     and(a, b) = Op::And(a, b);
-    /// Either
+    /// Logical or
     or(a, b) = Op::Or(a, b);
-    /// Not
+    /// Logical negation
     not(a) = Op::Not(a);
     /// If c then a else b
     select(c, a, b) = Op::Select(c, a, b);
@@ -505,7 +511,7 @@ operations! {
     from_bits(a) = Op::FromBits(a);
     /// Truncated towards zero
     to_int(a) = Op::ToInt(a);
-    /// As a real
+    /// The nearest real
     to_real(a) = Op::ToReal(a);
 }
 
@@ -520,32 +526,32 @@ impl Build {
         self.op(Op::Int(n))
     }
 
-    /// True or false.
+    /// A Boolean constant.
     pub fn truth(&mut self, b: bool) -> Value {
         self.op(Op::Bool(b))
     }
 
-    /// What a slot holds at the beginning.
+    /// The value of a slot at the start of the function.
     pub fn load(&mut self, slot: Slot) -> Value {
         self.op(Op::Load(slot))
     }
 
-    /// Entry `index` of the table at `base` of the pool; the index is held inside.
+    /// Entry `index` of the table of `len` numbers at `base` in the pool. An index out of range reads the last entry.
     pub fn pool(&mut self, base: u32, len: u32, index: Value) -> Value {
         self.op(Op::Pool { base, len, index })
     }
 
-    /// What slot `index` of a ring holds when the function begins; the index is held inside.
+    /// The value of slot `index` of a ring at the start of the function. An index out of range reads the last slot.
     pub fn ring(&mut self, base: Slot, len: u32, index: Value) -> Value {
         self.op(Op::Ring { base, len, index })
     }
 
-    /// An elementary function.
+    /// An elementary function of one argument.
     pub fn unary(&mut self, function: Unary, a: Value) -> Value {
         self.op(Op::Unary(function, a))
     }
 
-    /// An elementary function.
+    /// An elementary function of two arguments.
     pub fn binary(&mut self, function: Binary, a: Value, b: Value) -> Value {
         self.op(Op::Binary(function, a, b))
     }
@@ -555,39 +561,39 @@ impl Build {
         self.op(Op::ShiftLeft(a, n))
     }
 
-    /// Shifted right by a constant, zeros come in.
+    /// Logical shift right by a constant.
     pub fn shift_right(&mut self, a: Value, n: u8) -> Value {
         self.op(Op::ShiftRight(a, n))
     }
 
-    /// Shifted right by a constant, the sign comes in.
+    /// Arithmetic shift right by a constant.
     pub fn shift_right_signed(&mut self, a: Value, n: u8) -> Value {
         self.op(Op::ShiftRightSigned(a, n))
     }
 
-    /// `if a < b then a else b`: of NaN and b it is b.
+    /// `if a < b then a else b`. If either is NaN, the result is b.
     pub fn min(&mut self, a: Value, b: Value) -> Value {
         let less = self.less(a, b);
         self.select(less, a, b)
     }
 
-    /// `if b < a then a else b`: of NaN and b it is b.
+    /// `if b < a then a else b`. If either is NaN, the result is b.
     pub fn max(&mut self, a: Value, b: Value) -> Value {
         let less = self.less(b, a);
         self.select(less, a, b)
     }
 
-    /// `if x < lo then lo else if hi < x then hi else x`: NaN stays NaN.
+    /// `if x < lo then lo else if hi < x then hi else x`. NaN stays NaN.
     pub fn clamp(&mut self, x: Value, lo: Value, hi: Value) -> Value {
         let raised = self.max(lo, x);
         self.min(hi, raised)
     }
 
-    /// 1, −1, or 0 at 0; NaN stays NaN.
+    /// The sign of x: 1, −1, or ±0 for ±0. NaN stays NaN.
     pub fn sign(&mut self, x: Value) -> Value {
         let (zero, one, minus_one) = (self.real(0.0), self.real(1.0), self.real(-1.0));
         let (positive, negative) = (self.less(zero, x), self.less(x, zero));
-        // 0 · x and not 0, so that NaN is not taken for a standstill; its derivative, too, is 0.
+        // 0 · x instead of 0, so that NaN is not mistaken for a standstill. Its derivative is also 0.
         let rest = self.mul(zero, x);
         let not_positive = self.select(negative, minus_one, rest);
         self.select(positive, one, not_positive)
@@ -600,13 +606,13 @@ impl Build {
     }
 }
 
-/// A fast hash for operations: lookups only, so no result depends on it.
+/// A fast hash for operations. The map is only used for lookups, so no result depends on the hash.
 #[derive(Default, Clone)]
 struct Mix(u64);
 
 impl Hasher for Mix {
     fn finish(&self) -> u64 {
-        // The table takes its place from the top bits and the low ones: spread them.
+        // The hash map uses the top bits and the low bits of a hash, so both must be mixed.
         (self.0 ^ (self.0 >> 32)).wrapping_mul(0x9E37_79B9_7F4A_7C15)
     }
 
@@ -635,7 +641,7 @@ impl Hasher for Mix {
 mod tests {
     use super::*;
 
-    /// Builds one value of two loads, stores it in slot 9 and gives the listing without its first line.
+    /// Builds one value from two loads, stores it in slot 9 and returns the listing without its first line.
     fn built(make: impl Fn(&mut Build, Value, Value) -> Value) -> String {
         let mut build = Build::new("f");
         let (x, y) = (build.load(Slot(3)), build.load(Slot(4)));
@@ -710,7 +716,7 @@ mod tests {
         assert_eq!(built(twice), x);
     }
 
-    /// Each rewritten operation gives the same bits as the operation as written, on edge values.
+    /// On edge values, each rewritten operation has the same bits as the operation as written.
     #[test]
     fn rewrites_change_no_result() {
         let edges = [0.0, -0.0, 1.0, -1.0, 0.5, 3.0, -7.25, f64::INFINITY, f64::NEG_INFINITY, f64::NAN, 5e-324, 1e308];
@@ -799,7 +805,7 @@ mod tests {
     }
 
     #[test]
-    fn which_constant_was_chosen_is_asked_of_the_choice() {
+    fn equality_with_a_selected_constant_becomes_the_condition() {
         let listing = built(|b, x, y| {
             let [one, two] = [1.0, 2.0].map(|number| b.real(number));
             let less = b.less(x, y);
@@ -812,7 +818,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_needed_is_not_there() {
+    fn dead_code_is_removed() {
         assert_eq!(built(|_, x, _| x), "v0 = load 3; store 9 = v0");
         let mut build = Build::new("f");
         let x = build.load(Slot(9));
@@ -821,7 +827,7 @@ mod tests {
     }
 
     #[test]
-    fn a_million_operations_are_fine() {
+    fn a_million_operations_can_be_built() {
         let mut build = Build::new("long");
         let mut x = build.load(Slot(3));
         for i in 0..1_000_000 {

@@ -1,11 +1,12 @@
-//! The meaning of every operation, on bits: what constant folding, the interpreter and every back end agree on.
+//! The meaning of every operation, on bits: constant folding, the interpreter and every back end agree with it.
 
 use super::{Op, Value};
 
-/// The bits of the result of `op`, from the bits of its operands: a real as IEEE 754 binary64, an integer as it
-/// is, true as 1 and false as 0. None for what reads the block or the pool, and for elementary functions.
+/// Evaluates `op` on the bits of its operands, and returns the bits of the result. A real is IEEE 754 binary64, an
+/// integer is two's complement, true is 1 and false is 0. `None` for operations that read the block or the pool, and
+/// for elementary functions.
 ///
-/// A NaN result may have any payload and sign: all NaN count as one value.
+/// A NaN result may have any payload and sign, because all NaN count as one value.
 pub fn evaluate(op: Op, bits: impl Fn(Value) -> u64) -> Option<u64> {
     let real = |value| f64::from_bits(bits(value));
     let int = |value| bits(value) as i64;

@@ -1,14 +1,14 @@
-//! Formulas over a [`Build`] that read as formulas: `let r = k.fma(-LN2_HIGH, x)`.
+//! Operator overloading on a [`Build`], so that code reads as a formula: `let r = k.fma(-LN2_HIGH, x)`.
 //!
-//! A [`Real`], [`Int`] or [`Truth`] is a value with the builder it lives in; operators append operations to it.
-//! Constants may stand wherever a value may.
+//! A [`Real`], [`Int`] or [`Truth`] is a value together with its builder. Operators append operations to the builder. A
+//! constant may be used in place of a value.
 
 use super::build::Build;
 use super::{Unary, Value};
 use std::cell::RefCell;
 use std::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Shl, Shr, Sub};
 
-/// A builder that several formulas share.
+/// A builder that several values share.
 pub type Shared = RefCell<Build>;
 
 macro_rules! handle {
@@ -17,12 +17,12 @@ macro_rules! handle {
         #[derive(Clone, Copy)]
         pub struct $name<'a> {
             build: &'a Shared,
-            /// The value itself.
+            /// The value in the builder.
             pub value: Value,
         }
 
         impl<'a> $name<'a> {
-            /// A value of this builder.
+            /// Wraps a value of this builder.
             pub fn new(build: &'a Shared, value: Value) -> $name<'a> {
                 $name { build, value }
             }
@@ -56,7 +56,7 @@ handle! {
     Int, i64, int
 }
 handle! {
-    /// True or false.
+    /// A Boolean.
     Truth, bool, truth
 }
 
@@ -109,7 +109,7 @@ impl<'a> Shl<u8> for Int<'a> {
     }
 }
 
-/// The sign comes in.
+/// Arithmetic shift.
 impl<'a> Shr<u8> for Int<'a> {
     type Output = Int<'a>;
     fn shr(self, n: u8) -> Int<'a> {
@@ -129,17 +129,17 @@ impl<'a> Real<'a> {
         Truth { value: make(&mut self.build.borrow_mut()), build: self.build }
     }
 
-    /// A constant of the same builder.
+    /// A constant in the same builder.
     pub fn constant(self, x: f64) -> Real<'a> {
         Real::from((x, self.build))
     }
 
-    /// Another value of the same builder.
+    /// Wraps another value of the same builder.
     pub fn same(self, value: Value) -> Real<'a> {
         Real { value, build: self.build }
     }
 
-    /// An elementary function of it.
+    /// An elementary function of this value.
     pub fn of(self, function: Unary) -> Real<'a> {
         self.with(|b| b.unary(function, self.value))
     }
@@ -163,17 +163,17 @@ impl<'a> Real<'a> {
         self.with(|b| b.sqrt(self.value))
     }
 
-    /// Largest whole number not above.
+    /// ⌊self⌋: the largest integer that is at most self.
     pub fn floor(self) -> Real<'a> {
         self.with(|b| b.floor(self.value))
     }
 
-    /// Nearest whole number, ties to even.
+    /// The nearest integer, ties to even.
     pub fn nearest(self) -> Real<'a> {
         self.with(|b| b.nearest(self.value))
     }
 
-    /// self < other
+    /// self < other; false if either is NaN.
     pub fn below<T>(self, other: T) -> Truth<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -182,7 +182,7 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less(self.value, other))
     }
 
-    /// self > other
+    /// self > other; false if either is NaN.
     pub fn above<T>(self, other: T) -> Truth<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -191,7 +191,7 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less(other, self.value))
     }
 
-    /// self ≤ other; false of NaN.
+    /// self ≤ other; false if either is NaN.
     pub fn not_above<T>(self, other: T) -> Truth<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -200,7 +200,7 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less_equal(self.value, other))
     }
 
-    /// other ≤ self
+    /// self ≥ other; false if either is NaN.
     pub fn not_below<T>(self, other: T) -> Truth<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -209,12 +209,12 @@ impl<'a> Real<'a> {
         self.truth(|b| b.less_equal(other, self.value))
     }
 
-    /// Whether it is neither infinite nor NaN.
+    /// Whether the value is neither infinite nor NaN.
     pub fn finite(self) -> Truth<'a> {
         self.truth(|b| b.finite(self.value))
     }
 
-    /// self = other; −0 = 0.
+    /// self = other, where −0 = 0; false if either is NaN.
     pub fn is<T>(self, other: T) -> Truth<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -223,18 +223,18 @@ impl<'a> Real<'a> {
         self.truth(|b| b.equal(self.value, other))
     }
 
-    /// Its bits.
+    /// The bits as an integer.
     pub fn bits(self) -> Int<'a> {
         Int { value: self.build.borrow_mut().to_bits(self.value), build: self.build }
     }
 
-    /// Itself, but at least the limit; NaN stays NaN.
+    /// max(self, limit); NaN stays NaN.
     pub fn at_least(self, limit: f64) -> Real<'a> {
         let limit = self.constant(limit);
         self.with(|b| b.max(limit.value, self.value))
     }
 
-    /// Itself, but at most the limit; NaN stays NaN.
+    /// min(self, limit); NaN stays NaN.
     pub fn at_most<T>(self, limit: T) -> Real<'a>
     where
         Real<'a>: From<(T, &'a Shared)>,
@@ -243,34 +243,34 @@ impl<'a> Real<'a> {
         self.with(|b| b.min(limit, self.value))
     }
 
-    /// This size, not negative, with the sign of `of`, that of zeros too.
+    /// Copies the sign of `of` (also of a zero) to this value, which must not be negative.
     pub fn with_sign(self, of: Real<'a>) -> Real<'a> {
         (self.bits() | (of.bits() & i64::MIN)).real_of_bits()
     }
 }
 
 impl<'a> Int<'a> {
-    /// The real of these bits.
+    /// The real with these bits.
     pub fn real_of_bits(self) -> Real<'a> {
         Real { value: self.build.borrow_mut().from_bits(self.value), build: self.build }
     }
 
-    /// As a real.
+    /// The nearest real.
     pub fn real(self) -> Real<'a> {
         Real { value: self.build.borrow_mut().to_real(self.value), build: self.build }
     }
 
-    /// Entry of the table of `len` numbers at `base` of the pool.
+    /// This entry of the table of `len` numbers at `base` in the pool.
     pub fn entry(self, base: u32, len: u32) -> Real<'a> {
         Real { value: self.build.borrow_mut().pool(base, len, self.value), build: self.build }
     }
 
-    /// Shifted right, zeros come in.
+    /// Logical shift right.
     pub fn shift_right(self, n: u8) -> Int<'a> {
         self.with(|b| b.shift_right(self.value, n))
     }
 
-    /// self < other
+    /// self < other, signed.
     pub fn below(self, other: i64) -> Truth<'a> {
         let other = Int::from((other, self.build));
         Truth { value: self.build.borrow_mut().int_less(self.value, other.value), build: self.build }
@@ -284,7 +284,7 @@ impl<'a> Int<'a> {
 }
 
 impl<'a> Truth<'a> {
-    /// If true then a else b.
+    /// If true then a, else b: reals.
     pub fn choose<A, B>(self, a: A, b: B) -> Real<'a>
     where
         Real<'a>: From<(A, &'a Shared)> + From<(B, &'a Shared)>,
@@ -293,7 +293,7 @@ impl<'a> Truth<'a> {
         Real { value: self.build.borrow_mut().select(self.value, a.value, b.value), build: self.build }
     }
 
-    /// If true then a else b, of integers.
+    /// If true then a, else b: integers.
     pub fn choose_int<A, B>(self, a: A, b: B) -> Int<'a>
     where
         Int<'a>: From<(A, &'a Shared)> + From<(B, &'a Shared)>,

@@ -1,4 +1,7 @@
-//! The reference: runs expanded functions operation by operation, every access checked.
+//! The reference interpreter: runs expanded functions operation by operation and checks every access.
+//!
+//! In: functions, a block and a pool of constants. Out: the changed block and the status. Every back end must agree
+//! with it to the bit.
 
 use crate::ir::eval::evaluate;
 use crate::ir::verify::{Stage, verify};
@@ -6,7 +9,7 @@ use crate::ir::{Func, Op};
 use abi::table::Interpret;
 use abi::{Function, Layout};
 
-/// Functions that are interpreted.
+/// The functions of a model, ready to be interpreted.
 #[derive(Clone, Default)]
 pub struct Interpreter {
     funcs: [Option<Func>; Function::ALL.len()],
@@ -15,10 +18,11 @@ pub struct Interpreter {
 }
 
 impl Interpreter {
-    /// Takes the functions of a model over blocks of this layout.
+    /// Takes the functions of a model. `layout`: the block they work on. `pool_len`: the number of constants they may
+    /// read.
     ///
     /// # Panics
-    /// If a function is not sound or not expanded: a mistake of the passes before.
+    /// If a function does not verify or has unexpanded elementary functions: a bug in an earlier pass.
     pub fn new(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Interpreter {
         let mut interpreter = Interpreter { size: layout.size(), pool_len, ..Interpreter::default() };
         for (function, func) in funcs {
@@ -51,12 +55,12 @@ impl Interpret for Interpreter {
     }
 }
 
-/// Runs an expanded function once on a block of any size that holds all its slots; returns its status.
+/// Runs an expanded function once and returns its status. The block may have any size that holds all slots in use.
 pub fn run_once(func: &Func, block: &mut [f64], pool: &[f64]) -> u64 {
     run(func, block, pool, &mut vec![0; func.ops.len()])
 }
 
-/// Runs a function once; `values` takes the bits of every value.
+/// Runs a function once. `values` is scratch space for the bits of every value.
 fn run(func: &Func, block: &mut [f64], pool: &[f64], values: &mut [u64]) -> u64 {
     for (i, op) in func.ops.iter().enumerate() {
         values[i] = match *op {

@@ -1,7 +1,8 @@
-//! The straight-line program: a list of typed operations, each a value; no loops, no blocks, no calls.
+//! The intermediate representation (IR): a straight-line program in static single assignment form.
 //!
-//! So the interpreter, the derivative pass and every back end are one `match` in one pass over the list.
-//! After `lower` there are no units here, and names serve only printing.
+//! A function is a list of typed operations, and each operation defines one value. There are no loops, basic blocks or
+//! calls, so the interpreter, automatic differentiation and every back end walk the list once and match on the
+//! operation. After `lower` the IR has no units; names are only used for printing.
 
 pub mod scc;
 pub mod print;
@@ -16,7 +17,7 @@ pub mod random;
 
 use abi::Slot;
 
-/// The result of the operation of this number.
+/// The result of the operation with this number.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct Value(pub u32);
 
@@ -30,11 +31,11 @@ impl Value {
 /// The type of a value.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Type {
-    /// 64-bit float.
+    /// A 64-bit float.
     Real,
-    /// 64-bit integer, wrapping; only inside expanded functions, tables and counters.
+    /// A 64-bit integer that wraps. Only expanded functions, tables and counters use it.
     Int,
-    /// True or false.
+    /// A Boolean.
     Bool,
 }
 
@@ -68,34 +69,34 @@ pub enum Binary {
     Hypot,
 }
 
-/// One operation. Operands are values of earlier operations.
+/// An operation. Its operands are values of earlier operations.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Op {
-    /// A real constant, by its bits, so that operations can be compared and hashed.
+    /// A real constant, stored as bits so that operations can be compared and hashed.
     Real(u64),
     /// An integer constant.
     Int(i64),
     /// A Boolean constant.
     Bool(bool),
-    /// The value of a slot when the function begins.
+    /// The value of a slot at the start of the function.
     Load(Slot),
-    /// `pool[base + min(index as unsigned, len − 1)]`: a table. `index` is an integer.
+    /// A table in the pool: `pool[base + min(index as unsigned, len − 1)]`. `index` is an integer.
     Pool {
         /// First entry.
         base: u32,
         /// Number of entries, at least 1.
         len: u32,
-        /// Which.
+        /// Entry to read, from 0.
         index: Value,
     },
-    /// The slot `base + min(index as unsigned, len − 1)` when the function begins: a ring of samples. `index` is an
-    /// integer. No load and no store of the function touches the slots of a ring, only [`Write`]s do.
+    /// A ring buffer of samples: slot `base + min(index as unsigned, len − 1)` at the start of the function. `index` is
+    /// an integer. Only [`Write`]s may change the slots of a ring; no load and no store of the function accesses them.
     Ring {
         /// First slot.
         base: Slot,
         /// Number of slots, at least 1.
         len: u32,
-        /// Which.
+        /// Slot to read, from 0.
         index: Value,
     },
 
@@ -107,7 +108,7 @@ pub enum Op {
     Mul(Value, Value),
     /// a / b
     Div(Value, Value),
-    /// −a: flips the sign, of zeros and NaN too.
+    /// −a: flips the sign, also of zeros and NaN.
     Neg(Value),
     /// |a|
     Abs(Value),
@@ -115,37 +116,37 @@ pub enum Op {
     Sqrt(Value),
     /// a · b + c, rounded once.
     Fma(Value, Value, Value),
-    /// Largest whole number not above a.
+    /// ⌊a⌋: the largest integer that is at most a, as a real.
     Floor(Value),
-    /// Nearest whole number, ties to even.
+    /// a rounded to the nearest integer, ties to even, as a real.
     Nearest(Value),
 
-    /// An elementary function, before expansion.
+    /// An elementary function of one argument, until it is expanded.
     Unary(Unary, Value),
-    /// An elementary function, before expansion.
+    /// An elementary function of two arguments, until it is expanded.
     Binary(Binary, Value, Value),
 
     /// a < b; false if either is NaN.
     Less(Value, Value),
     /// a ≤ b; false if either is NaN.
     LessEqual(Value, Value),
-    /// a = b; −0 = 0; false if either is NaN.
+    /// a = b, where −0 = 0; false if either is NaN.
     Equal(Value, Value),
 
-    /// Both.
+    /// Logical and.
     And(Value, Value),
-    /// Either.
+    /// Logical or.
     Or(Value, Value),
-    /// Not.
+    /// Logical negation.
     Not(Value),
-    /// If the first (a Boolean) then the second else the third, of any one type.
+    /// If the first operand (a Boolean) is true then the second, else the third. Both have the same type.
     Select(Value, Value, Value),
 
     /// Wrapping sum of integers.
     IntAdd(Value, Value),
-    /// Wrapping difference.
+    /// Wrapping difference of integers.
     IntSub(Value, Value),
-    /// Wrapping product.
+    /// Wrapping product of integers.
     IntMul(Value, Value),
     /// Bitwise and.
     IntAnd(Value, Value),
@@ -155,9 +156,9 @@ pub enum Op {
     IntXor(Value, Value),
     /// Shift left by a constant 0..=63.
     ShiftLeft(Value, u8),
-    /// Shift right by a constant 0..=63, zeros come in.
+    /// Logical shift right by a constant 0..=63.
     ShiftRight(Value, u8),
-    /// Shift right by a constant 0..=63, the sign comes in.
+    /// Arithmetic shift right by a constant 0..=63.
     ShiftRightSigned(Value, u8),
     /// Signed comparison of integers.
     IntLess(Value, Value),
@@ -165,16 +166,16 @@ pub enum Op {
     IntEqual(Value, Value),
     /// The bits of a real as an integer.
     ToBits(Value),
-    /// The real of these bits.
+    /// The real with these bits.
     FromBits(Value),
-    /// A real, truncated towards zero; NaN gives 0, what is too large the nearest integer.
+    /// A real truncated towards zero. NaN becomes 0; a real out of range becomes the nearest integer.
     ToInt(Value),
-    /// An integer, rounded to the nearest real.
+    /// An integer rounded to the nearest real.
     ToReal(Value),
 }
 
-/// Whether a value is not above 0, or NaN, by how it is written: as −|a|, −(a · a), −|a|^b, min(a, 0) … `op`: what gives a
-/// value.
+/// Whether the form of a value shows that it is at most 0, or NaN: −|a|, −(a · a), −|a|^b, min(a, 0), and so on. `op`:
+/// the operation that defines a value.
 pub fn is_not_positive(value: Value, op: impl Fn(Value) -> Op) -> bool {
     match op(value) {
         Op::Neg(size) => is_not_negative(size, op),
@@ -183,20 +184,20 @@ pub fn is_not_positive(value: Value, op: impl Fn(Value) -> Op) -> bool {
     }
 }
 
-/// Whether a value is +0, above it or NaN, by how it is written.
+/// Whether the form of a value shows that it is +0, positive or NaN. `op`: the operation that defines a value.
 pub fn is_not_negative(value: Value, op: impl Fn(Value) -> Op) -> bool {
     match op(value) {
         Op::Abs(_) | Op::Unary(Unary::Exp | Unary::Cosh, _) => true,
         Op::Mul(a, b) if a == b => true,
         Op::Real(bits) => bits >> 63 == 0,
-        // Of a base that has no sign the power has none.
+        // A power has no negative sign if its base has none.
         Op::Binary(Binary::Pow, a, _) => is_not_negative(a, op),
         _ => false,
     }
 }
 
-/// What an operation gives the sign of, if it is that: 1, −1, and 0 · x of x = ±0 and of NaN, which is x itself. `op`: what
-/// gives a value.
+/// If an operation computes the sign of a value x, returns x. The form is that of [`Build::sign`](build::Build::sign):
+/// 1, −1, and 0 · x for x = ±0 and NaN, which equals x. `op`: the operation that defines a value.
 pub fn sign_of(sign: Op, op: impl Fn(Value) -> Op) -> Option<Value> {
     let is = |value: Value, number: f64| op(value) == Op::Real(number.to_bits());
     let Op::Select(positive, one, rest) = sign else { return None };
@@ -206,8 +207,8 @@ pub fn sign_of(sign: Op, op: impl Fn(Value) -> Op) -> Option<Value> {
     (alike && is(one, 1.0) && is(minus_one, -1.0)).then_some(x)
 }
 
-/// The load, its slot and the bits of the number, if it is asked whether a slot holds a number written down. `op`: what gives a
-/// value.
+/// If an operation tests whether a slot equals a constant, returns the load, its slot and the bits of the constant.
+/// `op`: the operation that defines a value.
 pub fn number_asked(asked: Op, op: impl Fn(Value) -> Op) -> Option<(Value, Slot, u64)> {
     let Op::Equal(a, b) = asked else { return None };
     [(a, b), (b, a)].into_iter().find_map(|(load, number)| match (op(load), op(number)) {
@@ -216,43 +217,43 @@ pub fn number_asked(asked: Op, op: impl Fn(Value) -> Op) -> Option<(Value, Slot,
     })
 }
 
-/// The slot `base + min(index as unsigned, len − 1)` of a ring takes a value, after all else.
+/// A write to slot `base + min(index as unsigned, len − 1)` of a ring buffer, after all stores.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Write {
     /// First slot of the ring.
     pub base: Slot,
     /// Number of its slots, at least 1.
     pub len: u32,
-    /// An integer: which slot.
+    /// The slot to write, from 0: an integer.
     pub index: Value,
-    /// The real it takes.
+    /// The real to write.
     pub value: Value,
 }
 
-/// A straight-line function over a block of slots: first all loads, then the operations, then all stores.
+/// A straight-line function over a block of slots. It behaves as if it performed all loads first and all stores last.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Func {
-    /// For listings.
+    /// The name in listings.
     pub name: String,
-    /// In order; operands stand before their users.
+    /// The operations; operands precede their users.
     pub ops: Vec<Op>,
-    /// What is written, each slot at most once, all at the end.
+    /// The stores at the end of the function, at most one per slot.
     pub stores: Vec<(Slot, Value)>,
-    /// What is written to rings, each at most once, after the stores.
+    /// The writes to ring buffers, after the stores.
     pub writes: Vec<Write>,
-    /// An integer: 0, or the number of the guard that failed. None: always 0.
+    /// The status, an integer: 0, or the number of the guard that failed. `None`: always 0.
     pub status: Option<Value>,
 }
 
 impl Write {
-    /// The same write of the values that `f` gives for its own.
+    /// The same write with its values mapped by `f`.
     pub fn map(self, f: impl Fn(Value) -> Value) -> Write {
         Write { index: f(self.index), value: f(self.value), ..self }
     }
 }
 
 impl Op {
-    /// What it takes of a processor's time, in instructions of one cycle; only its order of size matters.
+    /// Approximate cost, in instructions that take one cycle. Only the order of magnitude matters.
     pub fn effort(self) -> u32 {
         match self {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => 0,
@@ -262,12 +263,12 @@ impl Op {
         }
     }
 
-    /// Whether it is a number or a truth written down.
+    /// Whether it is a constant.
     pub fn is_constant(self) -> bool {
         matches!(self, Op::Real(_) | Op::Int(_) | Op::Bool(_))
     }
 
-    /// The same operation on the operands that `f` gives for its own, asked from left to right.
+    /// The same operation with its operands mapped by `f`, from left to right.
     pub fn map(self, mut f: impl FnMut(Value) -> Value) -> Op {
         match self {
             Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => self,
@@ -310,7 +311,7 @@ impl Op {
         }
     }
 
-    /// Calls `f` on each operand from left to right.
+    /// Calls `f` for each operand, from left to right.
     pub fn each_operand(self, mut f: impl FnMut(Value)) {
         self.map(|value| {
             f(value);
@@ -320,12 +321,13 @@ impl Op {
 }
 
 impl Func {
-    /// The operation that gives a value.
+    /// The operation that defines a value.
     pub fn op(&self, value: Value) -> Op {
         self.ops[value.index()]
     }
 
-    /// What must be there for an operation: of a table of which only the bits are wanted, that is the index.
+    /// The values that must be in registers to compute an operation. The bits of a table entry are loaded directly, so
+    /// they only need the index.
     pub fn reads(&self, op: Op) -> impl Iterator<Item = Value> + use<> {
         let mut operands = [None; 3];
         let mut n = 0;
@@ -340,8 +342,8 @@ impl Func {
         operands.into_iter().flatten()
     }
 
-    /// The truth that the status hangs on, what it is where something has failed, and the status then; otherwise that is 0.
-    /// None if there is no status, or one that is put together in another way.
+    /// The condition that selects the status, its truth value in case of a failure, and the status in that case; the
+    /// status is 0 otherwise. `None` if there is no status or if it has another form.
     pub fn failure(&self) -> Option<(Value, bool, Value)> {
         let Op::Select(when, yes, no) = self.op(self.status?) else { return None };
         let is_zero = |value: Value| self.op(value) == Op::Int(0);
@@ -358,12 +360,12 @@ impl Func {
         self.stores.iter().map(|(_, value)| *value).chain(written).chain(self.status)
     }
 
-    /// For each operation, whether a store, a write or the status needs it.
+    /// Liveness: for each operation, whether a store, a write or the status needs it.
     pub fn live(&self) -> Vec<bool> {
         self.live_for(self.results())
     }
 
-    /// The same of what these values need.
+    /// Liveness with respect to these values alone.
     pub fn live_for(&self, values: impl Iterator<Item = Value>) -> Vec<bool> {
         let mut live = vec![false; self.ops.len()];
         values.for_each(|value| live[value.index()] = true);
@@ -375,7 +377,7 @@ impl Func {
         live
     }
 
-    /// The slots read, ascending.
+    /// The slots that the function loads, ascending and without duplicates. Ring reads are not included.
     pub fn loads(&self) -> Vec<Slot> {
         let mut slots: Vec<Slot> =
             self.ops.iter().filter_map(|op| if let Op::Load(slot) = op { Some(*slot) } else { None }).collect();

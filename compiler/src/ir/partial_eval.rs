@@ -1,14 +1,21 @@
-//! What is left of operations where the values of some are known.
+//! Partial evaluation: the residual operations when some values are known, and backward slices.
+//!
+//! In: operations of a builder, and values that are known to be equal to others. Out: the residual values, added to the
+//! same builder. The operations are a straight line, so one walk in order suffices.
+//!
+//! Sources: Jones, Gomard, Sestoft, *Partial Evaluation and Automatic Program Generation*, 1993; Weiser, *Program
+//! Slicing*, 1984.
 
 use super::build::Build;
 use super::{Op, Value};
 use std::collections::{HashMap, HashSet};
 
-/// What is known of other truths where one is true or false.
-pub fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)> {
+/// The values that are known if a condition is known to be `truth`, each with its constant: the condition, its parts,
+/// and comparisons that follow from it.
+pub fn known(build: &mut Build, condition: Value, truth: bool) -> Vec<(Value, Value)> {
     let is = [false, true].map(|truth| build.truth(truth));
     let mut known = Vec::new();
-    let mut open = vec![(asked, truth)];
+    let mut open = vec![(condition, truth)];
     while let Some((value, truth)) = open.pop() {
         known.push((value, is[usize::from(truth)]));
         match (build.get(value), truth) {
@@ -27,7 +34,8 @@ pub fn known(build: &mut Build, asked: Value, truth: bool) -> Vec<(Value, Value)
     known
 }
 
-/// What a comparison of two reals tells of others of the same two; where it is false, one of them may be no number.
+/// The comparisons of the same two reals whose results follow if `comparison` has the result `truth`. A false
+/// comparison may have a NaN operand, so fewer results follow.
 fn implied(comparison: Op, truth: bool) -> Vec<(Op, bool)> {
     match (comparison, truth) {
         (Op::Less(a, b), true) => vec![
@@ -51,26 +59,28 @@ fn implied(comparison: Op, truth: bool) -> Vec<(Op, bool)> {
     }
 }
 
-/// What is left of outputs of a list, of which some values are others.
+/// Returns the residual values of `outputs`. `list`: the operations to evaluate, in order. `known`: values and their
+/// replacements.
 pub fn partial_eval(build: &mut Build, list: &[Value], known: &[(Value, Value)], outputs: &[Value]) -> Vec<Value> {
-    let mut left: HashMap<Value, Value> = known.iter().copied().collect();
+    let mut residual: HashMap<Value, Value> = known.iter().copied().collect();
     for value in list {
         let op = build.get(*value);
-        let now = op.map(|operand| left.get(&operand).copied().unwrap_or(operand));
-        if now != op && !left.contains_key(value) {
-            left.insert(*value, build.op(now));
+        let now = op.map(|operand| residual.get(&operand).copied().unwrap_or(operand));
+        if now != op && !residual.contains_key(value) {
+            residual.insert(*value, build.op(now));
         }
     }
-    outputs.iter().map(|output| left.get(output).copied().unwrap_or(*output)).collect()
+    outputs.iter().map(|output| residual.get(output).copied().unwrap_or(*output)).collect()
 }
 
-/// What some values need that is not there, in order.
-pub fn slice(build: &Build, there: &HashSet<Value>, of: &[Value]) -> Vec<Value> {
+/// The backward slice of `roots`: the operations that these values need, in order, without constants and without the
+/// values in `available` and what only those need.
+pub fn slice(build: &Build, available: &HashSet<Value>, roots: &[Value]) -> Vec<Value> {
     let mut list = HashSet::new();
-    let mut open = of.to_vec();
+    let mut open = roots.to_vec();
     while let Some(value) = open.pop() {
         let op = build.get(value);
-        if !there.contains(&value) && !op.is_constant() && list.insert(value) {
+        if !available.contains(&value) && !op.is_constant() && list.insert(value) {
             op.each_operand(|operand| open.push(operand));
         }
     }
@@ -86,7 +96,7 @@ mod tests {
     use abi::Slot;
 
     #[test]
-    fn what_a_comparison_tells_of_others_is_so() {
+    fn implied_comparisons_hold() {
         let numbers = [f64::NEG_INFINITY, -1.0, -0.0, 0.0, 1.0, f64::INFINITY, f64::NAN];
         let comparisons = [Op::Less, Op::LessEqual, Op::Equal].map(|of| of(Value(0), Value(1)));
         for (a, b) in numbers.into_iter().flat_map(|a| numbers.map(|b| (a, b))) {
@@ -100,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_known_is_not_asked_again() {
+    fn known_conditions_are_not_evaluated_again() {
         let mut build = Build::new("f");
         let [x, y] = [3, 4].map(|slot| build.load(Slot(slot)));
         let (less, more) = (build.less(x, y), build.less(y, x));

@@ -1,4 +1,4 @@
-//! A readable listing of a function, one operation a line.
+//! Text listing of a function, one operation per line.
 //!
 //! ```text
 //! step:
@@ -84,7 +84,7 @@ impl fmt::Display for Func {
 }
 
 impl Unary {
-    /// All of them.
+    /// All elementary functions of one argument.
     pub const ALL: [Unary; 13] = [
         Unary::Exp,
         Unary::Expm1,
@@ -101,7 +101,7 @@ impl Unary {
         Unary::Tanh,
     ];
 
-    /// As the user writes it.
+    /// The name in the language.
     pub fn name(self) -> &'static str {
         match self {
             Unary::Exp => "exp",
@@ -122,10 +122,10 @@ impl Unary {
 }
 
 impl Binary {
-    /// All of them.
+    /// All elementary functions of two arguments.
     pub const ALL: [Binary; 3] = [Binary::Atan2, Binary::Pow, Binary::Hypot];
 
-    /// As the user writes it; `^` as `pow`.
+    /// The name in the language, and `pow` for `^`.
     pub fn name(self) -> &'static str {
         match self {
             Binary::Atan2 => "atan2",

@@ -1,33 +1,33 @@
-//! A lowered model: straight-line functions over one block, and what it says of itself.
+//! A lowered model: straight-line functions over one block, and the description of that block.
 
 use crate::ir::Func;
 use abi::{Description, Slot};
 
-/// The functions of a model before a fixed step is fused and before any back end sees them.
+/// The functions of a model, before a fixed step is composed from them and before any back end.
 #[derive(Clone, Debug, Default)]
 pub struct Program {
     /// Quantities and layout. Its pool begins with the constants of the elementary functions.
     pub description: Description,
-    /// Defaults of the parameters, SI, as many as the layout has.
+    /// Default values of the parameters, in SI units, as many as the layout has.
     pub params: Vec<f64>,
-    /// Initial values, and the blocks due at 0.
+    /// Computes the initial values and runs the sampled blocks that are due at time 0.
     pub start: Func,
-    /// Outputs and observed quantities.
+    /// Computes outputs and observed quantities.
     pub outputs: Func,
-    /// dx/dt.
+    /// Computes dx/dt.
     pub derivatives: Func,
-    /// Sampled blocks, each if it is due.
+    /// Runs the sampled blocks that are due.
     pub tick: Option<Func>,
-    /// One transition per automaton, events, resets, and the memory of crossings.
+    /// At most one transition per automaton, then events, resets, and the memory of crossings.
     pub transitions: Option<Func>,
-    /// Switching surfaces.
+    /// Computes the switching functions, whose zeros are the switching surfaces.
     pub roots: Option<Func>,
-    /// Whether a contact stops what it acts on: then forces that balance must leave exactly 0.
+    /// Whether a contact can bring a body to rest. Forces in balance must then add up to exactly 0.
     pub balanced: bool,
 }
 
 impl Program {
-    /// Whether time stands in an equation: only then do fixed steps keep it.
+    /// Whether an equation uses time. If none does, a fixed step does not store time in the block.
     pub fn reads_time(&self) -> bool {
         let always = [&self.outputs, &self.derivatives];
         let own = always.into_iter().chain([&self.tick, &self.transitions, &self.roots].into_iter().flatten());

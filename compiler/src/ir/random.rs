@@ -1,10 +1,11 @@
-//! Sound functions by chance, from a seed: what back ends are held against each other with, here and in tests/.
+//! Random valid functions from a seed, for differential tests of the back ends, here and in `tests/`.
 
 use super::verify::result;
 use super::{Func, Op, Type, Value, Write};
 use abi::{Layout, Slot};
 
-/// SplitMix64.
+/// The SplitMix64 generator; the field is its state. Source: Steele, Lea, Flood, *Fast splittable pseudorandom number
+/// generators*, 2014.
 #[derive(Clone)]
 pub struct Random(pub u64);
 
@@ -18,7 +19,7 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// Below n.
+    /// Uniform in 0..n (with a negligible bias).
     pub fn below(&mut self, n: usize) -> usize {
         (self.bits() % n as u64) as usize
     }
@@ -28,7 +29,7 @@ impl Random {
         lo + (hi - lo) * (self.bits() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// A real: often an edge, sometimes any bits, mostly of moderate size.
+    /// A real: often an edge case, sometimes arbitrary bits, mostly of moderate size.
     pub fn real(&mut self) -> f64 {
         match self.below(8) {
             0 | 1 => REALS[self.below(REALS.len())],
@@ -40,7 +41,7 @@ impl Random {
         }
     }
 
-    /// An integer: often an edge or small.
+    /// An integer: often an edge case or small.
     pub fn int(&mut self) -> i64 {
         match self.below(4) {
             0 => INTS[self.below(INTS.len())],
@@ -50,7 +51,7 @@ impl Random {
     }
 }
 
-/// Reals at which operations differ if they differ at all.
+/// Edge cases of reals, at which wrong implementations differ.
 pub const REALS: &[f64] = &[
     0.0,
     -0.0,
@@ -83,19 +84,19 @@ pub const REALS: &[f64] = &[
     -745.13,
 ];
 
-/// Integers at which operations differ if they differ at all.
+/// Edge cases of integers, at which wrong implementations differ.
 pub const INTS: &[i64] =
     &[0, 1, -1, 2, 63, 64, -64, i64::MAX, i64::MIN, 0x3ff0_0000_0000_0000, 1 << 52, 1 << 53, (1 << 53) + 1];
 
-/// Layout of the functions made here: some of every segment that a function may read or write.
+/// The layout of the generated functions: slots in every segment that a function may read or write.
 pub fn layout() -> Layout {
     Layout::new([4, 2, 4, 2, 1, 3, 0, 0, 0, 1]).with_rings(8)
 }
 
-/// Length of the pool of the functions made here.
+/// The length of the pool of the generated functions.
 pub const POOL_LEN: usize = 24;
 
-/// A sound, expanded function of about `len` operations over [`layout`].
+/// A valid, expanded function of about `len` operations over [`layout`].
 pub fn func(random: &mut Random, len: usize) -> Func {
     let layout = layout();
     let mut made = Made::default();
@@ -108,7 +109,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
     while made.ops.len() < len {
         let mut any = |of: Type, made: &Made| {
             let fit: Vec<Value> = made.of(of);
-            // Mostly recent values, so that chains get long.
+            // Mostly recent values, so that dependency chains become long.
             let from = if random.below(3) > 0 { fit.len().saturating_sub(6) } else { 0 };
             fit[from + random.below(fit.len() - from)]
         };
@@ -151,7 +152,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
             33 => made.push(Op::IntLess(i, j)),
             34 => made.push(Op::IntEqual(i, j)),
             35 => {
-                // The bits of a NaN are nobody's business: ask only for those of numbers.
+                // The bits of a NaN are unspecified, so a NaN is replaced before its bits are used.
                 made.push(Op::Equal(x, x));
                 made.push(Op::Real(1f64.to_bits()));
                 let (number, one) = (made.last(1), made.last(0));
@@ -171,7 +172,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
                 made.push(Op::Pool { base, len, index: i });
             }
         }
-        // The pair of a minimum or maximum, which back ends know.
+        // The pattern of a minimum or maximum, which back ends recognise.
         if random.below(12) == 0 {
             let (a, b) = (x, made.of(Type::Real)[0]);
             made.push(Op::Less(a, b));
@@ -199,7 +200,8 @@ pub fn func(random: &mut Random, len: usize) -> Func {
         let fit = made.of(Type::Bool);
         let failed = fit[random.below(fit.len())];
         let other = fit[random.below(fit.len())];
-        // As guards have it, a chain of which a first test decides whether it matters; its end may be 0 all the same.
+        // The form of guards: a first test decides whether a chain of selects is evaluated. The chain may still yield
+        // 0.
         made.push(Op::Int(0));
         let zero = made.last(0);
         made.push(Op::Int(3));
@@ -216,7 +218,7 @@ pub fn func(random: &mut Random, len: usize) -> Func {
     Func { name: "random".into(), ops: made.ops, stores, writes, status }
 }
 
-/// Some of the slots for rings.
+/// A random part of the ring slots.
 fn ring(random: &mut Random, layout: &Layout) -> (Slot, u32) {
     let from = random.below(layout.rings.len as usize);
     (layout.rings.slot(from), 1 + random.below(layout.rings.len as usize - from) as u32)
@@ -234,7 +236,7 @@ impl Made {
         self.ops.push(op);
     }
 
-    /// The value `back` before the last.
+    /// The value `back` places before the last one.
     fn last(&self, back: usize) -> Value {
         Value((self.ops.len() - 1 - back) as u32)
     }

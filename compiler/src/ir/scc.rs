@@ -1,9 +1,12 @@
-//! Strongly connected components: what goes in circles, and in which order the rest may be done.
+//! Graph algorithms: strongly connected components and topological order.
 //!
-//! In: a graph, by its edges. Out: its components. It does not know what the vertices are.
+//! In: a graph, given by its edges. Out: components, or vertices in an order of evaluation. It does not know the
+//! meaning of the vertices.
 
-/// The strongly connected components of the vertices 0..n, each after all that its edges lead to; the `k`-th edge of `v`
-/// leads to `edge(v, k)`, up to the first that is none (Tarjan, without recursion).
+/// The strongly connected components of the vertices 0..n. A component comes after all components that its edges lead
+/// to. `edge(v, k)`: the target of the `k`-th edge of `v`, `None` after the last edge.
+///
+/// Source: Tarjan, *Depth-first search and linear graph algorithms*, 1972; here without recursion.
 pub fn components(n: usize, edge: impl Fn(usize, usize) -> Option<usize>) -> Vec<Vec<usize>> {
     const NONE: u32 = u32::MAX;
     let (mut number, mut low, mut on_stack) = (vec![NONE; n], vec![0u32; n], vec![false; n]);
@@ -48,8 +51,9 @@ pub fn components(n: usize, edge: impl Fn(usize, usize) -> Option<usize>) -> Vec
     out
 }
 
-/// What roots need, each behind its operands and once, each root's own in one piece; `index` tells nodes apart, of which there
-/// are `count`, what `is_read` stands nowhere, and `operands` come in the order in which they are wanted.
+/// Depth-first postorder of a directed acyclic graph: every node that the roots need, once and after its operands. The
+/// nodes that only one root needs are contiguous. `index`: a number for each node, below `count`. `is_read`: nodes to
+/// leave out, with what only they need. `operands`: the operands of a node, in the order of evaluation.
 pub fn topological_order<N: Copy>(
     roots: &[N],
     count: usize,
@@ -71,7 +75,7 @@ pub fn topological_order<N: Copy>(
                 continue;
             }
             open.push((node, true));
-            // The last pushed is done first.
+            // The stack is last in, first out, so the operands are pushed in reverse.
             open.extend(operands(node).into_iter().rev().map(|operand| (operand, false)));
         }
     }
@@ -83,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn circles_are_found_and_what_is_needed_comes_first() {
+    fn cycles_are_found_and_dependencies_come_first() {
         // 0 needs 1 and 4; 1, 2 and 3 need each other; 4 needs itself.
         let edges: [&[usize]; 5] = [&[1, 4], &[2], &[3, 2], &[1], &[4]];
         let found = components(5, |v, k| edges[v].get(k).copied());

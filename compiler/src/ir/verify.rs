@@ -1,20 +1,24 @@
-//! Checks what every pass and back end relies on: operands before users, types, slots, stores, tables.
+//! Verifier: checks the properties that every pass and back end relies on.
 //!
-//! In: a function and the block it works on. Out: the first fault, in words.
+//! In: a function and the block it works on. Out: the first fault, as a message. It checks that operands precede their
+//! users, types, slots, stores, rings and tables.
 
 use super::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
 
-/// Where a function stands among the passes.
+/// How far a function has been lowered.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Stage {
-    /// Elementary functions may stand in it.
+    /// It may contain elementary functions.
     Lowered,
-    /// Arithmetic only: what back ends take.
+    /// It contains arithmetic only, as back ends require.
     Expanded,
 }
 
-/// Checks `func` against the block it works on and the length of its pool of constants.
+/// Checks a function. `layout`: the block it works on. `pool_len`: the length of its pool of constants.
+///
+/// # Errors
+/// A message that describes the first fault.
 pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Result<(), String> {
     let fault = |what: String| Err(format!("{}: {what}", func.name));
     let types = match types(func) {
@@ -88,25 +92,28 @@ pub fn verify(func: &Func, layout: &Layout, pool_len: usize, stage: Stage) -> Re
     }
 }
 
-/// Whether a function of the model may write the slot: not the step, parameters, inputs, nor what is due.
+/// Whether a function may write the slot. The step length, parameters, inputs and due flags are read-only.
 fn storable(slot: Slot, layout: &Layout) -> bool {
     slot.index() < layout.size()
         && slot != Slot::STEP
         && ![layout.params, layout.inputs, layout.due].iter().any(|segment| segment.contains(slot))
 }
 
-/// The type of every value; fails where an operand does not stand before its user or has the wrong type.
+/// The type of every value.
+///
+/// # Errors
+/// A message, if an operand does not precede its user or has the wrong type.
 pub fn types(func: &Func) -> Result<Vec<Type>, String> {
     let mut types: Vec<Type> = Vec::with_capacity(func.ops.len());
     for (i, &op) in func.ops.iter().enumerate() {
         let value = Value(i as u32);
-        let mut late = None;
+        let mut undefined = None;
         op.each_operand(|operand| {
             if operand.index() >= i {
-                late = Some(operand);
+                undefined = Some(operand);
             }
         });
-        if let Some(operand) = late {
+        if let Some(operand) = undefined {
             return Err(format!("{value} uses {operand}, which does not stand before it"));
         }
         types.push(result(op, |operand| types[operand.index()]).map_err(|what| format!("{value} {what}"))?);
@@ -114,7 +121,10 @@ pub fn types(func: &Func) -> Result<Vec<Type>, String> {
     Ok(types)
 }
 
-/// The type of the result of an operation whose operands have these types.
+/// The type of an operation's result. `of`: the types of its operands.
+///
+/// # Errors
+/// A message, if an operand has the wrong type.
 pub fn result(op: Op, of: impl Fn(Value) -> Type) -> Result<Type, String> {
     use Type::{Bool, Int, Real};
     let (operands, result): (&[Type], Type) = match op {
@@ -181,13 +191,13 @@ mod tests {
     }
 
     #[test]
-    fn operands_stand_before_their_users() {
+    fn operands_precede_their_users() {
         check(&[Op::Neg(Value(0))], &[], None, "f: v0 uses v0, which does not stand before it");
         check(&[Op::Neg(Value(7))], &[], None, "f: v0 uses v7, which does not stand before it");
     }
 
     #[test]
-    fn types_fit() {
+    fn operand_types_are_checked() {
         check(&[Op::Bool(true), Op::Neg(Value(0))], &[], None, "f: v1 needs Real, v0 is Bool");
         check(
             &[Op::Bool(true), Op::Int(1), Op::Real(0), Op::Select(Value(0), Value(1), Value(2))],
@@ -200,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn slots_and_tables_lie_inside() {
+    fn accesses_stay_within_block_and_pool() {
         check(&[Op::Load(Slot(6))], &[], None, "f: v0 loads slot 6 of a block of 6");
         check(
             &[Op::Int(0), Op::Pool { base: 4, len: 5, index: Value(0) }],
@@ -218,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn stores_go_where_a_model_may_write_and_once() {
+    fn stores_are_unique_and_hit_writable_slots() {
         for slot in [1, 3, 5, 6] {
             check(
                 &[Op::Real(0)],
@@ -232,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn back_ends_take_arithmetic_only() {
+    fn elementary_functions_must_be_expanded() {
         let exp = [Op::Real(0), Op::Unary(crate::ir::Unary::Exp, Value(0))];
         check(&exp, &[], None, "f: v1 is an elementary function that nothing has expanded");
     }
