@@ -1,4 +1,4 @@
-//! How far the elementary functions are from the correctly rounded result, measured; and their edges.
+//! Measures the distance of the elementary functions from the correctly rounded result, and checks their special cases.
 
 use super::two_to;
 use super::{POOL, expand};
@@ -36,7 +36,7 @@ fn of_two(function: Binary) -> Code {
     code(|b, x, y| b.binary(function, x, y))
 }
 
-/// Number of doubles from one to the other; 0 if both are NaN.
+/// Number of doubles between the two; 0 if both are NaN.
 fn distance(a: f64, b: f64) -> u64 {
     let place =
         |x: f64| if x.is_sign_negative() { -((x.to_bits() & (i64::MAX as u64)) as i64) } else { x.to_bits() as i64 };
@@ -49,13 +49,13 @@ fn distance(a: f64, b: f64) -> u64 {
     }
 }
 
-/// Samples a range: each argument.
+/// A distribution of arguments.
 enum Range {
-    /// Uniform between the two.
+    /// Uniform between the two bounds.
     Within(f64, f64),
-    /// Of either sign, exponent uniform between the two powers of two.
+    /// Random sign; exponent uniform between the two exponents of 2.
     Powers(i32, i32),
-    /// Any bits.
+    /// Arbitrary bits.
     Any,
 }
 
@@ -81,8 +81,9 @@ impl Range {
     }
 }
 
-/// Prints a line of the table and checks the largest distance from the correctly rounded result. `FRIC_SAMPLES`
-/// sets the number of samples; `FRIC_WORST` prints the arguments of every miss.
+/// Prints a line of the table and checks the largest distance from the correctly rounded result. The environment
+/// variable `FRIC_SAMPLES` sets the number of samples; `FRIC_WORST` prints the arguments of every result that is not
+/// correctly rounded.
 #[track_caller]
 fn check(name: &str, code: &Code, exact: impl Fn(f64, f64) -> f64, ranges: &[(Range, Range)], most: u64) {
     let samples = std::env::var("FRIC_SAMPLES").ok().and_then(|n| n.parse().ok()).unwrap_or(30_000);
@@ -182,9 +183,9 @@ fn accuracy_of_functions_of_two_arguments() {
     check("hypot", &of_two(Binary::Hypot), m::hypot, &plane(), 1);
 }
 
-/// The same value at every edge, sign of zero included; for pow, atan2 and hypot at every pair.
+/// Results at edge cases agree, including the sign of zero; for pow, atan2 and hypot at every pair.
 #[test]
-fn edges_are_those_of_ieee_754() {
+fn special_cases_are_those_of_ieee_754() {
     use core_math as m;
     let edges = [
         0.0,
@@ -233,7 +234,7 @@ fn edges_are_those_of_ieee_754() {
         let code = of_one(function);
         let periodic = matches!(function, Unary::Sin | Unary::Cos | Unary::Tan);
         for &x in &edges {
-            // Beyond 2^40 sin and cos only promise to stay within ±1.
+            // Beyond 2^40, sin and cos only guarantee results within ±1.
             if periodic && x.is_finite() && x.abs() > 1e12 {
                 assert!(run(&code, x, 0.0).abs() <= 1.0);
             } else {
@@ -252,9 +253,9 @@ fn edges_are_those_of_ieee_754() {
     }
 }
 
-/// A base that is known to have no sign gives the same bits in fewer operations, and so does an exponent of e.
+/// The variants for a known sign of the argument (pow with base ≥ 0, exp with argument ≤ 0) have the same bits.
 #[test]
-fn what_is_known_of_an_argument_changes_no_bit() {
+fn variants_for_a_known_sign_change_no_bit() {
     let (any, of_size) = (
         of_two(Binary::Pow),
         code(|b, x, y| {
@@ -283,7 +284,7 @@ fn what_is_known_of_an_argument_changes_no_bit() {
     }
 }
 
-/// Odd functions are odd to the last bit, even ones even: friction does not prefer a direction.
+/// Odd functions are odd to the bit, and even ones are even, so that friction has no preferred direction.
 #[test]
 fn symmetry_is_exact() {
     let mut random = Random(77);
@@ -305,7 +306,7 @@ fn symmetry_is_exact() {
     }
 }
 
-/// The tables are what they say, as far as functions that are correctly rounded can tell.
+/// The tables agree with correctly rounded functions where such functions exist.
 #[test]
 fn tables_hold_the_rounded_values() {
     for (i, entry) in POOL.iter().enumerate().take(64) {

@@ -1,7 +1,9 @@
-//! log, log1p, pow.
+//! log, log1p and pow.
 //!
-//! One reduction for all: x = 2^k z with z in [0.689, 1.379), z/c = 1 + r with 1/c from a table of 128 numbers of few
-//! bits, so that r is exact near 1, and log x = k ln2 + log c + log(1 + r).
+//! All use one argument reduction: x = 2^k z with z in [0.689, 1.379), and z/c = 1 + r, where 1/c comes from a table of
+//! 128 numbers with few bits. So r is exact near 1, and log x = k ln2 + log c + log(1 + r).
+//!
+//! Source: Tang, *Table-driven implementation of the logarithm function in IEEE floating-point arithmetic*, 1990.
 
 use super::exponential::Parts;
 use super::two_to;
@@ -27,12 +29,12 @@ const LOG_LONG: [f64; 7] = [
     -0.12500643829837513,
     0.11111850754499299,
 ];
-/// ln2: a multiple of 2^-42, so that k times it is exact; and the rest.
+/// ln2 in two parts. The first is a multiple of 2^-42, so that its product with k is exact.
 const LN2: (f64, f64) = (0.6931471805598903, 5.497923018708371e-14);
-/// Bits of the lower end of the first cell: 1 lies in the middle of one.
+/// The bits of the lower end of the first table interval. 1 is in the middle of an interval.
 const FIRST: i64 = 0x3fe6_1000_0000_0000;
 
-/// x = 2^k z; log c = high + low.
+/// x = 2^k z, `inverse` = 1/c, and log c = high + low.
 struct Reduced<'a> {
     k: Int<'a>,
     z: Real<'a>,
@@ -42,7 +44,7 @@ struct Reduced<'a> {
 }
 
 impl<'a> Reduced<'a> {
-    /// Of x, normal and positive; of anything else, some numbers.
+    /// Reduces a normal, positive x. For other arguments the fields are arbitrary.
     fn of(x: Real<'a>) -> Reduced<'a> {
         let bits = x.bits();
         let place = bits - FIRST;
@@ -58,13 +60,13 @@ impl<'a> Reduced<'a> {
     }
 }
 
-/// A subnormal x times 2^52, and what that adds to k.
+/// Multiplies a subnormal x by 2^52; also returns the resulting correction of k, −52 or 0.
 fn normal<'a>(x: Real<'a>) -> (Real<'a>, Real<'a>) {
     let subnormal: Truth = x.below(f64::MIN_POSITIVE);
     (subnormal.choose(x * two_to(52), x), subnormal.choose(-52.0, 0.0))
 }
 
-/// k ln2 + log c + log(1 + r), from r that lacks `r_low`.
+/// k ln2 + log c + log(1 + r).
 fn sum<'a>(k: Real<'a>, reduced: &Reduced<'a>, r: Real<'a>) -> Real<'a> {
     let whole = k.fma(LN2.0, reduced.high);
     let high = whole + r;
@@ -72,7 +74,7 @@ fn sum<'a>(k: Real<'a>, reduced: &Reduced<'a>, r: Real<'a>) -> Real<'a> {
     high + (r * r).fma(polynomial(r, &LOG), low)
 }
 
-/// Within 0.52 ulp.
+/// log x, within 0.52 ulp.
 pub fn log(x: Real) -> Real {
     let (scaled, more) = normal(x);
     let reduced = Reduced::of(scaled);
@@ -82,11 +84,11 @@ pub fn log(x: Real) -> Real {
     (x.above(0.0) & x.below(f64::INFINITY)).choose(value, edge)
 }
 
-/// log(1 + x): what 1 + x loses is added to r. Within 1.2 ulp.
+/// log(1 + x), within 1.2 ulp. The rounding error of 1 + x is added to r.
 pub fn log1p(x: Real) -> Real {
     let (one, lost) = two_sum(x.constant(1.0), x);
     let reduced = Reduced::of(one);
-    // For k > 1022 nothing is lost.
+    // If k > 1022, the rounding error of 1 + x is 0.
     let unscale = reduced.k.below(1023).choose_int((1023 - reduced.k) << 52, 0).real_of_bits();
     let r = (lost * unscale).fma(reduced.inverse, reduced.z.fma(reduced.inverse, -1.0));
     let value = sum(reduced.k.real(), &reduced, r);
@@ -95,10 +97,10 @@ pub fn log1p(x: Real) -> Real {
     x.abs().below(two_to(-54)).choose(x, inside)
 }
 
-/// e^(y log x), the logarithm with 68 bits: within 0.52 ulp, and as IEEE 754 defines it at the edges.
+/// x^y = e^(y log x), within 0.52 ulp, with the special cases of IEEE 754. The logarithm has 68 bits.
 pub fn pow<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     let magnitude = pow_of_size(x.abs(), y);
-    // Below zero y must be whole; an odd y keeps the sign. Infinities are even.
+    // A negative base needs an integer y, and an odd y keeps the sign. Infinite y count as even.
     let whole = y.floor().is(y);
     let half = 0.5 * y;
     let odd = whole & !half.floor().is(half);
@@ -108,26 +110,26 @@ pub fn pow<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     x.above(0.0).choose(magnitude, any)
 }
 
-/// The same bits of an x without a sign, or NaN.
+/// The same bits as [`pow`], for an x that has no negative sign or is NaN.
 pub fn pow_of_size<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
-    let times = y.abs();
+    let exponent = y.abs();
     let plain = y.is(1.0);
-    let usual = x.above(0.0) & x.below(f64::INFINITY) & times.above(0.0) & times.below(f64::INFINITY) & !plain;
-    // x^1 = x, x^0 = 1 and 1^y = 1, of NaN too. Else x is 0 or infinite, or y is.
+    let usual = x.above(0.0) & x.below(f64::INFINITY) & exponent.above(0.0) & exponent.below(f64::INFINITY) & !plain;
+    // x^1 = x; x^0 = 1 and 1^y = 1, also for NaN. In the remaining cases x is 0 or infinite, or y is infinite.
     let one = x.is(1.0) | y.is(0.0);
     let number = x.is(x) & y.is(y);
     let falls = y.below(0.0);
-    let grows = x.above(1.0).choose(falls.choose(0.0, f64::INFINITY), falls.choose(f64::INFINITY, 0.0));
-    usual.choose(power(x, y), plain.choose(x, one.choose(1.0, number.choose(grows, f64::NAN))))
+    let limit = x.above(1.0).choose(falls.choose(0.0, f64::INFINITY), falls.choose(f64::INFINITY, 0.0));
+    usual.choose(power(x, y), plain.choose(x, one.choose(1.0, number.choose(limit, f64::NAN))))
 }
 
-/// x^y of an x above 0, both finite.
+/// x^y for x > 0, both finite.
 fn power<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     let (scaled, more) = normal(x);
     let reduced = Reduced::of(scaled);
     let k = reduced.k.real() + more;
     let r = reduced.z.fma(reduced.inverse, -1.0);
-    // Largest first: k ln2 + log c, r, −r²/2 as high and low part, then all that is small.
+    // The terms in order of size: k ln2 + log c, r, −r²/2 as high and low part, then all small terms.
     let whole = k.fma(LN2.0, reduced.high);
     let first = whole + r;
     let first_low = whole - first + r;

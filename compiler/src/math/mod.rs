@@ -1,10 +1,13 @@
-//! Elementary functions as arithmetic of the IR: so every back end and machine gives the same bits, and functions
-//! inline, fold and vectorise like any other code.
+//! Elementary functions, expanded to arithmetic of the IR. Every back end and every machine thus computes the same
+//! bits, and the functions inline, fold and vectorise like other code.
 //!
-//! In: a function with elementary operations. Out: the same with additions, products, fused products, table reads
-//! and selects only. Each algorithm is free of branches and right at 0, −0, inf, NaN, subnormals and overflow; no
-//! payload of a NaN becomes a number or a choice that matters. Polynomials are minimax fits, evaluated in pairs
-//! (Estrin), which is shorter in latency than Horner's chain. Coefficients and tables were computed with 60 digits.
+//! In: a function with elementary operations. Out: the same function with additions, products, fused products, table
+//! reads and selects only. Each algorithm is branch-free and correct at 0, −0, ∞, NaN, subnormals and overflow. The
+//! payload of a NaN never influences a number or a relevant condition. Polynomials are minimax fits, evaluated by
+//! Estrin's scheme, which has a shorter latency than Horner's. Coefficients and tables were computed with 60 digits.
+//!
+//! Sources: Muller, *Elementary Functions*, 3rd ed. 2016; Tang, *Table-driven implementation of the exponential
+//! function*, 1989, and *… of the logarithm function*, 1990.
 
 pub mod tables;
 pub mod exponential;
@@ -19,18 +22,18 @@ use crate::ir::expr::{Real, Shared};
 use crate::ir::{Binary, Func, Op, Unary, Value, is_not_negative, is_not_positive};
 pub use tables::POOL;
 
-/// The tables of the elementary functions: the beginning of every pool.
+/// The tables of the elementary functions. Every pool begins with them.
 pub fn pool() -> &'static [f64] {
     &POOL
 }
 
-/// 2^n for −1022 ≤ n ≤ 1023, exact.
+/// 2^n, exact, for −1022 ≤ n ≤ 1023.
 const fn two_to(n: i32) -> f64 {
     assert!(n >= -1022 && n <= 1023);
     f64::from_bits(((n + 1023) as u64) << 52)
 }
 
-/// Replaces elementary functions by arithmetic. The pool that the result runs with begins with [`POOL`].
+/// Replaces elementary functions by arithmetic. The result must run with a pool that begins with [`POOL`].
 pub fn expand(func: &Func) -> Func {
     expand_by(func, &|function, x, below| {
         Some(match function {
@@ -40,8 +43,8 @@ pub fn expand(func: &Func) -> Func {
     })
 }
 
-/// The same bits for lanes, of which many go side by side: in the fewest operations. `kept` are functions that a back end has
-/// instructions for: those must give the same bits.
+/// Like [`expand`], with the same bits, but with the fewest operations: many lanes run side by side, so throughput
+/// matters more than latency. `kept`: functions that the back end computes itself; it must compute the same bits.
 pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
     expand_by(func, &|function, x, below| match function {
         function if kept.contains(&function) => None,
@@ -50,8 +53,8 @@ pub fn expand_for_lanes(func: &Func, kept: &[Unary]) -> Func {
     })
 }
 
-/// Replaces functions of one argument by what `by` makes of them, if it does; it is told whether the argument is known not
-/// to be above 0.
+/// Replaces each function of one argument by the result of `by`; `None` keeps the function. The last argument of `by`:
+/// whether the argument is known to be at most 0, or NaN.
 fn expand_by(func: &Func, by: &dyn for<'a> Fn(Unary, Real<'a>, bool) -> Option<Real<'a>>) -> Func {
     let build = Shared::new(Build::new(&func.name).with_pool(POOL.as_slice().into()));
     let mut values: Vec<Value> = Vec::with_capacity(func.ops.len());
@@ -100,7 +103,7 @@ fn binary<'a>(function: Binary, x: Real<'a>, y: Real<'a>) -> Real<'a> {
     }
 }
 
-/// c0 + c1 x + c2 x² + …, in pairs.
+/// c0 + c1 x + c2 x² + …, by Estrin's scheme.
 fn polynomial<'a>(x: Real<'a>, coefficients: &[f64]) -> Real<'a> {
     let pair = |pair: &[f64]| match *pair {
         [c0, c1] => x.fma(c1, c0),
@@ -121,8 +124,8 @@ fn polynomial<'a>(x: Real<'a>, coefficients: &[f64]) -> Real<'a> {
     terms[0]
 }
 
-/// √(x² + y²): scaled against overflow and underflow, the sum of squares as high and low part, the root corrected
-/// by one Newton step.
+/// √(x² + y²). The operands are scaled against overflow and underflow, the sum of squares has a high and a low part,
+/// and one Newton step corrects the root.
 fn hypot<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     let (x, y) = (x.abs(), y.abs());
     let less = y.below(x);
@@ -141,7 +144,8 @@ fn hypot<'a>(x: Real<'a>, y: Real<'a>) -> Real<'a> {
     (x.is(f64::INFINITY) | y.is(f64::INFINITY)).choose(f64::INFINITY, root * back)
 }
 
-/// a + b = sum + rest exactly, for any sizes.
+/// Returns sum and rest with a + b = sum + rest exactly, for operands of any size. Source: Knuth, *The Art of Computer
+/// Programming 2*, 4.2.2 (2Sum).
 fn two_sum<'a>(a: Real<'a>, b: Real<'a>) -> (Real<'a>, Real<'a>) {
     let sum = a + b;
     let of_b = sum - a;

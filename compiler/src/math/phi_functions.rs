@@ -1,4 +1,9 @@
-//! What an exponential makes of a state that relaxes: φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² of q ≤ 0.
+//! The φ-functions of exponential integrators: φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q², for q ≤ 0.
+//!
+//! In: the product q of step length and rate constant of a relaxing state. Out: both functions, before elementary
+//! functions are expanded.
+//!
+//! Source: Hochbruck, Ostermann, *Exponential integrators*, Acta Numerica 2010, sec. 2.1.
 
 use super::polynomial;
 use crate::ir::Unary;
@@ -19,9 +24,10 @@ const NEAR: [f64; 11] = [
     1.7245982496880484e-09,
 ];
 
-/// φ(q) and φ2(q) for q ≤ 0, before elementary functions are expanded; NaN gives NaN. Within 2 ulp, and 8 ulp.
+/// φ(q) within 2 ulp and φ2(q) within 8 ulp, for q ≤ 0. NaN gives NaN.
 pub fn phis(q: Real) -> [Real; 2] {
-    // Near 0 the exponential comes out of the series, elsewhere φ and φ2 out of the exponential, which there is far from 1.
+    // Near 0, φ comes from the series of φ2. Elsewhere both come from the exponential, which is then far from 1, so
+    // that the differences do not cancel.
     let near = q.above(-0.5);
     let series = polynomial(q, &NEAR);
     let phi = (q.of(Unary::Exp) - 1.0) / q;
@@ -60,7 +66,7 @@ mod tests {
             let [phi, phi2] = at(q);
             let exact = core_math::expm1(q) / q;
             assert!((phi - exact).abs() <= 4.0 * f64::EPSILON * exact, "φ({q}) = {phi} and not {exact}");
-            // By its series, of which enough terms are taken.
+            // The Taylor series, with enough terms.
             let mut series = 0.0;
             for n in (2..40).rev() {
                 series = (1.0 + series * q) / f64::from(n);

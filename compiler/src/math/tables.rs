@@ -1,32 +1,33 @@
-//! The tables of the elementary functions: the beginning of every pool.
+//! The tables of the elementary functions. Every pool of constants begins with them.
 
-/// 2^(i/64) for i < 64, its bits less i · 2^46, so that adding k · 2^46 for k = 64 e + i gives 2^(k/64).
+/// 2^(i/64) for i < 64. i · 2^46 is subtracted from the bits, so that adding k · 2^46 with k = 64 e + i gives 2^(k/64).
 pub const EXP_SCALE: u32 = 0;
-/// What 2^(i/64) is more than its rounded value, relative.
+/// The relative rounding error of 2^(i/64).
 pub const EXP_TAIL: u32 = 64;
-/// Number of entries of each.
+/// Number of entries in each table for the exponential.
 pub const EXP_LEN: u32 = 64;
-/// For each of 128 cells of [0.689, 1.379): a reciprocal 1/c of few bits, exactly 1 around 1.
+/// For each of 128 intervals of [0.689, 1.379): a reciprocal 1/c with few bits, exactly 1 around 1.
 pub const LOG_INVERSE: u32 = 128;
-/// log c, a multiple of 2^-42.
+/// log c, rounded to a multiple of 2^-42.
 pub const LOG_HIGH: u32 = 256;
-/// What log c is more than that.
+/// The rounding error of log c.
 pub const LOG_LOW: u32 = 384;
-/// Number of entries of each.
+/// Number of entries in each table for the logarithm.
 pub const LOG_LEN: u32 = 128;
-/// For each of 32 ranges of atan a and b, with c = b/a amid it: four for each doubling from 1/16 to 16, but below the second it
-/// is 0, and above the last but one inf. Numbered by the exponents of reals: the first range has number 12, 0 follows on 31.
+/// For each of 32 ranges: a, where c = b/a is in the middle of the range. There are four ranges per octave from 1/16 to
+/// 16; in the first range c is 0, and in the last it is ∞. The index consists of the low bits of the exponent and the
+/// first bits of the mantissa: the first range has index 12, and 0 follows 31.
 pub const ATAN_A: u32 = 512;
-/// See [`ATAN_A`].
+/// b, see [`ATAN_A`].
 pub const ATAN_B: u32 = 544;
 /// atan c, rounded.
 pub const ATAN_HIGH: u32 = 576;
-/// What atan c is more than that.
+/// The rounding error of atan c.
 pub const ATAN_LOW: u32 = 608;
-/// Number of entries of each.
+/// Number of entries in each table for the arctangent.
 pub const ATAN_LEN: u32 = 32;
 
-/// The numbers, computed with 60 digits and rounded.
+/// All tables, computed with 60 digits and rounded.
 #[allow(clippy::approx_constant)]
 #[rustfmt::skip]
 pub static POOL: [f64; 640] = [
@@ -47,7 +48,7 @@ pub static POOL: [f64; 640] = [
     0.9718760801866497, 0.9736257462632606, 0.9754795375015536, 0.9774385877501994,
     0.9795040432046712, 0.9816770625416927, 0.98395881705515, 0.9863504907934828,
     0.9888532806985737, 0.9914683967461472, 0.9941970620877001, 0.9970405131939755,
-    // tails of 2^(i/64)
+    // rounding errors of 2^(i/64)
     0.0, -1.507066976926039e-17, 4.9997448722726326e-17, 7.357846871247418e-18,
     8.189317638195515e-17, 1.6665881442326747e-18, -7.402825309426177e-17, -6.170654745608695e-17,
     -2.7939114859515733e-17, 4.776959425256223e-17, 9.341710609905046e-17, 4.585670326662351e-17,
@@ -114,7 +115,7 @@ pub static POOL: [f64; 640] = [
     0.25187261975497677, 0.26197371574153294, 0.2670627852489815, 0.2721778859158803,
     0.27731928541629713, 0.28248725557477883, 0.28768207245184385, 0.29290401643288533,
     0.3034304294199046, 0.30873548164959175, 0.3140688276250785, 0.3194307707663029,
-    // tails of log c
+    // rounding errors of log c
     -1.0849569622967912e-13, -3.6708569716349383e-16, -2.6842260285856373e-14, -6.654491643324795e-14,
     -1.077574303757264e-13, 8.82452633212564e-14, 7.925157831386559e-14, 1.1118671389559323e-13,
     1.0475750058776541e-13, 1.7625431312172662e-14, -1.1211800740360982e-13, -1.0033796982039214e-13,
@@ -174,7 +175,7 @@ pub static POOL: [f64; 640] = [
     0.2687293355778861, 0.31617385846595414, 0.3707027696330689, 0.43271737308386593,
     0.501943053643421, 0.576649776147467, 0.658333148384756, 0.7426543564509179,
     0.8283623618773753, 0.9124779468411415, 0.9934379102387927, 1.069351601299526,
-    // tails of atan c
+    // rounding errors of atan c
     -9.706016138230991e-17, -7.085316039427243e-17, -4.143848431205914e-17, -1.0860972168790675e-16,
     8.128955450391763e-17, 5.1364135039443334e-17, 3.538523188732227e-17, 8.733707009023821e-17,
     6.832912875567632e-17, 3.310625444116637e-17, -5.764489521839267e-17, 6.123233995736766e-17,

@@ -1,4 +1,7 @@
 //! sin, cos, tan, and their inverses.
+//!
+//! Sine and cosine reduce the argument to ±π/4 with π/2 in three parts (Cody, Waite, *Software Manual for the
+//! Elementary Functions*, 1980). The arctangent uses a table and the difference formula.
 
 use super::exponential::ROUND;
 use super::two_to;
@@ -43,10 +46,10 @@ const ASIN: [f64; 12] = [
 ];
 /// π/2 in three parts.
 const HALF_PI: [f64; 3] = [std::f64::consts::FRAC_PI_2, 6.123233995736766e-17, -1.4973849048591698e-33];
-/// Up to here the reduction is exact to 2^-110; beyond, sin is 0 and cos is 1.
+/// Up to this argument the reduction is exact to 2^-110. Beyond it, sin returns 0 and cos returns 1.
 const LIMIT: f64 = 1099511627776.0;
 
-/// Sine and cosine of r in ±π/4 with x = q π/2 + r.
+/// Sine and cosine of r in ±π/4, where x = q π/2 + r. `quarters`: q, in the low bits.
 struct Reduced<'a> {
     quarters: Int<'a>,
     sin: Real<'a>,
@@ -57,7 +60,7 @@ impl<'a> Reduced<'a> {
     fn of(x: Real<'a>) -> Reduced<'a> {
         let rounded = x.fma(std::f64::consts::FRAC_2_PI, ROUND);
         let (k, quarters) = (rounded - ROUND, rounded.bits());
-        // Exact: k · π/2 is a multiple of 2^-52 and so is what it leaves, which is less than 1.
+        // Exact: k · `HALF_PI[0]` is a multiple of 2^-52 and so is the difference, which is less than 1.
         let first = k.fma(-HALF_PI[0], x);
         let product = k * HALF_PI[1];
         let product_low = k.fma(HALF_PI[1], -product);
@@ -71,13 +74,13 @@ impl<'a> Reduced<'a> {
         Reduced { quarters, sin, cos }
     }
 
-    /// Whether an odd number of quarters.
+    /// Whether the number of quarter turns is odd.
     fn odd(&self) -> crate::ir::expr::Truth<'a> {
         (self.quarters & 1).is(1)
     }
 }
 
-/// Within 0.8 ulp up to 1e12; beyond, 0.
+/// sin x, within 0.8 ulp up to 1e12; 0 beyond.
 pub fn sin(x: Real) -> Real {
     let reduced = Reduced::of(x);
     let size = reduced.odd().choose(reduced.cos, reduced.sin);
@@ -87,7 +90,7 @@ pub fn sin(x: Real) -> Real {
     x.abs().below(LIMIT).choose(near, 0.0 * x)
 }
 
-/// Within 0.8 ulp up to 1e12; beyond, 1.
+/// cos x, within 0.8 ulp up to 1e12; 1 beyond.
 pub fn cos(x: Real) -> Real {
     let reduced = Reduced::of(x);
     let size = reduced.odd().choose(reduced.sin, reduced.cos);
@@ -95,7 +98,7 @@ pub fn cos(x: Real) -> Real {
     x.abs().below(LIMIT).choose(value, 0.0 * x + 1.0)
 }
 
-/// sin/cos, or −cos/sin in odd quarters. Within 2 ulp up to 1e12; beyond, 0.
+/// tan x = sin/cos, or −cos/sin in odd quarters. Within 2 ulp up to 1e12; 0 beyond.
 pub fn tan(x: Real) -> Real {
     let reduced = Reduced::of(x);
     let odd = reduced.odd();
@@ -104,7 +107,7 @@ pub fn tan(x: Real) -> Real {
     x.abs().below(LIMIT).choose(near, 0.0 * x)
 }
 
-/// asin s − s, in s + s z R(z) with z = s²; of |x| > 1/2 through s = √((1 − |x|)/2).
+/// Returns s and asin s − s = s z R(z) with z = s². s = |x| for |x| < 1/2, otherwise s = √((1 − |x|)/2).
 fn asin_parts<'a>(x: Real<'a>) -> (Real<'a>, Real<'a>) {
     let a = x.abs();
     let near = a.below(0.5);
@@ -113,16 +116,16 @@ fn asin_parts<'a>(x: Real<'a>) -> (Real<'a>, Real<'a>) {
     (s, s * z * polynomial(z, &ASIN))
 }
 
-/// Within 2 ulp; of |x| > 1 it is NaN.
+/// asin x, within 2 ulp; NaN for |x| > 1.
 pub fn asin(x: Real) -> Real {
     let a = x.abs();
     let (s, more) = asin_parts(x);
-    // π/2 − 2 s is exact or nearly so: first it, then what is small.
+    // π/2 − 2 s is exact or nearly exact, so it is computed first and the small terms are added last.
     let far = (HALF_PI[0] - 2.0 * s) - (2.0 * more - HALF_PI[1]);
     a.below(0.5).choose(s + more, far).with_sign(x)
 }
 
-/// Within 1.2 ulp; of |x| > 1 it is NaN.
+/// acos x, within 1.2 ulp; NaN for |x| > 1.
 pub fn acos(x: Real) -> Real {
     let (s, more) = asin_parts(x);
     let (signed, signed_more) = (s.with_sign(x), x.below(0.0).choose(-more, more));
@@ -132,14 +135,14 @@ pub fn acos(x: Real) -> Real {
     x.abs().below(0.5).choose(near, far)
 }
 
-/// The range of 32 to which a number in [1/16, 16) belongs, by its bits.
+/// The index of the table range that contains a number in [1/16, 16), from its bits.
 fn atan_range(bits: Int) -> Int {
     bits.shift_right(50) & i64::from(tables::ATAN_LEN - 1)
 }
 
-/// atan(y/x) for y, x ≥ 0, neither both 0 nor both infinite, y below 2^1020: by c = b/a of a range that y/x lies in or, by a
-/// twelfth of an octave, beside, from the difference formula,
-/// atan(y/x) = atan c + atan t with t = (a y − b x)/(b y + a x), |t| ≤ 0.0789.
+/// atan(y/x) for y, x ≥ 0, not both 0, not both infinite, y below 2^1020. `range`: index of the range that contains
+/// y/x, or of a neighbour that is at most a twelfth of an octave away. With c = b/a from that range, the difference
+/// formula is atan(y/x) = atan c + atan t, where t = (a y − b x)/(b y + a x) and |t| ≤ 0.0789.
 fn atan_quotient<'a>(y: Real<'a>, x: Real<'a>, range: Int<'a>) -> Real<'a> {
     let entry = |base| range.entry(base, tables::ATAN_LEN);
     let (a, b) = (entry(tables::ATAN_A), entry(tables::ATAN_B));
@@ -148,32 +151,32 @@ fn atan_quotient<'a>(y: Real<'a>, x: Real<'a>, range: Int<'a>) -> Real<'a> {
     entry(tables::ATAN_HIGH) + (t + (t * z).fma(polynomial(z, &ATAN), entry(tables::ATAN_LOW)))
 }
 
-/// Within 0.9 ulp; ±π/2 at ±inf.
+/// atan x, within 0.9 ulp; ±π/2 at ±∞.
 pub fn atan(x: Real) -> Real {
-    // From 2^66 on it is π/2.
+    // From 2^66 on the result is π/2.
     let a = x.abs().at_most(two_to(66));
     let inside = a.at_least(1.0 / 16.0).at_most(16f64.next_down());
     atan_quotient(a, a.constant(1.0), atan_range(inside.bits())).with_sign(x)
 }
 
-/// The angle of the point (x, y), within 1.5 ulp and as IEEE 754 defines it at the edges.
+/// The angle of the point (x, y), within 1.5 ulp, with the special cases of IEEE 754.
 pub fn atan2<'a>(y: Real<'a>, x: Real<'a>) -> Real<'a> {
     let (ay, ax) = (y.abs(), x.abs());
-    // Infinite ones become 1, and what is finite beside them 0.
+    // An infinite coordinate becomes 1; a finite one next to it becomes 0.
     let (iy, ix) = (ay.is(f64::INFINITY), ax.is(f64::INFINITY));
     let (fy, fx) = (ix.choose(0.0, ay), iy.choose(0.0, ax));
     let (fy, fx) = (iy.choose(1.0, fy), ix.choose(1.0, fx));
-    // Both large: their sum would overflow. Both tiny: their products would lose bits.
+    // If one is large, the sum in `atan_quotient` would overflow. If both are tiny, its products would lose bits.
     let large = fy.above(two_to(1000)) | fx.above(two_to(1000));
     let tiny = fy.below(two_to(-900)) & fx.below(two_to(-900));
     let scale = large.choose(two_to(-6), tiny.choose(two_to(120), 1.0));
     let (fy, fx) = (fy * scale, fx * scale);
-    // The bits of sizes are nearly their logarithms, of which a doubling is 2^52.
+    // The bits of a positive number are nearly proportional to its logarithm; an octave is 2^52.
     let doublings = fy.bits() - fx.bits();
     let low = doublings.below(-4 << 52).choose_int(-4 << 52, doublings);
     let inside = low.below(4 << 52).choose_int(low, (4 << 52) - 1) + 1f64.to_bits() as i64;
     let quotient = fy.is(0.0).choose(0.0, atan_quotient(fy, fx, atan_range(inside)));
-    let left = x.bits().below(0);
-    let angle = left.choose(2.0 * HALF_PI[0] - (quotient - 2.0 * HALF_PI[1]), quotient);
+    let negative = x.bits().below(0);
+    let angle = negative.choose(2.0 * HALF_PI[0] - (quotient - 2.0 * HALF_PI[1]), quotient);
     (x.is(x) & y.is(y)).choose(angle.with_sign(y), f64::NAN)
 }
