@@ -1,9 +1,12 @@
-//! Derivatives of functions, as functions: forward along directions, before elementary functions are expanded.
+//! Automatic differentiation, forward mode, as a program transformation.
 //!
-//! In: a function and the slots along which to differentiate. Out: with its values, theirs. A direction that a value
-//! does not depend on is not there at all, so the sparsity of a Jacobian is found on the way and nothing is computed
-//! for its zeros. The derivative of abs, min, max, clamp and if is that of the branch taken; of sign and floor, of
-//! tables' indices and of whatever is an integer, it is 0.
+//! In: a function, before elementary functions are expanded, and the slots along which to differentiate. Out: its
+//! values and their derivatives, as operations. Gradients are sparse: a direction that a value does not depend on has
+//! no entry, so the sparsity of a Jacobian results from the transformation, and its zeros cost no operation. The
+//! derivative of abs, min, max, clamp and `if` is that of the selected branch. The derivative of sign, floor, integers
+//! and table indices is 0.
+//!
+//! Source: Griewank, Walther, *Evaluating Derivatives*, 2008, ch. 3 and 7.
 
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
@@ -12,16 +15,16 @@ use crate::ir::{Binary, Func, Op, Unary, Value};
 use abi::Slot;
 use std::collections::HashMap;
 
-/// The derivatives of a value along the directions it depends on, in their order.
+/// Sparse gradient: the derivatives of a value along the directions it depends on, ascending by direction.
 pub type Gradient = Vec<(u32, Value)>;
 
-/// Inlines `func` on `env`, as [`Build::inline`] does, and gives for each slot it stores the derivatives of what it
-/// stores along `directions`: direction k is the slot `directions[k]`, all others being constant.
+/// Inlines `func` on `env` as [`Build::inline`] does, and returns the gradient of each value that it stores. Direction
+/// k is the slot `directions[k]`; all other slots are constant.
 pub fn inline(build: &Shared, func: &Func, env: &mut Env, directions: &[Slot]) -> HashMap<Slot, Gradient> {
     inline_given(build, func, env, directions, &HashMap::new())
 }
 
-/// The same where some values of `func` are given, and constant.
+/// Like [`inline`], but the values of `func` in `given` are replaced and count as constant.
 pub fn inline_given(
     build: &Shared,
     func: &Func,
@@ -55,7 +58,8 @@ pub fn inline_given(
             &gradients[operands[k].index()]
         };
         gradients[i] = gradient(build, op, values[i], &of);
-        // A sum over a thousand parts has half a million entries on its way.
+        // Frees gradients that have no further use: on a sum over a thousand parts, they would have half a million
+        // entries.
         func.ops[i].each_operand(|operand| {
             if last[operand.index()] == i {
                 gradients[operand.index()] = Gradient::new();
@@ -70,7 +74,7 @@ pub fn inline_given(
     of_slots
 }
 
-/// For each operation the last one that uses its value; the number of operations for what is stored.
+/// For each operation, the index of the last operation that uses its value; the number of operations if it is stored.
 fn last_uses(func: &Func) -> Vec<usize> {
     let mut last = vec![0; func.ops.len()];
     for (i, op) in func.ops.iter().enumerate() {
@@ -82,8 +86,8 @@ fn last_uses(func: &Func) -> Vec<usize> {
     last
 }
 
-/// Which of what a function stores depends on which directions: (row, direction), where row r is the r-th of `rows`.
-/// None where there are more than `most`.
+/// The sparsity pattern of the Jacobian: pairs (row, direction), where row r is the stored slot `rows[r]`. `None` if
+/// there are more than `most` pairs.
 pub fn coupling(func: &Func, rows: &[Slot], directions: &[Slot], most: usize) -> Option<Vec<(u32, u32)>> {
     let direction: HashMap<Slot, u32> = directions.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
     let live = func.live();
@@ -119,7 +123,7 @@ pub fn coupling(func: &Func, rows: &[Slot], directions: &[Slot], most: usize) ->
     Some(entries)
 }
 
-/// What is in either of two ascending lists, ascending.
+/// Union of two ascending lists, ascending.
 fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
     let (mut i, mut j) = (0, 0);
     let mut out = Vec::with_capacity(a.len() + b.len());
@@ -134,8 +138,8 @@ fn union(a: &[u32], b: &[u32]) -> Vec<u32> {
     out
 }
 
-/// The function that writes ∂f/∂x and ∂f/∂t of dx/dt = f(t, x) into the segment `jacobian`: all entries, or those of the
-/// coupling where the model has one.
+/// The function that writes ∂f/∂x and ∂f/∂t of dx/dt = f(t, x) to the segment `jacobian`. It writes all entries of
+/// ∂f/∂x, or only those of the coupling if the model has one.
 pub fn jacobian(program: &Program) -> Func {
     let layout = &program.description.layout;
     let coupling = &program.description.coupling;
@@ -157,7 +161,7 @@ pub fn jacobian(program: &Program) -> Func {
         for j in columns.into_iter().chain([n]) {
             let entry = gradient.and_then(|gradient| entry(gradient, j as u32));
             let mut entry = entry.unwrap_or_else(|| build.real(0.0));
-            // What was before moves along time too.
+            // A delayed value depends on time too, with the slope of its samples.
             for (k, delay) in delays.iter().enumerate().filter(|_| j == n) {
                 if let Some(d) = gradient.and_then(|gradient| self::entry(gradient, (n + 1 + k) as u32)) {
                     let slope = build.load(delay.slope);
@@ -174,12 +178,12 @@ pub fn jacobian(program: &Program) -> Func {
     build.finish()
 }
 
-/// The derivative along one direction, if there is one.
+/// The derivative along one direction; `None` if it is 0.
 pub fn entry(gradient: &Gradient, direction: u32) -> Option<Value> {
     gradient.binary_search_by_key(&direction, |(k, _)| *k).ok().map(|at| gradient[at].1)
 }
 
-/// The derivatives of the result `y` of `op`, from those of its operands.
+/// The gradient of the result `y` of `op`. `of(k)`: the gradient of operand k.
 fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &'g Gradient) -> Gradient {
     let at = |value| Real::new(build, value);
     let y = at(y);
@@ -203,7 +207,7 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
                 (None, None) => return None,
             })
         }),
-        // 0 · x is 0 wherever x is a number.
+        // 0 · x is 0 for every finite x.
         Op::Mul(a, b) if [a, b].iter().any(|v| build.borrow().constant(*v) == Some(0.0)) => Gradient::new(),
         Op::Mul(a, b) => both(&|| at(b), &|| at(a)),
         Op::Div(_, b) => {
@@ -213,7 +217,7 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
         }
         Op::Neg(_) => of(0).iter().map(|(k, d)| (*k, (-at(*d)).value)).collect(),
         Op::Abs(a) => of(0).iter().map(|(k, d)| (*k, at(a).below(0.0).choose(-at(*d), at(*d)).value)).collect(),
-        // At 0 the slope is infinite: 0, so that nothing but numbers travels on.
+        // At 0 the slope is infinite; 0 is used instead, so that derivatives stay finite.
         Op::Sqrt(_) => chain(&|| y.above(0.0).choose(0.5 / y, 0.0)),
         Op::Fma(a, b, _) => {
             let product = both(&|| at(b), &|| at(a));
@@ -242,16 +246,16 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
         Op::Binary(function, a, b) => {
             let (a, b) = (at(a), at(b));
             match function {
-                // of y and x: (x dy − y dx)/(x² + y²)
+                // For operands y and x: (x dy − y dx)/(x² + y²)
                 Binary::Atan2 => both(&|| b / a.fma(a, b * b), &|| -(a / a.fma(a, b * b))),
-                // a^b: b a^b/a da + a^b log a db. For b = 1 the first is 1; at a = 0 it is else 0, also where it is
-                // infinite, and the second is 0: nothing but numbers travels on.
+                // d(a^b) = b a^b/a da + a^b log a db. The first factor is 1 for b = 1. At a = 0 it is otherwise 0, even
+                // where it would be infinite, and the second is 0, so that derivatives stay finite.
                 Binary::Pow => {
                     let log = || at(build.borrow_mut().unary(Unary::Log, a.value));
                     let slope = || b.is(1.0).choose(1.0, a.is(0.0).choose(0.0, b * (y / a)));
                     both(&slope, &|| a.above(0.0).choose(y * log(), 0.0))
                 }
-                // At the origin the direction is undefined: 0.
+                // The gradient is undefined at the origin; 0 is used.
                 Binary::Hypot => {
                     let share = |x: Real<'a>| y.above(0.0).choose(x / y, 0.0);
                     both(&|| share(a), &|| share(b))
@@ -273,7 +277,7 @@ fn gradient<'a, 'g>(build: &'a Shared, op: Op, y: Value, of: &dyn Fn(usize) -> &
     }
 }
 
-/// Each derivative times a factor, which is asked for only if there is one.
+/// Multiplies each derivative by a factor, which is only computed if there is a derivative.
 fn scale<'a>(build: &'a Shared, gradient: &Gradient, factor: &dyn Fn() -> Real<'a>) -> Gradient {
     if gradient.is_empty() {
         return Gradient::new();
@@ -290,7 +294,7 @@ fn sum(build: &Shared, a: Option<Value>, b: Option<Value>) -> Value {
     }
 }
 
-/// Joins two gradients direction by direction.
+/// Combines two gradients direction by direction.
 fn merge(a: &Gradient, b: &Gradient, mut join: impl FnMut(Option<Value>, Option<Value>) -> Option<Value>) -> Gradient {
     let (mut i, mut j) = (0, 0);
     let mut merged = Gradient::with_capacity(a.len().max(b.len()));
@@ -317,7 +321,7 @@ mod tests {
     use crate::math::{POOL, expand};
     use abi::{Description, Layout};
 
-    /// dx/dt = f(t, x) of n states, with its Jacobian.
+    /// The program dx/dt = f(t, x) with n states, and room for its Jacobian.
     fn program(n: u32, f: impl FnOnce(&mut Build, &Layout)) -> Program {
         let layout = Layout::new([0, 0, n, 0, 0, 0, n, 0, n * n + n, 0]);
         let mut build = Build::new("derivatives");
@@ -326,7 +330,7 @@ mod tests {
         Program { description, derivatives: build.finish(), ..Program::default() }
     }
 
-    /// Compares every entry with central differences at random points between the two bounds.
+    /// Compares every entry of the Jacobian with central differences, at random points between the bounds.
     #[track_caller]
     fn check(program: &Program, bounds: (f64, f64), tolerance: f64) {
         let layout = &program.description.layout;
@@ -423,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_depend_costs_nothing() {
+    fn zero_derivatives_cost_no_operation() {
         let program = program(2, |b, layout| {
             let (x, v) = (b.load(layout.states.slot(0)), b.load(layout.states.slot(1)));
             let sign = b.sign(x);

@@ -1,8 +1,9 @@
-//! What it takes to give an input of a part another value at once: an impulse of the force that the part exerts.
+//! Impulses: the momentum transfer that gives the input of a part a new value at once.
 //!
-//! In: the input and the rates as functions, of the states and of that force. Out: a function that moves the states. A
-//! contact that comes to rest within a fixed step stops the mass it acts on this way, whatever its inertia. Two free
-//! masses get opposite impulses, so that what they conserve stays. Knows no text.
+//! In: the input and the rates, as functions of the states and of the force that the part exerts. Out: a function that
+//! changes the states as an impulse of that force does. A contact that comes to rest within a fixed step stops the mass
+//! it acts on in this way, for any inertia. Two free masses receive opposite impulses, so that their total momentum is
+//! conserved. Does not know the source text.
 
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Real, Shared};
@@ -11,28 +12,29 @@ use crate::numerics::autodiff::{self, entry};
 use abi::Slot;
 use std::sync::Arc;
 
-/// Slots outside of every block, for what the functions of this module exchange with their caller.
+/// The force of the part. This and the following slots are outside of every block: they exchange values with the
+/// caller.
 pub const FORCE: Slot = Slot(u32::MAX - 1);
-/// Where `speed` stores the value of the input.
+/// The value of the input, stored by `speed`.
 pub const SPEED: Slot = Slot(u32::MAX - 2);
-/// Where the impulse finds the value that the input shall have.
+/// The value that the input shall have after the impulse.
 pub const TARGET: Slot = Slot(u32::MAX - 3);
-/// Where it finds whether it acts: 1 or 0.
+/// Whether the impulse acts: 1 or 0.
 pub const ACTS: Slot = Slot(u32::MAX - 4);
 
-/// Where it finds the force as it is now.
+/// The present force.
 pub const PRESENT: Slot = Slot(u32::MAX - 5);
 
-/// A part of the force that rounding may leave: what a contact that holds takes out of the speed besides.
+/// Relative rounding error of the force. A contact at rest also removes the speed that this error causes.
 const ROUNDING: f64 = 1.0 / 1_048_576.0;
 
-/// The function that moves the states such that the input v, which `speed` stores to [`SPEED`], becomes [`TARGET`].
+/// The function that changes the states so that the input v, which `speed` stores to [`SPEED`], becomes [`TARGET`].
 ///
 ///   x' = x + G (target − v)/a,   a = ∂v/∂x · G,   G = ∂(dx/dt)/∂F     F in the slot [`FORCE`] of `rates`
 ///
-/// for the states x on which v depends. None where F moves none of them, or where the rates are not affine in F. A speed
-/// that 2^-20 of the present force gives in one step, |v| ≤ 2^-20 |h a F|, becomes 0 in any case: forces that balance leave
-/// it by rounding, and a contact at rest would pass it on from step to step.
+/// x: the states on which v depends. `None` if F moves none of them, or if the rates are not affine in F. A speed that
+/// the rounding error of the present force causes in one step, |v| ≤ 2^-20 |h a F|, becomes 0 in any case: forces in
+/// balance leave it behind, and a contact at rest would carry it from step to step.
 pub fn impulse(speed: &Func, rates: &Func, states: &[Slot], derivatives: &[Slot], pool: &Arc<[f64]>) -> Option<Func> {
     let build = Shared::new(Build::new("impulse").with_pool(pool.clone()));
     let real = |value| Real::new(&build, value);
@@ -56,14 +58,14 @@ pub fn impulse(speed: &Func, rates: &Func, states: &[Slot], derivatives: &[Slot]
     let least = ROUNDING * (load(Slot::STEP) * all * load(PRESENT)).abs();
     let (acts, rests) = (load(ACTS).above(0.5) & moves, v.abs().not_above(least) & moves);
     let target = acts.choose(load(TARGET), 0.0);
-    // One state alone takes all of it, whatever the force does to it.
+    // A single state takes the whole impulse, whatever effect the force has on it.
     let alone = shares.len() == 1;
     let scaled = speed.stores.iter().any(|(slot, value)| *slot == SPEED && is_scaled(speed, *value, states));
     let mut stores = Vec::new();
     for (state, slope, push) in &shares {
         let x = load(*state);
         let set = match (alone, scaled) {
-            // Where v = a x nothing is added that rounding could leave a rest of: 0 is 0.
+            // If v = a x, x is set rather than changed, so that no rounding error remains: 0 is exactly 0.
             (true, true) => target / *slope,
             (true, false) => x + (target - v) / *slope,
             (false, _) => x + *push * ((target - v) / all),
@@ -72,11 +74,11 @@ pub fn impulse(speed: &Func, rates: &Func, states: &[Slot], derivatives: &[Slot]
     }
     let mut build = build.into_inner();
     stores.into_iter().for_each(|(slot, value)| build.store(slot, value));
-    // What bends the rates is no force: an impulse of it means nothing.
+    // Rates that are not affine in F have no impulse: G would depend on F.
     Some(build.finish()).filter(|func| !func.loads().contains(&FORCE))
 }
 
-/// Whether a value is a state times something, and nothing else.
+/// Whether a value is a multiple of a single state.
 fn is_scaled(func: &Func, value: Value, states: &[Slot]) -> bool {
     match func.op(value) {
         Op::Load(slot) => states.contains(&slot),
@@ -92,7 +94,7 @@ mod tests {
     use crate::ir::interpret::run_once;
     use crate::math::{POOL, expand};
 
-    /// What stores some values of the slots 3 and 4 and of the force.
+    /// A function that stores values computed from the slots 3 and 4 and the force.
     fn of(f: impl for<'a> Fn([Real<'a>; 3]) -> Vec<(Slot, Real<'a>)>) -> Func {
         let build = Shared::new(Build::new("f"));
         let x = [Slot(3), Slot(4), FORCE].map(|slot| Real::new(&build, build.borrow_mut().load(slot)));
@@ -102,7 +104,7 @@ mod tests {
         build.finish()
     }
 
-    /// Two masses in slots 3 and 4 that rub on each other: they go on together, with the momentum that they had.
+    /// Two masses, with speeds in slots 3 and 4, rub on each other: they continue together with their total momentum.
     #[test]
     fn two_free_masses_keep_their_momentum() {
         let states = [Slot(3), Slot(4)];
@@ -118,7 +120,7 @@ mod tests {
         build.store_env(&env, |slot| slot.0 < 10);
         let mut block = [0.0, 0.0, 0.0, 4.0, -1.0, 0.0, 0.0];
         run_once(&expand(&build.finish()), &mut block, &POOL);
-        // 2 · 4 − 3 · 1 is 5 · 1: equal but for rounding.
+        // 2 · 4 − 3 · 1 = 5 · 1: equal up to rounding.
         assert!(block[3..5].iter().all(|speed| (speed - 1.0).abs() < 1e-15), "{:?}", &block[3..5]);
     }
 }

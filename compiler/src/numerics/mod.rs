@@ -1,7 +1,7 @@
-//! Numerical methods as program transformations: derivatives, fixed steps, the adaptive step.
+//! Numerical methods as program transformations: automatic differentiation, fixed steps and the adaptive step.
 //!
-//! In: the functions of a model as straight-line programs. Out: further functions of the same kind: Jacobians, gradients, one
-//! step by a method. Knows neither the language nor any back end.
+//! In: the functions of a model as straight-line programs. Out: further straight-line functions, such as Jacobians,
+//! gradients, or one step of a method. Knows neither the language nor any back end.
 
 pub mod autodiff;
 pub mod impulse;

@@ -1,8 +1,10 @@
-//! Gauss elimination of small sparse systems, unrolled into formulas.
+//! Symbolic sparse LU factorisation: Gauss elimination of small sparse systems, unrolled into operations.
 //!
-//! In: the rows of a matrix as values of a builder. Out: its factors, and solutions of right sides. The order of
-//! elimination is fixed here, by where entries can be at all, not by their size; whether a pivot came out too small is
-//! told as a truth value.
+//! In: the rows of a matrix, as values of a builder. Out: its factors, and solutions for right-hand sides. The order of
+//! elimination is chosen at compile time from the sparsity pattern, not from the size of the entries. A Boolean value
+//! reports at run time whether a pivot is too small.
+//!
+//! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986; order of elimination: Markowitz, 1957.
 
 use crate::ir::expr::{Real, Truth};
 use crate::numerics::autodiff::Gradient;
@@ -16,16 +18,16 @@ pub struct Matrix<'a> {
 /// A = L U, with the order in which rows and columns are eliminated.
 pub struct Factors<'a> {
     order: Vec<usize>,
-    /// Below the pivots, in the columns eliminated before: the multipliers; the rest: U.
+    /// The multipliers of L in the columns eliminated before the row's pivot, and U in the other columns.
     rows: Vec<BTreeMap<usize, Real<'a>>>,
     /// 1/pivot of each row.
     inverse: HashMap<usize, Real<'a>>,
-    /// Whether a pivot is too small.
+    /// Whether a pivot is too small. `None` for the empty matrix.
     pub singular: Option<Truth<'a>>,
 }
 
 impl<'a> Matrix<'a> {
-    /// I − c · J
+    /// I − c · J. `jacobian`: the rows of J.
     pub fn identity_less(c: Real<'a>, jacobian: &[Gradient]) -> Matrix<'a> {
         let row = |(i, gradient): (usize, &Gradient)| {
             let mut row: BTreeMap<usize, Real> = BTreeMap::from([(i, c.constant(1.0))]);
@@ -39,24 +41,26 @@ impl<'a> Matrix<'a> {
         Matrix { rows: jacobian.iter().enumerate().map(row).collect() }
     }
 
-    /// Gauss elimination, unrolled. The order is fixed: at each turn the diagonal entry whose elimination can fill in
-    /// least (Markowitz), the first among equals.
+    /// Factorises the matrix. Each step eliminates the diagonal entry that can cause the least fill-in (Markowitz), the
+    /// first among equals.
     ///
-    /// A pivot smaller than `least` of the rest of its row is too small.
+    /// `least`: a pivot is too small if it is at most this fraction of the largest other entry of its row.
     pub fn factorise(self, least: f64) -> Factors<'a> {
         let mut rows = self.rows;
         let n = rows.len();
-        let mut left: Vec<usize> = (0..n).collect();
+        let mut remaining: Vec<usize> = (0..n).collect();
         let mut factors = Factors { order: Vec::new(), rows: Vec::new(), inverse: HashMap::new(), singular: None };
-        while !left.is_empty() {
-            let in_row = |p: usize, left: &[usize]| left.iter().filter(|j| rows[p].contains_key(j)).count() - 1;
-            let in_column = |p: usize, left: &[usize]| left.iter().filter(|i| rows[**i].contains_key(&p)).count() - 1;
-            let cost = |p: &usize| (in_row(*p, &left) * in_column(*p, &left), *p);
-            let pivot = left.iter().copied().min_by_key(cost).expect("one is left");
-            left.retain(|i| *i != pivot);
+        while !remaining.is_empty() {
+            let in_row =
+                |p: usize, remaining: &[usize]| remaining.iter().filter(|j| rows[p].contains_key(j)).count() - 1;
+            let in_column =
+                |p: usize, remaining: &[usize]| remaining.iter().filter(|i| rows[**i].contains_key(&p)).count() - 1;
+            let cost = |p: &usize| (in_row(*p, &remaining) * in_column(*p, &remaining), *p);
+            let pivot = remaining.iter().copied().min_by_key(cost).expect("one remains");
+            remaining.retain(|i| *i != pivot);
             let diagonal = rows[pivot][&pivot];
-            let others: Vec<Real> = left.iter().filter_map(|j| rows[pivot].get(j).copied()).collect();
-            // A row of its own pivot only is as good as its pivot is not 0.
+            let others: Vec<Real> = remaining.iter().filter_map(|j| rows[pivot].get(j).copied()).collect();
+            // A row without other entries only needs a pivot that is not 0.
             let size = others.into_iter().map(Real::abs).reduce(|a, b| a.below(b).choose(b, a));
             let small = match size {
                 Some(size) => !diagonal.abs().above(least * size),
@@ -67,8 +71,8 @@ impl<'a> Matrix<'a> {
             factors.inverse.insert(pivot, inverse);
             factors.order.push(pivot);
             let of_pivot: Vec<(usize, Real)> =
-                left.iter().filter_map(|j| rows[pivot].get(j).map(|entry| (*j, *entry))).collect();
-            for &i in &left {
+                remaining.iter().filter_map(|j| rows[pivot].get(j).map(|entry| (*j, *entry))).collect();
+            for &i in &remaining {
                 let Some(entry) = rows[i].get(&pivot).copied() else { continue };
                 let multiplier = entry * inverse;
                 rows[i].insert(pivot, multiplier);
@@ -87,7 +91,7 @@ impl<'a> Matrix<'a> {
 }
 
 impl<'a> Factors<'a> {
-    /// x of A x = `right`.
+    /// The solution x of A x = `right`.
     pub fn solve(&self, right: &[Real<'a>]) -> Vec<Real<'a>> {
         let mut x = right.to_vec();
         for (k, &i) in self.order.iter().enumerate() {

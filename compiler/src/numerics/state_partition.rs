@@ -1,7 +1,9 @@
-//! Which states a step by `expo` must iterate, and in which order it comes to them.
+//! Block-triangular partition of the states for a step by `expo`: which states must be iterated, and in which order.
 //!
-//! In: the function of the rates dx/dt. Out: groups of states, each behind the groups that its rates depend on. It computes
-//! no step.
+//! In: the function of the rates dx/dt. Out: groups of states, each after the groups that its rates depend on. It
+//! computes no step.
+//!
+//! Source: Duff, Erisman, Reid, *Direct Methods for Sparse Matrices*, 1986, ch. 6 (block triangular form).
 
 use crate::ir::scc::components;
 use crate::ir::{Func, Op, Value};
@@ -12,52 +14,52 @@ use std::collections::{BTreeMap, HashMap};
 /// States that are stepped together.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Group {
-    /// Their numbers, ascending.
+    /// Indices of the states, ascending.
     pub states: Vec<usize>,
-    /// What their rates are like.
+    /// How the rates depend on these states.
     pub shape: Shape,
 }
 
-/// What a rate is like along its own state.
+/// How a rate depends on its own state.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Shape {
-    /// Affine, and free of the other states of the group: one evaluation is exact.
+    /// Affine, and independent of the other states of the group: one evaluation is exact.
     Affine,
-    /// That, but for choices that the state makes: one evaluation is exact once it is known what they are.
+    /// Affine for fixed switching conditions on the state: one evaluation is exact once these are known.
     PiecewiseAffine,
-    /// All else: it is iterated.
+    /// Anything else: the step is iterated.
     Nonlinear,
-    /// Of several states that need each other: affine in all of them, with coefficients that no state changes. The
-    /// exponential of their matrix is exact.
+    /// For several states that depend on each other: affine in all of them jointly, with coefficients that no state
+    /// changes. The matrix exponential is exact.
     Linear,
 }
 
-/// Most states whose joint exponential is taken.
+/// Largest group for which the matrix exponential is used.
 const MOST_LINEAR: usize = 8;
 
-/// How a value depends on a state, the other states and the answers to all questions given.
+/// How a value depends on a state, while the other states and all switching conditions are fixed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 struct Depend {
-    /// Its number.
+    /// Index of the state.
     state: u32,
-    /// The degree: 0 for what it changes in jumps only, 1 for affine, 2 for all else.
+    /// 0: only through switching conditions; 1: affine; 2: anything else.
     degree: u8,
-    /// Whether something on the way asks a question of the state.
+    /// Whether a switching condition depends on the state.
     asks: bool,
 }
 
-/// What a value depends on, numbers of states ascending.
+/// The dependences of a value, ascending by state.
 type Depends = Vec<Depend>;
 
-/// What of the states depends on what.
+/// The dependences between states.
 pub struct Coupling {
-    /// The groups, each behind those that its rates depend on.
+    /// The groups, each after those that its rates depend on.
     pub groups: Vec<Group>,
-    /// For each state whether it can die away: its rate depends on it, and not in jumps only.
+    /// For each state, whether it can decay: its rate depends on it, and not only through switching conditions.
     pub fades: Vec<bool>,
 }
 
-/// How the states are coupled whose rates `func` stores to the slots of `rates`.
+/// Partitions the states. `func` stores the rates to the slots of `rates`.
 pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
     let rows = depends(func, rates, states);
     let edge = |v: usize, k: usize| rows[v].get(k).map(|on: &Depend| on.state as usize);
@@ -90,20 +92,20 @@ pub fn coupling(func: &Func, rates: &[Slot], states: &[Slot]) -> Coupling {
     Coupling { groups: groups.into_iter().map(group).collect(), fades }
 }
 
-/// How a value depends on the states of a component.
+/// How a value depends on the states of a component jointly.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 enum Joint {
-    /// On no state at all.
+    /// Depends on no state.
     Given,
-    /// On other states only.
+    /// Depends on states outside the component only.
     Moving,
-    /// Affine in those of the component, with given coefficients.
+    /// Affine in the states of the component, with coefficients that no state changes.
     Affine,
-    /// All else.
+    /// Anything else.
     Nonlinear,
 }
 
-/// Whether the rates of a component are affine in all its states together, with coefficients that no state changes.
+/// Whether the rates of a component are jointly affine in its states, with coefficients that no state changes.
 fn is_linear(func: &Func, rates: &[Slot], states: &[Slot], component: &[usize]) -> bool {
     use Joint::{Affine, Given, Moving, Nonlinear};
     let times = |a: Joint, b: Joint| match (a.min(b), a.max(b)) {
@@ -142,7 +144,7 @@ fn is_linear(func: &Func, rates: &[Slot], states: &[Slot], component: &[usize]) 
     component.iter().all(|k| rate(k) <= Affine)
 }
 
-/// For each rate, what it depends on.
+/// For each rate, its dependences.
 fn depends(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Depends> {
     let number: HashMap<Slot, u32> = states.iter().enumerate().map(|(k, slot)| (*slot, k as u32)).collect();
     let mut last = vec![0; func.ops.len()];
@@ -155,31 +157,31 @@ fn depends(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Depends> {
     let mut of: Vec<Depends> = vec![Depends::new(); func.ops.len()];
     for (i, op) in func.ops.iter().enumerate() {
         let at = |value: Value| &of[value.index()];
-        let mine = match *op {
+        let own = match *op {
             Op::Load(slot) => {
                 number.get(&slot).map(|k| Depend { state: *k, degree: 1, asks: false }).into_iter().collect()
             }
-            Op::Add(a, b) | Op::Sub(a, b) => either(at(a), at(b)),
+            Op::Add(a, b) | Op::Sub(a, b) => sum(at(a), at(b)),
             Op::Neg(a) => at(a).clone(),
-            // A kink where it has a degree.
+            // |x| has a kink, which is a switching condition, unless x is piecewise constant.
             Op::Abs(a) => at(a).iter().map(|on| Depend { asks: on.asks || on.degree > 0, ..*on }).collect(),
             Op::Mul(a, b) => product(at(a), at(b)),
-            Op::Fma(a, b, c) => either(&product(at(a), at(b)), at(c)),
-            Op::Div(a, b) => product(at(a), &bent(at(b))),
-            // The condition is a truth: its degree is 0.
-            Op::Select(condition, a, b) => either(at(condition), &either(at(a), at(b))),
+            Op::Fma(a, b, c) => sum(&product(at(a), at(b)), at(c)),
+            Op::Div(a, b) => product(at(a), &nonlinear(at(b))),
+            // The condition is a Boolean, so its degree is 0.
+            Op::Select(condition, a, b) => sum(at(condition), &sum(at(a), at(b))),
             op => {
                 let mut all = Depends::new();
                 let answer = asks(op);
                 op.each_operand(|operand| {
-                    let operand = if answer { asked(at(operand)) } else { bent(at(operand)) };
-                    all = either(&all, &operand);
+                    let operand = if answer { condition_on(at(operand)) } else { nonlinear(at(operand)) };
+                    all = sum(&all, &operand);
                 });
                 all
             }
         };
-        of[i] = mine;
-        // A sum over a thousand parts has half a million entries on its way.
+        of[i] = own;
+        // Frees lists that have no further use: on a sum over a thousand parts, they would have half a million entries.
         op.each_operand(|operand| {
             if last[operand.index()] == i {
                 of[operand.index()] = Depends::new();
@@ -190,27 +192,27 @@ fn depends(func: &Func, rates: &[Slot], states: &[Slot]) -> Vec<Depends> {
     rates.iter().map(|slot| stored.get(slot).map_or_else(Depends::new, |value| of[value.index()].clone())).collect()
 }
 
-/// Of a function: of what is affine it is not.
-fn bent(of: &Depends) -> Depends {
+/// Dependences of a nonlinear function of a value.
+fn nonlinear(of: &Depends) -> Depends {
     of.iter().map(|on| Depend { degree: if on.degree == 0 { 0 } else { 2 }, ..*on }).collect()
 }
 
-/// Of an answer.
-fn asked(of: &Depends) -> Depends {
+/// Dependences of a switching condition on a value.
+fn condition_on(of: &Depends) -> Depends {
     of.iter().map(|on| Depend { degree: 0, asks: true, ..*on }).collect()
 }
 
-/// Of a sum.
-fn either(a: &Depends, b: &Depends) -> Depends {
+/// Dependences of a sum.
+fn sum(a: &Depends, b: &Depends) -> Depends {
     joined(a, b, u8::max)
 }
 
-/// Of a product: not affine in what both depend on.
+/// Dependences of a product. It is not affine in a state on which both factors depend.
 fn product(a: &Depends, b: &Depends) -> Depends {
     joined(a, b, |a, b| (a + b).min(2))
 }
 
-/// What is in either of the two; of what is in both the degree is as `both` says.
+/// Union of two dependence lists. `both`: the degree for a state that is in both.
 fn joined(a: &Depends, b: &Depends, both: impl Fn(u8, u8) -> u8) -> Depends {
     let (mut i, mut j) = (0, 0);
     let mut out = Depends::with_capacity(a.len().max(b.len()));
@@ -259,15 +261,15 @@ mod tests {
     }
 
     #[test]
-    fn what_relaxes_toward_others_comes_behind_them() {
-        // A filter of a filter of 1.
+    fn dependent_states_come_after_those_they_depend_on() {
+        // A second-order filter of the constant 1.
         check(|[x, y]| [(y - x) * 3.0, (1.0 - y) / 2.0], &[(&[1], Affine), (&[0], Affine)]);
-        // Two that do not know of each other.
+        // Two independent states.
         check(|[x, y]| [1.0 - x, 2.0 - y], &[(&[0, 1], Affine)]);
     }
 
     #[test]
-    fn what_goes_in_a_circle_is_iterated() {
+    fn cyclic_dependences_are_iterated_unless_linear() {
         check(|[x, v, z]| [v, -x, v.abs() * (1.0 - z)], &[(&[0, 1], Linear), (&[2], Affine)]);
         check(|[x, v, z]| [v, z.abs() - x, 1.0 - z], &[(&[2], Affine), (&[0, 1], Linear)]);
         check(|[x, v, z]| [v, -(z * x), 1.0 - z], &[(&[2], Affine), (&[0, 1], Nonlinear)]);
@@ -275,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_bends_is_iterated() {
+    fn a_nonlinear_rate_is_iterated() {
         check(|[x]| [-(x * x)], &[(&[0], Nonlinear)]);
         check(|[x]| [1.0 / x], &[(&[0], Nonlinear)]);
         check(|[x]| [x.above(0.0).choose(-(x * x), 1.0)], &[(&[0], Nonlinear)]);
@@ -284,8 +286,8 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_breaks_is_affine_in_each_of_its_branches() {
-        // Each branch is free of x, but not which one it is.
+    fn a_piecewise_affine_rate_is_affine_in_each_branch() {
+        // Each branch is independent of x, but the selection of the branch is not.
         check(|[x]| [x.above(0.0).choose(-1.0, 1.0)], &[(&[0], PiecewiseAffine)]);
         check(|[x]| [(x * x).above(2.0).choose(-1.0, x)], &[(&[0], PiecewiseAffine)]);
         check(|[x]| [-x.abs()], &[(&[0], PiecewiseAffine)]);
@@ -295,7 +297,7 @@ mod tests {
     }
 
     #[test]
-    fn what_its_rate_does_not_know_cannot_die_away() {
+    fn a_state_that_its_rate_ignores_cannot_decay() {
         let all = of(|[x, v, w, z]| [v, -x, x.above(0.0).choose(1.0, w.abs()), w - z]);
         assert_eq!(all.fades, [true; 4]);
         let none = of(|[x, v, w, z]| [v, v.above(0.0).choose(-1.0, 1.0), w.constant(0.0), x.above(z).choose(x, w)]);

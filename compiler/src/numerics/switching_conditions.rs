@@ -1,44 +1,46 @@
-//! What of a rate its own state decides in jumps: the questions that its choices ask.
+//! Switching conditions: the comparisons by which a rate selects a branch that depends on its own state.
 //!
-//! In: the function of some rates, and their states. Out: the same rates, and the questions on whose answers they depend;
-//! with these given, nothing jumps or has a kink. It computes no step.
+//! In: the function of some rates, and their states. Out: the same rates, and the conditions they depend on. For fixed
+//! results of these conditions, the rates have no jump and no kink. It computes no step.
+//!
+//! Source: Hairer, Nørsett, Wanner, *Solving ODEs I*, II.6 (discontinuities and switching functions).
 
 use crate::ir::build::{Build, Env, prune};
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::HashMap;
 
-/// Whether an operation answers a question: what it gives stays the same while its operands move a little.
+/// Whether the result of an operation is piecewise constant in its operands: comparisons and roundings.
 pub fn asks(op: Op) -> bool {
     let truth = matches!(op, Op::Less(..) | Op::LessEqual(..) | Op::Equal(..) | Op::IntLess(..) | Op::IntEqual(..));
     truth || matches!(op, Op::Floor(_) | Op::Nearest(_) | Op::ToInt(_))
 }
 
-/// Rates and what they ask of their states.
+/// Rates and the conditions on their states.
 pub struct SwitchingConditions {
-    /// The rates; each |x| that has a kink is written as a choice.
+    /// The rates. Each |x| that causes a kink is written as a select.
     pub rates: Func,
-    /// Operations whose answers depend on the states.
-    questions: Vec<Value>,
+    /// The comparisons and roundings that depend on the states.
+    conditions: Vec<Value>,
 }
 
 impl SwitchingConditions {
-    /// What these rates ask of these states.
+    /// Finds the conditions of these rates on these states.
     pub fn of(rates: &Func, states: &[Slot]) -> SwitchingConditions {
         let depends = dependent(rates, states);
-        // What is needed for itself and not only for an answer.
-        let mut plain = vec![false; rates.ops.len()];
-        rates.stores.iter().for_each(|(_, value)| plain[value.index()] = true);
+        // Values that enter a rate directly, and not only through a condition.
+        let mut is_direct = vec![false; rates.ops.len()];
+        rates.stores.iter().for_each(|(_, value)| is_direct[value.index()] = true);
         for (i, op) in rates.ops.iter().enumerate().rev() {
-            if plain[i] && !asks(*op) {
-                op.each_operand(|operand| plain[operand.index()] = true);
+            if is_direct[i] && !asks(*op) {
+                op.each_operand(|operand| is_direct[operand.index()] = true);
             }
         }
         let mut build = Build::new(&rates.name);
         let mut values: Vec<Value> = Vec::with_capacity(rates.ops.len());
         for (i, op) in rates.ops.iter().enumerate() {
             values.push(match op.map(|operand| values[operand.index()]) {
-                Op::Abs(x) if plain[i] && depends[i] => {
+                Op::Abs(x) if is_direct[i] && depends[i] => {
                     let zero = build.real(0.0);
                     let (negative, minus) = (build.less(x, zero), build.neg(x));
                     build.select(negative, minus, x)
@@ -50,11 +52,11 @@ impl SwitchingConditions {
         let rates = prune(&build.finish());
         let depends = dependent(&rates, states);
         let all = rates.ops.iter().enumerate();
-        let questions = all.filter(|(i, op)| depends[*i] && asks(**op)).map(|(i, _)| Value(i as u32)).collect();
-        SwitchingConditions { rates, questions }
+        let conditions = all.filter(|(i, op)| depends[*i] && asks(**op)).map(|(i, _)| Value(i as u32)).collect();
+        SwitchingConditions { rates, conditions }
     }
 
-    /// The answers where the slots hold what `env` says.
+    /// Evaluates the conditions with the slot values of `env`: each condition with its result.
     pub fn answers(&self, build: &mut Build, env: &Env) -> HashMap<Value, Value> {
         let mut values: Vec<Value> = Vec::with_capacity(self.rates.ops.len());
         for op in &self.rates.ops {
@@ -63,11 +65,11 @@ impl SwitchingConditions {
                 op => build.op(op.map(|operand| values[operand.index()])),
             });
         }
-        self.questions.iter().map(|question| (*question, values[question.index()])).collect()
+        self.conditions.iter().map(|condition| (*condition, values[condition.index()])).collect()
     }
 }
 
-/// Which operations depend on any of these slots.
+/// For each operation, whether it depends on any of these slots.
 fn dependent(func: &Func, slots: &[Slot]) -> Vec<bool> {
     let mut depends = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
@@ -83,7 +85,7 @@ mod tests {
     use super::*;
     use crate::ir::expr::{Real, Shared};
 
-    /// The rates of one state, in slot 3, and how many questions they ask.
+    /// The listing of the rate of one state (slot 3) and the number of its conditions.
     fn asking(f: impl for<'a> Fn(Real<'a>, Real<'a>) -> Real<'a>) -> (String, usize) {
         let build = Shared::new(Build::new("rates"));
         let [x, v] = [Slot(3), Slot(4)].map(|slot| Real::new(&build, build.borrow_mut().load(slot)));
@@ -91,23 +93,23 @@ mod tests {
         let mut build = build.into_inner();
         build.store(Slot(5), rate);
         let asking = SwitchingConditions::of(&build.finish(), &[Slot(3)]);
-        (asking.rates.to_string(), asking.questions.len())
+        (asking.rates.to_string(), asking.conditions.len())
     }
 
     #[test]
-    fn a_kink_is_a_question_and_a_size_that_only_answers_one_is_not() {
-        let (listing, questions) = asking(|x, v| x.abs() - v.abs());
-        assert_eq!(questions, 1);
+    fn a_kink_is_a_condition_but_an_absolute_value_in_a_comparison_is_not() {
+        let (listing, conditions) = asking(|x, v| x.abs() - v.abs());
+        assert_eq!(conditions, 1);
         assert!(listing.contains("select") && listing.matches("abs").count() == 1, "{listing}");
-        let (listing, questions) = asking(|x, v| (x.abs() * v).above(1.0).choose(v, -x));
-        assert_eq!(questions, 1);
+        let (listing, conditions) = asking(|x, v| (x.abs() * v).above(1.0).choose(v, -x));
+        assert_eq!(conditions, 1);
         assert!(listing.contains("abs"), "{listing}");
         assert_eq!(asking(|x, v| v.above(0.0).choose(v.floor(), -x)).1, 0);
     }
 
-    /// With the answers of another place a rate goes on as if the state had not left the branch of that place.
+    /// With the conditions of another point, a rate continues its branch of that point smoothly.
     #[test]
-    fn with_answers_given_nothing_jumps() {
+    fn rates_are_smooth_for_fixed_conditions() {
         let build = Shared::new(Build::new("rates"));
         let x = Real::new(&build, build.borrow_mut().load(Slot(3)));
         let rate = (x.above(1.0).choose(x * 10.0, -x) + x.abs()).value;
