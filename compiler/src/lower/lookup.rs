@@ -1,37 +1,38 @@
-//! Tables in the pool, and what is read of them at a number.
+//! Table lookup: places tables in the pool, and generates the operations that interpolate them.
 //!
-//! In: the points of a table. Out: their numbers in the pool, and operations that find the interval by halving and go along its
-//! line or cubic; the ends are held. What an interval needs lies side by side.
+//! In: the points of a table. Out: its numbers in the pool, and operations that find the interval by binary search and
+//! evaluate its line or cubic. Beyond the ends the table is constant. All numbers of an interval are adjacent in
+//! memory.
 
 use crate::frontend::system::Table;
 use crate::ir::Value;
 use crate::ir::build::Build;
 
-/// A table that has its place in the pool.
+/// A table in the pool.
 pub struct Lookup {
-    /// The first point's x, the last point's, and the last point's y.
+    /// x of the first point, x of the last point, and y of the last point.
     first: f64,
     last: f64,
     end: f64,
     smooth: bool,
-    /// Intervals are found by so many questions.
-    questions: u32,
-    /// Where their beginnings lie, and then their rows.
+    /// Number of comparisons of the binary search.
+    comparisons: u32,
+    /// Index of the table in the pool: the starts of the intervals, then their rows.
     start: u32,
 }
 
-/// Numbers of an interval, as a power of two: beginning, width, value, rise; or beginning, width, value and the coefficients of
-/// s, s², s³.
+/// Length of a row as a power of two. A line has start, width, value and rise; a cubic has start, width, value and the
+/// coefficients of s, s² and s³.
 const LINE: u8 = 2;
 const CUBIC: u8 = 3;
 
 impl Lookup {
-    /// Puts tables behind what is in the pool, in their order.
+    /// Appends tables to the pool, in their order.
     pub fn place_all(tables: &[Table], pool: &mut Vec<f64>) -> Vec<Lookup> {
         tables.iter().map(|table| Lookup::place(table, pool)).collect()
     }
 
-    /// Puts a table, which has at least one point, behind what is in the pool.
+    /// Appends a table with at least one point to the pool.
     fn place(table: &Table, pool: &mut Vec<f64>) -> Lookup {
         let Table { x, y, smooth, .. } = table;
         let n = x.len();
@@ -42,13 +43,14 @@ impl Lookup {
             last: x[n - 1],
             end: y[n - 1],
             smooth: *smooth,
-            questions: rows.trailing_zeros(),
+            comparisons: rows.trailing_zeros(),
             start: pool.len() as u32,
         };
         if intervals == 0 {
             return lookup;
         }
-        // No number lies behind the beginning of what is no interval; but infinity, which the last row answers.
+        // Padding intervals start at ∞, so that no finite number falls into them. ∞ itself does; the last row handles
+        // it.
         pool.extend((0..rows).map(|k| if k < intervals { x[k] } else { f64::INFINITY }));
         let slopes = if *smooth { monotone_slopes(x, y) } else { Vec::new() };
         for k in (0..rows).map(|k| k.min(intervals - 1)) {
@@ -65,27 +67,27 @@ impl Lookup {
         lookup
     }
 
-    /// The table at x; of NaN it is NaN.
+    /// The table at x. For NaN it is NaN (unless the table has one point).
     pub fn at(&self, x: Value, build: &mut Build) -> Value {
         let [first, last, end] = [self.first, self.last, self.end].map(|number| build.real(number));
         if self.first == self.last {
             return end;
         }
-        let rows = 1 << self.questions;
+        let rows = 1 << self.comparisons;
         let mut row = build.int(0);
-        for question in (0..self.questions).rev() {
-            let stride = build.int(1 << question);
+        for comparison in (0..self.comparisons).rev() {
+            let stride = build.int(1 << comparison);
             let probe = build.int_add(row, stride);
             let begins = build.pool(self.start, rows, probe);
-            let behind = build.less_equal(begins, x);
-            row = build.select(behind, probe, row);
+            let is_beyond = build.less_equal(begins, x);
+            row = build.select(is_beyond, probe, row);
         }
         let numbers = if self.smooth { CUBIC } else { LINE };
         let at = build.shift_left(row, numbers);
         let number = |k: u32, build: &mut Build| build.pool(self.start + rows + k, ((rows - 1) << numbers) + 1, at);
-        let held = build.clamp(x, first, last);
+        let clamped = build.clamp(x, first, last);
         let [begin, width, value] = [0, 1, 2].map(|k| number(k, build));
-        let offset = build.sub(held, begin);
+        let offset = build.sub(clamped, begin);
         let s = build.div(offset, width);
         let coefficients = if self.smooth { 3..6 } else { 3..4 };
         let mut sum = None;
@@ -96,13 +98,14 @@ impl Lookup {
         }
         let value = build.add(value, sum.expect("there is a coefficient"));
         // The last point belongs to no interval.
-        let ends = build.less_equal(last, held);
+        let ends = build.less_equal(last, clamped);
         build.select(ends, end, value)
     }
 }
 
-/// Slopes at the points such that cubics between them are monotone where the points are.
-/// Source: Fritsch, Butland, SIAM J. Sci. Stat. Comput. 5 (1984), eq. 6, with one-sided ends.
+/// Slopes at the points, such that the cubics between them are monotone where the points are.
+///
+/// Source: Fritsch, Butland, SIAM J. Sci. Stat. Comput. 5 (1984), eq. 6, with one-sided slopes at the ends.
 fn monotone_slopes(x: &[f64], y: &[f64]) -> Vec<f64> {
     let n = x.len();
     let secant = |k: usize| (y[k + 1] - y[k]) / (x[k + 1] - x[k]);
@@ -134,7 +137,7 @@ mod tests {
     use abi::Slot;
     use abi::unit::Dimension;
 
-    /// A table of the points (k², (k − 2)³), read at x.
+    /// A table of n points (k², (k − 2)³), read at x.
     fn read(n: usize, smooth: bool, x: f64) -> f64 {
         let points = || (0..n).map(|k| k as f64);
         let dimension = Dimension::NONE;
@@ -158,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn tables_go_through_their_points_and_are_held_behind_the_ends() {
+    fn tables_interpolate_their_points_and_are_constant_beyond_the_ends() {
         for (n, smooth) in (1..20).flat_map(|n| [(n, false), (n, true)]) {
             let y = |k: usize| (k as f64 - 2.0).powi(3);
             for k in 0..n {

@@ -1,8 +1,11 @@
-//! Fuses one fixed step of a method with all that belongs to it into one straight-line function.
+//! Fixed steps: composes one step of a method, and everything that belongs to it, into one straight-line function.
 //!
-//! In: a [`Program`] and a method. Out: a function that advances the states, counts, renews time, runs the sampled
-//! blocks that are due, the transitions and the outputs, and watches the guards, in this order. Inputs, sampled
-//! states and regimes are frozen while the states advance.
+//! In: a [`Program`] and a method. Out: a function that does the following, in this order: it advances the states, the
+//! step count and time, runs the sampled blocks that are due, the transitions and the outputs, and checks the guards.
+//! Inputs, sampled states and modes are frozen while the states advance.
+//!
+//! Sources: Hairer, Nørsett, Wanner, *Solving ODEs I*, II.1 (`euler`, `rk4`); Hochbruck, Ostermann, *Exponential
+//! integrators*, Acta Numerica 2010 (`expo`); Verwer et al. 1999 (`implicit`, see there).
 
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
@@ -19,10 +22,10 @@ use abi::plan::Method;
 use std::cell::RefCell;
 use std::collections::{BTreeSet, HashMap, HashSet};
 
-/// One fixed step by `method`, of the length in [`Slot::STEP`].
+/// One fixed step by `method`. Its length is in [`Slot::STEP`].
 ///
 /// # Panics
-/// For the adaptive method, which is no fixed step.
+/// For the adaptive method, which has no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
     let layout = &program.description.layout;
     let build = Shared::new(Build::new("step").with_pool(program.description.pool.clone()));
@@ -31,9 +34,9 @@ pub fn step(program: &Program, method: Method) -> Func {
 
     let mut env = Env::new();
     for (k, x) in next.into_iter().enumerate() {
-        // What is left of something that has died away would only slow the processor down.
-        let settled = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
-        env.insert(layout.states.slot(k), settled.value);
+        // States that have decayed are set to 0, because subnormal numbers slow the processor down.
+        let nonzero = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
+        env.insert(layout.states.slot(k), nonzero.value);
     }
     let count = model.load(Slot::COUNT) + 1.0;
     env.insert(Slot::COUNT, count.value);
@@ -41,7 +44,8 @@ pub fn step(program: &Program, method: Method) -> Func {
     model.delays(1.0, &mut env);
     if let Some(tick) = &program.tick {
         for block in &program.description.ticks {
-            // COUNT is a multiple of n exactly if the nearest quotient times n gives it back: both are whole.
+            // COUNT and n are integers, so COUNT is a multiple of n exactly if the nearest quotient times n equals
+            // COUNT.
             let n = (model.load(block.period) / model.h).nearest();
             let due = ((count / n).nearest() * n).is(count).choose(1.0, 0.0);
             env.insert(block.due, due.value);
@@ -55,7 +59,7 @@ pub fn step(program: &Program, method: Method) -> Func {
     let status = watch(&build, &program.description.guards, &env);
 
     for delay in &program.description.delays {
-        let index = place_in(delay.ring, count).value;
+        let index = ring_index(delay.ring, count).value;
         let mut build = build.borrow_mut();
         let value = build.read(delay.source, &env);
         build.write(Write { base: Slot(delay.ring.start), len: delay.ring.len, index, value });
@@ -75,10 +79,11 @@ pub fn step(program: &Program, method: Method) -> Func {
     build.finish()
 }
 
-/// What one fixed step makes of the continuous states, everything else frozen: no ticks, no transitions, no guards.
+/// One fixed step of the continuous states alone, with everything else frozen: no sampled blocks, transitions or
+/// guards.
 ///
 /// # Panics
-/// For the adaptive method, which is no fixed step.
+/// For the adaptive method, which has no fixed step.
 pub fn advance(program: &Program, method: Method) -> Func {
     let states = program.description.layout.states;
     let build = Shared::new(Build::new("advance").with_pool(program.description.pool.clone()));
@@ -88,24 +93,26 @@ pub fn advance(program: &Program, method: Method) -> Func {
     build.finish()
 }
 
-/// Where a ring, whose length is a power of two, has the sample of this number: a whole one from 0 up to 2⁵².
-fn place_in<'a>(ring: Segment, number: Real<'a>) -> Int<'a> {
-    // Behind 2⁵² numbers lie 1 apart: the last digits are the number.
+/// The index of a sample in a ring whose length is a power of two. `number`: the sample's number, an integer from 0 to
+/// 2⁵².
+fn ring_index<'a>(ring: Segment, number: Real<'a>) -> Int<'a> {
+    // From 2⁵² on, doubles are 1 apart, so the low bits of the sum are the integer.
     (number + 4503599627370496.0).bits() & (i64::from(ring.len) - 1)
 }
 
-/// Guards that are put together before they meet others, so that many do not wait for each other one by one, and those of
-/// parts of one kind are computed alike.
+/// Guards are combined in groups of this size first. This shortens the dependency chain of many guards, and the guards
+/// of equal parts are computed by equal operations.
 const TOGETHER: usize = 8;
+
 /// γ of a step by `implicit`.
 pub const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
-/// The status: 0, or the number of the first guard whose quantity is not finite or out of its range by more than 1e-6
-/// of the range's width or, of a range open on one side, of its bound.
+/// The status: 0, or the number of the first guard that fails. A guard fails if its quantity is not finite, or leaves
+/// its range by more than a tolerance: 1e-6 of the range's width, or of the bound if the range is open on one side.
 fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     let mut total: Option<Real> = None;
     let mut outside: Option<Truth> = None;
-    // What is watched twice, as a state and as an output that is that state, enters once.
+    // A state that is also an output has two guards, but enters the sum once.
     let mut summed: HashSet<Value> = HashSet::new();
     let number = |n: i64| build.borrow_mut().int(n);
     let mut first = number(0);
@@ -114,7 +121,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
         for (k, guard) in guards.iter().enumerate().rev() {
             let x = Real::new(build, build.borrow_mut().read(guard.slot, env));
             let (low, high) = widened(guard.range);
-            // What lies between two bounds is finite.
+            // A value between two finite bounds is finite.
             let between = (low.is_finite() && high.is_finite()).then(|| match low == -high {
                 true => x.abs().not_above(high),
                 false => x.not_below(low) & x.not_above(high),
@@ -139,9 +146,9 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
         total = total.zip(sum).map(|(all, sum)| all + sum).or(sum);
         outside = either(outside, beyond);
     }
-    // One test decides; which guard it is, and whether it is one (a sum may overflow), matters only then, and code may find
-    // it out apart from the step.
-    // Of something infinite or NaN the sum is that too, and less itself it is 0 or NaN: of these two this asks with one test.
+    // One test decides whether any guard can have failed. Only then does it matter which guard it is, and whether it is
+    // one (a sum may overflow), so a back end may move this off the hot path. If a value is infinite or NaN, so is the
+    // sum, and sum − sum is NaN; otherwise it is 0. `rest ≤ rest` distinguishes the two with one test.
     #[allow(clippy::eq_op, reason = "of what is not finite it is NaN")]
     let rest = total.map(|sum| sum - sum);
     let any = either(outside, rest.map(|rest| !rest.not_above(rest)))?;
@@ -149,7 +156,7 @@ fn watch(build: &Shared, guards: &[Guard], env: &Env) -> Option<Value> {
     Some(build.borrow_mut().select(any.value, first, none))
 }
 
-/// Both that are there, or the one that is.
+/// Disjunction of the tests that exist.
 fn either<'a>(a: Option<Truth<'a>>, b: Option<Truth<'a>>) -> Option<Truth<'a>> {
     match (a, b) {
         (Some(a), Some(b)) => Some(a | b),
@@ -157,7 +164,7 @@ fn either<'a>(a: Option<Truth<'a>>, b: Option<Truth<'a>>) -> Option<Truth<'a>> {
     }
 }
 
-/// A range and its tolerance.
+/// A range widened by its tolerance.
 fn widened((low, high): (f64, f64)) -> (f64, f64) {
     let tolerance = match (low.is_finite(), high.is_finite()) {
         (true, true) => 1e-6 * (high - low),
@@ -168,22 +175,22 @@ fn widened((low, high): (f64, f64)) -> (f64, f64) {
     (low - tolerance, high + tolerance)
 }
 
-/// Most slopes between which a rate may choose for each to have an exponential of its own.
+/// Largest number of slopes among which a rate may select for each slope to have its own exponential.
 const MOST_CHOSEN: usize = 4;
 
-/// dx/dt = f(t, x) with everything else frozen.
+/// dx/dt = f(t, x), with everything else frozen.
 struct Model<'a> {
     program: &'a Program,
     build: &'a Shared,
-    /// The step, in s.
+    /// Step length, in s.
     h: Real<'a>,
-    /// Time at its beginning, in s.
+    /// Time at the start of the step, in s.
     t: Real<'a>,
-    /// States at its beginning.
+    /// States at the start of the step.
     x: Vec<Real<'a>>,
-    /// What of them depends on what.
+    /// Dependences between the states.
     coupling: Coupling,
-    /// Of the values built so far: which depend on no state.
+    /// For each value built so far, whether it depends on no state.
     given: RefCell<Vec<bool>>,
 }
 
@@ -214,12 +221,12 @@ impl<'a> Model<'a> {
         Real::new(self.build, self.build.borrow_mut().load(slot))
     }
 
-    /// Slots at a part `c` of the step, where the states are x.
+    /// Slot values at the fraction `c` of the step, with the states x.
     fn env(&self, c: f64, x: &[Real<'a>]) -> Env {
         self.env_of(c, x.iter().copied().enumerate())
     }
 
-    /// The same where only some states are read.
+    /// Slot values at the fraction `c` of the step, with only some states, by index.
     fn env_of(&self, c: f64, x: impl Iterator<Item = (usize, Real<'a>)>) -> Env {
         let states = self.program.description.layout.states;
         let mut env: Env = x.map(|(k, x)| (states.slot(k), x.value)).collect();
@@ -229,7 +236,7 @@ impl<'a> Model<'a> {
         env
     }
 
-    /// The same for a function that reads only some states.
+    /// Slot values at the fraction `c` of the step, with the states that `func` loads.
     fn env_for(&self, func: &Func, c: f64, x: &[Real<'a>]) -> Env {
         let states = self.program.description.layout.states;
         let read = |slot: &Slot| states.contains(*slot).then(|| slot.index() - states.start as usize);
@@ -237,14 +244,16 @@ impl<'a> Model<'a> {
         self.env_of(c, read.into_iter().map(|k| (k, x[k])))
     }
 
-    /// Puts what is delayed in place at a part `c` of the step. Samples are those at the ends of the steps before.
+    /// Interpolates the delayed values at the fraction `c` of the step. The samples are values at the ends of earlier
+    /// steps.
     fn delays(&self, c: f64, env: &mut Env) {
         let count = self.load(Slot::COUNT);
         for delay in &self.program.description.delays {
             let Segment { start, len } = delay.ring;
             assert!(len.is_power_of_two(), "the rings of `{}` have no size", self.program.description.name);
             let sample = |index: Int<'a>| self.h.same(self.build.borrow_mut().ring(Slot(start), len, index.value));
-            // In steps, back from the newest sample: at the end of the step it is known from the start on.
+            // All in steps. `back` is the distance from the newest sample at the end of the step, which `Start` has
+            // computed.
             let back = self.load(delay.back);
             let ago = if c == 1.0 {
                 back
@@ -257,11 +266,11 @@ impl<'a> Model<'a> {
                 }
                 (steps - c).at_least(0.0)
             };
-            // Not to before the first.
+            // Not further back than the first sample.
             let ago = ago.at_most(count);
             let whole = ago.floor();
-            let newer = place_in(delay.ring, count - whole);
-            // Of the first sample nothing is before: then its part is 0.
+            let newer = ring_index(delay.ring, count - whole);
+            // No sample precedes the first one; its weight is then 0.
             let older = (newer - 1) & (i64::from(len) - 1);
             let (newer, older) = (sample(newer), sample(older));
             env.insert(delay.past, (newer + (ago - whole) * (older - newer)).value);
@@ -279,7 +288,7 @@ impl<'a> Model<'a> {
         self.rates(&env)
     }
 
-    /// f and the rows of ∂f/∂x.
+    /// f, and the rows of ∂f/∂x.
     fn f_and_gradient(&self, c: f64, x: &[Real<'a>]) -> (Vec<Real<'a>>, Vec<Gradient>) {
         let layout = &self.program.description.layout;
         let mut env = self.env(c, x);
@@ -298,7 +307,7 @@ impl<'a> Model<'a> {
         self.moved(self.h, &self.f(0.0, &self.x))
     }
 
-    /// The classical method of order 4.
+    /// The classical Runge–Kutta method of order 4.
     fn rk4(&self) -> Vec<Real<'a>> {
         let (h, half) = (self.h, 0.5 * self.h);
         let k1 = self.f(0.0, &self.x);
@@ -310,16 +319,18 @@ impl<'a> Model<'a> {
         self.moved(h / 6.0, &means)
     }
 
-    /// Exact for a state that relaxes, dx/dt = b − a x; each other state linearised in itself. X is the mean over the
-    /// step, at which the others see it.
+    /// Exponential integrator: exact for a state that relaxes, dx/dt = b − a x. Every other state is linearised in
+    /// itself. X is the mean over the step; the rates of other states see this value.
     ///
     ///   x' = x + h φ(h a) f,  X = x + h φ2(h a) f              f, a = min(∂f/∂x, 0) at (t, x)
     ///   three times: r = f + a (x − X), and r in place of f    f, a at (t + h/2, X)
     ///
-    /// Whoever depends on others comes behind them. Of a rate that is affine in its state r is the same wherever it is
-    /// evaluated, so once is enough: at (t + h/2, x). Of one that is affine but for choices that the state makes these are
-    /// made where the state will be, roughly, in the middle of the step, x + h f/(2 − h a), and all else is as before.
-    /// States that need each other and are affine in all of them take the exponential of their matrix.
+    /// States are stepped after those that they depend on. The iteration depends on the shape of the rate:
+    ///
+    /// - Affine in its own state: r is the same for every X, so one evaluation at (t + h/2, x) is enough.
+    /// - Piecewise affine: the switching conditions are evaluated near the state's value in the middle of the step, x +
+    ///   h f/(2 − h a). The rest is as in the affine case.
+    /// - States that depend on each other and are jointly affine use the matrix exponential.
     fn expo(&self) -> Vec<Real<'a>> {
         let layout = &self.program.description.layout;
         let stored: HashMap<Slot, Value> = self.program.derivatives.stores.iter().copied().collect();
@@ -328,12 +339,12 @@ impl<'a> Model<'a> {
             let states = &group.states;
             let rates = self.rates_of(states, &stored);
             match group.shape {
-                Shape::Affine => self.at_once(&rates, &HashMap::new(), states, &mut next, &mut middle),
+                Shape::Affine => self.affine(&rates, &HashMap::new(), states, &mut next, &mut middle),
                 Shape::PiecewiseAffine => {
                     let own: Vec<Slot> = states.iter().map(|k| layout.states.slot(*k)).collect();
                     let asking = SwitchingConditions::of(&rates, &own);
                     let answers = self.answers(&asking, states, &middle);
-                    self.at_once(&asking.rates, &answers, states, &mut next, &mut middle);
+                    self.affine(&asking.rates, &answers, states, &mut next, &mut middle);
                 }
                 Shape::Nonlinear => self.iterated(&rates, states, &mut next, &mut middle),
                 Shape::Linear => self.linear(&rates, states, &stored, &mut next, &mut middle),
@@ -342,8 +353,8 @@ impl<'a> Model<'a> {
         next
     }
 
-    /// Steps states whose rates are affine in them, once what they ask of them is answered.
-    fn at_once(
+    /// Steps states whose rates are affine for fixed `answers` (the results of their switching conditions).
+    fn affine(
         &self,
         rates: &Func,
         answers: &HashMap<Value, Value>,
@@ -356,33 +367,34 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// What the rates will ask of their states, answered about the middle of the step.
+    /// The results of the switching conditions near the middle of the step.
     fn answers(&self, asking: &SwitchingConditions, states: &[usize], middle: &[Real<'a>]) -> HashMap<Value, Value> {
-        let mut there = middle.to_vec();
+        let mut mid_step = middle.to_vec();
         for (k, (f, a)) in states.iter().zip(self.relaxation(&asking.rates, &HashMap::new(), 0.5, middle, states)) {
-            there[*k] = self.x[*k] + self.part(a) * f;
+            mid_step[*k] = self.x[*k] + self.to_middle(a) * f;
         }
-        let env = self.env_for(&asking.rates, 0.5, &there);
+        let env = self.env_for(&asking.rates, 0.5, &mid_step);
         asking.answers(&mut self.build.borrow_mut(), &env)
     }
 
-    /// h/(2 − min(h a, 0)): h/2 of the slope 0, and never beyond the rest point of a steep one.
-    fn part(&self, a: Option<Real<'a>>) -> Real<'a> {
-        match (self.sloping(a), self.apart(a)) {
+    /// h/(2 − min(h a, 0)): h/2 for the slope 0, and at most the distance to the rest point for a steep slope.
+    fn to_middle(&self, a: Option<Real<'a>>) -> Real<'a> {
+        match (self.nonzero(a), self.split_slope(a)) {
             (None, _) => 0.5 * self.h,
-            (_, Some((condition, [yes, no]))) => condition.choose(self.part(Some(yes)), self.part(Some(no))),
+            (_, Some((condition, [yes, no]))) => condition.choose(self.to_middle(Some(yes)), self.to_middle(Some(no))),
             (Some(a), None) => self.h / (2.0 - self.falling(self.h * a)),
         }
     }
 
-    /// Where a state is at the end of the step, and its mean, of the rate f at x that is affine with the slope `a`.
+    /// The state at the end of the step and its mean, for a rate that is affine with the slope `a` and has the value f
+    /// at x.
     fn relaxed(&self, x: Real<'a>, f: Real<'a>, a: Option<Real<'a>>) -> [Real<'a>; 2] {
-        match (self.sloping(a), self.apart(a)) {
+        match (self.nonzero(a), self.split_slope(a)) {
             (None, _) => [1.0, 0.5].map(|part| self.added(x, part * self.h, f)),
             (_, Some((condition, sides))) => {
                 let [yes, no] = [true, false].map(|truth| {
                     let a = sides[usize::from(!truth)];
-                    self.relaxed(x, self.given_that(f, condition, truth), Some(a))
+                    self.relaxed(x, self.simplified(f, condition, truth), Some(a))
                 });
                 [0, 1].map(|k| condition.choose(yes[k], no[k]))
             }
@@ -393,7 +405,7 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// x + h f, and x where f is 0.
+    /// x + h f, without the operations if f is 0, or a select with a branch that is 0.
     fn added(&self, x: Real<'a>, h: Real<'a>, f: Real<'a>) -> Real<'a> {
         let op = self.build.borrow().get(f.value);
         let zero = |value: Value| self.build.borrow().constant(value) == Some(0.0);
@@ -407,32 +419,33 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// A slope that is not 0 in any case.
-    fn sloping(&self, a: Option<Real<'a>>) -> Option<Real<'a>> {
+    /// The slope, unless it is the constant 0.
+    fn nonzero(&self, a: Option<Real<'a>>) -> Option<Real<'a>> {
         a.filter(|a| self.build.borrow().constant(a.value) != Some(0.0))
     }
 
-    /// The two sides of a choice between slopes that no state changes, or of whether there is one: what belongs to each of
-    /// them is known once for all rounds, or computed only where it is chosen.
-    fn apart(&self, a: Option<Real<'a>>) -> Option<(Truth<'a>, [Real<'a>; 2])> {
+    /// Splits a slope that is a select, if one side is 0, or if it selects among a few slopes that do not depend on a
+    /// state. The φ-functions of each side are then hoisted out of the step loop, or are only computed if the side is
+    /// selected.
+    fn split_slope(&self, a: Option<Real<'a>>) -> Option<(Truth<'a>, [Real<'a>; 2])> {
         let a = a?;
         let op = self.build.borrow().get(a.value);
         let Op::Select(condition, yes, no) = op else { return None };
         let sides = [yes, no].map(|side| a.same(side));
-        let level = sides.iter().any(|side| self.sloping(Some(*side)).is_none());
+        let level = sides.iter().any(|side| self.nonzero(Some(*side)).is_none());
         let chosen = !self.is_given(a.value) && self.is_chosen(a.value);
         (level || chosen).then(|| (Truth::new(self.build, condition), sides))
     }
 
-    /// A value where a condition is as told.
-    fn given_that(&self, value: Real<'a>, condition: Truth<'a>, truth: bool) -> Real<'a> {
+    /// Simplifies a value for a condition that is known to be `truth`.
+    fn simplified(&self, value: Real<'a>, condition: Truth<'a>, truth: bool) -> Real<'a> {
         match self.build.borrow().get(value.value) {
-            Op::Select(asked, yes, no) if asked == condition.value => value.same(if truth { yes } else { no }),
+            Op::Select(selector, yes, no) if selector == condition.value => value.same(if truth { yes } else { no }),
             _ => value,
         }
     }
 
-    /// Rate and slope anew at each X.
+    /// Steps states by fixed-point iteration: rates and slopes are evaluated again at each new X.
     fn iterated(&self, rates: &Func, states: &[usize], next: &mut [Real<'a>], middle: &mut [Real<'a>]) {
         for round in 0..4 {
             let (c, at) = if round == 0 { (0.0, &self.x[..]) } else { (0.5, &*middle) };
@@ -445,7 +458,7 @@ impl<'a> Model<'a> {
                 };
                 moved.push((*k, self.phis(a).map(|phi| x + self.h * phi * r)));
             }
-            // Whoever depends on them sees the X at which the last of their rates were taken.
+            // States that depend on these use the X at which the last rates were evaluated.
             let last = round == 3;
             for (k, [end, mean]) in moved {
                 next[k] = end;
@@ -454,13 +467,14 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// dx/dt = A x + b(t) with b a straight line through its values at the two points of Gauss: the Taylor series of the
-    /// exact solution and of its mean, each term from the one before.
+    /// Matrix exponential for dx/dt = A x + b(t), where b is the straight line through its values at the two Gauss
+    /// points: the Taylor series of the exact solution and of its mean, each term computed from the previous one.
     ///
     ///   c1 = h (f̄ − Δ/2),  c2 = h (A c1 + Δ)/2,  ck+1 = h A ck/(k + 1),  x' = x + Σ ck,  X = x + Σ ck/(k + 1)
     ///   f̄ = (f⁺ + f⁻)/2,  Δ = √3 (f⁺ − f⁻)       f⁺, f⁻ at (t + (1/2 ± √3/6) h, x)
     ///
-    /// Where the last term is above 1e-6 of their sum, h A is too large for the series, and the states are iterated.
+    /// If the last term exceeds 1e-6 of the sum of their sizes, h A is too large for the series, and the states are
+    /// iterated.
     fn linear(
         &self,
         rates: &Func,
@@ -476,7 +490,8 @@ impl<'a> Model<'a> {
         for slot in rates.loads().into_iter().filter(|slot| layout.states.contains(*slot) && !own.contains(slot)) {
             let k = slot.index() - layout.states.start as usize;
             if !self.coupling.fades[k] {
-                // Of what integrates others the mean is that of a parabola: from its rate at the start and both ends.
+                // For a state that integrates others, the mean of a parabola: from its rate at the start and both end
+                // values.
                 let f = self.relaxation(&self.rates_of(&[k], stored), &HashMap::new(), 0.0, &self.x, &[k])[0].0;
                 mean[k] = self.x[k] + (0.5 * h * f + (next[k] - self.x[k] - h * f) / 3.0);
             }
@@ -557,8 +572,8 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// What iterating makes of a rate `f` at x that is affine, with the slope `a`: itself, unless it grows away from its
-    /// rest point, X = x + h r/2 of r = f + a (X − x).
+    /// The result of the fixed-point iteration for an affine rate with the value `f` at x and the slope `a`. This is f
+    /// itself, unless the state grows (a > 0): then X = x + h r/2 with r = f + a (X − x), iterated.
     fn once(&self, f: Real<'a>, a: Real<'a>) -> Real<'a> {
         let half = 0.5 * self.h;
         let mut r = f;
@@ -568,7 +583,7 @@ impl<'a> Model<'a> {
         a.above(0.0).choose(r, f)
     }
 
-    /// The function that gives the rates of these states alone, made of what they need and nothing else.
+    /// The function of the rates of these states alone: only the operations that they need.
     fn rates_of(&self, states: &[usize], stored: &HashMap<Slot, Value>) -> Func {
         let func = &self.program.derivatives;
         let slots = states.iter().map(|k| self.program.description.layout.derivatives.slot(*k));
@@ -587,7 +602,7 @@ impl<'a> Model<'a> {
         Func { name: func.name.clone(), ops, stores, ..Func::default() }
     }
 
-    /// For each of these states f, and ∂f/∂x of itself alone; none where it does not depend on itself.
+    /// For each of these states f, and ∂f/∂x with respect to itself; `None` if f does not depend on it.
     fn relaxation(
         &self,
         rates: &Func,
@@ -614,9 +629,9 @@ impl<'a> Model<'a> {
         a.below(0.0).choose(a, 0.0)
     }
 
-    /// φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² of q = min(h a, 0); φ(0) = 1, φ2(0) = 1/2.
+    /// φ(q) = (e^q − 1)/q and φ2(q) = (e^q − 1 − q)/q² for q = min(h a, 0); φ(0) = 1, φ2(0) = 1/2.
     fn phis(&self, a: Option<Real<'a>>) -> [Real<'a>; 2] {
-        match (self.sloping(a), self.apart(a)) {
+        match (self.nonzero(a), self.split_slope(a)) {
             (Some(a), None) if self.build.borrow().constant(a.value).is_none_or(|a| a < 0.0) => {
                 phi_functions::phis(self.falling(self.h * a))
             }
@@ -628,7 +643,7 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// Whether a value is one of a few that no state changes.
+    /// Whether a value is selected among at most [`MOST_CHOSEN`] values that do not depend on a state.
     fn is_chosen(&self, value: Value) -> bool {
         let (mut open, mut seen, mut given) = (vec![value], HashSet::new(), 0);
         while let Some(value) = open.pop() {
@@ -648,8 +663,8 @@ impl<'a> Model<'a> {
         true
     }
 
-    /// The same with its choices outermost, where only these depend on states: (if c then 1 else 0) · x − y → if c then
-    /// x − y else −y. 0 · x and 0/x are 0, as in a derivative.
+    /// Moves selects outwards, if only their conditions depend on states: (if c then 1 else 0) · x − y → if c then x −
+    /// y else −y. 0 · x and 0/x become 0, as in a derivative.
     fn chosen(&self, value: Value, deepest: u32) -> Value {
         let op = self.build.borrow().get(value);
         if deepest == 0 || self.is_given(value) {
@@ -664,7 +679,7 @@ impl<'a> Model<'a> {
             Op::Add(a, b) | Op::Sub(a, b) | Op::Mul(a, b) | Op::Div(a, b) => (a, b),
             _ => return value,
         };
-        // One operand is a choice, the other given.
+        // One operand is a select, and the other does not depend on a state.
         let (choice, other) = if self.is_given(a) { (b, a) } else { (a, b) };
         if choice != other && !self.is_given(other) {
             return value;
@@ -685,7 +700,7 @@ impl<'a> Model<'a> {
         })
     }
 
-    /// A choice with `f` applied to what is chosen.
+    /// Applies `f` to each value that a nest of selects can return.
     fn for_each_choice(&self, value: Value, f: &dyn Fn(Value) -> Value) -> Value {
         let op = self.build.borrow().get(value);
         match op {
@@ -697,7 +712,7 @@ impl<'a> Model<'a> {
         }
     }
 
-    /// If c then a else if d then a else b → if c or d then a else b.
+    /// A select, simplified: if c then a else if d then a else b → if c or d then a else b.
     fn choice(&self, condition: Value, yes: Value, no: Value) -> Value {
         let mut build = self.build.borrow_mut();
         match build.get(no) {
@@ -723,11 +738,11 @@ impl<'a> Model<'a> {
         given[value.index()]
     }
 
-    /// Order 2, L-stable, whatever J is; one factorisation. γ = 1 − 1/√2 ([`GAMMA`]), J = ∂f/∂x at (t, x).
+    /// Rosenbrock method of order 2, L-stable for any J, with one factorisation. γ = 1 − 1/√2 ([`GAMMA`]), J = ∂f/∂x at (t, x).
     ///
     ///   (I − γhJ) k1 = f(t, x),  (I − γhJ) k2 = f(t + h, x + h k1) − 2 k1,  x' = x + h (3 k1 + k2)/2
     ///
-    /// Where a pivot is below 1e-12 of its row, the step is that of `expo`.
+    /// If a pivot is below 1e-12 of its row, the step is that of `expo`.
     /// Source: Verwer, Spee, Blom, Hundsdorfer, SIAM J. Sci. Comput. 20 (1999), eq. 3.2.
     fn implicit(&self) -> Vec<Real<'a>> {
         let h = self.h;
@@ -758,12 +773,12 @@ mod tests {
     use abi::{Code, Description, Function, Layout};
     use std::sync::Arc;
 
-    /// Slots of a model with n states, one period, one held value and one output.
+    /// The layout of a model with n states, one period, one held value and one output.
     fn layout(n: u32) -> Layout {
         Layout::new([0, 0, n, 2, 1, 1, n, 0, 0, 1])
     }
 
-    /// dx/dt = f(t, x), and one output.
+    /// The program of dx/dt = f(t, x) with one output.
     fn program(n: u32, f: impl for<'a> Fn(Real<'a>, &[Real<'a>]) -> (Vec<Real<'a>>, Real<'a>)) -> Program {
         let layout = layout(n);
         let func = |name: &str, outputs: bool| {
@@ -786,7 +801,7 @@ mod tests {
         Program { description, outputs, derivatives, ..Program::default() }
     }
 
-    /// dz/dt and F of the LuGre model with the textbook's values, N, m, s; `sigma1` is 316 or √1e5 there.
+    /// dz/dt and F of the LuGre model with the textbook's values, in N, m, s; `sigma1` is 316 or √1e5 there.
     fn lugre<'a>(v: Real<'a>, z: Real<'a>, sigma1: f64) -> (Real<'a>, Real<'a>) {
         let ratio = v / 1e-3;
         let g = 1.0 + 0.5 * (-(ratio * ratio)).of(Unary::Exp);
@@ -820,7 +835,7 @@ mod tests {
         }
     }
 
-    /// x' = cos t + x sin t, v' = −x: smooth, with known order of convergence against a fine solution.
+    /// x' = cos t + x sin t, v' = −x: smooth; the error against a fine solution has the order of the method.
     #[test]
     fn methods_have_their_orders() {
         let program = program(2, |t, x| {
@@ -842,7 +857,7 @@ mod tests {
         }
     }
 
-    /// dx/dt = 2 − 50 x: expo is exact, whatever the step, and stays between x and its rest point.
+    /// dx/dt = 2 − 50 x: expo is exact for any step length, and stays between x and its rest point.
     #[test]
     fn expo_is_exact_for_a_state_that_relaxes() {
         let program = program(1, |_, x| (vec![2.0 - 50.0 * x[0]], x[0]));
@@ -854,9 +869,9 @@ mod tests {
         }
     }
 
-    /// An oscillator and what it is moved by, a ramp and a parabola of time: exact, whatever the step.
+    /// An oscillator, driven by a ramp and a parabola of time: exact for any step length.
     #[test]
-    fn expo_is_exact_for_states_that_need_each_other() {
+    fn expo_is_exact_for_coupled_linear_states() {
         let program = program(4, |t, x| {
             let force = 4.0 * (x[2] - x[0]) + 0.5 * (x[3] - x[1]);
             (vec![x[1], force, x[3], t * 0.0 + 3.0], x[0])
@@ -870,14 +885,14 @@ mod tests {
         for n in [2, 4, 20, 200] {
             let found = end(Method::Expo, n);
             let error = (found[0] - exact[0]).abs() + (found[1] - exact[1]).abs();
-            // The parabola is a straight line between the points of Gauss.
+            // The parabola is approximated by a straight line through the Gauss points.
             assert!(error < 6e-2 * (2.0 / n as f64).powi(4) + 1e-11, "{n} steps: {found:?} and not {exact:?}");
         }
     }
 
-    /// A stop that pushes back beyond 0.3 with k (x − 0.3): order 2, wherever in a step its edge lies.
+    /// A stop that pushes back beyond 0.3 with k (x − 0.3): order 2, wherever the edge lies within a step.
     #[test]
-    fn expo_sees_choices_of_a_state_in_the_middle_of_the_step() {
+    fn expo_evaluates_switching_conditions_mid_step() {
         let program = |k: f64| {
             program(1, move |t, x| {
                 let beyond = x[0] - 0.3;
@@ -901,7 +916,7 @@ mod tests {
         let (coarse, fine) = (error(1 << 8), error(1 << 12));
         let order = (coarse / fine).log2() / 4.0;
         assert!((1.8..2.3).contains(&order), "order {order}, errors {coarse} and {fine}");
-        // However stiff it is, nothing passes, and what is drawn back leaves at once.
+        // For any stiffness, the state does not pass the stop, and it leaves as soon as it is pulled back.
         let mut run = Run::new(&program(1e9), Method::Expo, 0.01, &[0.0]);
         let course: Vec<f64> = (0..628).map(|_| (run.advance(1), run.x(0)).1).collect();
         let most = course.iter().copied().fold(0.0, f64::max);
@@ -909,9 +924,9 @@ mod tests {
         assert!((course[627] - (0.3 - 1.0)).abs() < 0.01, "{}", course[627]);
     }
 
-    /// Coulomb friction on a mass alone: it goes on within what it travels in one and a half steps.
+    /// Coulomb friction on a mass alone: the state stays within the distance of one and a half steps.
     #[test]
-    fn a_state_that_is_drawn_to_a_jump_stays_near_it() {
+    fn a_state_attracted_to_a_jump_stays_near_it() {
         let program = program(1, |_, x| (vec![x[0].above(0.0).choose(-1.0, 1.0)], x[0]));
         let mut run = Run::new(&program, Method::Expo, 0.1, &[0.96]);
         run.advance(9);
@@ -922,9 +937,9 @@ mod tests {
         }
     }
 
-    /// Largest |z| in µm under 50 mm/s, 1 Hz, for 2 s: the table of the language's manual, section 8.2.
+    /// Largest |z| in µm at 50 mm/s, 1 Hz, for 2 s: the table in section 8.2 of the language manual.
     #[test]
-    fn driven_bristle_as_computed_elsewhere() {
+    fn driven_bristle_agrees_with_the_published_table() {
         let program = program(1, |t, x| {
             let v = 0.05 * (t * (2.0 * std::f64::consts::PI)).of(Unary::Sin);
             let (rate, force) = lugre(v, x[0], 316.0);
@@ -955,9 +970,9 @@ mod tests {
         }
     }
 
-    /// A mass of 1 kg thrown at 1 m/s travels 0.394792 m; at 1 ms expo gives 0.394793.
+    /// A mass of 1 kg thrown at 1 m/s travels 0.394792 m; at 1 ms expo returns 0.394793.
     #[test]
-    fn coasting_down_loses_no_impulse() {
+    fn coasting_down_conserves_momentum() {
         let program = program(3, |_, x| {
             let (rate, force) = lugre(x[1], x[2], 1e5f64.sqrt());
             (vec![x[1], -force, rate], force)
@@ -967,10 +982,10 @@ mod tests {
         assert!((run.x(0) - 0.394793).abs() < 1e-6, "{}", run.x(0));
     }
 
-    /// A mass pulled through a spring of 2 N/m at 0.1 m/s for 40 s: end position in m. `implicit` and `rk4` as in
-    /// section 8.2; `expo` as an independent program of the same formulas gives it.
+    /// A mass pulled through a spring of 2 N/m at 0.1 m/s for 40 s: end position in m. The values of `implicit` and
+    /// `rk4` are from section 8.2; those of `expo` are from an independent program with the same formulas.
     #[test]
-    fn pulling_ends_where_computed_elsewhere() {
+    fn pulling_agrees_with_an_independent_program() {
         let program = program(3, |t, x| {
             let (rate, force) = lugre(x[1], x[2], 316.0);
             (vec![x[1], 2.0 * (0.1 * t - x[0]) - force, rate], force)
@@ -997,9 +1012,9 @@ mod tests {
         }
     }
 
-    /// The PID servo hunts: peak to peak after 50 s in mm.
+    /// Limit cycle of the PID servo (hunting): peak to peak after 50 s, in mm.
     #[test]
-    fn hunting_swings_as_computed_elsewhere() {
+    fn hunting_agrees_with_an_independent_program() {
         let program = program(5, |_, x| {
             let [position, v, z, i, filtered] = x.try_into().expect("five states");
             let e = 1.0 - position;
@@ -1031,9 +1046,9 @@ mod tests {
         }
     }
 
-    /// A pivot of exactly 0 takes the step of expo: 1 − γ h a = 0.
+    /// If a pivot is exactly 0, 1 − γ h a = 0, the step is that of expo.
     #[test]
-    fn a_singular_step_is_done_by_expo() {
+    fn a_singular_step_falls_back_to_expo() {
         let gamma = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
         let program = program(1, move |_, x| (vec![x[0] * (1.0 / gamma)], x[0]));
         let mut run = Run::new(&program, Method::Implicit, 1.0, &[1.0]);
@@ -1045,10 +1060,10 @@ mod tests {
     }
 
     #[test]
-    fn time_is_a_count_and_ticks_are_met() {
+    fn time_is_count_times_step_and_sampled_blocks_run_on_time() {
         let mut program = program(1, |t, x| (vec![t * 0.0], x[0]));
         let layout = program.description.layout.clone();
-        // A tick adds 1 to the held value, the transition writes the number of steps to the regime.
+        // The sampled block adds 1 to the held value; the transition copies it to the mode.
         let (period, held, due) = (layout.memory.slot(0), layout.memory.slot(1), layout.due.slot(0));
         let mut tick = Build::new("tick");
         let (flag, before) = (tick.load(due), tick.load(held));
@@ -1073,7 +1088,7 @@ mod tests {
     }
 
     #[test]
-    fn a_guard_names_the_first_that_leaves() {
+    fn the_status_names_the_first_failed_guard() {
         let mut program = program(2, |_, x| (vec![x[0] * 0.0 + 1.0, 0.0 * x[0]], x[0] / x[1]));
         let layout = program.description.layout.clone();
         let guard = |slot, range| Guard { path: String::new(), slot, range, unit: Unit::none() };
@@ -1082,7 +1097,7 @@ mod tests {
             guard(layout.states.slot(0), (0.0, 3.0)),
             guard(layout.states.slot(1), (f64::NEG_INFINITY, f64::INFINITY)),
         ];
-        // Within the tolerance of 3e-6 still, then 4.
+        // Starts within the tolerance of 3e-6 below the range, and ends at 4.
         let mut run = Run::new(&program, Method::Euler, 1.0, &[2e-6, 1.0]);
         assert_eq!(run.advance(100), 2);
         assert_eq!(run.block[Slot::COUNT.index()], 4.0);
@@ -1095,7 +1110,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_on_both_sides_hold_what_is_no_number_too() {
+    fn bounds_on_both_sides_also_catch_nan() {
         let guard = |range| Guard { path: String::new(), slot: Slot(0), range, unit: Unit::none() };
         for (range, far) in [((-2.0, 2.0), -2.1), ((-1.0, 2.0), -1.1), ((-1.0, 2.0), 2.1)] {
             let mut program = program(1, |_, x| (vec![x[0] * 0.0], x[0]));
@@ -1111,9 +1126,9 @@ mod tests {
         }
     }
 
-    /// With any ranges of a state and an output, from any number.
+    /// For various ranges of a state and an output, from edge-case numbers.
     #[test]
-    fn a_prepared_step_gives_the_status_of_the_reference() {
+    fn a_prepared_step_returns_the_status_of_the_reference() {
         const ALL: f64 = f64::INFINITY;
         let mut program = program(1, |_, x| (vec![0.5 * x[0] * x[0]], 0.75 - x[0]));
         let layout = program.description.layout.clone();
@@ -1134,7 +1149,7 @@ mod tests {
                 found.resize(expected.len() + prepared.len, f64::NAN);
                 let status = code.step_prepared(&mut found, &POOL, false).expect("it has such a step");
                 let of_reference = reference.call(Function::Step, &mut expected, &POOL, 1);
-                // Who calls keeps the count.
+                // The caller updates the count.
                 found[Slot::COUNT.index()] = expected[Slot::COUNT.index()];
                 let same =
                     found.iter().zip(&expected).all(|(a, b)| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan());
@@ -1149,7 +1164,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_model_with_time_in_it_keeps_time() {
+    fn only_a_model_that_uses_time_stores_it() {
         let keeps = |program: &Program| step(program, Method::Rk4).stores.iter().any(|(slot, _)| *slot == Slot::TIME);
         assert!(!keeps(&program(1, |_, x| (vec![-1.0 * x[0]], x[0]))));
         assert!(keeps(&program(1, |t, x| (vec![-1.0 * x[0] * t], x[0]))));
@@ -1157,7 +1172,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_died_away_is_zero() {
+    fn a_decayed_state_becomes_zero() {
         let program = program(1, |_, x| (vec![-1.0 * x[0]], x[0]));
         let mut run = Run::new(&program, Method::Euler, 0.5, &[1e-29]);
         run.advance(3);
@@ -1166,7 +1181,7 @@ mod tests {
         assert_eq!(run.x(0).to_bits(), 0);
     }
 
-    /// Steps of every method, interpreted and as machine code, from states of every size.
+    /// Steps of every method, interpreted and compiled, from states of every size.
     #[test]
     fn steps_agree_to_the_bit() {
         let program = program(3, |t, x| {

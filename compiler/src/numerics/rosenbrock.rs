@@ -1,11 +1,16 @@
-//! Adaptive steps: the whole of Rodas5P around a model as one straight-line function, with the choice of the next length.
+//! The adaptive step: one step of the Rosenbrock method Rodas5P as one straight-line function, with its step control.
 //!
-//! In: a [`Program`]. Out: a function over the segment [`Trial`]: from t, the wanted length, the states, derivatives and
-//! Jacobian at the start, to those at the end, the course between, the estimated errors and the switching surfaces on the
-//! way. So f and its derivatives at the end share what they have in common and serve the next step; zeros and constants
-//! of the Jacobian are known, so that rows like dx/dt = v cost no division; and nothing goes through memory between the
-//! stages. A trial at which nothing happens is settled here, so that a loop around the function makes step after step:
-//! accepted, or refused for its error. What happens at an event is not known here.
+//! In: a [`Program`]. Out: a function over the segment [`Trial`]. It reads t, the wanted step length, and the states,
+//! derivatives and Jacobian at the start. It writes the same quantities at the end, the interpolant, the estimated
+//! errors and the switching functions along the step. As one function, f and its derivatives at the end share
+//! operations and serve as the start of the next step; zeros and constants of the Jacobian are known, so that rows like
+//! dx/dt = v cost no division; and values between the stages stay in registers.
+//!
+//! The function itself accepts a trial without events, or rejects it for its error, so that a loop around it makes step
+//! after step. It does not know what happens at an event.
+//!
+//! Sources: Steinebach, BIT 63:27, 2023 (method); Hairer, Wanner, *Solving ODEs II*, IV.7 and IV.8 (stages, step
+//! control).
 
 use crate::ir::build::{Build, Env};
 use crate::ir::expr::{Int, Real, Shared, Truth};
@@ -25,15 +30,14 @@ use abi::rosenbrock::step_control::{
 use std::collections::HashSet;
 use std::sync::OnceLock;
 
-/// A pivot smaller than this part of its row is too small: the digits that are left do for an error estimate, not for
-/// more.
+/// A pivot is too small below this fraction of its row. The remaining digits are just enough for an error estimate.
 const LEAST_PIVOT: f64 = 1e-6;
 
-/// Operations of the derivatives, before functions are expanded, up to which a step is unrolled: it holds them eight times
-/// and must pay for being compiled.
+/// Largest number of operations of the derivatives, before expansion, for which a step is unrolled. A step contains
+/// them eight times, and its compilation must pay off.
 const MOST_OPERATIONS: usize = 400;
 
-/// The step; none of a model whose layout has no room for it, or whose equations are many.
+/// The step function. `None` if the layout has no room for it or the model has too many operations.
 pub fn rosenbrock(program: &Program) -> Option<Func> {
     if program.derivatives.ops.len() > MOST_OPERATIONS {
         return None;
@@ -46,9 +50,8 @@ pub fn rosenbrock(program: &Program) -> Option<Func> {
     let why = build.select(singular, pivot, looked_at);
     let status = build.select(look, why, zero);
     build.status(status);
-    // The model's equations stand in the order of the text: a contact that sticks holds by differences that are exactly
-    // zero, which neither regrouping nor contraction would keep. What the method adds is contracted: its sums weigh
-    // stages that are zero then.
+    // The model's equations are neither reassociated nor contracted: a contact that sticks relies on differences that
+    // are exactly zero. The method's own weighted sums are fused: the stages they weigh are zero in that case.
     Some(build.finish())
 }
 
@@ -56,8 +59,8 @@ fn slots(segment: Segment) -> impl Iterator<Item = Slot> {
     segment.range().map(|slot| Slot(slot as u32))
 }
 
-/// Constants of this function, to stand in the pool behind those of the elementary functions: it has too many for the
-/// registers, and in memory they are operands.
+/// The constants of this function. They follow the constants of the elementary functions in the pool: they are too many
+/// for the registers, and memory operands are cheap.
 pub fn constants() -> &'static [f64] {
     static CONSTANTS: OnceLock<Vec<f64>> = OnceLock::new();
     CONSTANTS.get_or_init(|| {
@@ -74,7 +77,7 @@ pub fn constants() -> &'static [f64] {
                 ops.iter().filter_map(|op| if let Op::Real(bits) = op { Some(f64::from_bits(*bits)) } else { None }),
             );
         }
-        // By size, each once; NaN is no constant of a formula.
+        // Sorted and unique. NaN is not a constant of a formula.
         constants.retain(|x| !x.is_nan());
         constants.sort_by(f64::total_cmp);
         constants.dedup_by_key(|x| x.to_bits());
@@ -82,7 +85,7 @@ pub fn constants() -> &'static [f64] {
     })
 }
 
-/// The expanded function with those constants read from the pool.
+/// Replaces the constants of the expanded function by reads from the pool.
 pub fn pooled(func: &Func) -> Func {
     let constants = constants();
     let mut build = Build::new(&func.name);
@@ -103,18 +106,18 @@ pub fn pooled(func: &Func) -> Func {
     build.finish_as(func, &values)
 }
 
-/// How long a step is.
+/// The length of a step.
 struct Length<'a> {
-    /// As wanted and allowed, if no stop were near.
+    /// The length by error control and the largest permitted step, if no stop were near.
     wanted: Real<'a>,
     h: Real<'a>,
-    /// Where its last stages are evaluated.
+    /// The time at which the last stages are evaluated.
     end: Real<'a>,
-    /// Whether it reaches the stop.
+    /// Whether the step reaches the stop.
     hits: Truth<'a>,
 }
 
-/// A trial from t over h, and what is at its end.
+/// The result of a trial step from t over h: the values at its end.
 struct Found<'f, 'a> {
     t: Real<'a>,
     h: Real<'a>,
@@ -134,7 +137,8 @@ struct Step<'a> {
 }
 
 impl<'a> Step<'a> {
-    /// Appends and stores everything; gives whether a pivot is too small, and whether anybody has to look.
+    /// Appends and stores everything. Returns whether a pivot is too small, and whether the caller must look at the
+    /// trial.
     fn build(self) -> (Value, Value) {
         let n = self.program.description.layout.states.len as usize;
         let t = self.load(self.trial.time());
@@ -158,7 +162,7 @@ impl<'a> Step<'a> {
                 let time = if stage < 5 { t + C[stage] * h } else { end };
                 let mut env = self.env(time, &x);
                 f = self.rates(&mut env);
-                turned = turned | self.turned(&mut env);
+                turned = turned | self.crosses_in_stage(&mut env);
             }
             let right: Vec<Real> = (0..n)
                 .map(|i| {
@@ -215,12 +219,12 @@ impl<'a> Step<'a> {
             }
             let ends = [&on_the_way[0][..], &on_the_way[1][..]];
             met = turned
-                | self.meets(ends[0], ends[1])
-                | self.comes_and_goes((t, h), [0.25, 0.75].map(between), &moving, ends);
+                | self.crosses(ends[0], ends[1])
+                | self.may_cross_within_halves((t, h), [0.25, 0.75].map(between), &moving, ends);
         }
         self.keep(self.trial.met(), met.choose(1.0, t.constant(0.0)));
 
-        // What is allowed to each state, and how much of it the two measures of the error take.
+        // The permitted error of each state, and the largest ratio of either error measure to it.
         let tol = self.load(self.trial.tol());
         let scales = self.loads(self.trial.scales());
         let rate = 1.0 / h;
@@ -238,7 +242,7 @@ impl<'a> Step<'a> {
             finite = Some(finite.map_or(0.0 * x1[i], |sum| sum + 0.0 * x1[i]));
         }
         let defect = defect * (1.0 / fastest.sqrt());
-        // Zero times what is not finite is NaN.
+        // 0 · x is NaN if x is not finite.
         let worst = finite.map_or(worst, |zero| worst + zero);
         self.keep(self.trial.worst(), worst);
         self.keep(self.trial.defect(), defect);
@@ -257,8 +261,8 @@ impl<'a> Step<'a> {
         (singular.value, look.value)
     }
 
-    /// How long the step is: as wanted, but no longer than allowed, to the stop if that is near, and half the way if the
-    /// stop is less than two steps away.
+    /// The step length: the wanted one, at most the largest permitted one. It is the distance to the stop if that is
+    /// near, and half of it if the stop is less than two steps away.
     fn length(&self, t: Real<'a>) -> Length<'a> {
         let left = self.load(self.trial.stop()) - t;
         let (next, longest) = (self.load(self.trial.next()), self.load(self.trial.longest()));
@@ -270,9 +274,9 @@ impl<'a> Step<'a> {
         Length { wanted, h, end, hits }
     }
 
-    /// Whether a stage evaluates the rates on the other side of a surface: a stiff step may end on the old side though what
-    /// holds it there holds no longer.
-    fn turned(&self, env: &mut Env) -> Truth<'a> {
+    /// Whether a stage evaluates the rates on the other side of a switching surface. A stiff step may end on the old
+    /// side, although the condition for being there no longer holds.
+    fn crosses_in_stage(&self, env: &mut Env) -> Truth<'a> {
         let mut turned = Truth::from((false, self.build));
         let Some(roots) = &self.program.roots else { return turned };
         self.build.borrow_mut().inline(roots, env);
@@ -285,23 +289,25 @@ impl<'a> Step<'a> {
         turned
     }
 
-    /// Whether a surface is crossed in the middle or at the end, or may be between: there a parabola through the three
-    /// values tells how near it comes.
-    fn meets(&self, middle: &[Real<'a>], last: &[Real<'a>]) -> Truth<'a> {
+    /// Whether a switching surface is crossed in the middle or at the end, or possibly in between, where a parabola
+    /// through the three values estimates how close to zero it comes.
+    fn crosses(&self, middle: &[Real<'a>], last: &[Real<'a>]) -> Truth<'a> {
         let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
         let mut met = Truth::from((false, self.build));
-        // Observed quantities decide on no step; the observer looks at each step.
+        // Surfaces of observed quantities decide on no step; the observer checks each step itself.
         let surfaces = sides.into_iter().zip(here).zip(middle).zip(last).zip(&self.program.description.roots);
         for ((((side, a), b), c), _) in surfaces.filter(|(_, root)| !root.observed) {
-            met = met | self.passes(side, [a, *b, *c]);
+            met = met | self.may_cross(side, [a, *b, *c]);
         }
         met
     }
 
-    /// Whether a surface with these values at even distances is crossed, or may be between, where a parabola comes near zero.
-    fn passes(&self, side: Real<'a>, [a, b, c]: [Real<'a>; 3]) -> Truth<'a> {
+    /// Whether a switching function with these equidistant values changes its sign, or may do so in between because the
+    /// parabola through them comes close to zero. `side`: its sign at the start.
+    fn may_cross(&self, side: Real<'a>, [a, b, c]: [Real<'a>; 3]) -> Truth<'a> {
         let stays = (side * b).above(0.0) & (side * c).above(0.0);
-        // Least at θ = rise / bend, where it is a − rise² / bend; nothing is divided.
+        // The parabola has its extremum at θ = rise / bend, with the value a − rise² / bend; the test avoids the
+        // division.
         let (rise, bend) = (1.5 * a - 2.0 * b + 0.5 * c, 2.0 * (a - 2.0 * b + c));
         let steep = bend.abs();
         let inside = (rise * bend).above(0.0) & rise.abs().below(steep);
@@ -313,9 +319,10 @@ impl<'a> Step<'a> {
         !stays | turns
     }
 
-    /// The same over both halves of the step, with the states at a quarter and three quarters, of surfaces that move with
-    /// time: a model at rest makes long steps, on which a push comes and goes. `moving`: which.
-    fn comes_and_goes(
+    /// The same test over both halves of the step, with the states at one quarter and three quarters, for surfaces that
+    /// depend on time. A model at rest makes long steps, within which a short pulse can begin and end. `moving`: the
+    /// surfaces that depend on time.
+    fn may_cross_within_halves(
         &self,
         (t, h): (Real<'a>, Real<'a>),
         quarters: [Vec<Real<'a>>; 2],
@@ -333,13 +340,13 @@ impl<'a> Step<'a> {
         });
         for k in (0..moving.len()).filter(|k| moving[*k]) {
             let halves = [[here[k], early[k], middle[k]], [middle[k], late[k], last[k]]];
-            met = halves.into_iter().fold(met, |met, half| met | self.passes(sides[k], half));
+            met = halves.into_iter().fold(met, |met, half| met | self.may_cross(sides[k], half));
         }
         met
     }
 
-    /// Accepts or refuses the trial, unless somebody has to look, and gives whether; `met`: there is something to see if it
-    /// is accurate; `singular`: nothing of it counts.
+    /// Accepts or rejects the trial, unless the caller must look at it, and returns whether it must. `met`: an accurate
+    /// trial has an event. `singular`: the trial is invalid.
     fn settle(
         &self,
         found: Found<'_, 'a>,
@@ -355,15 +362,15 @@ impl<'a> Step<'a> {
         let fine = !error.above(1.0);
         let accepted = self.load(trial.accepted()) + 1.0;
 
-        // The next length, by Gustafsson's predictive control.
+        // The next step length, by Gustafsson's predictive control.
         let error = error.below(LEAST_ERROR).choose(LEAST_ERROR, error);
         let inverse = self.inverse_fifth_root(error);
         let plain = SAFETY * inverse;
         let square = inverse * inverse;
         let (last_step, last_root) = (self.load(trial.last_step()), self.load(trial.last_root()));
-        // What the error did from step to step, it will do again.
-        let foretold = (SAFETY * (h / last_step) * last_root) * square;
-        let part = (last_step.above(0.0) & foretold.below(plain)).choose(foretold, plain);
+        // The prediction extrapolates the trend of the error from step to step.
+        let predicted = (SAFETY * (h / last_step) * last_root) * square;
+        let part = (last_step.above(0.0) & predicted.below(plain)).choose(predicted, plain);
         let rejected = self.load(trial.rejected());
         let part = (rejected.above(0.0) & part.above(1.0)).choose(1.0, part);
         let part = part.below(LEAST_GAIN).choose(LEAST_GAIN, part);
@@ -416,8 +423,8 @@ impl<'a> Step<'a> {
         seen
     }
 
-    /// Whether the step ends behind a surface, and then how long one is that ends before the first of them, which it may have
-    /// failed for.
+    /// Whether the step ends beyond a switching surface, and if so, the length of a step that ends before the first
+    /// such surface: the crossing may be the reason why the error is too large.
     fn overrun(&self, h: Real<'a>, last: &[Real<'a>]) -> (Truth<'a>, Real<'a>) {
         let mut first = (Truth::from((false, self.build)), h.constant(MOST_BEFORE_SURFACE));
         let (sides, here) = (self.loads(self.trial.sides()), self.loads(self.trial.here()));
@@ -430,7 +437,7 @@ impl<'a> Step<'a> {
         (first.0, BEFORE_SURFACE * first.1 * h)
     }
 
-    /// Whether a quantity that is watched is not fine where the step ends.
+    /// Whether a guard fails at the end of the step.
     fn outside(&self, end: Real<'a>, x: &[Real<'a>]) -> Truth<'a> {
         let guards = &self.program.description.guards;
         let mut env = self.env(end, x);
@@ -443,15 +450,16 @@ impl<'a> Step<'a> {
         for ((guard, low), high) in guards.iter().zip(self.loads(self.trial.lows())).zip(self.loads(self.trial.highs()))
         {
             let value = self.read(guard.slot, &env);
-            // Of what is not finite this is NaN, and so is the sum.
+            // 0 · value is NaN if the value is not finite, and so is the sum.
             zero = value.fma(0.0, zero);
             fine = fine & !value.below(low) & !value.above(high);
         }
         !(fine & zero.is(0.0))
     }
 
-    /// x^(−1/5) of a positive number to four digits, by Newton's method from its exponent: no division, since the next
-    /// step waits for it. As [`abi::rosenbrock::step_control::inverse_fifth_root`] to the bit.
+    /// x^(−1/5) of a positive number to four digits, by Newton's method from its exponent. There is no division,
+    /// because the next step waits for the result. Equal to [`abi::rosenbrock::step_control::inverse_fifth_root`] to
+    /// the bit.
     fn inverse_fifth_root(&self, x: Real<'a>) -> Real<'a> {
         let bits = x.bits();
         let mut fifth = bits.shift_right(3) + bits.shift_right(4);
@@ -466,7 +474,7 @@ impl<'a> Step<'a> {
         y
     }
 
-    /// State i at which a stage evaluates f; `last` is that of the stage before.
+    /// State i at which a stage evaluates f. `last`: the states of the previous stage.
     fn argument(&self, stage: usize, i: usize, x0: &[Real<'a>], last: &[Real<'a>], u: &[Vec<Real<'a>>]) -> Real<'a> {
         if stage > 5 {
             return last[i] + u[stage - 1][i];
@@ -474,8 +482,8 @@ impl<'a> Step<'a> {
         A[stage].iter().zip(u).fold(x0[i], |sum, (weight, u)| u[i].fma(*weight, sum))
     }
 
-    /// Rows of ∂f/∂x at the start, and ∂f/∂t. What depends on neither time nor states is computed, what does is loaded:
-    /// it was computed as the end of the step before.
+    /// The rows of ∂f/∂x at the start, and ∂f/∂t. Entries that depend on neither time nor states are computed; the
+    /// others are loaded, because they were computed at the end of the previous step.
     fn jacobian(&self, t: Real<'a>, x: &[Real<'a>], from: Point) -> (Vec<Gradient>, Vec<Option<Real<'a>>>) {
         let n = x.len();
         let (_, gradients) = self.gradients(t, x);
@@ -500,7 +508,7 @@ impl<'a> Step<'a> {
         (rows, df_dt)
     }
 
-    /// Stores f and the Jacobian at the end; gives both.
+    /// Stores f and the Jacobian at the end, and returns both.
     fn end(&self, t: Real<'a>, x: &[Real<'a>], at_start: &[Gradient]) -> (Vec<Real<'a>>, Vec<Real<'a>>) {
         let (n, to) = (x.len(), self.trial.to());
         let (f, gradients) = self.gradients(t, x);
@@ -527,7 +535,7 @@ impl<'a> Step<'a> {
         (f, slots(layout.derivatives).map(|slot| gradients.remove(&slot).unwrap_or_default()).collect())
     }
 
-    /// For each operation so far, whether it depends on time or states.
+    /// Variance: for each operation so far, whether it depends on time or states.
     fn varies(&self, t: Real<'a>, x: &[Real<'a>]) -> Vec<bool> {
         let build = self.build.borrow();
         let sources: HashSet<Value> = x.iter().map(|x| x.value).chain([t.value]).collect();
@@ -541,7 +549,8 @@ impl<'a> Step<'a> {
         varies
     }
 
-    /// The square of the fastest frequency that the Jacobian knows: exact for a mass on a spring, and for what decays.
+    /// The square of the highest frequency in the Jacobian: exact for a mass on a spring and for a decaying state.
+    /// `rate`: 1/h, the least frequency to return.
     fn fastest(&self, rate: Real<'a>, rows: &[Gradient]) -> Real<'a> {
         let mut fastest = rate * rate;
         for (i, row) in rows.iter().enumerate() {
@@ -643,7 +652,7 @@ experiment waves { run Waves() for 1 s }
         read.unwrap_or_else(|found| panic!("{found:?}")).remove(0).program
     }
 
-    /// The model at a point, by its plain functions.
+    /// Evaluates a model at a point with its plain functions.
     struct Plain<'p> {
         program: &'p Program,
         derivatives: Func,
@@ -685,7 +694,7 @@ experiment waves { run Waves() for 1 s }
         }
     }
 
-    /// x of A x = b by elimination with the largest pivot.
+    /// The solution x of A x = b, by elimination with partial pivoting.
     fn solve(a: &[f64], b: &[f64]) -> Vec<f64> {
         let n = b.len();
         let mut rows: Vec<Vec<f64>> = (0..n).map(|i| [&a[i * n..(i + 1) * n], &[b[i]]].concat()).collect();
@@ -703,7 +712,7 @@ experiment waves { run Waves() for 1 s }
         (0..n).map(|k| rows[k][n] / rows[k][k]).collect()
     }
 
-    /// u of every stage, as the formulas of the method stand in its source.
+    /// u of every stage, by the formulas of the source.
     fn stages(plain: &mut Plain, t: f64, h: f64, end: f64, x0: &[f64]) -> Vec<Vec<f64>> {
         let n = x0.len();
         let jacobian = plain.jacobian(t, x0);
@@ -726,7 +735,7 @@ experiment waves { run Waves() for 1 s }
     }
 
     #[test]
-    fn a_step_is_that_of_the_method() {
+    fn a_step_agrees_with_the_formulas_of_the_method() {
         for name in ["pull", "hunting", "waves"] {
             let program = program(name);
             let layout = &program.description.layout;
@@ -776,7 +785,7 @@ experiment waves { run Waves() for 1 s }
                         check("course", i, found(segment)[i], (0..STAGES).map(|j| H[k][j] * u[j][i]).sum());
                     }
                 }
-                // What holds at the end is that of the state found, up to rounding.
+                // The values at the end are those of the final state, up to rounding.
                 let near = |what: &str, found: &[f64], expected: &[f64]| {
                     for (a, b) in found.iter().zip(expected) {
                         assert!(
@@ -801,7 +810,7 @@ experiment waves { run Waves() for 1 s }
         }
     }
 
-    /// Interpreted and as machine code, over many steps.
+    /// Interpreted and compiled code agree over many steps.
     #[test]
     fn steps_agree_to_the_bit() {
         let program = program("hunting");
@@ -838,7 +847,7 @@ experiment waves { run Waves() for 1 s }
             for (slot, (a, b)) in block.iter().zip(&other).enumerate() {
                 assert_eq!(a.to_bits(), b.to_bits(), "slot {slot} of {trial:?}: {a} and {b}");
             }
-            // What is left is settled by force.
+            // Trials that the function leaves to the caller are accepted or rejected here.
             settled = block[trial.accepted().index()];
             if status == 0 {
                 continue;

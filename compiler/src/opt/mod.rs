@@ -61,7 +61,7 @@ pub static PASSES: [Pass; 4] = [
     // Last, because it derives the finiteness of values from the final operations.
     Pass {
         name: "guard_reduction",
-        does: "drops addends from the finiteness guard whose failure shows in another addend",
+        does: "drops addends from the finiteness guard that other addends imply",
         run: |func, _| guard_reduction::reduce_guards(func),
     },
 ];
