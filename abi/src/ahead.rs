@@ -1,7 +1,10 @@
-//! A step in two parts: what depends on nothing but time, for several instants at once, and the rest step by step.
+//! Loop distribution: a step in two parts. One computes, for several instants at once, everything that depends on time
+//! alone; the other runs the rest step by step.
 //!
-//! What neither the states nor anything they lead to can change goes ahead of them: lanes are instants here. The same
-//! operations are done on the same numbers, so the bits are those of the step in one piece.
+//! Values that depend on no state are computed ahead of the states, in lanes that are instants here. Operations and
+//! operands are the same as in the undivided step, so the bits are too.
+//!
+//! Source: Kennedy, Allen, *Optimizing Compilers for Modern Architectures*, 2001, ch. 5.
 
 use crate::description::{Layout, Slot};
 use crate::lanes::{Lanes, Line};
@@ -9,14 +12,14 @@ use std::any::Any;
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 
-/// Machine code of the rest: as [`Entry`](crate::table::Entry), for `count` steps of which `ahead` has what went ahead:
-/// number `k` of step `i` at `ahead[k · lanes + i]`.
+/// Machine code of the remaining part: as [`Entry`](crate::table::Entry), for `count` steps. `ahead` holds the values
+/// computed ahead: value `k` of step `i` is `ahead[k · lanes + i]`.
 pub type RestEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, ahead: *const f64) -> u64;
 
-/// Numbers that an advance has room for on the stack: 32 KiB.
+/// Capacity of the stack buffer, in numbers: 32 KiB.
 const ROOM: usize = 4096;
 
-/// Most instants at once.
+/// Maximum number of instants at once.
 const INSTANTS: usize = 64;
 
 /// A step in two parts.
@@ -31,15 +34,15 @@ pub struct Ahead {
 }
 
 impl Ahead {
-    /// The parts, if there is room for them.
+    /// Combines the parts. `None` if they exceed the stack buffer or the maximum number of instants.
     ///
-    /// `instants` and `once` work on numbers of their own, laid out as `layout` says: time and count, in the parameters the
-    /// numbers of the block that `loads` names, in the states what `once` computes and no step changes, in the outputs
-    /// what the rest is given.
+    /// `instants` and `once` work on a block of their own with the layout `layout`. It has time and count; its
+    /// parameters are the numbers of the model's block that `loads` names; its states are computed by `once` and are
+    /// the same in every step; its outputs are the values for the remaining part.
     ///
     /// # Safety
-    /// `rest` must be valid as long as `memory` lives, must access only the block and the pool that the step in one piece
-    /// may, and of what went ahead as many numbers as `layout` has outputs, and must not unwind.
+    /// `rest` must be valid as long as `memory` lives, must not unwind, and must access only what the undivided step
+    /// may access in block and pool, and as many values computed ahead as `layout` has outputs.
     pub unsafe fn new(
         once: Option<Lanes>,
         instants: Lanes,
@@ -58,20 +61,21 @@ impl Ahead {
         fits.then_some(Ahead { once, instants, layout, loads, rest, _memory: memory })
     }
 
-    /// Steps from which on going ahead costs less than it spares.
+    /// Smallest number of steps for which computing ahead pays off.
     pub(crate) fn pays(&self) -> u64 {
         self.instants.width() as u64 / 2
     }
 
-    /// Advances by steps, as many as are worth going ahead, up to `count`; gives how many those are and the first status
-    /// that is not 0. None are if the count of steps so far is no whole number, of which nothing can be told ahead.
+    /// Advances by up to `count` steps, as many as are worth computing ahead. Returns the number of steps done and the
+    /// first status that is not 0. No step is done if the step count so far is not an integer, because time cannot then
+    /// be computed ahead.
     ///
     /// # Safety
-    /// The block must have all slots of the model, the pool all numbers of its code.
+    /// The block must have all slots of the model, and the pool all numbers of its code.
     #[inline(never)]
     pub(crate) unsafe fn advance(&self, block: &mut [f64], pool: &[f64], count: u64) -> (u64, u64) {
         let begin = block[Slot::COUNT.index()];
-        // Up to 2^53 every whole number is a number, and one more than it is exact.
+        // Up to 2^53 every integer is a double, so adding 1 to a smaller one is exact.
         let exact = 9007199254740992.0 - self.instants.width() as f64;
         if !(begin >= 0.0 && begin.floor() == begin && begin + count as f64 <= exact) {
             return (0, 0);
@@ -83,18 +87,18 @@ impl Ahead {
         let (numbers, statuses) = (room.as_mut_ptr().cast::<f64>(), statuses.as_mut_ptr());
         let set = |slot: Slot, lane: usize, value: f64| {
             debug_assert!(slot.index() < self.layout.size() && lane < width);
-            // SAFETY: `new` has seen that the numbers of all slots have room.
+            // SAFETY: `new` has checked that the buffer has room for all slots.
             unsafe { numbers.add(slot.index() * width + lane).write(value) };
         };
         for (k, from) in self.loads.iter().enumerate() {
             (0..width).for_each(|lane| set(self.layout.params.slot(k), lane, block[from.index()]));
         }
         if let Some(once) = &self.once {
-            // SAFETY: `Lanes::new` was promised that the entry accesses only its numbers, for which there is room, the pool
-            // and a status a lane.
+            // SAFETY: by the contract of `Lanes::new`, the entry accesses only its numbers, for which there is room,
+            // the pool, and one status per lane.
             unsafe { once.run(numbers, pool.as_ptr(), 1, statuses) };
         }
-        // SAFETY: the outputs lie among the numbers.
+        // SAFETY: the outputs are within the numbers.
         let ahead = unsafe { numbers.add(self.layout.outputs.start as usize * width) };
         let mut done = 0;
         while count - done >= self.pays() {
@@ -103,12 +107,13 @@ impl Ahead {
                 set(Slot::COUNT, lane, number);
                 set(Slot::TIME, lane, number * step);
             }
-            // Whoever called may have set another time.
+            // The caller may have set another time.
             set(Slot::TIME, 0, block[Slot::TIME.index()]);
             // SAFETY: as above.
             unsafe { self.instants.run(numbers, pool.as_ptr(), 1, statuses) };
             let some = (count - done).min(width as u64);
-            // SAFETY: `new` was promised that the entry accesses only the block, the pool and what has just gone ahead.
+            // SAFETY: by the contract of `new`, the entry accesses only the block, the pool and the values just
+            // computed.
             let status = unsafe { (self.rest)(block.as_mut_ptr(), pool.as_ptr(), some, ahead) };
             done += some;
             if status != 0 {

@@ -1,19 +1,19 @@
-//! What a compiled model says of itself: its quantities, and where in the block their values lie.
+//! The description of a compiled model: its quantities, and the slots of the block that hold their values.
 
 use crate::unit::Unit;
 
-/// A place in the block.
+/// Index of a number in the block.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct Slot(pub u32);
 
 impl Slot {
-    /// Time `t`, in s. Code of a model in whose equations it stands keeps it; all else is told by
+    /// Time `t`, in s. The code stores it if an equation of the model uses it; otherwise the caller does, with
     /// [`keep_clock`](crate::table::keep_clock).
     pub const TIME: Slot = Slot(0);
-    /// Fixed step `h`, in s.
+    /// Length of a fixed step `h`, in s.
     pub const STEP: Slot = Slot(1);
-    /// Number of fixed steps done since the start: a whole number. `t = COUNT · STEP`, never a running sum. Of a single step
-    /// it is told as time is.
+    /// Number of fixed steps since the start, an integer. `t = COUNT · STEP`, never a running sum. After a single step,
+    /// the caller stores it, like time.
     pub const COUNT: Slot = Slot(2);
     /// Number of slots before the first segment.
     pub const FIXED: u32 = 3;
@@ -24,7 +24,7 @@ impl Slot {
     }
 }
 
-/// Consecutive slots of one purpose.
+/// Consecutive slots with one purpose.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Segment {
     /// First slot.
@@ -40,7 +40,7 @@ impl Segment {
         Slot(self.start + i as u32)
     }
 
-    /// Whether the slot lies in this segment.
+    /// Whether the slot is in this segment.
     pub fn contains(self, slot: Slot) -> bool {
         (self.start..self.start + self.len).contains(&slot.0)
     }
@@ -51,33 +51,33 @@ impl Segment {
     }
 }
 
-/// The segments of a block, in this order, behind the fixed slots.
+/// The segments of a block, in this order, after the fixed slots.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Layout {
     /// Parameters: constant during a step.
     pub params: Segment,
-    /// Inputs that come from outside: held during a step.
+    /// Inputs from outside: held during a step.
     pub inputs: Segment,
     /// Continuous states x.
     pub states: Segment,
-    /// Sampled states, held outputs, tick counters, what is delayed, crossing memory.
+    /// Sampled states, held outputs, tick counters, delayed values, and the memory of crossings.
     pub memory: Segment,
-    /// Active regime of each automaton: a whole number.
+    /// Active regime of each automaton, an integer.
     pub regimes: Segment,
     /// Outputs and observed quantities, written by `Outputs` and `Step`.
     pub outputs: Segment,
     /// dx/dt, written by `Derivatives`.
     pub derivatives: Segment,
-    /// Switching surfaces, written by `Roots`.
+    /// Switching functions, written by `Roots`.
     pub roots: Segment,
-    /// ∂f/∂x, row-major n × n or the entries of the [coupling](Description::coupling), written by `Jacobian`; then ∂f/∂t,
-    /// n entries.
+    /// ∂f/∂x, row-major n × n or only the entries of the [coupling](Description::coupling), written by `Jacobian`; then
+    /// ∂f/∂t, n entries.
     pub jacobian: Segment,
-    /// For each sampled block: is it due (1) or not (0), read by `Tick`.
+    /// For each sampled block whether it is due (1 or 0), read by `Tick`.
     pub due: Segment,
-    /// One adaptive step that is tried: see [`Trial`](crate::rosenbrock::layout::Trial). Empty where `Rosenbrock` is not there.
+    /// A trial of one adaptive step: see [`Trial`](crate::rosenbrock::layout::Trial). Empty without `Rosenbrock`.
     pub trial: Segment,
-    /// Samples of what is delayed, of fixed steps: a ring for each [`Delay`]. Empty until the step is known.
+    /// Samples of delayed quantities in fixed steps: one ring for each [`Delay`]. Empty until the step length is known.
     pub rings: Segment,
 }
 
@@ -88,7 +88,7 @@ impl Layout {
         segments.map(|segment| segment.start + segment.len).into_iter().fold(Slot::FIXED, u32::max) as usize
     }
 
-    /// The same with so many slots for rings.
+    /// The same layout with `len` slots for rings.
     pub fn with_rings(self, len: u32) -> Layout {
         let start = Layout { rings: Segment::default(), ..self.clone() }.size() as u32;
         Layout { rings: Segment { start, len }, ..self }
@@ -100,7 +100,7 @@ impl Layout {
         [params, inputs, states, memory, regimes, outputs, derivatives, roots, jacobian, due].map(|segment| segment.len)
     }
 
-    /// Puts segments of these lengths one behind the other; the order of the arguments is that of the fields.
+    /// A layout of consecutive segments with these lengths, in the order of the fields.
     pub fn new(lens: [u32; 10]) -> Layout {
         let mut next = Slot::FIXED;
         let mut take = |len: u32| {
@@ -126,24 +126,24 @@ impl Layout {
     }
 }
 
-/// What a quantity is to its model.
+/// The role of a quantity in its model.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Kind {
     /// Constant during a step.
     Param,
-    /// From outside.
+    /// Set from outside.
     Input,
     /// Continuous state.
     State,
-    /// State that changes at ticks only.
+    /// State that only changes at ticks.
     SampledState,
-    /// Computed, visible from outside.
+    /// Computed, visible outside the model.
     Output,
-    /// Computed, private.
+    /// Computed, private to the model.
     Let,
     /// True while this regime is active.
     Regime,
-    /// An expression that an experiment or a rig asked for.
+    /// An expression that an experiment or a rig observes.
     Observed,
 }
 
@@ -152,17 +152,17 @@ pub enum Kind {
 pub struct Quantity {
     /// Dotted path as the user writes it: `fr.F`, `el[2].f`. For `Observed`: the expression as written.
     pub path: String,
-    /// What it is.
+    /// Its role.
     pub kind: Kind,
-    /// The unit it is declared and shown in. Values in the block are SI.
+    /// The unit in which it is declared and displayed. Values in the block are SI.
     pub unit: Unit,
-    /// Whether it is true (1) or false (0) rather than a quantity.
+    /// Whether it is a Boolean: 1 or 0.
     pub boolean: bool,
-    /// Where its value lies. Of outputs and lets, after `Outputs` or `Step`.
+    /// Slot of its value. Outputs and lets are valid after `Outputs` or `Step`.
     pub slot: Slot,
-    /// Declared range in SI, infinite where open.
+    /// Declared range in SI, infinite if open.
     pub range: (f64, f64),
-    /// The doc comment.
+    /// The doc comment of the model text.
     pub doc: Option<String>,
 }
 
@@ -171,66 +171,66 @@ pub struct Quantity {
 pub struct Tick {
     /// Slot of its period in s, written by `Start`.
     pub period: Slot,
-    /// Slot that says whether it is due, in the segment `due`.
+    /// Slot of its due flag, in the segment `due`.
     pub due: Slot,
 }
 
-/// `delay(x, T)`: x as it was T ago, on straight lines between samples. Functions of the model read it as
-/// `past + weight · (x − past)`; whoever runs them puts past and weight in place, a fixed step from its ring.
+/// `delay(x, T)`: the value of x a time T ago, interpolated linearly between samples. Functions of the model read it as
+/// `past + weight · (x − past)`. The caller provides past and weight; a fixed step computes them from its ring.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Delay {
     /// Slot of T in s, in the segment `memory`, written by `Start`.
     pub time: Slot,
-    /// Least and greatest T in s.
+    /// Smallest and largest T in s.
     pub range: (f64, f64),
-    /// Slot of how many fixed steps T lies before the newest sample at the end of a step, no less than 0, in the segment
-    /// `memory`, written by `Start` if there is a ring.
+    /// Slot of the distance, in fixed steps and at least 0, by which T exceeds the newest sample at the end of a step.
+    /// In the segment `memory`, written by `Start` if there is a ring.
     pub back: Slot,
     /// Slot of x: its own, or one of the segment `outputs`.
     pub source: Slot,
-    /// Slot of the value before, in the segment `memory`.
+    /// Slot of the past value, in the segment `memory`.
     pub past: Slot,
-    /// Slot of the part of the way from there to the present x, 0 to 1; 0 where T is no shorter than a step. At the end of
-    /// fixed steps it is always the same, and written by `Start`. None where no step may be longer than the least T: then x at
-    /// this instant is not needed.
+    /// Slot of the weight of the present x, 0 to 1; 0 if T is at least one step. At the end of a fixed step it is
+    /// constant, and written by `Start`. `None` if no step may be longer than the smallest T: the present x is then not
+    /// needed.
     pub weight: Option<Slot>,
-    /// Slot of the slope of the value before along time, per s: for ∂f/∂t.
+    /// Slot of the slope of the past value over time, per s: for ∂f/∂t.
     pub slope: Slot,
-    /// First slot and number of slots of its ring, a power of two: sample k, at the end of step k, lies in slot
-    /// k mod number. Empty until the step is known.
+    /// The ring buffer. Its length is a power of two, and sample k, taken at the end of step k, is in slot k mod
+    /// length. Empty until the step length is known.
     pub ring: Segment,
 }
 
-/// One automaton: its regimes in the order of the text.
+/// An automaton: its regimes in the order of the text.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Automaton {
-    /// Path of the part that it belongs to; empty for the whole.
+    /// Path of the part that it belongs to; empty for the whole model.
     pub path: String,
     /// Names of the regimes.
     pub regimes: Vec<String>,
-    /// Slot of the number of the active one, in the segment `regimes`.
+    /// Slot of the index of the active regime, in the segment `regimes`.
     pub slot: Slot,
 }
 
-/// The least number above 0 that a range `in > 0` allows, in SI: nothing that is measured is smaller, and products and
-/// quotients of some such numbers are no zero of a double.
+/// The smallest positive number that a range `in > 0` allows, in SI. No measured quantity is smaller, and products and
+/// quotients of a few such numbers do not underflow.
 pub const TINY: f64 = 1e-40;
 
-/// A range that is watched while running. A step that leaves it returns the number of the guard, counted from 1.
+/// A range that is checked at run time. A step that leaves it returns the number of the guard, counted from 1.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Guard {
     /// Path of the quantity.
     pub path: String,
-    /// Where its value lies.
+    /// Slot of its value.
     pub slot: Slot,
-    /// Smallest and largest value in SI, as declared; a bound of [`TINY`] is that of a range without its zero.
+    /// Smallest and largest value in SI, as declared. A bound of [`TINY`] means that the range excludes 0.
     pub range: (f64, f64),
-    /// For messages.
+    /// The unit for messages.
     pub unit: Unit,
 }
 
 impl Guard {
-    /// Both bounds in words, each shown by `show` from its value in SI.
+    /// Both bounds in words. `show`: formats a value in SI.
     pub fn bounds(&self, show: impl Fn(f64) -> String) -> (String, String) {
         let side = |bound: f64, word: &str| match bound.abs() == TINY {
             true => format!("{word} {}", show(0.0)),
@@ -245,53 +245,53 @@ impl Guard {
 pub struct Root {
     /// The condition as written, with its part: `fr: v < -v_hold`.
     pub text: String,
-    /// Whether a transition or an event depends on it, rather than a branch only.
+    /// Whether a transition or an event depends on it, and not only a branch.
     pub decides: bool,
-    /// Whether derivatives at most bend there, as at x = 0 with |x|; else they may jump.
+    /// Whether the derivatives are continuous there and only have a kink, as |x| at 0; otherwise they may jump.
     pub bends: bool,
-    /// Whether only observed quantities change their branch there: neither states nor regimes depend on it.
+    /// Whether only observed quantities change their branch there: no state or regime depends on it.
     pub observed: bool,
 }
 
-/// All that is known of a compiled model besides its code.
+/// Everything that is known of a compiled model besides its code.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Description {
     /// The instance as written: `Servo(r = 1 m)`.
     pub name: String,
-    /// Where the values lie.
+    /// The layout of its block.
     pub layout: Layout,
-    /// Every quantity, parts after their owner, in the order of the text.
+    /// Every quantity, in the order of the text; parts after their owner.
     pub quantities: Vec<Quantity>,
-    /// Sampled blocks, in the order in which they run when due together.
+    /// Sampled blocks, in the order in which they run if they are due together.
     pub ticks: Vec<Tick>,
     /// Automata.
     pub automata: Vec<Automaton>,
-    /// What is delayed.
+    /// Delayed quantities.
     pub delays: Vec<Delay>,
-    /// Watched ranges; `status = k + 1` names guard k.
+    /// Guards; `status = k + 1` refers to guard k.
     pub guards: Vec<Guard>,
     /// Switching surfaces.
     pub roots: Vec<Root>,
-    /// Of a model with many states: the entries (row, column) of ∂f/∂x that are not always 0, by rows and then columns.
-    /// `Jacobian` then writes these one behind the other, and ∂f/∂t behind them. Empty where it writes all entries.
+    /// For a model with many states, the entries (row, column) of ∂f/∂x that are not always 0, sorted by row and
+    /// column. `Jacobian` then writes these entries consecutively, followed by ∂f/∂t. Empty if it writes all entries.
     pub coupling: std::sync::Arc<[(u32, u32)]>,
-    /// Constants that generated code reads by index: tables.
+    /// Constants and tables that generated code reads by index.
     pub pool: std::sync::Arc<[f64]>,
 }
 
 impl Description {
-    /// The quantity of this path.
+    /// The quantity with this path.
     pub fn quantity(&self, path: &str) -> Option<&Quantity> {
         self.quantities.iter().find(|quantity| quantity.path == path)
     }
 
-    /// Every slot that is named in it.
+    /// Every slot that the description refers to.
     pub fn slots(&self) -> impl Iterator<Item = Slot> {
         let quantities = self.quantities.iter().map(|quantity| quantity.slot);
         let ticks = self.ticks.iter().flat_map(|tick| [tick.period, tick.due]);
         let automata = self.automata.iter().map(|automaton| automaton.slot);
         let delays = self.delays.iter().flat_map(|delay| {
-            // An empty ring lies nowhere.
+            // An empty ring has no slot.
             let ring = (delay.ring.len > 0).then(|| delay.ring.slot(delay.ring.len as usize - 1));
             let each = [delay.time, delay.back, delay.source, delay.past, delay.slope];
             each.into_iter().chain(delay.weight).chain(ring)

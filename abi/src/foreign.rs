@@ -1,26 +1,26 @@
-//! Texts that come from elsewhere: from another computer, out of a package or a log.
+//! Checks of untrusted text: from another computer, a package or a log.
 //!
-//! In: a text nobody here has written. Out: whether it can serve as a name or as one component of a path, and a form of it
-//! that has no effect on a terminal. Knows nothing of where it came from.
+//! In: an untrusted text. Out: whether it can serve as a name or as one component of a path, and a form of it without
+//! any effect on a terminal. Does not know where the text came from.
 
 use std::borrow::Cow;
 
-/// Bytes of the longest name: with what is appended to it, it still fits into a file system.
+/// Maximum length of a name in bytes. With a suffix, it still fits into a file system.
 const LONGEST_NAME: usize = 128;
 
-/// Whether a character changes the state of a terminal, or the order or visibility of what stands beside it.
+/// Whether a character changes the state of a terminal, or the order or visibility of its neighbours.
 fn acts(c: char) -> bool {
-    // Controls; then marks of direction, of joining, and the invisible operators of Unicode.
+    // Control characters; then direction marks, joiners, and invisible operators of Unicode.
     c.is_control()
         || matches!(c, '\u{200B}'..='\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2060}'..='\u{206F}' | '\u{FEFF}')
 }
 
-/// Whether a text is one line that a terminal shows as it stands.
+/// Whether a text is one line that a terminal displays unchanged.
 pub fn is_plain(text: &str) -> bool {
     !text.chars().any(acts)
 }
 
-/// Whether a text of one line or several can be shown as it stands.
+/// Whether a text of one or more lines can be displayed unchanged.
 pub fn is_text(text: &str) -> bool {
     !text.chars().any(hidden)
 }
@@ -29,7 +29,7 @@ fn hidden(c: char) -> bool {
     acts(c) && !matches!(c, '\n' | '\t')
 }
 
-/// A text with every character that acts on a terminal written as an escape; line feeds and tabs stay.
+/// Escapes every character that affects a terminal. Line feeds and tabs are unchanged.
 ///
 /// `"x\u{1b}[2J"` becomes `x\u{1b}[2J` in letters.
 pub fn shown(text: &str) -> Cow<'_, str> {
@@ -40,12 +40,12 @@ pub fn shown(text: &str) -> Cow<'_, str> {
     Cow::Owned(escaped.collect())
 }
 
-/// Whether a text is a name as the language has them: letters, digits and `_`, not empty, not too long for a file.
+/// Whether a text is a name of the language: letters, digits and `_`, not empty, not too long for a file.
 pub fn is_name(text: &str) -> bool {
     (1..=LONGEST_NAME).contains(&text.len()) && text.chars().all(|c| c.is_alphanumeric() || c == '_')
 }
 
-/// Whether a text names one file inside a folder: one component of a path, visible, and no option of a command.
+/// Whether a text names one file in a folder: one component of a path, not hidden, and not an option of a command.
 pub fn is_component(text: &str) -> bool {
     (1..=2 * LONGEST_NAME - 1).contains(&text.len())
         && is_plain(text)

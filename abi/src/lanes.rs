@@ -1,19 +1,20 @@
-//! Many instances of one model, advanced together: lane by lane to the bit as each would be alone.
+//! Many instances of one model, advanced together in the lanes of vectors. Each lane has the same bits as the instance
+//! alone.
 
 use crate::description::Slot;
 use std::any::Any;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Machine code that advances all lanes by up to `count` fixed steps, at least by one if `count` is not 0, and stops at the
-/// latest after a step at which the status of a lane is not 0. Returns the number of steps done; `statuses` gets one number
-/// a lane, those of the last step.
+/// Machine code that advances all lanes by up to `count` fixed steps, and by at least one if `count` is not 0. It stops
+/// no later than after a step at which the status of a lane is not 0. Returns the number of steps done; `statuses`
+/// receives the status of each lane after the last step.
 ///
-/// A slot's values lie side by side, `block[slot · width + lane]`; behind the slots the code has room of its own. Block
-/// and statuses begin at multiples of 64 bytes.
+/// The values of a slot are adjacent: `block[slot · width + lane]`. The code has scratch space after the slots. Block
+/// and statuses are aligned to 64 bytes.
 pub type LanesEntry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64;
 
-/// The step of a model for many instances at once.
+/// The step of a model, for many instances at once.
 #[derive(Clone)]
 pub struct Lanes {
     entry: LanesEntry,
@@ -26,8 +27,8 @@ pub struct Lanes {
 }
 
 impl Lanes {
-    /// Code for `width` instances with blocks of `size` slots, that needs `scratch` more numbers and a pool of `pool_len`.
-    /// `name`: what does it, for reports.
+    /// Code for `width` instances with blocks of `size` slots, `scratch` numbers of scratch space and a pool of
+    /// `pool_len` numbers. `name`: the instruction set, for reports.
     ///
     /// # Safety
     /// The entry must be valid as long as `memory` lives, must access only `block[..size * width + scratch]`,
@@ -49,17 +50,17 @@ impl Lanes {
         self.width
     }
 
-    /// What does it: `AVX-512 × 4`.
+    /// The instruction set and the number of vectors: `AVX-512 × 4`.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Slots of a block.
+    /// Number of slots of a block.
     pub(crate) fn size(&self) -> usize {
         self.size
     }
 
-    /// Numbers that all blocks and what the code needs behind them take.
+    /// Number of doubles for all blocks and the scratch space.
     pub(crate) fn room(&self) -> usize {
         self.size * self.width + self.scratch
     }
@@ -67,20 +68,20 @@ impl Lanes {
     /// Runs the code.
     ///
     /// # Safety
-    /// `numbers` must begin at a multiple of 64 bytes and have as many as there is [`room`](Lanes::room) for, the pool as
-    /// many as the code needs, and `statuses` one a lane.
+    /// `numbers` must be aligned to 64 bytes and have [`room`](Lanes::room) doubles, the pool must be as long as the
+    /// code needs, and `statuses` must have one entry per lane.
     pub(crate) unsafe fn run(&self, numbers: *mut f64, pool: *const f64, count: u64, statuses: *mut u64) -> u64 {
-        // SAFETY: `Lanes::new` was promised that the entry accesses only these.
+        // SAFETY: by the contract of `Lanes::new`, the entry accesses only these.
         unsafe { (self.entry)(numbers, pool, count, statuses) }
     }
 }
 
-/// Eight numbers that lie where vectors want them.
+/// Eight numbers, aligned for vectors.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 pub(crate) struct Line([u64; 8]);
 
-/// As many instances as the code has lanes, with their numbers.
+/// The blocks of as many instances as the code has lanes.
 #[derive(Clone)]
 pub struct Batch {
     lanes: Lanes,
@@ -89,7 +90,7 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// All numbers 0.
+    /// A batch in which all numbers are 0.
     pub fn new(lanes: Lanes) -> Batch {
         let lines = |numbers: usize| vec![Line([0; 8]); numbers.div_ceil(8)];
         let numbers = lines(lanes.room());
@@ -121,7 +122,7 @@ impl Batch {
         self.numbers[line].0[at] = value.to_bits();
     }
 
-    /// Gives a lane the numbers of an instance: its block, all slots.
+    /// Copies the block of an instance, all slots, to a lane.
     pub fn load(&mut self, lane: usize, block: &[f64]) {
         assert_eq!(block.len(), self.lanes.size, "a block of another model");
         for (slot, value) in block.iter().enumerate() {
@@ -129,7 +130,7 @@ impl Batch {
         }
     }
 
-    /// Gives an instance the numbers of a lane.
+    /// Copies a lane to the block of an instance.
     pub fn save(&self, lane: usize, block: &mut [f64]) {
         assert_eq!(block.len(), self.lanes.size, "a block of another model");
         for (slot, value) in block.iter_mut().enumerate() {
@@ -137,14 +138,14 @@ impl Batch {
         }
     }
 
-    /// Where the first of these slots lies; the others follow at a distance of the width.
+    /// Index of the first of these slots in a lane; the others follow at a stride of the width.
     fn begin(&self, lane: usize, slots: &Range<usize>) -> usize {
         let Lanes { width, size, .. } = self.lanes;
         assert!(slots.end <= size && lane < width, "slots {slots:?} of {size}, lane {lane} of {width}");
         slots.start * width + lane
     }
 
-    /// As [`Batch::load`], of these slots alone.
+    /// As [`Batch::load`], for these slots alone.
     pub fn load_part(&mut self, lane: usize, slots: Range<usize>, block: &[f64]) {
         let (width, mut at) = (self.lanes.width, self.begin(lane, &slots));
         for value in &block[slots] {
@@ -153,7 +154,7 @@ impl Batch {
         }
     }
 
-    /// As [`Batch::save`], of these slots alone.
+    /// As [`Batch::save`], for these slots alone.
     pub fn save_part(&self, lane: usize, slots: Range<usize>, block: &mut [f64]) {
         let (width, mut at) = (self.lanes.width, self.begin(lane, &slots));
         for value in &mut block[slots] {
@@ -162,7 +163,7 @@ impl Batch {
         }
     }
 
-    /// Gives a lane the numbers of another one.
+    /// Copies all numbers of one lane to another.
     pub fn copy_lane(&mut self, from: usize, to: usize) {
         for slot in 0..self.lanes.size {
             let value = self.get(Slot(slot as u32), from);
@@ -170,17 +171,18 @@ impl Batch {
         }
     }
 
-    /// The status of a lane after its last step, 0 for none.
+    /// The status of a lane after its last step; 0: no guard failed.
     pub fn status(&self, lane: usize) -> u64 {
         assert!(lane < self.lanes.width, "lane {lane} of {}", self.lanes.width);
         self.statuses[lane / 8].0[lane % 8]
     }
 
-    /// Advances all lanes by up to `n` fixed steps and returns how many were done: it stops after a step at which the
-    /// status of a lane is not 0. Time is what the code keeps of it: see [`keep_time`](crate::table::keep_time).
+    /// Advances all lanes by up to `n` fixed steps and returns the number of steps done. Stops after a step at which
+    /// the status of a lane is not 0. Time is only stored as far as the code does so: see
+    /// [`keep_time`](crate::table::keep_time).
     ///
     /// # Panics
-    /// If the pool is shorter than the code needs: a mistake of the caller.
+    /// If the pool is shorter than the code needs: a bug in the caller.
     pub fn advance(&mut self, pool: &[f64], n: u64) -> u64 {
         let needed = self.lanes.pool_len;
         assert!(pool.len() >= needed, "pool of {} numbers, {needed} needed", pool.len());
@@ -188,7 +190,7 @@ impl Batch {
         self.statuses.fill(Line([0; 8]));
         while done < n && (0..self.lanes.width).all(|lane| self.status(lane) == 0) {
             let (numbers, statuses) = (self.numbers.as_mut_ptr().cast(), self.statuses.as_mut_ptr().cast());
-            // SAFETY: `Batch::new` has made room, and the pool is as long as needed.
+            // SAFETY: `Batch::new` has allocated the numbers and statuses, and the length of the pool was checked.
             done += unsafe { self.lanes.run(numbers, pool.as_ptr(), n - done, statuses) };
         }
         done

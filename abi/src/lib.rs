@@ -1,7 +1,8 @@
-//! What a compiled model *is*: the one contract between whoever makes code and whoever runs it.
+//! The interface of a compiled model: the contract between the compiler, which generates code, and the runtime, which
+//! runs it.
 //!
-//! A model's numbers live in one flat block of `f64`, addressed by [`Slot`]s; every function of the model reads
-//! and writes that block and nothing else. Knows neither the language nor any solver.
+//! All numbers of a model are in one flat block of `f64`, addressed by [`Slot`]s. Every function of the model reads and
+//! writes that block and nothing else. Knows neither the language nor any solver.
 
 pub mod unit;
 pub mod foreign;

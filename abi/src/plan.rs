@@ -1,4 +1,5 @@
-//! What to run, as plain data. Every expression in it is a quantity of the program already: a plan holds slots.
+//! The plan of an experiment, as plain data. All expressions are quantities of the program, so a plan only refers to
+//! slots.
 
 use crate::description::Slot;
 use crate::rig::Bench;
@@ -14,72 +15,72 @@ pub struct Experiment {
     pub name: String,
     /// Simulated time in s.
     pub duration: f64,
-    /// How. In a dry run: how the crossed-out part is stepped, while the rig says how the rest is.
+    /// The method. In a software-in-the-loop run: that of the plant, while the rig has its own for the control program.
     pub solver: Solver,
-    /// A dry run: the instance is the control program of a rig, and this what stands around it.
+    /// A software-in-the-loop run: the instance is the control program of a rig, and this is its surroundings.
     pub bench: Option<Box<Bench>>,
-    /// What is drawn and written.
+    /// The plots to draw and write.
     pub plots: Vec<Plot>,
-    /// What must hold.
+    /// The conditions that must hold.
     pub expects: Vec<Expect>,
     /// Instants in s, ascending, at which a signal or a recording has a corner.
     pub corners: Vec<f64>,
-    /// The system as it is stepped is what is judged: discretisation leaves no verdict open.
+    /// The system is judged as it is stepped: the discretisation error leaves no verdict undecided.
     pub stepped: bool,
 }
 
 /// One plot.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Plot {
-    /// Drawn upwards.
+    /// Quantities on the vertical axis.
     pub series: Vec<Series>,
-    /// Drawn to the right; time where none.
+    /// Quantity on the horizontal axis; `None`: time.
     pub against: Option<Series>,
 }
 
-/// One expectation.
+/// An expectation.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Expect {
     /// As written, without the word `expect`.
     pub text: String,
-    /// What the condition needs.
+    /// The measures that the condition uses.
     pub measures: Vec<Measure>,
-    /// What must hold at the end.
+    /// The condition that must hold at the end.
     pub condition: Formula,
-    /// The window in s: points with `after <= t <= before` count.
+    /// Start of the window in s: points with `after <= t <= before` count.
     pub after: f64,
-    /// End of the window.
+    /// End of the window in s.
     pub before: f64,
 }
 
-/// A number taken from the course of a quantity.
+/// A number that is computed from the time series of a quantity.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Measure {
     /// As written: `peak_to_peak(x)`.
     pub text: String,
-    /// Which number.
+    /// How it is computed.
     pub kind: MeasureKind,
     /// The quantity, after each step, in SI.
     pub slot: Slot,
     /// The unit in which the result is shown.
     pub unit: Unit,
-    /// The part of the expectation's window in which it is taken.
+    /// The part of the expectation's window that it covers.
     pub window: Window,
 }
 
-/// Begin and end of the part of a run in which a measure is taken.
+/// The part of a run that a measure covers.
 #[derive(Clone, Copy, PartialEq, Default, Debug)]
 pub struct Window {
-    /// Its begin.
+    /// Start.
     pub after: Edge,
-    /// Its end.
+    /// End.
     pub before: Edge,
 }
 
 /// An end of a window.
 #[derive(Clone, Copy, PartialEq, Default, Debug)]
 pub enum Edge {
-    /// That of the expectation.
+    /// The start or end of the expectation's window.
     #[default]
     Open,
     /// This time in s.
@@ -88,25 +89,25 @@ pub enum Edge {
     First(Slot),
 }
 
-/// An instant that only the run shows.
+/// An instant that is only known from the run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Moment {
     /// When the condition in this slot first holds.
     First(Slot),
-    /// When the condition in this slot first turns true, having been false.
+    /// When the condition in this slot first becomes true, having been false.
     Rises(Slot),
-    /// When the quantity in this slot is least.
+    /// When the quantity in this slot has its minimum.
     Least(Slot),
-    /// When it is greatest.
+    /// When the quantity in this slot has its maximum.
     Greatest(Slot),
 }
 
-/// What a measure measures. Booleans count as 0 and 1.
+/// How a measure is computed. Booleans count as 0 and 1.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum MeasureKind {
-    /// Least value.
+    /// Smallest value.
     Min,
-    /// Greatest value.
+    /// Largest value.
     Max,
     /// Mean over time, trapezoidal.
     Mean,
@@ -118,48 +119,48 @@ pub enum MeasureKind {
     Final,
     /// Value at this time in s, linear between points.
     At(f64),
-    /// Greatest minus least.
+    /// Largest minus smallest value.
     PeakToPeak,
     /// Number of changes of sign.
     Crossings,
-    /// Mean distance of upward crossings through the mean; needs three.
+    /// Mean interval between upward crossings of the mean; needs three.
     Period,
     /// Earliest time after which the value stays within this band of its final value.
     Settling(f64),
-    /// First time the condition holds; inf if never.
+    /// First time at which the condition holds; inf if never.
     First,
-    /// First time the condition turns true, having been false; inf if never.
+    /// First time at which the condition becomes true, having been false; inf if never.
     Rises,
-    /// First time the condition turns; inf if never.
+    /// First time at which the condition changes; inf if never.
     Turns,
-    /// Value at a moment of the run.
+    /// Value at an instant of the run.
     AtMoment(Moment),
-    /// When the quantity is least.
+    /// Time of the minimum.
     TimeOfLeast,
-    /// When it is greatest.
+    /// Time of the maximum.
     TimeOfGreatest,
-    /// Number of phases in which the condition holds; one that holds at the begin of the window counts.
+    /// Number of phases in which the condition holds, including one that already holds at the start of the window.
     Count,
-    /// How often the condition turns true, having been false.
+    /// How often the condition becomes true, having been false.
     CountRises,
-    /// How often the condition turns.
+    /// How often the condition changes.
     CountTurns,
-    /// For how long the condition holds, in all.
+    /// Total time for which the condition holds.
     Duration,
     /// Number of local maxima.
     Peaks,
-    /// The local maximum of this number, from 1.
+    /// The local maximum with this number, from 1.
     Peak(f64),
-    /// When it is.
+    /// Time of the local maximum with this number.
     TimeOfPeak(f64),
 }
 
-/// A function that the compiler hands over, so that every machine computes it alike: numbers in their order → number.
+/// An elementary function that the compiler provides, so that every machine computes the same bits.
 #[derive(Clone)]
 pub struct Elementary {
     /// Its name in the language.
     pub name: &'static str,
-    /// Its value; a number that is missing counts as 0.
+    /// The function; a missing second argument counts as 0.
     pub at: Arc<dyn Fn(f64, f64) -> f64 + Send + Sync>,
 }
 
@@ -191,7 +192,7 @@ pub enum Formula {
     Divide(Box<Formula>, Box<Formula>),
     Min(Box<Formula>, Box<Formula>),
     Max(Box<Formula>, Box<Formula>),
-    /// Comparisons and connectives give 1 or 0.
+    /// Comparisons and connectives yield 1 or 0.
     Less(Box<Formula>, Box<Formula>),
     LessEqual(Box<Formula>, Box<Formula>),
     Greater(Box<Formula>, Box<Formula>),
@@ -206,10 +207,10 @@ pub enum Formula {
         tolerance: Box<Formula>,
         relative: bool,
     },
-    /// An elementary function of one or two numbers.
+    /// An elementary function of one or two arguments.
     Function(Elementary, Vec<Formula>),
-    /// A number that is shown in this unit and not judged.
+    /// A number that is displayed in this unit and not judged.
     Shown(Unit, Box<Formula>),
-    /// A comparison whose sides are shown in this unit.
+    /// A comparison whose sides are displayed in this unit.
     In(Unit, Box<Formula>),
 }

@@ -1,9 +1,9 @@
-//! How time is stepped and what is watched of it: what experiments and rigs share.
+//! Methods, solver settings and recorded series, which experiments and rigs share.
 
 use crate::description::Slot;
 use crate::unit::Unit;
 
-/// How time is stepped.
+/// A method of time integration.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum Method {
@@ -15,10 +15,10 @@ pub enum Method {
 }
 
 impl Method {
-    /// All of them.
+    /// All methods.
     pub const ALL: [Method; 5] = [Method::Adaptive, Method::Expo, Method::Implicit, Method::Rk4, Method::Euler];
 
-    /// As written behind `solver`.
+    /// The name after the keyword `solver`.
     pub fn name(self) -> &'static str {
         match self {
             Method::Euler => "euler",
@@ -29,7 +29,7 @@ impl Method {
         }
     }
 
-    /// The method of this name.
+    /// The method with this name.
     pub fn named(name: &str) -> Option<Method> {
         Method::ALL.into_iter().find(|method| method.name() == name)
     }
@@ -40,26 +40,26 @@ impl Method {
 pub struct Solver {
     /// The method.
     pub method: Method,
-    /// Fixed step in s; of an adaptive run 0.
+    /// Fixed step in s; 0 for an adaptive run.
     pub step: f64,
     /// Relative tolerance of an adaptive run.
     pub tol: f64,
-    /// In how many parts an adaptive run is made at least: no step is longer than the duration divided by it.
+    /// Minimum number of parts of an adaptive run: no step is longer than the duration divided by it.
     pub parts: f64,
 }
 
-/// The parts of an adaptive run, at least, unless somebody wants it finer.
+/// Default for [`Solver::parts`].
 pub const PARTS: f64 = 50.0;
 
-/// A drawn quantity.
+/// A plotted or recorded quantity.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Series {
     /// As written: `body.v`.
     pub label: String,
-    /// Where its value lies after a step, in SI.
+    /// Slot of its value after a step, in SI.
     pub slot: Slot,
-    /// The unit it is shown in.
+    /// The unit in which it is displayed.
     pub unit: Unit,
-    /// True or false rather than a quantity.
+    /// Whether it is a Boolean.
     pub boolean: bool,
 }
