@@ -183,8 +183,8 @@ pub struct Delay {
     pub time: Slot,
     /// Smallest and largest T in s.
     pub range: (f64, f64),
-    /// Slot of the distance, in fixed steps and at least 0, by which T exceeds the newest sample at the end of a step.
-    /// In the segment `memory`, written by `Start` if there is a ring.
+    /// Slot of the distance from the delayed instant t − T to the newest sample, for t at the end of a step; in fixed
+    /// steps, at least 0. In the segment `memory`, written by `Start` if there is a ring.
     pub back: Slot,
     /// Slot of x: its own, or one of the segment `outputs`.
     pub source: Slot,

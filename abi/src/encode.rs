@@ -1,15 +1,15 @@
-//! Values as bytes and back.
+//! Serialisation: values as bytes, and back.
 //!
-//! Equal values give equal bytes, on every machine; bytes that are no value of the type are told and never become one.
-//! Whole numbers and reals are little endian, a list is its length (32 bits) and its entries, a struct its fields in
-//! their order. Knows no versions: whoever writes a file says which it is.
+//! Equal values have equal bytes on every machine. Bytes that do not encode a value of the type are an error. Integers
+//! and reals are little endian; a list is its length (32 bits) followed by its entries; a struct is its fields in
+//! order. There are no versions: a file format has to store its own.
 
 use crate::description::{Automaton, Delay, Guard, Kind, Layout, Quantity, Root, Segment, Slot, Tick};
 use crate::unit::{Angle, Dimension, Ratio, Unit};
 use std::fmt;
 use std::sync::Arc;
 
-/// Why bytes are not the value they should be.
+/// Why bytes do not encode the expected value.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Malformed(pub String);
 
@@ -21,14 +21,14 @@ impl fmt::Display for Malformed {
 
 impl std::error::Error for Malformed {}
 
-/// Bytes that are read from their beginning.
+/// Reads bytes from the beginning.
 pub struct Reader<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
 impl<'a> Reader<'a> {
-    /// At the beginning.
+    /// A reader at the first byte.
     pub fn new(bytes: &'a [u8]) -> Reader<'a> {
         Reader { bytes, at: 0 }
     }
@@ -36,7 +36,7 @@ impl<'a> Reader<'a> {
     /// The next `count` bytes.
     ///
     /// # Errors
-    /// If fewer are left.
+    /// If fewer remain.
     pub fn take(&mut self, count: usize) -> Result<&'a [u8], Malformed> {
         let rest = &self.bytes[self.at..];
         let taken = rest.get(..count).ok_or_else(|| {
@@ -46,7 +46,7 @@ impl<'a> Reader<'a> {
         Ok(taken)
     }
 
-    /// Number of bytes that are left.
+    /// Number of remaining bytes.
     pub fn left(&self) -> usize {
         self.bytes.len() - self.at
     }
@@ -60,7 +60,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// What can be written as bytes and read back.
+/// A type with an encoding in bytes.
 pub trait Encode: Sized {
     /// Appends the bytes of the value.
     fn encode(&self, out: &mut Vec<u8>);
@@ -68,20 +68,20 @@ pub trait Encode: Sized {
     /// Reads a value.
     ///
     /// # Errors
-    /// Where and why the bytes are not one.
+    /// Where and why the bytes do not encode one.
     fn decode(reader: &mut Reader) -> Result<Self, Malformed>;
 
-    /// The bytes of the value alone.
+    /// The bytes of the value.
     fn to_bytes(&self) -> Vec<u8> {
         let mut out = Vec::new();
         self.encode(&mut out);
         out
     }
 
-    /// The value whose bytes are these, and no more.
+    /// The value that all of these bytes encode.
     ///
     /// # Errors
-    /// Where and why they are not one.
+    /// Where and why they do not encode one.
     fn from_bytes(bytes: &[u8]) -> Result<Self, Malformed> {
         let mut reader = Reader::new(bytes);
         let value = Self::decode(&mut reader)?;
@@ -108,7 +108,7 @@ macro_rules! numbers {
 
 numbers!(u8, u16, u32, u64, i32, f64);
 
-/// As 64 bits.
+/// Encoded as 64 bits.
 impl Encode for usize {
     fn encode(&self, out: &mut Vec<u8>) {
         (*self as u64).encode(out);
@@ -120,7 +120,7 @@ impl Encode for usize {
     }
 }
 
-/// How many entries a list can have at most: each takes a byte at least, so a wrong length is found at once.
+/// Reads the length of a list. Each entry takes at least one byte, so a length that is too large is detected at once.
 fn length(reader: &mut Reader) -> Result<usize, Malformed> {
     let len = u32::decode(reader)? as usize;
     if len > reader.left() {
@@ -212,7 +212,7 @@ impl Encode for Arc<[f64]> {
     }
 }
 
-/// Structs of fields that can be encoded: `encode_structs! { Segment { start, len } … }`.
+/// Implements [`Encode`](crate::encode::Encode) for structs of encodable fields: `encode_structs! { Segment { start, len } … }`.
 #[macro_export]
 macro_rules! encode_structs {
     ($($name:ty { $($field:ident),* $(,)? })*) => {$(
@@ -229,7 +229,8 @@ macro_rules! encode_structs {
     )*};
 }
 
-/// Enums without fields, one byte each: `encode_enums! { Kind { Param = 0, Input = 1 } … }`. A number once given stays.
+/// Implements [`Encode`](crate::encode::Encode) for enums without fields, one byte each: `encode_enums! { Kind { Param = 0, Input = 1 } … }`.
+/// The numbers must never change.
 #[macro_export]
 macro_rules! encode_enums {
     ($($name:ty { $($variant:ident = $number:literal),* $(,)? })*) => {$(
@@ -258,7 +259,7 @@ impl Encode for Slot {
     }
 }
 
-/// As the lengths of its segments, which lie one behind the other.
+/// Encoded as the lengths of its consecutive segments.
 impl Encode for Layout {
     fn encode(&self, out: &mut Vec<u8>) {
         self.lens().iter().chain([&self.trial.len, &self.rings.len]).for_each(|len| len.encode(out));
@@ -272,12 +273,13 @@ impl Encode for Layout {
         let (trial, rings) = (u32::decode(reader)?, u32::decode(reader)?);
         let all = lens.iter().chain([&trial, &rings]);
         let size = all.fold(Slot::FIXED.into(), |sum: u64, len| sum + u64::from(*len));
-        // Generated code addresses a block by 32-bit offsets in bytes.
+        // Generated code addresses the block with 32-bit byte offsets.
         if size > i32::MAX as u64 / 8 {
             return reader.wrong(format!("a block of {size} slots is too large"));
         }
         let layout = Layout::new(lens);
-        // Its length follows from the others and the number of guards; of more states it could not be counted.
+        // The length of a trial follows from the other lengths and the number of guards. The limit on states prevents
+        // overflow.
         let least = (lens[2] < 1 << 14).then(|| layout.clone().with_trial(0).trial.len);
         match least.and_then(|least| trial.checked_sub(least)) {
             _ if trial == 0 => Ok(layout.with_rings(rings)),
@@ -322,7 +324,7 @@ encode_structs! {
     Root { text, decides, bends, observed }
 }
 
-/// Without the coupling of its Jacobian: what lies in a file makes fixed steps.
+/// The coupling of the Jacobian is not encoded: files only contain code for fixed steps.
 impl Encode for crate::description::Description {
     fn encode(&self, out: &mut Vec<u8>) {
         let Self { name, layout, quantities, ticks, automata, delays, guards, roots, coupling: _, pool } = self;

@@ -1,8 +1,8 @@
-//! Whether the plan of a rig fits its two programs: everything that the code running it takes for granted.
+//! Validation of a rig against its two programs: everything that the code running it assumes.
 //!
-//! In: a [`Rig`] and what its programs say of themselves. Out: nothing, or the first thing that does not fit, in words. The
-//! compiler asserts it of what it makes; a package is refused by it, whatever its hashes say. Ranges are those that the
-//! compiler accepts, so no rig that was checked is refused here.
+//! In: a [`Rig`] and the descriptions of its programs. Out: nothing, or the first violation, as a message. The compiler
+//! asserts validity of its own output; an invalid package is refused even if its hashes are correct. The limits are
+//! those that the compiler accepts, so no checked rig is refused here.
 
 use crate::description::{Description, Segment, Slot};
 use crate::foreign::{is_name, is_text};
@@ -10,28 +10,28 @@ use crate::rig::{Cia402, Field, Format, Input, Kind, Message, Mode, Node, Output
 use crate::series::Method;
 use crate::unit::Unit;
 
-/// Periods of a cycle, ns.
+/// Permitted periods of a cycle, ns.
 const PERIODS_NS: std::ops::RangeInclusive<u64> = 20_000..=1_000_000_000;
-/// Steps in one period.
+/// Permitted numbers of steps in one period.
 const STEPS: std::ops::RangeInclusive<u32> = 1..=10_000;
-/// Longest time until the watchdog acts, ns.
+/// Longest watchdog time, ns.
 const WATCHDOG_NS: u64 = 10_000_000_000;
-/// Most ticks that may be missed in a row.
+/// Permitted numbers of consecutive missed ticks.
 const HOLD: std::ops::RangeInclusive<u32> = 1..=1000;
-/// Longest dead time in periods, and longest of all dead times and lags, s.
+/// Longest dead time in periods; and the longest dead time or lag in s.
 const DELAY: (f64, f64) = (200.0, 1.0);
-/// Longest time between two frames of a device, ns.
+/// Longest interval between two frames of a device, ns.
 const RARE_NS: u64 = 1_000_000_000_000_000;
-/// Frames that a device sends come no closer than this, ns: the shortest frame at 1 Mbit/s takes as long.
+/// Shortest interval between two frames of a device, ns: the duration of the shortest frame at 1 Mbit/s.
 const FRAME_NS: u64 = 47_000;
-/// Most buses and nodes: a frame of the log names its bus in a byte.
+/// Maximum number of buses, and of nodes: a log frame stores its bus in one byte.
 const MOST: usize = 128;
-/// Most messages of a node, and signals of a message.
+/// Maximum number of messages of a node, and of signals of a message.
 const MOST_SIGNALS: usize = 4096;
-/// Bytes of the longest text.
+/// Maximum length of a text in bytes.
 const LONGEST: usize = 1 << 16;
 
-/// Nothing, or why not.
+/// The first violation as a message, if any.
 type Fits = Result<(), String>;
 
 fn ensure(holds: bool, why: impl FnOnce() -> String) -> Fits {
@@ -39,10 +39,10 @@ fn ensure(holds: bool, why: impl FnOnce() -> String) -> Fits {
 }
 
 impl Rig {
-    /// Whether the plan makes sense in itself and fits its control and its plant program.
+    /// Checks that the plan is consistent and fits its control program and its plant program.
     ///
     /// # Errors
-    /// The first thing that does not, in words.
+    /// The first violation, as a message.
     pub fn fits(&self, control: &Description, plant: &Description) -> Fits {
         ensure(is_name(&self.name), || format!("its rig is called {:?}, which is no name", short(&self.name)))?;
         self.times()?;
@@ -118,7 +118,7 @@ impl Rig {
         }
     }
 
-    /// Whether two drives of a bus have one node id.
+    /// Whether two drives on a bus have the same node id.
     fn share_id(&self, a: &Node, b: &Node) -> bool {
         match (&a.kind, &b.kind) {
             (Kind::Cia402(one), Kind::Cia402(other)) => a.bus == b.bus && one.node == other.node,
@@ -126,7 +126,7 @@ impl Rig {
         }
     }
 
-    /// The field that a signal names, none for one of a drive.
+    /// The field that a signal refers to; `None` for a signal of a CiA 402 drive.
     fn signal_fits(&self, signal: Signal) -> Result<Option<(&Message, &Field)>, String> {
         let Signal { node, what } = signal;
         let Some(found) = self.nodes.get(node) else {
@@ -136,8 +136,8 @@ impl Rig {
             (Kind::Cia402(_), What::Field(..)) => Err(format!("drive `{}` has no fields", found.name)),
             (Kind::Cia402(_), _) => Ok(None),
             (Kind::Frames(messages), What::Field(message, field)) => {
-                let there = messages.get(message).and_then(|all| Some((all, all.fields.get(field)?)));
-                there.map(Some).ok_or_else(|| format!("`{}` has no message {message}, field {field}", found.name))
+                let found_field = messages.get(message).and_then(|all| Some((all, all.fields.get(field)?)));
+                found_field.map(Some).ok_or_else(|| format!("`{}` has no message {message}, field {field}", found.name))
             }
             (Kind::Frames(_), what) => Err(format!("`{}` has no {what:?}", found.name)),
         }
@@ -213,7 +213,7 @@ fn text(what: &str, text: &str) -> Fits {
     ensure(fits, || format!("{what} cannot be shown: {:?}", short(text)))
 }
 
-/// The begin of a text, for a message.
+/// The beginning of a text, for a message.
 fn short(text: &str) -> String {
     text.chars().take(40).collect()
 }
@@ -259,7 +259,7 @@ fn field_fits(field: &Field, message: &Message) -> Fits {
         Format::Float64 => *bits == 64,
     };
     ensure(wide, || format!("signal `{name}` has {bits} bits as {format:?}"))?;
-    // A big-endian signal starts at its most significant bit: the order of the wire.
+    // A big-endian signal starts at its most significant bit, which is the order on the wire.
     let first = if *big_endian { start_bit / 8 * 8 + (7 - start_bit % 8) } else { *start_bit };
     let within = u32::from(first) + u32::from(*bits) <= 8 * u32::from(message.length);
     ensure(within, || format!("signal `{name}` does not fit into {} bytes", message.length))?;
@@ -271,7 +271,7 @@ fn field_fits(field: &Field, message: &Message) -> Fits {
     unit_fits(unit)
 }
 
-/// What a program says of itself, as far as a rig reads it.
+/// Checks the parts of a program's description that a rig uses.
 fn program_fits(program: &Description) -> Fits {
     text("its name", &program.name)?;
     let size = program.layout.size();
@@ -291,7 +291,7 @@ fn program_fits(program: &Description) -> Fits {
         automaton.regimes.iter().try_for_each(|regime| text("a regime", regime))
     })?;
     for delay in &program.delays {
-        // Samples are found by a mask: 0 where no ring was made.
+        // Samples are addressed by a mask, so a ring has a power of two slots, or 0 if there is none.
         ensure(delay.ring.len == 0 || delay.ring.len.is_power_of_two(), || format!("a ring of {}", delay.ring.len))?;
     }
     Ok(())
@@ -304,7 +304,7 @@ mod tests {
     use crate::rig::{Bus, Plant, Stop};
     use crate::series::Series;
 
-    /// A drive and a device on two buses; control and plant have two inputs, 3 and 4, and two outputs, 5 and 6.
+    /// A drive and a device on two buses. Control and plant program have inputs 3 and 4 and outputs 5 and 6.
     fn whole() -> (Rig, Description, Description) {
         let layout = Layout::new([0, 2, 0, 0, 0, 2, 0, 0, 0, 0]);
         let quantity = Quantity {
@@ -410,7 +410,7 @@ mod tests {
     type Change = (&'static str, fn(&mut Rig));
 
     #[test]
-    fn a_plan_fits_or_is_told_what_does_not() {
+    fn each_violation_has_its_message() {
         let (rig, control, plant) = whole();
         assert_eq!(rig.fits(&control, &plant), Ok(()));
         let changes: [Change; 46] = [

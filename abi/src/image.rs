@@ -1,8 +1,7 @@
-//! A compiled model as one flat file: the code of all its functions, its constants and what it says of itself.
+//! Images: a compiled model as one flat file with the code of all functions, the constants and the description.
 //!
-//! The compiler writes it for a processor, on any machine; whoever runs it maps the code and jumps. The code is
-//! position-independent, has no symbols, calls nothing and needs no relocation, so that nothing is left to be done when
-//! it is loaded but to look whether it fits.
+//! The compiler can generate an image for any target on any machine. The runtime maps the code and jumps to it. The
+//! code is position-independent, without symbols, calls or relocations, so loading it only has to check that it fits.
 //!
 //! ```text
 //!    0  "FRICCODE"                     104  for each function: offset of its entry in the code, or all ones
@@ -13,7 +12,7 @@
 //!   32  slots of a block u64           Numbers are little endian, offsets are from the beginning of the file, and
 //!   40  4 sections: offset, length     the code is its end: a page of it can be mapped as it lies.
 //! ```
-//! The hash finds what has changed, by whatever accident; it does not say who made the file.
+//! The hash detects accidental changes; it does not authenticate the author of the file.
 
 use crate::description::Description;
 use crate::encode::{Encode, Malformed, Reader};
@@ -21,31 +20,31 @@ use crate::table::Function;
 use sha2::{Digest, Sha256};
 use std::fmt;
 
-/// The first bytes.
+/// The first bytes of an image.
 pub const MAGIC: [u8; 8] = *b"FRICCODE";
-/// Of the format, and of the calls into the code.
+/// Version of the format and of the calling convention.
 pub const VERSION: u32 = 3;
-/// The code begins at a multiple of this.
+/// Alignment of the code in the file.
 pub const PAGE: usize = 4096;
 
 const HEADER: usize = 256;
 const HASH: std::ops::Range<usize> = 176..208;
 const NO_ENTRY: u64 = u64::MAX;
 
-/// Families of processors that code is made for. All are little endian with 64 bits.
+/// Processor families for which code can be generated. All are little endian with 64 bits.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Target {
-    /// x86-64 with [`Target::needs`].
+    /// x86-64 with the features of [`Target::needs`].
     X86_64,
-    /// 64-bit Arm; nothing beyond the base.
+    /// 64-bit Arm, base instruction set.
     Aarch64,
 }
 
 impl Target {
-    /// All of them.
+    /// All targets.
     pub const ALL: [Target; 2] = [Target::X86_64, Target::Aarch64];
 
-    /// As written behind `--target`.
+    /// The name for the option `--target`.
     pub fn name(self) -> &'static str {
         match self {
             Target::X86_64 => "x86_64",
@@ -53,17 +52,17 @@ impl Target {
         }
     }
 
-    /// The target of this name.
+    /// The target with this name.
     pub fn named(name: &str) -> Option<Target> {
         Target::ALL.into_iter().find(|target| target.name() == name)
     }
 
-    /// The one this program runs on, if it is one.
+    /// The target that this program runs on; `None` if it is another processor.
     pub fn here() -> Option<Target> {
         Target::named(std::env::consts::ARCH)
     }
 
-    /// What code for it takes for granted.
+    /// The features that code for this target always uses.
     pub fn needs(self) -> &'static [Feature] {
         match self {
             Target::X86_64 => &Feature::ALL[..6],
@@ -71,7 +70,7 @@ impl Target {
         }
     }
 
-    /// What code for it may use besides, if it is asked to: it then runs on processors that have it only.
+    /// The features that code for this target may use on request. It then only runs on processors that have them.
     pub fn may_use(self) -> &'static [Feature] {
         match self {
             Target::X86_64 => &Feature::ALL[6..],
@@ -87,7 +86,7 @@ impl Target {
     }
 }
 
-/// Instructions beyond the base of x86-64. Without FMA and SSE4.1 fused products and roundings would be calls.
+/// Instruction sets beyond the base of x86-64. Without FMA and SSE4.1, fused products and roundings would be calls.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum Feature {
@@ -105,7 +104,7 @@ pub enum Feature {
 }
 
 impl Feature {
-    /// All of them; the place is the bit in the header. Those that code for x86-64 needs come first.
+    /// All features; the index is the bit in the header. Those that x86-64 code always uses come first.
     pub const ALL: [Feature; 11] = [
         Feature::Sse3,
         Feature::Ssse3,
@@ -120,12 +119,12 @@ impl Feature {
         Feature::Popcnt,
     ];
 
-    /// The feature of this name, in letters of any size.
+    /// The feature with this name, in upper or lower case.
     pub fn named(name: &str) -> Option<Feature> {
         Feature::ALL.into_iter().find(|feature| feature.name().eq_ignore_ascii_case(name))
     }
 
-    /// As the processor's maker calls it.
+    /// The manufacturer's name.
     pub fn name(self) -> &'static str {
         match self {
             Feature::Sse3 => "SSE3",
@@ -167,32 +166,32 @@ impl Feature {
     }
 }
 
-/// Why a file is not run.
+/// Why an image is refused.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Refusal {
-    /// It does not begin like one.
+    /// It does not begin with [`MAGIC`].
     NotAnImage,
-    /// It is of another version.
+    /// It has another version of the format.
     Version(u32),
-    /// It is shorter or longer than it says.
+    /// Its length differs from the length in its header.
     Length {
-        /// Bytes that it says it has.
+        /// Bytes by its header.
         said: u64,
-        /// Bytes that it has.
+        /// Actual bytes.
         found: u64,
     },
-    /// Its hash is another.
+    /// Its hash does not match.
     Changed,
-    /// Its hash is right and its content impossible: whoever made it made a mistake.
+    /// Its hash matches, but its content is invalid: a bug in the program that generated it.
     Malformed(String),
     /// It is for another processor.
     Target {
-        /// The processor that it is for.
+        /// The processor it is for.
         made_for: Target,
     },
-    /// This processor lacks instructions.
+    /// This processor lacks these instruction sets.
     Lacks(Vec<Feature>),
-    /// There is no memory for it, or none that may be executed.
+    /// Memory for the code could not be allocated or made executable.
     Memory(String),
 }
 
@@ -231,28 +230,28 @@ impl fmt::Display for Refusal {
 
 impl std::error::Error for Refusal {}
 
-/// A compiled model, taken apart.
+/// A parsed image.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Image {
-    /// What its code runs on.
+    /// The processor family its code runs on.
     pub target: Target,
-    /// What its code needs there.
+    /// The instruction sets its code uses.
     pub features: Vec<Feature>,
-    /// What it says of itself, with its pool of constants.
+    /// Its description, with the pool of constants.
     pub description: Description,
-    /// Defaults of its parameters, SI, as many as the layout has.
+    /// Default values of its parameters, SI, as many as the layout has.
     pub params: Vec<f64>,
     /// Its machine code.
     pub code: Vec<u8>,
-    /// Where in the code each function begins, in the order of [`Function::ALL`].
+    /// Offset of each function in the code, in the order of [`Function::ALL`].
     pub entries: [Option<u64>; Function::ALL.len()],
 }
 
 impl Image {
-    /// The file.
+    /// Writes the file.
     ///
     /// # Panics
-    /// If it contradicts itself: a mistake of whoever made it.
+    /// If the image is inconsistent: a bug in the caller.
     pub fn to_bytes(&self) -> Vec<u8> {
         if let Some(fault) = self.fault() {
             panic!("an image that contradicts itself: {fault}");
@@ -284,7 +283,7 @@ impl Image {
         out
     }
 
-    /// Takes a file apart that is whole and unchanged. Whether it fits this processor is [`Image::fits`].
+    /// Parses a file, and checks its length and hash. [`Image::fits`] checks whether it fits this processor.
     ///
     /// # Errors
     /// Why it cannot be used.
@@ -345,15 +344,15 @@ impl Image {
         image.fault().map_or(Ok(image), |fault| Err(malformed(fault)))
     }
 
-    /// Whether this processor runs it.
+    /// Checks that this processor can run it.
     ///
     /// # Errors
-    /// Why not.
+    /// Why it cannot.
     pub fn fits(&self) -> Result<(), Refusal> {
         self.fits_on(Target::here(), Feature::here)
     }
 
-    /// Whether a processor runs it that is of this make and has these features.
+    /// Checks that a processor of this family with these features can run it.
     fn fits_on(&self, target: Option<Target>, has: impl Fn(Feature) -> bool) -> Result<(), Refusal> {
         if target != Some(self.target) {
             return Err(Refusal::Target { made_for: self.target });
@@ -362,7 +361,7 @@ impl Image {
         if lacking.is_empty() { Ok(()) } else { Err(Refusal::Lacks(lacking)) }
     }
 
-    /// What in it contradicts itself.
+    /// The first inconsistency, as a message.
     fn fault(&self) -> Option<String> {
         let layout = &self.description.layout;
         if self.params.len() != layout.params.len as usize {
@@ -390,10 +389,10 @@ pub fn sha256(bytes: &[u8]) -> [u8; 32] {
     Sha256::digest(bytes).into()
 }
 
-/// SHA-256 of a file whose own hash, which lies at `own`, counts as zeros.
+/// SHA-256 of a file that contains its own hash at `own`; those bytes count as zeros.
 ///
 /// # Panics
-/// If the file ends before its hash does: a mistake of the caller.
+/// If the file ends before its hash does: a bug in the caller.
 pub fn sha256_without(bytes: &[u8], own: std::ops::Range<usize>) -> [u8; 32] {
     let mut hasher = Sha256::new();
     hasher.update(&bytes[..own.start]);
@@ -440,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn an_image_is_read_as_it_was_written_and_equal_images_have_equal_bytes() {
+    fn images_round_trip_and_equal_images_have_equal_bytes() {
         let bytes = image().to_bytes();
         assert_eq!(Image::read(&bytes), Ok(image()));
         assert_eq!(bytes, image().to_bytes());
@@ -462,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_short_or_something_else_is_told_apart() {
+    fn truncated_files_and_other_files_have_different_errors() {
         let bytes = image().to_bytes();
         for len in 0..bytes.len() {
             let expected = if len < MAGIC.len() { "no compiled model" } else { "not copied whole" };
@@ -491,9 +490,9 @@ mod tests {
         assert_eq!(image().fits_on(Some(Target::X86_64), |_| true), Ok(()));
     }
 
-    /// Right hashes over wrong contents, as a faulty compiler would make them.
+    /// Valid hashes over invalid content, as a faulty compiler would generate them.
     #[test]
-    fn what_contradicts_itself_is_refused() {
+    fn inconsistent_images_are_refused() {
         let resealed = |change: &dyn Fn(&mut Vec<u8>)| {
             let mut bytes = image().to_bytes();
             change(&mut bytes);
@@ -515,9 +514,9 @@ mod tests {
         }
     }
 
-    /// Whatever the bytes of a description are: it is read or refused, and never a reason to panic.
+    /// For any bytes, a description is either read or refused, without a panic.
     #[test]
-    fn no_description_upsets_the_reader() {
+    fn no_description_causes_a_panic() {
         let bytes = image().description.to_bytes();
         for at in 0..bytes.len() {
             for value in [0, 1, 0x7f, 0x80, 0xff] {

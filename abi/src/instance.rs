@@ -1,27 +1,27 @@
-//! A model that runs: its block of numbers and its code, with every access checked.
+//! A running model: its block of numbers and its code, with every access checked.
 
 use crate::description::{Automaton, Delay, Description, Kind, Quantity, Slot};
 use crate::table::{Code, Function, Machine, keep_clock};
 use std::sync::Arc;
 
-/// One running copy of a compiled model.
+/// One running instance of a compiled model.
 #[derive(Clone)]
 pub struct Instance {
     description: Arc<Description>,
     code: Code,
-    /// So many slots, and behind them what the code prepares of parameters.
+    /// The block of `size` slots, followed by the values that are hoisted out of the step.
     numbers: Vec<f64>,
     size: usize,
-    /// Whether that was prepared since a parameter or the length of the step changed.
+    /// Whether the hoisted values are current: no parameter and no step length has changed since they were computed.
     is_prepared: bool,
     /// The same program for adaptive runs, where this one has fixed steps and there is such.
     adaptive: Option<Arc<Instance>>,
 }
 
 impl Instance {
-    /// A copy whose parameters have their defaults: `params`, SI, as many as the layout has.
+    /// An instance with the default parameters `params`, in SI, as many as the layout has.
     pub fn new(description: Arc<Description>, code: Code, params: &[f64]) -> Instance {
-        // So that what is in time need not make room.
+        // Allocates the room for hoisted values now, so that real-time code need not.
         let prepared = code.made(Function::Step).and_then(Machine::prepared).map_or(0, |prepared| prepared.len);
         let size = description.layout.size();
         let mut numbers = vec![0.0; size + prepared];
@@ -49,7 +49,7 @@ impl Instance {
         Some(adaptive)
     }
 
-    /// What it is.
+    /// The description of its model.
     pub fn description(&self) -> &Arc<Description> {
         &self.description
     }
@@ -59,7 +59,7 @@ impl Instance {
         self.code.has(function)
     }
 
-    /// The value in a slot, SI.
+    /// The value of a slot, SI.
     pub fn get(&self, slot: Slot) -> f64 {
         self.block()[slot.index()]
     }
@@ -70,24 +70,24 @@ impl Instance {
         self.numbers[..self.size][slot.index()] = value;
     }
 
-    /// All slots.
+    /// The block.
     pub fn block(&self) -> &[f64] {
         &self.numbers[..self.size]
     }
 
-    /// All slots, to write.
+    /// The block, for writing.
     pub fn block_mut(&mut self) -> &mut [f64] {
         self.is_prepared = false;
         &mut self.numbers[..self.size]
     }
 
-    /// Runs one function once; returns its status, 0 for none.
+    /// Runs one function once and returns its status; 0: no guard failed.
     pub fn call(&mut self, function: Function) -> u64 {
         self.call_up_to(function, 1)
     }
 
-    /// Runs one function up to `n` times; returns the first status that is not 0, at which it stops. Behind fixed steps the
-    /// block tells their count and the time.
+    /// Runs one function up to `n` times, stops at the first non-zero status and returns it. After fixed steps, the
+    /// block contains their count and the time.
     pub fn call_up_to(&mut self, function: Function, n: u64) -> u64 {
         let before = self.get(Slot::COUNT);
         let single = if (function, n) == (Function::Step, 1) { self.step_prepared() } else { None };
@@ -99,21 +99,21 @@ impl Instance {
         status
     }
 
-    /// One fixed step, if there is code for which what hangs on parameters is prepared.
+    /// One fixed step with hoisted values, if the code has such a step.
     fn step_prepared(&mut self) -> Option<u64> {
         let machine = self.code.made(Function::Step)?;
         let size = self.size + machine.prepared()?.len;
         if self.numbers.len() < size {
-            // The code was made since.
+            // The code was compiled since this instance was created.
             self.numbers.resize(size, 0.0);
             self.is_prepared = false;
         }
-        let there = std::mem::replace(&mut self.is_prepared, true);
-        machine.step_prepared(&mut self.numbers, &self.description.pool, there)
+        let is_current = std::mem::replace(&mut self.is_prepared, true);
+        machine.step_prepared(&mut self.numbers, &self.description.pool, is_current)
     }
 
-    /// Puts the model at t = 0 for steps of `h` seconds: initial values and the blocks due at 0, then transitions
-    /// until none applies (at most as often as an automaton has regimes), then outputs.
+    /// Starts the model at t = 0 for steps of `h` seconds: initial values and the sampled blocks due at 0, then
+    /// transitions until none applies (at most as often as an automaton has regimes), then outputs.
     pub fn start(&mut self, h: f64) -> u64 {
         self.set(Slot::TIME, 0.0);
         self.set(Slot::COUNT, 0.0);
@@ -133,28 +133,28 @@ impl Instance {
         status.max(self.call(Function::Outputs))
     }
 
-    /// Advances by up to `n` fixed steps; returns the first status that is not 0, at which it stops.
+    /// Advances by up to `n` fixed steps, stops at the first non-zero status and returns it.
     pub fn advance(&mut self, n: u64) -> u64 {
         self.call_up_to(Function::Step, n)
     }
 }
 
-/// What became of the states of an instance when another took its place.
+/// What happened to the states when one instance replaced another.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Carried {
-    /// Paths of states and automata that went on where they were.
+    /// Paths of states and automata that continue.
     pub kept: Vec<String>,
-    /// Those that are new, or of another unit or other regimes than before, and begin anew.
+    /// Those that start anew, because they are new or have another unit or other regimes.
     pub fresh: Vec<String>,
-    /// Those that are no more.
+    /// Those that no longer exist.
     pub lost: Vec<String>,
 }
 
 impl Instance {
-    /// Goes on where another instance is: states take over the value of the state with the same path and dimension,
-    /// automata the regime of the same name. What has no name (held outputs, crossings, what is delayed) is taken over where
-    /// both have the same; else it stays as it is after a start. Time stays this instance's own, and so do periods and
-    /// dead times; outputs are computed anew. A past that reaches back behind this instance's own start is lost.
+    /// Continues where another instance is. A state takes the value of the state with the same path and dimension, and
+    /// an automaton takes the regime of the same name. Unnamed memory (held outputs, crossings, delayed values) is
+    /// copied if both models have the same; otherwise it keeps its start values. Time, periods and dead times remain
+    /// those of this instance, and outputs are computed again. Samples from before the start of this instance are lost.
     pub fn carry(&mut self, from: &Instance) -> Carried {
         let mut carried = Carried::default();
         let (new, old) = (self.description.clone(), from.description.clone());
@@ -218,8 +218,8 @@ impl Instance {
         carried
     }
 
-    /// Fills a ring with the samples of another one, between which lie straight lines; returns whether they reach back far
-    /// enough. Rings are of fixed steps: there is none where either instance has no step.
+    /// Fills a ring by linear interpolation between the samples of another ring. Returns whether these reach back far
+    /// enough. Rings have fixed steps, so the result is false if either instance has no step length.
     fn carry_past(&mut self, delay: &Delay, from: &Instance, before: &Delay) -> bool {
         let (len, count, h) = (delay.ring.len as usize, self.get(Slot::COUNT) as usize, self.get(Slot::STEP));
         let (old_len, old_count, old_h) =
@@ -227,7 +227,7 @@ impl Instance {
         if len == 0 || old_len == 0 || h <= 0.0 || old_h <= 0.0 {
             return false;
         }
-        // So many steps of the other one ago, at most to where its ring or its time begins.
+        // The sample so many steps ago in the other instance, clamped to the start of its ring and its time.
         let sample = |ago: usize| {
             let number = old_count - ago.min(old_count).min(old_len - 1);
             from.get(before.ring.slot(number % old_len))
@@ -248,7 +248,7 @@ mod tests {
     use crate::description::Layout;
     use crate::table::{Interpret, Prepared};
 
-    /// Counts many steps, one not, and knows no time.
+    /// Counts steps only in calls for several steps, and does not store time.
     struct Counts;
 
     impl Interpret for Counts {
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn the_clock_is_kept_behind_steps_whose_code_leaves_it() {
+    fn count_and_time_are_stored_after_steps_whose_code_does_not() {
         let layout = Layout::new([0; 10]);
         let description = Arc::new(Description { layout, ..Description::default() });
         let mut instance = Instance::new(description, Code::Interpreted(Arc::new(Counts)), &[]);
@@ -277,7 +277,7 @@ mod tests {
         assert_eq!(instance.get(Slot::TIME), 9.0, "what makes no step leaves it");
     }
 
-    /// Slot 6, behind the block, is twice the parameter in slot 3; slot 5 counts how often it was prepared.
+    /// Computes the hoisted value in slot 6, after the block: twice the parameter in slot 3. Slot 5 counts the calls.
     unsafe extern "C" fn prepare(block: *mut f64, _: *const f64, _: u64) -> u64 {
         // SAFETY: the block has six slots and a number behind them.
         unsafe {
@@ -287,7 +287,7 @@ mod tests {
         0
     }
 
-    /// The state in slot 4 grows by it.
+    /// Adds the hoisted value to the state in slot 4.
     unsafe extern "C" fn step(block: *mut f64, _: *const f64, _: u64) -> u64 {
         // SAFETY: as above.
         unsafe { *block.add(4) += *block.add(6) };
@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn what_hangs_on_parameters_is_prepared_when_one_changes() {
+    fn hoisted_values_are_computed_again_when_a_parameter_changes() {
         let layout = Layout::new([1, 0, 1, 1, 0, 0, 0, 0, 0, 0]);
         let (param, state, prepared) = (layout.params.slot(0), layout.states.slot(0), layout.memory.slot(0));
         let description = Arc::new(Description { layout, ..Description::default() });

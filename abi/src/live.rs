@@ -1,9 +1,9 @@
-//! What a start checks of the parameters of a rig, as plain data: so that a set of parameters given later is judged by
-//! the same conditions and refused with the same words.
+//! The conditions that the start of a rig checks on its parameters, as plain data. A set of parameters that arrives
+//! later is checked by the same conditions and refused with the same messages.
 //!
 //! A *judge* program computes the numbers of all conditions from a block of parameters; each [`Check`] names the slots
-//! of its numbers in that block. Only the compiler knows how they come about. It also says of each parameter whether the
-//! step reads it, so that it may change while the rig runs, or why only a start does.
+//! of its numbers in that block. Only the compiler knows how they are computed. It also records for each parameter
+//! whether the step reads it, so that it may change while the rig runs, or why only a start reads it.
 
 use crate::description::{Slot, TINY};
 use crate::encode::{Encode, Malformed, Reader};
@@ -13,9 +13,9 @@ use crate::unit::{Unit, three_digits};
 /// The parameters of a rig and the conditions on them.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Live {
-    /// Every parameter of the rig's text, in its order.
+    /// Every parameter of the rig, in the order of the text.
     pub params: Vec<Param>,
-    /// In the order in which a start reports what is broken.
+    /// The conditions, in the order in which a start reports violations.
     pub checks: Vec<Check>,
 }
 
@@ -26,33 +26,33 @@ pub struct Param {
     pub path: String,
     /// The unit it is declared in.
     pub unit: Unit,
-    /// Whether it is true or false.
+    /// Whether it is a Boolean.
     pub boolean: bool,
-    /// Where it may change while the rig runs, or why it may not.
+    /// Whether it may change while the rig runs.
     pub place: Place,
 }
 
 /// Whether a parameter may change while the rig runs.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Place {
-    /// Yes: its slot in the control program and the one in the judge.
+    /// Yes: its slot in the control program and its slot in the judge.
     Live(Slot, Slot),
-    /// No, only a start reads it: why, as a clause such as "a period follows from it".
+    /// No, only a start reads it. The reason, as a clause such as "a period follows from it".
     Start(String),
 }
 
 /// A condition that a start checks.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Check {
-    /// E0502: a value lies in its declared range.
+    /// E0502: a value is in its declared range.
     Range {
         /// Dotted path.
         path: String,
-        /// Own name.
+        /// Its own name.
         name: String,
         /// The model that declares it.
         model: String,
-        /// For messages.
+        /// The unit for messages.
         unit: Unit,
         /// The value.
         value: Slot,
@@ -63,14 +63,14 @@ pub enum Check {
     },
     /// E0501: a `require` holds.
     Require {
-        /// What is said if it does not.
+        /// The message if it does not hold.
         message: String,
         /// Not 0 if it holds.
         value: Slot,
     },
     /// E0502: a period is positive.
     Period(Slot),
-    /// E0701: a period is a whole number of steps.
+    /// E0701: a period is an integer number of steps.
     Multiple {
         /// The period, s.
         period: Slot,
@@ -81,23 +81,24 @@ pub enum Check {
     Carried {
         /// The command: `panel.lamp`.
         path: String,
-        /// For messages.
+        /// The unit for messages.
         unit: Unit,
         /// Its value; NaN if it is not constant.
         value: Slot,
-        /// Least and greatest value that the field carries.
+        /// Smallest and largest value that the field can carry.
         range: (f64, f64),
     },
 }
 
-/// Conditions of a later stage are looked at only if all before hold: a start ends with the first stage that fails.
+/// Number of stages. A condition is only checked if all conditions of earlier stages hold: a start ends with the first
+/// stage that fails.
 pub const STAGES: u8 = 2;
 
-/// The most numbers that a condition depends on.
+/// Maximum number of values that a condition depends on.
 pub const NUMBERS: usize = 3;
 
 impl Check {
-    /// Its code, as `fric explain` takes it.
+    /// Its error code, for `fric explain`.
     pub fn code(&self) -> &'static str {
         match self {
             Check::Range { .. } | Check::Period(_) => "E0502",
@@ -107,7 +108,7 @@ impl Check {
         }
     }
 
-    /// 0 for what is checked of values, 1 for what is checked of the rig.
+    /// Its stage: 0 for conditions on values, 1 for conditions on the rig.
     pub fn stage(&self) -> u8 {
         match self {
             Check::Range { .. } | Check::Require { .. } | Check::Period(_) => 0,
@@ -124,7 +125,7 @@ impl Check {
         }
     }
 
-    /// Its numbers; NaN where it has none.
+    /// Its numbers; NaN for those it does not have.
     pub fn numbers(&self, block: &[f64]) -> [f64; NUMBERS] {
         self.slots().map(|slot| slot.map_or(f64::NAN, |slot| block[slot.index()]))
     }
@@ -140,12 +141,12 @@ impl Check {
             Check::Require { .. } => value != 0.0,
             Check::Period(_) => is_period(value),
             Check::Multiple { step, .. } => is_multiple(value, *step),
-            // NaN lies nowhere: a command that changes is watched elsewhere.
+            // NaN is not constant; a command that changes is checked at run time.
             Check::Carried { range, .. } => !(value < range.0 || value > range.1),
         }
     }
 
-    /// What numbers for which it does not hold break, in words.
+    /// The message for numbers that violate the condition.
     pub fn words(&self, numbers: [f64; NUMBERS]) -> String {
         let [value, low, high] = numbers;
         match self {
@@ -170,7 +171,7 @@ fn bound(declared: &Option<(Slot, bool)>, number: f64) -> Option<(f64, bool)> {
     declared.map(|(_, strict)| (number, strict))
 }
 
-/// The bound of a range that a value breaks.
+/// The bound of a range that a value violates.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Beyond {
     /// `above`, `at least`, `below`, `at most`.
@@ -179,11 +180,11 @@ pub struct Beyond {
     pub bound: f64,
 }
 
-/// The bound that a value breaks; each bound with whether it is excluded.
+/// The bound that a value violates. Each bound comes with whether it is excluded.
 pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> Option<Beyond> {
     let below = low.filter(|(bound, strict)| value < least(*bound, *strict));
     let above = high.filter(|(bound, strict)| value > greatest(*bound, *strict));
-    // 0 is left out with all that is too small to be told from it.
+    // A bound that excludes 0 also excludes everything below TINY.
     let tiny = value != 0.0 && value.abs() < TINY;
     let named = |(bound, strict): (f64, bool)| {
         if strict && bound == 0.0 && tiny { (TINY.copysign(value), strict) } else { (bound, strict) }
@@ -195,7 +196,7 @@ pub fn beyond(value: f64, low: Option<(f64, bool)>, high: Option<(f64, bool)>) -
     }
 }
 
-/// The least value of a range with this lower bound, which may be excluded.
+/// The smallest value of a range with this lower bound. `strict`: the bound is excluded.
 pub fn least(bound: f64, strict: bool) -> f64 {
     match strict {
         true if bound == 0.0 => TINY,
@@ -204,7 +205,7 @@ pub fn least(bound: f64, strict: bool) -> f64 {
     }
 }
 
-/// The greatest value of a range with this upper bound, which may be excluded.
+/// The largest value of a range with this upper bound. `strict`: the bound is excluded.
 pub fn greatest(bound: f64, strict: bool) -> f64 {
     -least(-bound, strict)
 }
@@ -214,38 +215,38 @@ pub fn is_empty(low: Option<(f64, bool)>, high: Option<(f64, bool)>) -> bool {
     matches!((low, high), (Some((low, _)), Some((high, _))) if low > high)
 }
 
-/// E0502: a value outside of its range.
+/// E0502: the message for a value outside of its range.
 pub fn beyond_words(name: &str, model: &str, unit: &Unit, value: f64, beyond: Beyond) -> String {
     let (bound, value) = (shown(beyond.bound, unit), shown(value, unit));
     format!("`{name}` of {model} must be {} {bound}, not {value}", beyond.word)
 }
 
-/// E0502: a range whose lower bound is above its upper one.
+/// E0502: the message for a range whose lower bound is above its upper one.
 pub fn nothing_in_range(name: &str) -> String {
     format!("nothing lies in the range of `{name}`")
 }
 
-/// E0502: what a period must be.
+/// E0502: the message for an invalid period.
 pub const NO_PERIOD: &str = "a period must be positive and known before the run";
 
-/// Whether it can be a period.
+/// Whether a value is a valid period.
 pub fn is_period(seconds: f64) -> bool {
     seconds > 0.0 && seconds.is_finite()
 }
 
-/// Whether a period is a whole number of steps, but for rounding.
+/// Whether a period is an integer number of steps, up to rounding.
 pub fn is_multiple(period: f64, step: f64) -> bool {
     let ratio = period / step;
     (ratio - ratio.round()).abs() <= 1e-9 * ratio && ratio.round() >= 1.0
 }
 
-/// E0701: a period that is no whole number of steps.
+/// E0701: the message for a period that is not an integer number of steps.
 pub fn no_multiple(period: f64, step: f64) -> String {
     let second = Unit::parse("s").expect("the second is known");
     format!("a period of {} is no multiple of the step of {}", shown(period, &second), shown(step, &second))
 }
 
-/// E0802: a command that its field cannot carry.
+/// E0802: the message for a command that its field cannot carry.
 pub fn cannot_be(path: &str, unit: &Unit, value: f64) -> String {
     format!("`{path}` cannot be {}", three_digits(unit.from_si(value)))
 }
@@ -257,17 +258,17 @@ pub fn shown(si: f64, unit: &Unit) -> String {
 }
 
 impl Live {
-    /// The parameter of this path.
+    /// The parameter with this path.
     pub fn param(&self, path: &str) -> Option<&Param> {
         self.params.iter().find(|param| param.path == path)
     }
 
-    /// Where a slot of the control program lies in the judge, if it is that of a parameter that may change.
+    /// The judge's slot for a slot of the control program, if it is a parameter that may change.
     pub fn judged(&self, control: Slot) -> Option<Slot> {
         self.places().find(|(slot, _)| *slot == control).map(|(_, judge)| judge)
     }
 
-    /// Both slots of each parameter that may change.
+    /// Both slots of each parameter that may change: control program, judge.
     pub fn places(&self) -> impl Iterator<Item = (Slot, Slot)> {
         self.params.iter().filter_map(|param| match &param.place {
             Place::Live(control, judge) => Some((*control, *judge)),
@@ -275,8 +276,8 @@ impl Live {
         })
     }
 
-    /// Why it cannot be of these programs: blocks of `control` slots, of which `params` are parameters, and of `judge`
-    /// slots.
+    /// An inconsistency with the programs, as a message. `params`: the parameter slots of the control program. `judge`:
+    /// number of slots of the judge's block.
     pub fn fault(&self, params: std::ops::Range<usize>, judge: usize) -> Option<String> {
         let slots = self.checks.iter().flat_map(|check| check.slots().into_iter().flatten());
         if let Some(slot) = self.places().map(|(_, slot)| slot).chain(slots).find(|slot| slot.index() >= judge) {
@@ -408,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_read_as_it_was_written_and_no_byte_upsets_the_reader() {
+    fn it_round_trips_and_no_byte_causes_a_panic() {
         let bytes = live().to_bytes();
         assert_eq!(Live::from_bytes(&bytes), Ok(live()));
         for at in 0..bytes.len() {
@@ -424,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_that_are_excluded_are_broken_by_themselves() {
+    fn excluded_bounds_violate_their_range() {
         for (value, low, high, word) in [
             (0.0, Some((0.0, true)), None, Some("above")),
             (0.0, Some((0.0, false)), None, None),

@@ -1,4 +1,4 @@
-//! Rigs as bytes and back, for packages and logs.
+//! Serialisation of rigs, for packages and logs.
 
 use crate::encode::{Encode, Malformed, Reader};
 use crate::plan::{Method, Series};
@@ -35,7 +35,7 @@ encode_structs! {
     Plant { applied, seen, inertia }
 }
 
-/// Nothing for `stop`, the number of ticks for `hold`.
+/// Encoded as an optional number of ticks: none for `stop`.
 impl Encode for Overrun {
     fn encode(&self, out: &mut Vec<u8>) {
         match self {
@@ -190,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_comes_back_as_it_was() {
+    fn a_rig_round_trips() {
         let bytes = rig().to_bytes();
         assert_eq!(Rig::from_bytes(&bytes), Ok(rig()));
         let stopping = Rig { overrun: Overrun::Stop, predict: None, ..rig() };
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn no_beginning_of_a_rig_is_one() {
+    fn a_truncated_rig_is_an_error() {
         let bytes = rig().to_bytes();
         for length in 0..bytes.len() {
             assert!(Rig::from_bytes(&bytes[..length]).is_err(), "{length} bytes");

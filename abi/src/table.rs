@@ -1,14 +1,14 @@
-//! The functions of a compiled model, behind one door, whatever made them.
+//! The functions of a compiled model, behind one interface for machine code and interpreters.
 
 use crate::ahead::Ahead;
 use crate::description::Slot;
 use std::any::Any;
 use std::sync::Arc;
 
-/// The functions of a model. Each reads and writes the block only, and neither allocates nor calls anything.
+/// The functions of a model. Each reads and writes only the block, and neither allocates nor calls anything.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub enum Function {
-    /// Parameters and inputs → states, memory, regimes at t = 0, sampled blocks that are due at 0 included.
+    /// Parameters and inputs → states, memory and regimes at t = 0, including the sampled blocks that are due at 0.
     Start,
     /// → outputs.
     Outputs,
@@ -20,17 +20,17 @@ pub enum Function {
     Roots,
     /// Runs the sampled blocks that are `due`.
     Tick,
-    /// One transition per automaton, events and their resets; remembers for crossings.
+    /// At most one transition per automaton, then events and their resets; also stores the memory of crossings.
     Transitions,
-    /// One fixed step with all that belongs to it: states, count, time where the model reads it, ticks, transitions, outputs,
-    /// guards.
+    /// One complete fixed step: states, count, time (if the model reads it), ticks, transitions, outputs, guards.
     Step,
-    /// Up to `count` adaptive steps, tried and as far as possible settled: see [`trial`](crate::rosenbrock::layout).
+    /// Up to `count` trials of adaptive steps, accepted or rejected as far as possible: see
+    /// [`trial`](crate::rosenbrock::layout).
     Rosenbrock,
 }
 
 impl Function {
-    /// All of them, in order.
+    /// All functions, in order.
     pub const ALL: [Function; 9] = [
         Function::Start,
         Function::Outputs,
@@ -43,7 +43,7 @@ impl Function {
         Function::Rosenbrock,
     ];
 
-    /// Its name in listings.
+    /// The name in listings.
     pub fn name(self) -> &'static str {
         match self {
             Function::Start => "start",
@@ -59,14 +59,14 @@ impl Function {
     }
 }
 
-/// Machine code of one function: runs it up to `count` times on the block and stops early at the first non-zero
-/// status, which it returns (0: none). `pool` is the description's pool of constants. A call for one fixed step may leave the
-/// count of steps where nothing that it computes hangs on it, and any leaves time where no equation reads it: whoever calls
-/// keeps these, with [`keep_clock`].
+/// Machine code of one function: runs it up to `count` times on the block, stops at the first non-zero status and
+/// returns it (0: none). `pool`: the description's pool of constants. A call for one fixed step need not store the step
+/// count if nothing else depends on it, and no call need store time if no equation reads it. The caller stores these
+/// with [`keep_clock`].
 pub type Entry = unsafe extern "C" fn(block: *mut f64, pool: *const f64, count: u64) -> u64;
 
-/// The count and time behind a call for `count` fixed steps, at least one, into the block: how many were done, code tells if
-/// it was asked for more than one. `before` is the count before the call.
+/// Stores the step count and time after a call for `count` fixed steps, at least one. The code itself has stored the
+/// count if it was called for more than one step. `before`: the count before the call.
 pub fn keep_clock(block: &mut [f64], before: f64, count: u64) {
     if count == 1 {
         block[Slot::COUNT.index()] = before + 1.0;
@@ -74,31 +74,31 @@ pub fn keep_clock(block: &mut [f64], before: f64, count: u64) {
     keep_time(block);
 }
 
-/// Time behind fixed steps, into the block: the count times the step.
+/// Stores time after fixed steps: count times step length.
 pub fn keep_time(block: &mut [f64]) {
     block[Slot::TIME.index()] = block[Slot::COUNT.index()] * block[Slot::STEP.index()];
 }
 
-/// Machine code of one fixed step of which what hangs on parameters and the length of the step alone is computed beforehand:
-/// so many numbers behind the block.
+/// Machine code of one fixed step from which the expressions of parameters and step length are hoisted. Their values
+/// are stored after the block.
 #[derive(Clone, Copy)]
 pub struct Prepared {
-    /// Writes these numbers, whatever the count; none if there are none.
+    /// Computes the hoisted values, whatever the count; `None` if there are none.
     pub prepare: Option<Entry>,
-    /// One step, on a block whose numbers were written since a parameter or the length of the step changed; the count is 1. It
-    /// returns the status.
+    /// One step, and its status; the count must be 1. The hoisted values must have been computed since a parameter or
+    /// the step length last changed.
     pub step: Entry,
-    /// How many they are.
+    /// Number of hoisted values.
     pub len: usize,
 }
 
-/// Code that is interpreted, made late, or written by hand in tests.
+/// Code that is interpreted, compiled lazily, or written by hand in tests.
 pub trait Interpret: Send + Sync {
     /// As [`Entry`], on a block of the description's size.
     fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64;
-    /// Whether the function is there.
+    /// Whether the function exists.
     fn has(&self, function: Function) -> bool;
-    /// Machine code of the function, if by now there is such.
+    /// Machine code of the function, if it has been compiled by now.
     fn made(&self, _: Function) -> Option<&Machine> {
         None
     }
@@ -113,25 +113,25 @@ pub enum Code {
     Interpreted(Arc<dyn Interpret>),
 }
 
-/// Entries of machine code, and whatever keeps their memory alive.
+/// Entry points of machine code, and the owner of their memory.
 #[derive(Clone)]
 pub struct Machine {
     entries: [Option<Entry>; Function::ALL.len()],
     size: usize,
     pool_len: usize,
-    /// The step again, in two parts.
+    /// The step again, as two distributed loops.
     ahead: Option<Arc<Ahead>>,
-    /// The step again, one at a time.
+    /// The step again, as a single step with hoisted values.
     prepared: Option<Prepared>,
     _memory: Arc<dyn Any + Send + Sync>,
 }
 
 impl Machine {
-    /// Entries in the order of [`Function::ALL`] that work on blocks of `size` slots with a pool of `pool_len` numbers.
+    /// Entry points in the order of [`Function::ALL`], for blocks of `size` slots and a pool of `pool_len` numbers.
     ///
     /// # Safety
-    /// Each entry must be valid as long as `memory` lives, must access only `block[..size]` and `pool[..pool_len]`
-    /// and must not unwind.
+    /// Each entry must be valid as long as `memory` lives, must access only `block[..size]` and `pool[..pool_len]`, and
+    /// must not unwind.
     pub unsafe fn new(
         entries: [Option<Entry>; Function::ALL.len()],
         size: usize,
@@ -141,24 +141,24 @@ impl Machine {
         Machine { entries, size, pool_len, ahead: None, prepared: None, _memory: memory }
     }
 
-    /// The same, which takes many steps in two parts.
+    /// The same code, which makes many steps with the distributed loops.
     ///
     /// # Safety
-    /// The parts must give the bits of the step that is there, and work on the same block and pool.
+    /// They must compute the same bits as the existing step, and work on the same block and pool.
     pub unsafe fn with_ahead(self, ahead: Ahead) -> Machine {
         Machine { ahead: Some(Arc::new(ahead)), ..self }
     }
 
-    /// The same, which takes a single step where that is prepared.
+    /// The same code, which makes a single step with hoisted values.
     ///
     /// # Safety
-    /// It must give the bits of the step that is there, access only the block, so many numbers behind it and the pool,
-    /// be valid as long as the memory of this lives, and not unwind.
+    /// It must compute the same bits as the existing step, access only the block, the hoisted values after it and the
+    /// pool, be valid as long as the memory of this code lives, and not unwind.
     pub unsafe fn with_prepared(self, prepared: Prepared) -> Machine {
         Machine { prepared: Some(prepared), ..self }
     }
 
-    /// Whether many steps are taken in two parts.
+    /// Whether many steps use distributed loops.
     pub fn goes_ahead(&self) -> bool {
         self.ahead.is_some()
     }
@@ -180,22 +180,22 @@ impl Machine {
                 return status;
             }
         }
-        // SAFETY: `Machine::new` was promised that entries access only the lengths just checked.
+        // SAFETY: by the contract of `Machine::new`, entries access only the lengths just checked.
         unsafe { entry(block.as_mut_ptr(), pool.as_ptr(), left) }
     }
 
-    /// Its single step that is prepared, if it has one.
+    /// The single step with hoisted values, if there is one.
     pub fn prepared(&self) -> Option<Prepared> {
         self.prepared
     }
 
-    /// One fixed step on a block with the numbers of [`Prepared`] behind it, which are written before unless they are `there`;
-    /// none if the code has no such step.
-    pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], there: bool) -> Option<u64> {
+    /// One fixed step on a block followed by the values of [`Prepared`]; they are computed first unless they are
+    /// `there`. `None` if the code has no such step.
+    pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], is_current: bool) -> Option<u64> {
         let Prepared { prepare, step, len } = self.prepared?;
         self.check(block, pool, len);
-        if let Some(prepare) = prepare.filter(|_| !there) {
-            // SAFETY: `with_prepared` was promised that it accesses only the lengths just checked.
+        if let Some(prepare) = prepare.filter(|_| !is_current) {
+            // SAFETY: by the contract of `with_prepared`, it accesses only the lengths just checked.
             unsafe { prepare(block.as_mut_ptr(), pool.as_ptr(), 1) };
         }
         // SAFETY: as above.
@@ -210,7 +210,7 @@ impl Machine {
 }
 
 impl Code {
-    /// Whether the function is there.
+    /// Whether the function exists.
     pub fn has(&self, function: Function) -> bool {
         match self {
             Code::Machine(machine) => machine.entries[function as usize].is_some(),
@@ -218,7 +218,7 @@ impl Code {
         }
     }
 
-    /// The entry of a function, for whoever calls it himself; none if there is no machine code of it.
+    /// The entry point of a function, for direct calls; `None` if it is not machine code.
     pub fn entry(&self, function: Function) -> Option<Entry> {
         match self {
             Code::Machine(machine) => machine.entries[function as usize],
@@ -226,7 +226,7 @@ impl Code {
         }
     }
 
-    /// Machine code of a function, if by now there is such.
+    /// Machine code of a function, if it has been compiled by now.
     pub fn made(&self, function: Function) -> Option<&Machine> {
         match self {
             Code::Machine(machine) => Some(machine),
@@ -237,7 +237,7 @@ impl Code {
     /// Runs a function up to `count` times; see [`Entry`].
     ///
     /// # Panics
-    /// If the function is not there, or block or pool are shorter than the code needs: mistakes of the caller.
+    /// If the function does not exist, or if block or pool are shorter than the code needs: a bug in the caller.
     pub fn call(&self, function: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
         match self {
             Code::Machine(machine) => machine.call(function, block, pool, count),

@@ -1,8 +1,8 @@
-//! Dimensions and units: the group of SI exponents, and the scales with which people write numbers.
+//! Dimensions, as exponents of SI base units, and units, as scales in which numbers are written.
 
 use std::fmt;
 
-/// An exact fraction, in lowest terms, denominator positive.
+/// An exact fraction in lowest terms with a positive denominator.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Ratio {
     num: i32,
@@ -15,11 +15,11 @@ impl Ratio {
     /// 1
     pub const ONE: Ratio = Ratio { num: 1, den: 1 };
 
-    /// Stands for every fraction whose lowest terms do not fit 32 bits. Exponents of physics are small: code that makes one
-    /// from a text asks [`Ratio::is_beyond`].
+    /// Represents every fraction whose lowest terms do not fit 32 bits. Exponents in physics are small; code that
+    /// parses one must check [`Ratio::is_beyond`].
     pub const BEYOND: Ratio = Ratio { num: i32::MAX, den: 1 };
 
-    /// `num / den`, `den` not 0.
+    /// `num / den`
     ///
     /// # Panics
     /// If `den` is 0.
@@ -30,7 +30,7 @@ impl Ratio {
             (a, b) = (b, a % b);
         }
         let divisor = i128::from(a.max(1)) * i128::from(den.signum());
-        // The least number has no opposite, so it is left out.
+        // i32::MIN is excluded, because its negative does not fit.
         let fit = |n: i64| i32::try_from(i128::from(n) / divisor).ok().filter(|n| *n != i32::MIN);
         match (fit(num), fit(den)) {
             (Some(num), Some(den)) => Ratio { num, den },
@@ -38,12 +38,12 @@ impl Ratio {
         }
     }
 
-    /// Whether it stands for fractions that are too large to be told apart.
+    /// Whether it is [`Ratio::BEYOND`].
     pub fn is_beyond(self) -> bool {
         self == Ratio::BEYOND
     }
 
-    /// The whole number `n`.
+    /// The integer `n`.
     pub fn whole(n: i32) -> Ratio {
         Ratio { num: n, den: 1 }
     }
@@ -58,7 +58,7 @@ impl Ratio {
         self.num == 0
     }
 
-    /// The fraction nearest to `x` with a denominator up to 12, if it is equal to 1e-12.
+    /// The fraction with a denominator of at most 12 that equals `x` up to 1e-12, if there is one.
     pub fn approximate(x: f64) -> Option<Ratio> {
         (1..=12i64).find_map(|den| {
             let num = (x * den as f64).round();
@@ -116,15 +116,15 @@ impl fmt::Debug for Ratio {
     }
 }
 
-/// Exponents over kg, m, s, A, K.
+/// Exponents of kg, m, s, A, K.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct Dimension(pub [Ratio; 5]);
 
 impl Dimension {
-    /// A pure number.
+    /// Dimensionless.
     pub const NONE: Dimension = Dimension([Ratio::ZERO; 5]);
 
-    /// Whole exponents of kg, m, s, A, K.
+    /// Integer exponents of kg, m, s, A, K.
     pub const fn of(exponents: [i32; 5]) -> Dimension {
         let mut out = [Ratio::ZERO; 5];
         let mut i = 0;
@@ -135,28 +135,28 @@ impl Dimension {
         Dimension(out)
     }
 
-    /// Product.
+    /// The dimension of a product.
     pub fn times(self, other: Dimension) -> Dimension {
         Dimension(std::array::from_fn(|i| self.0[i] + other.0[i]))
     }
 
-    /// Quotient.
+    /// The dimension of a quotient.
     pub fn over(self, other: Dimension) -> Dimension {
         self.times(other.power(Ratio::whole(-1)))
     }
 
-    /// Power.
+    /// The dimension of a power.
     pub fn power(self, exponent: Ratio) -> Dimension {
         Dimension(self.0.map(|e| e * exponent))
     }
 
-    /// The rotary twin: m → 1 (rad), kg → kg·m². A homomorphism: products map to products.
+    /// The rotary twin: m → 1 (rad), kg → kg·m². It is a homomorphism: products map to products.
     pub fn rotary(self) -> Dimension {
         let [kg, _, s, a, k] = self.0;
         Dimension([kg, kg + kg, s, a, k])
     }
 
-    /// Whether a command of this kind moves what it acts on, unless it is 0: force, torque, velocity, angular velocity,
+    /// Whether a nonzero command of this dimension causes motion: force, torque, velocity, angular velocity,
     /// acceleration, current.
     pub fn moves(self) -> bool {
         let kinds: [[i32; 5]; 7] = [
@@ -171,17 +171,17 @@ impl Dimension {
         kinds.iter().any(|exponents| Dimension::of(*exponents) == self)
     }
 
-    /// Whether one of its exponents is too large to be told from others.
+    /// Whether an exponent is [`Ratio::BEYOND`].
     pub fn is_beyond(self) -> bool {
         self.0.iter().any(|exponent| exponent.is_beyond())
     }
 
-    /// Whether it is that of a pure number.
+    /// Whether it is dimensionless.
     pub fn is_none(self) -> bool {
         self == Dimension::NONE
     }
 
-    /// What people call such a quantity: `a force`, `a velocity`; `a quantity in kg·m` where it has no name.
+    /// The usual name of such a quantity: `a force`, `a velocity`; `a quantity in kg·m` if it has none.
     pub fn describe(self) -> String {
         match KINDS.iter().find(|(_, exponents)| Dimension::of(*exponents) == self) {
             Some((name, _)) => (*name).to_string(),
@@ -190,7 +190,7 @@ impl Dimension {
     }
 }
 
-/// Names of the kinds of quantity, exponents over kg, m, s, A, K.
+/// Names of kinds of quantity, with exponents of kg, m, s, A, K.
 const KINDS: &[(&str, [i32; 5])] = &[
     ("a pure number", [0, 0, 0, 0, 0]),
     ("a length", [0, 1, 0, 0, 0]),
@@ -210,28 +210,28 @@ const KINDS: &[(&str, [i32; 5])] = &[
     ("a pressure", [1, -1, -2, 0, 0]),
 ];
 
-/// What is written of angles: a soft tag that travels with units as written, not with dimensions.
+/// Whether a unit mentions angles. This tag belongs to units as written, not to dimensions.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug, Default)]
 pub enum Angle {
-    /// Nothing that concerns angles.
+    /// No angle.
     #[default]
     Silent,
-    /// rad, deg, rev or rpm stands in it.
+    /// Contains rad, deg, rev or rpm.
     Angle,
     /// Hz, or 1/s without an angle.
     Rate,
 }
 
-/// A unit as people write it. `value in SI = scale · number`.
+/// A unit as written. `value in SI = scale · number`.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Unit {
-    /// What it measures.
+    /// The dimension of its quantities.
     pub dimension: Dimension,
-    /// SI value of one.
+    /// SI value of one unit.
     pub scale: f64,
-    /// As shown: `N·s/m`, `µm`; empty for a pure number.
+    /// As displayed: `N·s/m`, `µm`; empty if dimensionless.
     pub text: String,
-    /// Whether it speaks of angles.
+    /// Whether it mentions angles.
     pub angle: Angle,
 }
 
@@ -241,7 +241,7 @@ impl Default for Unit {
     }
 }
 
-/// Known units: symbol, SI scale, exponents, takes prefixes, angle tag.
+/// Known units: symbol, SI scale, exponents, whether prefixes are allowed, angle tag.
 const UNITS: &[(&str, f64, [i32; 5], bool, Angle)] = &[
     ("m", 1.0, [0, 1, 0, 0, 0], true, Angle::Silent),
     ("g", 1e-3, [1, 0, 0, 0, 0], true, Angle::Silent),
@@ -265,27 +265,27 @@ const UNITS: &[(&str, f64, [i32; 5], bool, Angle)] = &[
     ("%", 1e-2, [0, 0, 0, 0, 0], false, Angle::Silent),
 ];
 
-/// Prefixes; `c` goes with `m` only.
+/// Prefixes. `c` is only allowed with `m`.
 const PREFIXES: &[(&str, f64)] = &[("G", 1e9), ("M", 1e6), ("k", 1e3), ("m", 1e-3), ("u", 1e-6), ("n", 1e-9)];
 
-/// Greatest exponent of a factor as written: nobody measures in m^100.
+/// Largest exponent of a factor as written: no real unit needs a larger one.
 const MOST_EXPONENT: u32 = 99;
 
 impl Unit {
-    /// A pure number.
+    /// Dimensionless.
     pub fn none() -> Unit {
         Unit { dimension: Dimension::NONE, scale: 1.0, text: String::new(), angle: Angle::Silent }
     }
 
-    /// The SI unit of a dimension, under the name people use where there is one: `N·s/m` rather than `kg/s`.
+    /// The SI unit of a dimension, by its usual name if there is one: `N·s/m` rather than `kg/s`.
     pub fn si(dimension: Dimension) -> Unit {
         Unit { dimension, scale: 1.0, text: si_text(dimension), angle: Angle::Silent }
     }
 
-    /// Reads a unit as written, without brackets: `N·s/m`, `1/s`, `µm`, `kg*m^2`, `1`.
+    /// Parses a unit as written, without brackets: `N·s/m`, `1/s`, `µm`, `kg*m^2`, `1`.
     ///
     /// # Errors
-    /// The part that is not known.
+    /// The unknown part of the text.
     pub fn parse(text: &str) -> Result<Unit, String> {
         let mut unit = Unit::none();
         let mut parts: Vec<(i32, String)> = Vec::new();
@@ -323,7 +323,7 @@ impl Unit {
             }
         }
         take(&mut atom, sign)?;
-        // One that cannot be told from 0 or from infinity measures nothing.
+        // A unit whose scale underflows or overflows is useless.
         if !unit.scale.is_normal() || unit.dimension.is_beyond() {
             return Err(text.to_string());
         }
@@ -334,7 +334,7 @@ impl Unit {
         Ok(unit)
     }
 
-    /// A value in SI as a number in this unit.
+    /// Converts a value in SI to a number in this unit.
     pub fn from_si(&self, si: f64) -> f64 {
         match self.divisor() {
             Some(divisor) => si * divisor,
@@ -342,7 +342,7 @@ impl Unit {
         }
     }
 
-    /// A number in this unit as a value in SI. Of `20 us` it is the nearest to 2e-5.
+    /// Converts a number in this unit to a value in SI. `20 us` becomes the double nearest to 2e-5.
     pub fn to_si(&self, number: f64) -> f64 {
         match self.divisor() {
             Some(divisor) => number / divisor,
@@ -350,20 +350,20 @@ impl Unit {
         }
     }
 
-    /// The whole number that one in SI is of this unit, if it is one: dividing by 1000 rounds once, multiplying with
-    /// 0.001 twice.
+    /// The number of these units in one SI unit, if it is an integer. Division by 1000 rounds once, but multiplication
+    /// by 0.001 rounds twice.
     fn divisor(&self) -> Option<f64> {
         let divisor = (1.0 / self.scale).round();
         (self.scale < 1.0 && (divisor * self.scale - 1.0).abs() < 1e-14).then_some(divisor)
     }
 
-    /// The unit of the rotary twin of a quantity declared in this one: `um` → `µrad`, `N` → `N·m`.
+    /// The unit of the rotary twin of a quantity with this unit: `um` → `µrad`, `N` → `N·m`.
     pub fn rotary(&self) -> Unit {
         let dimension = self.dimension.rotary();
         if dimension == self.dimension {
             return self.clone();
         }
-        // A prefix survives where the unit is a single word that has a twin.
+        // The prefix is kept if the unit is a single symbol with a twin.
         let [_, length, ..] = self.dimension.0;
         let prefix = PREFIXES.iter().find(|(_, scale)| *scale == self.scale).map_or("", |(prefix, _)| *prefix);
         let mut text = si_text(dimension);
@@ -374,7 +374,7 @@ impl Unit {
         } else if dimension == Dimension::of([0, 0, -2, 0, 0]) {
             text = "rad/s^2".into();
         } else if length == Ratio::ZERO && self.dimension.0[0] == Ratio::ONE {
-            // Stiffness and damping: per rad.
+            // Stiffness and damping are per rad.
             text = match self.dimension.0[2].parts() {
                 (-2, 1) => "N·m/rad".into(),
                 (-1, 1) => "N·m·s/rad".into(),
@@ -392,7 +392,7 @@ impl fmt::Display for Unit {
     }
 }
 
-/// One factor of a unit: the unit without its exponent, its text, its exponent.
+/// Parses one factor of a unit: the unit without its exponent, its text, its exponent.
 fn parse_atom(atom: &str) -> Result<(Unit, String, i32), String> {
     let (word, exponent) = match atom.split_once('^') {
         Some((word, exponent)) => {
@@ -429,7 +429,7 @@ fn parse_atom(atom: &str) -> Result<(Unit, String, i32), String> {
     Ok((one, shown, exponent))
 }
 
-/// `N·s/m` from its factors; several below the line repeat it: `N/m/s` is N/(m·s).
+/// Joins factors to a text such as `N·s/m`. Each factor in the denominator has its own slash: `N/m/s` is N/(m·s).
 fn joined(parts: &[(i32, String)]) -> String {
     let mut text = String::new();
     let power = |exponent: i32| if exponent.abs() == 1 { String::new() } else { format!("^{}", exponent.abs()) };
@@ -448,7 +448,7 @@ fn joined(parts: &[(i32, String)]) -> String {
     text
 }
 
-/// Named combinations first, then base units.
+/// The text for a dimension: a usual combination if there is one, otherwise base units.
 fn si_text(dimension: Dimension) -> String {
     const NAMED: &[(&str, [i32; 5])] = &[
         ("", [0, 0, 0, 0, 0]),
@@ -493,12 +493,12 @@ fn si_text(dimension: Dimension) -> String {
     text
 }
 
-/// Why a text is no quantity.
+/// Why a text is not a quantity.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum NoQuantity {
     /// It does not begin with a number.
     Number(String),
-    /// The text after the number is not a unit: the part that is not known.
+    /// The text after the number is not a unit: the unknown part.
     Unit(String),
 }
 
@@ -511,13 +511,13 @@ impl fmt::Display for NoQuantity {
     }
 }
 
-/// Reads `10us`, `2 N`, `1e-3`: a number as written, and its unit.
+/// Parses a number and its unit: `10us`, `2 N`, `1e-3`.
 ///
 /// # Errors
-/// What is wrong with it.
+/// Why the text is not a quantity.
 pub fn quantity(text: &str) -> Result<(f64, Unit), NoQuantity> {
     let text = text.trim();
-    // The longest beginning that is a number: an `e` may be an exponent or the start of a unit.
+    // The longest prefix that is a number: an `e` may belong to an exponent or to a unit.
     let starts = (1..=text.len()).rev().filter(|end| text.is_char_boundary(*end)).map(|end| &text[..end]);
     let read = |start: &str| match start.ends_with(|c: char| c.is_ascii_digit() || c == '.') {
         true => start.parse::<f64>().ok().map(|number| (number, start.len())),
@@ -531,12 +531,12 @@ pub fn quantity(text: &str) -> Result<(f64, Unit), NoQuantity> {
     Ok((number, unit))
 }
 
-/// A number with three digits, as messages show it.
+/// Formats a number with three digits, for messages.
 pub fn three_digits(x: f64) -> String {
     if x == 0.0 || !x.is_finite() {
         return format!("{x}");
     }
-    // The exponent as the scientific form has it.
+    // The exponent of the scientific notation.
     let scientific = format!("{x:e}");
     let exponent: i32 = scientific.split_once('e').and_then(|(_, e)| e.parse().ok()).unwrap_or(0);
     if !(-4..6).contains(&exponent) {
@@ -560,7 +560,7 @@ mod tests {
         (unit.scale, unit.text)
     }
 
-    /// No exponent is a reason to panic or to take long: it is exact, or beyond what can be told.
+    /// No exponent causes a panic or a long computation: the result is exact or BEYOND.
     #[test]
     fn exponents_are_exact_or_beyond() {
         let large = [1, -1, 2, 12, 99_999, -99_999, i64::from(i32::MAX), i64::from(i32::MIN), i64::MAX, i64::MIN];

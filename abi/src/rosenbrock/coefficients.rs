@@ -1,4 +1,5 @@
-//! Coefficients of Rodas5P, for whoever unrolls it into code and whoever runs it on a system too large for that.
+//! Coefficients of Rodas5P, for the compiler, which unrolls it, and for the runtime, which uses it for systems that are
+//! too large for that.
 //!
 //!   (I/(γh) − J) u_i = f(t + c_i h, x0 + Σ_j A_ij u_j) + Σ_j (W_ij/h) u_j + h d_i ∂f/∂t       j < i
 //!   x1 = x0 + Σ_j A_8j u_j + u_8,   error ≈ u_8,   k_q = Σ_i H_qi u_i
@@ -40,7 +41,7 @@ pub const A: [[f64; 5]; 6] = [
     [-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946],
 ];
 
-/// Weights of earlier stages in the right side.
+/// Weights of earlier stages in the right-hand side.
 pub const W: [[f64; 7]; STAGES] = [
     [0.0; 7],
     [-14.155112264123755, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -68,7 +69,7 @@ pub const W: [[f64; 7]; STAGES] = [
     ],
 ];
 
-/// Of the continuous extension.
+/// Weights of the continuous extension.
 pub const H: [[f64; STAGES]; 3] = [
     [
         25.948786856663858,

@@ -1,24 +1,26 @@
-//! Where the numbers of adaptive steps lie, as `Function::Rosenbrock` reads and writes them.
+//! The layout of adaptive steps in the block, as `Function::Rosenbrock` reads and writes them.
 //!
-//! A step goes from (t, x0) over h; between its ends its states are
+//! A step goes from (t, x0) over h. Between its ends, the states are
 //!
 //!   x(t + θh) = x0 + θ (x1 − x0) + θ (1 − θ) (k1 + θ (k2 + θ k3))
 //!
-//! A call tries up to `count` steps. One that needs nobody is settled by the function itself: accepted, the end becomes the
-//! start of the next, or refused for its error; either way the next length is chosen. At the first other one the call
-//! ends, with the status [`LOOK`] or [`PIVOT`]: nothing of it is settled, and the trial is there to be looked at. So does
-//! every one that somebody attends. Whoever settles it copies [`Trial::to`] to [`Trial::from`], which has the same order.
+//! A call makes up to `count` trials. The function settles a trial without events by itself: it accepts it, so that its
+//! end becomes the next start, or rejects it for its error; in both cases it chooses the next step length. At the first
+//! other trial, or at every trial if the caller attends, the call ends with the status [`LOOK`] or [`PIVOT`]. That
+//! trial is not settled, and its data remain available. A caller that accepts it copies [`Trial::to`] to
+//! [`Trial::from`], which has the same order.
 
 use crate::description::{Layout, Segment, Slot};
 
-/// A status: the elimination met a pivot that is too small; nothing of the trial counts.
+/// Status: the elimination met a pivot that is too small; the trial is invalid.
 pub const PIVOT: u64 = 1;
 
-/// A status: the trial is accurate and crosses a switching surface, or comes close to one, reaches an instant that is met or
-/// looked at, or leaves a range; or it runs over a surface again and again, is not finite, or somebody attends it.
+/// Status: the caller must look at the trial. It is accurate and crosses a switching surface or comes close to one,
+/// reaches a stop or a watched instant, or leaves a range; or it repeatedly crosses a surface, is not finite, or the
+/// caller attends.
 pub const LOOK: u64 = 2;
 
-/// The segment `trial` of a layout, by its parts.
+/// The parts of the segment `trial` of a layout.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Trial {
     start: u32,
@@ -27,10 +29,10 @@ pub struct Trial {
     guards: u32,
 }
 
-/// Entries before the first segment.
+/// Number of entries before the first segment.
 const SINGLE: u32 = 18;
 
-/// States, their derivatives and the Jacobian at one point: n, n and n² + n numbers, one behind the other.
+/// States, their derivatives and the Jacobian at one point: n, n and n² + n consecutive numbers.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Point {
     /// x
@@ -42,7 +44,7 @@ pub struct Point {
 }
 
 impl Point {
-    /// All of it.
+    /// The three segments as one.
     pub fn whole(self) -> Segment {
         let len = self.states.len + self.derivatives.len + self.jacobian.len;
         Segment { start: self.states.start, len }
@@ -50,7 +52,7 @@ impl Point {
 }
 
 impl Layout {
-    /// The same with room for a trial step behind all else, of a model with so many guards.
+    /// The same layout with room for a trial step at the end. `guards`: number of guards of the model.
     pub fn with_trial(mut self, guards: u32) -> Layout {
         let trial = Trial { start: self.size() as u32, states: self.states.len, roots: self.roots.len, guards };
         self.trial = Segment { start: trial.start, len: trial.len() };
@@ -59,7 +61,7 @@ impl Layout {
 }
 
 impl Trial {
-    /// None of a layout without room for it.
+    /// `None` if the layout has no room for it.
     pub fn of(layout: &Layout) -> Option<Trial> {
         let trial = Trial { start: layout.trial.start, states: layout.states.len, roots: layout.roots.len, guards: 0 };
         let bounds = layout.trial.len.checked_sub(trial.len())?;
@@ -71,7 +73,7 @@ impl Trial {
         self.defect().0 + 1 - self.start
     }
 
-    /// The entries before the first segment: how the run stands, and what is said of the trial.
+    /// The entries before the first segment: the state of the run and the results of the trial.
     pub fn single(self) -> Segment {
         Segment { start: self.start, len: SINGLE }
     }
@@ -81,7 +83,7 @@ impl Trial {
         Slot(self.start)
     }
 
-    /// Length of the next step in s, as far as the error allows it; read and written.
+    /// Length of the next step in s, as far as the error permits it; read and written.
     pub fn next(self) -> Slot {
         Slot(self.start + 1)
     }
@@ -91,53 +93,53 @@ impl Trial {
         Slot(self.start + 2)
     }
 
-    /// The fifth root of its error; read and written.
+    /// The fifth root of the error of the last accepted step; read and written.
     pub fn last_root(self) -> Slot {
         Slot(self.start + 3)
     }
 
-    /// Number of trials refused since the last accepted one, read and written.
+    /// Number of trials rejected since the last accepted one; read and written.
     pub fn rejected(self) -> Slot {
         Slot(self.start + 4)
     }
 
-    /// Number of steps accepted so far, read and written.
+    /// Number of steps accepted so far; read and written.
     pub fn accepted(self) -> Slot {
         Slot(self.start + 5)
     }
 
-    /// Number of trials refused by the function itself, read and written.
+    /// Number of trials that the function itself rejected; read and written.
     pub fn refused(self) -> Slot {
         Slot(self.start + 6)
     }
 
-    /// The next instant that is met exactly, in s; read.
+    /// The next stop: an instant that a step must reach exactly, in s; read.
     pub fn stop(self) -> Slot {
         Slot(self.start + 7)
     }
 
-    /// The instant just before it, where the last stages of a step that ends there are evaluated: what jumps at the stop
-    /// has not jumped yet. In s, read.
+    /// The instant just before the stop, in s, at which the last stages of a step that ends there are evaluated:
+    /// signals that jump at the stop have not jumped yet. Read.
     pub fn before_stop(self) -> Slot {
         Slot(self.start + 8)
     }
 
-    /// The longest step, in s; read.
+    /// The longest permitted step, in s; read.
     pub fn longest(self) -> Slot {
         Slot(self.start + 9)
     }
 
-    /// A step that ends at this instant or behind it is to be looked at; in s, infinite if there is none; read.
+    /// The caller must look at a step that ends at or after this instant; in s, infinite if there is none; read.
     pub fn watched(self) -> Slot {
         Slot(self.start + 10)
     }
 
-    /// 1 if every trial is to be looked at, else 0; read.
+    /// 1 if the caller must look at every trial, otherwise 0; read.
     pub fn attend(self) -> Slot {
         Slot(self.start + 11)
     }
 
-    /// Relative tolerance, read.
+    /// Relative tolerance; read.
     pub fn tol(self) -> Slot {
         Slot(self.start + 12)
     }
@@ -147,63 +149,63 @@ impl Trial {
         Slot(self.start + 13)
     }
 
-    /// Where its last stages are evaluated: t + h, or `before_stop`.
+    /// The time of its last stages: t + h, or `before_stop`.
     pub fn end(self) -> Slot {
         Slot(self.start + 14)
     }
 
-    /// 1 if the trial crosses a switching surface or comes close to one, else 0.
+    /// 1 if the trial crosses a switching surface or comes close to one, otherwise 0.
     pub fn met(self) -> Slot {
         Slot(self.start + 15)
     }
 
-    /// 1 if a quantity that is watched is not fine at the end, else 0.
+    /// 1 if a guard fails at the end, otherwise 0.
     pub fn outside(self) -> Slot {
         Slot(self.start + 16)
     }
 
-    /// Number of trials refused by the function itself that ended behind a switching surface, read and written.
+    /// Number of trials that ended beyond a switching surface and that the function itself rejected; read and written.
     pub fn overruns(self) -> Slot {
         Slot(self.start + 17)
     }
 
-    /// For each state, what its size is measured with: tol · (|x| + s) is allowed, where s is half the width of its declared
-    /// range or the largest |x| so far. SI, read and written.
+    /// For each state, the scale s of its error: tol · (|x| + s) is permitted. s is half the width of its declared
+    /// range, or the largest |x| so far. SI, read and written.
     pub fn scales(self) -> Segment {
         Segment { start: self.start + SINGLE, len: self.states }
     }
 
-    /// For each guard the least value that is still fine, SI, read.
+    /// For each guard the smallest value that passes; SI, read.
     pub fn lows(self) -> Segment {
         Segment { start: end(self.scales()), len: self.guards }
     }
 
-    /// For each guard the greatest value that is still fine, SI, read.
+    /// For each guard the largest value that passes; SI, read.
     pub fn highs(self) -> Segment {
         Segment { start: end(self.lows()), len: self.guards }
     }
 
-    /// The side of each switching surface, −1 or 1, or 0 on it; read.
+    /// The side of each switching surface: −1 or 1, or 0 on it; read.
     pub fn sides(self) -> Segment {
         Segment { start: end(self.highs()), len: self.roots }
     }
 
-    /// Switching surfaces at the start; read and written.
+    /// Switching functions at the start; read and written.
     pub fn here(self) -> Segment {
         Segment { start: end(self.sides()), len: self.roots }
     }
 
-    /// The start; read and written.
+    /// The start point; read and written.
     pub fn from(self) -> Point {
         self.point(end(self.here()))
     }
 
-    /// The end.
+    /// The end point.
     pub fn to(self) -> Point {
         self.point(end(self.from().whole()))
     }
 
-    /// k1, k2, k3 of the course between.
+    /// k1, k2, k3 of the continuous extension.
     pub fn course(self) -> [Segment; 3] {
         let start = end(self.to().whole());
         [0, 1, 2].map(|k| Segment { start: start + k * self.states, len: self.states })
@@ -214,23 +216,23 @@ impl Trial {
         Segment { start: end(self.course()[2]), len: self.states }
     }
 
-    /// Switching surfaces at θ = 1/2.
+    /// Switching functions at θ = 1/2.
     pub fn middle(self) -> Segment {
         Segment { start: end(self.error()), len: self.roots }
     }
 
-    /// Switching surfaces at the end.
+    /// Switching functions at the end.
     pub fn last(self) -> Segment {
         Segment { start: end(self.middle()), len: self.roots }
     }
 
-    /// Largest error as a part of what is allowed; NaN if anything at the end is not finite.
+    /// Largest ratio of error to permitted error; NaN if a value at the end is not finite.
     pub fn worst(self) -> Slot {
         Slot(end(self.last()))
     }
 
-    /// By how much the course fails the equations at its end, gathered over the fastest time the Jacobian knows, as a
-    /// part of what is allowed.
+    /// The defect of the continuous extension at the end, accumulated over the shortest time constant of the Jacobian,
+    /// as a ratio to the permitted error.
     pub fn defect(self) -> Slot {
         Slot(end(self.last()) + 1)
     }

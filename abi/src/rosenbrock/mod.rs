@@ -1,5 +1,5 @@
-//! The adaptive step as compiled code and the runtime agree on it: Rosenbrock's method of order 5, its step control, and where the
-//! numbers of a trial step lie in the block.
+//! The adaptive step, as shared by compiled code and runtime: the Rosenbrock method of order 5, its step control, and
+//! the slots of a trial step.
 
 pub mod step_control;
 pub mod layout;
