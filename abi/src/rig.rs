@@ -1,9 +1,9 @@
-//! A rig as plain data: what drives the crossed-out part, how signals travel, what must never be exceeded.
+//! The plan of a rig, as plain data: the hardware that replaces a part of a system, how signals travel, and the limits.
 //!
-//! Like a plan, it holds slots: every expression of a rig's text is a quantity of one of two programs. The *control*
-//! program is the system with one part crossed out: the signals read from the bus are its inputs, the commands it
-//! requests are its outputs. The *plant* program is the crossed-out part alone, driven by what the drives apply and
-//! giving what their encoders see: it stands in where there is no hardware.
+//! Like a plan, it refers to slots: every expression in the text of a rig is a quantity of one of two programs. The
+//! *control* program is the system without the part that hardware replaces: signals read from the bus are its inputs,
+//! and requested commands are its outputs. The *plant* program is the replaced part alone; it receives what the drives
+//! apply and returns what their encoders measure. It simulates the hardware where there is none.
 
 use crate::description::Slot;
 use crate::instance::Instance;
@@ -18,9 +18,9 @@ pub struct Rig {
     pub name: String,
     /// Period of the cycle.
     pub period_ns: u64,
-    /// Fixed method of the control program.
+    /// Fixed-step method of the control program.
     pub method: Method,
-    /// Steps of the method in one period, at least 1.
+    /// Steps of the method per period, at least 1.
     pub steps: u32,
     /// The buses, in the order of the text.
     pub buses: Vec<Bus>,
@@ -28,80 +28,80 @@ pub struct Rig {
     pub nodes: Vec<Node>,
     /// Signals that the control program reads.
     pub inputs: Vec<Input>,
-    /// Commands that the control program gives.
+    /// Commands that the control program computes.
     pub outputs: Vec<Output>,
     /// Time without a cycle after which the watchdog stops the drives.
     pub watchdog_ns: u64,
-    /// What a missed tick does.
+    /// The reaction to a missed tick.
     pub overrun: Overrun,
-    /// Conditions under which the rig stops by itself.
+    /// Conditions under which the rig stops.
     pub stops: Vec<Stop>,
-    /// What is kept for every tick besides inputs, outputs and states.
+    /// Quantities to record at every tick, besides inputs, outputs and states.
     pub record: Vec<Series>,
-    /// The drive (index into `nodes`) whose command is computed for the moment it acts.
+    /// The drive (index into `nodes`) whose command is predicted for the instant at which it acts.
     pub predict: Option<usize>,
-    /// Its contacts are stable only while commands are computed ahead: a rig that loses sight of its shaft stops. Judged after
-    /// the compiler, when it is run or packed.
+    /// Its contacts are only stable with prediction, so a rig that loses its shaft position must stop. This is
+    /// determined after compilation, when the rig is run or packed.
     pub needs_look: bool,
-    /// The crossed-out part as a program of its own.
+    /// The part that hardware replaces, as a program.
     pub plant: Plant,
 }
 
 /// `overrun stop` or `overrun hold N`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Overrun {
-    /// To the safe values at the first missed tick.
+    /// Safe values at the first missed tick.
     Stop,
-    /// Up to this many consecutive missed ticks the last permitted commands stay.
+    /// The last permitted commands are held for up to this many consecutive missed ticks.
     Hold(u32),
 }
 
 /// One bus.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Bus {
-    /// As the rig calls it: `can0`.
+    /// Its name in the rig: `can0`.
     pub name: String,
-    /// Where it is: `socketcan:can0`, `sim:bench`, `slcan:/dev/ttyACM0@1000000`, `socketcand:host:29536/can0`.
+    /// Its address: `socketcan:can0`, `sim:bench`, `slcan:/dev/ttyACM0@1000000`, `socketcand:host:29536/can0`.
     pub address: String,
-    /// In bit/s; 0 where the kind has none.
+    /// In bit/s; 0 if this kind of bus has none.
     pub bit_rate: u32,
 }
 
 /// A drive or a device on a bus.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Node {
-    /// As the rig calls it: `load`.
+    /// Its name in the rig: `load`.
     pub name: String,
     /// Index into [`Rig::buses`].
     pub bus: usize,
-    /// What it speaks.
+    /// Its protocol.
     pub kind: Kind,
-    /// It can move: it is supervised and has a safe value. A `device` only talks.
+    /// Whether it can move: it is then supervised and has a safe value. A `device` only communicates.
     pub moves: bool,
     /// Dead time from a command to its effect, s.
     pub delay: f64,
     /// Time constant of the effect, s.
     pub lag: f64,
-    /// Age at which a signal of it is lost; 0 where the rig names none.
+    /// Age at which one of its signals counts as lost; 0 if the rig specifies none.
     pub timeout_ns: u64,
-    /// What it must not exceed, where it is a drive that speaks in frames.
+    /// Its limits, for a drive described by frames.
     pub within: Within,
 }
 
-/// What a drive that speaks in frames must not exceed, SI; one with a profile has arguments of its own.
+/// Limits of a drive described by frames, SI. A drive with a profile has arguments of its own.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Within {
-    /// Greatest speed, rad/s.
+    /// Largest speed, rad/s.
     pub max_speed: Option<f64>,
-    /// Permitted positions, rad, as it tells them.
+    /// Permitted positions, rad, as the drive reports them.
     pub travel: Option<(f64, f64)>,
-    /// Greatest power, W; none: greatest torque times greatest speed.
+    /// Largest power, W; `None`: largest torque times largest speed.
     pub max_power: Option<f64>,
 }
 
 impl Node {
-    /// The signal by which it tells its torque, its speed or its position. Of a drive that speaks in frames: the one of that
-    /// name, else the only one that it could be by its unit.
+    /// The signal with which the node reports its torque, speed or position. For a drive described by frames: the field
+    /// with that name, otherwise the only field with a suitable unit.
     pub fn tells(&self, what: What) -> Option<What> {
         let Kind::Frames(messages) = &self.kind else { return Some(what) };
         let (name, dimension) = match what {
@@ -123,7 +123,8 @@ impl Node {
         named.or(found.first().filter(|_| found.len() == 1)).map(|(m, f, _)| What::Field(*m, *f))
     }
 
-    /// What a command for this signal asks for: torque, speed or position of a drive; none where it is something else.
+    /// The quantity that a command to this signal controls: torque, speed or position of a drive; `None` for anything
+    /// else.
     pub fn asks_for(&self, what: What) -> Option<What> {
         match (&self.kind, what) {
             (Kind::Cia402(drive), _) => Some(match drive.mode {
@@ -145,8 +146,8 @@ impl Node {
         }
     }
 
-    /// Whether a command for this signal moves the node, unless it is 0: torque, speed or position of a drive with a profile; of
-    /// one described by frames what has the dimension of a force, a torque, a speed, an acceleration or a current.
+    /// Whether a nonzero command to this signal moves the node: torque, speed or position of a drive with a profile;
+    /// for a drive described by frames, a field with the dimension of a force, torque, speed, acceleration or current.
     pub fn is_moved_by(&self, what: What) -> bool {
         self.moves
             && match (&self.kind, what) {
@@ -159,12 +160,12 @@ impl Node {
     }
 }
 
-/// How a node speaks.
+/// The protocol of a node.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Kind {
     /// CANopen with the drive profile CiA 402.
     Cia402(Cia402),
-    /// Frames described by hand or by a DBC file.
+    /// Frames described in the rig or by a DBC file.
     Frames(Vec<Message>),
 }
 
@@ -173,29 +174,29 @@ pub enum Kind {
 pub struct Cia402 {
     /// Node id, 1 to 127.
     pub node: u8,
-    /// Rated torque, N·m: object 6076 must agree.
+    /// Rated torque, N·m; object 6076 must agree.
     pub rated_torque: f64,
     /// The commanded signal.
     pub mode: Mode,
-    /// Angle of one step of object 6064, rad.
+    /// Angle of one increment of object 6064, rad.
     pub count: f64,
-    /// One step of object 606C, rad/s.
+    /// One increment of object 606C, rad/s.
     pub speed_unit: f64,
-    /// Greatest torque, N·m; none: object 6072.
+    /// Largest torque, N·m; `None`: object 6072.
     pub max_torque: Option<f64>,
-    /// Greatest speed, rad/s; none: object 6080.
+    /// Largest speed, rad/s; `None`: object 6080.
     pub max_speed: Option<f64>,
     /// Permitted positions, rad, counted from enabling.
     pub travel: Option<(f64, f64)>,
-    /// Greatest power, W; none: greatest torque times greatest speed.
+    /// Largest power, W; `None`: largest torque times largest speed.
     pub max_power: Option<f64>,
-    /// A command acts with the next SYNC rather than when it arrives.
+    /// Whether a command acts at the next SYNC rather than on arrival.
     pub at_sync: bool,
     /// The profile it is based on: `cia402`, `fc302`, `vlt5000`.
     pub profile: String,
 }
 
-/// What a drive is told to follow.
+/// The quantity that a drive controls.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Mode {
@@ -209,11 +210,11 @@ pub enum Mode {
 pub struct Signal {
     /// Index into [`Rig::nodes`].
     pub node: usize,
-    /// Which one.
+    /// The signal within the node.
     pub what: What,
 }
 
-/// Which signal of a node.
+/// A signal within a node.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub enum What {
     /// Torque of a CiA 402 drive, N·m.
@@ -228,26 +229,26 @@ pub enum What {
     Fault,
     /// 1 while the drive reports an internal limit.
     Limited,
-    /// A field of a node that speaks in frames: message and field, as indices.
+    /// A field of a node described by frames: indices of message and field.
     Field(usize, usize),
 }
 
-/// One frame of a device.
+/// A frame of a device.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Message {
     /// Its name in a DBC file, or the name of its first signal.
     pub name: String,
     /// The identifier.
     pub id: u32,
-    /// 29-bit rather than 11-bit.
+    /// Whether the identifier has 29 bits rather than 11.
     pub extended: bool,
     /// Number of data bytes.
     pub length: u8,
-    /// From us to the device.
+    /// Whether we send it to the device.
     pub send: bool,
-    /// How often it is sent or expected, ns; 0: unknown.
+    /// Period in which it is sent or expected, ns; 0: unknown.
     pub period_ns: u64,
-    /// What it carries.
+    /// Its signals.
     pub fields: Vec<Field>,
 }
 
@@ -256,28 +257,28 @@ pub struct Message {
 pub struct Field {
     /// Its name.
     pub name: String,
-    /// Bit of the frame at which it starts, as a DBC file counts: byte · 8 + bit in the byte, least significant bit of a
-    /// little-endian, most significant bit of a big-endian signal.
+    /// Start bit as in a DBC file, byte · 8 + bit in the byte: the least significant bit of a little-endian signal, the
+    /// most significant bit of a big-endian one.
     pub start_bit: u16,
     /// Number of bits.
     pub bits: u16,
-    /// Most significant byte first.
+    /// Whether the most significant byte comes first.
     pub big_endian: bool,
-    /// How the bits are read.
+    /// Number format.
     pub format: Format,
-    /// SI value of one step.
+    /// SI value of one raw unit.
     pub scale: f64,
     /// SI value of raw 0.
     pub offset: f64,
-    /// Value before the first frame and in dry runs, SI.
+    /// Value before the first frame and in software-in-the-loop runs, SI.
     pub start: f64,
-    /// The unit it is shown in.
+    /// The unit in which it is displayed.
     pub unit: Unit,
-    /// Sent only while another field of the message has this raw value: DBC multiplexing.
+    /// Multiplexing as in a DBC file: the field is only present while another field of the message has this raw value.
     pub multiplexed: Option<(usize, u64)>,
 }
 
-/// How the bits of a field are read.
+/// Number format of a field.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Format {
@@ -290,61 +291,61 @@ pub enum Format {
 /// A signal that the control program reads.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Input {
-    /// Where it comes from.
+    /// Its source.
     pub signal: Signal,
-    /// The input slot of the control program it goes to.
+    /// The input slot of the control program.
     pub slot: Slot,
-    /// Value before anything has arrived, SI.
+    /// Value before the first frame arrives, SI.
     pub start: f64,
-    /// `hardware` or a `stop` needs it: it must be fresh.
+    /// Whether it must be fresh, because `hardware` or a `stop` depends on it.
     pub needed: bool,
 }
 
-/// A command that the control program gives.
+/// A command that the control program computes.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Output {
-    /// Where it goes.
+    /// Its destination.
     pub signal: Signal,
-    /// The output slot of the control program that holds the request, SI.
+    /// The output slot of the control program with the requested value, SI.
     pub slot: Slot,
-    /// Least permitted value, SI; −inf where the rig names none.
+    /// Smallest permitted value, SI; −inf if the rig specifies none.
     pub low: f64,
-    /// Greatest permitted value, SI.
+    /// Largest permitted value, SI; inf if the rig specifies none.
     pub high: f64,
-    /// Greatest change per second, SI; inf where the rig names none.
+    /// Largest rate of change, SI per second; inf if the rig specifies none.
     pub slew: f64,
-    /// Sent on any stop, SI.
+    /// Value to send on any stop, SI.
     pub safe: f64,
 }
 
 /// `stop when COND, "why"`.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Stop {
-    /// The output slot of the control program that is not 0 when the rig must stop.
+    /// The output slot of the control program that is not 0 if the rig must stop.
     pub slot: Slot,
-    /// As written.
+    /// The condition as written.
     pub condition: String,
-    /// What the operator is told.
+    /// The message to the operator.
     pub why: String,
 }
 
-/// The crossed-out part as a program.
+/// The part that hardware replaces, as a program.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Plant {
-    /// What drives apply (SI) → input slots of the plant program.
+    /// Quantities that drives apply (SI) → input slots of the plant program.
     pub applied: Vec<(Signal, Slot)>,
-    /// What encoders see (SI) ← output slots of the plant program.
+    /// Quantities that encoders measure (SI) ← output slots of the plant program.
     pub seen: Vec<(Signal, Slot)>,
-    /// Moment of inertia of the shaft, kg·m², where the compiler could find it; for prediction and its checks.
+    /// Moment of inertia of the shaft, kg·m², if the compiler could determine it; for prediction and its checks.
     pub inertia: Option<f64>,
 }
 
-/// What stands around the control program of a rig in a dry run: all but the hardware.
+/// The simulated surroundings of a rig's control program in a software-in-the-loop run.
 #[derive(Clone)]
 pub struct Bench {
     /// The rig.
     pub rig: Rig,
-    /// The crossed-out part, at its start.
+    /// The part that hardware replaces, at its start.
     pub plant: Instance,
 }
 

@@ -189,8 +189,8 @@ impl Machine {
         self.prepared
     }
 
-    /// One fixed step on a block followed by the values of [`Prepared`]; they are computed first unless they are
-    /// `there`. `None` if the code has no such step.
+    /// One fixed step on a block followed by the values of [`Prepared`], and its status. `is_current`: the values need not
+    /// be computed again. `None` if the code has no such step.
     pub fn step_prepared(&self, block: &mut [f64], pool: &[f64], is_current: bool) -> Option<u64> {
         let Prepared { prepare, step, len } = self.prepared?;
         self.check(block, pool, len);
