@@ -35,8 +35,8 @@ pub fn step(program: &Program, method: Method) -> Func {
     let mut env = Env::new();
     for (k, x) in next.into_iter().enumerate() {
         // States that have decayed are set to 0, because subnormal numbers slow the processor down.
-        let nonzero = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
-        env.insert(layout.states.slot(k), nonzero.value);
+        let flushed = if model.coupling.fades[k] { x.abs().below(1e-30).choose(0.0, x) } else { x };
+        env.insert(layout.states.slot(k), flushed.value);
     }
     let count = model.load(Slot::COUNT) + 1.0;
     env.insert(Slot::COUNT, count.value);

@@ -2,7 +2,7 @@
 //!
 //! In: a step function whose status is selected by one condition. Out: the same function, in which that condition needs
 //! fewer additions. A guard fails if a value is infinite or NaN; one test of the sum of all guarded values covers all
-//! of them. A value may leave the sum if another guarded value can only be finite when this one is.
+//! of them. A value leaves the sum if its finiteness follows from that of another addend.
 //!
 //! The condition may also hold if no guard has failed, because a sum of finite values may overflow. That is harmless:
 //! the status itself comes from exact tests of each value, and they are evaluated when the condition holds.

@@ -7,9 +7,9 @@
 //! midpoint x + c s, where c is a positive fraction of the step length. The pass moves the second test to x + c r:
 //!
 //! - If the first test is false, s is r and nothing changes.
-//! - If the first test is true, s is 0, so the second test is true as well. At x + c r it is also true. This point has
-//!   the sign of x and is at least as far from 0, because rounding is monotonic; so its product with r is no smaller
-//!   either.
+//! - If the first test is true, s is 0, so the second test is at x again and also true. It is true at x + c r as well: r
+//!   has the sign of x, so this point has that sign too and is at least as far from 0 (rounding is monotonic), and its
+//!   product with r is no smaller.
 //!
 //! Nothing uses the first test after that, and it is removed as dead code.
 //!

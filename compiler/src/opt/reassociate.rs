@@ -196,7 +196,7 @@ impl<'a> Pass<'a> {
         }
     }
 
-    /// Collects the factors of a product. Divisors that depend on no state become factors (their inverse).
+    /// Collects the factors of a product. Each divisor that depends on no state becomes a factor, its inverse.
     fn factors(&mut self, value: Value, inverted: bool, product: &mut Product) {
         // Eight factors are enough for formulas of physics, and bound the recursion.
         let full = product.numerator.len() + product.denominator.len() >= 8;
@@ -259,8 +259,8 @@ impl<'a> Pass<'a> {
         if self.ready_at(whole) < self.ready_at(sum) {
             return whole;
         }
-        // Splitting at the end gains nothing if the addends on the way are as late as the last value; a chain that is
-        // affine throughout is such a case. A split in the middle may still gain. It duplicates operations, because the
+        // A split at the end of the chain gains nothing if the addends on the way are as late as the last value, as in a
+        // chain that is affine throughout. A split in the middle may still gain. It duplicates operations, because the
         // values on the way have other uses, so the gain must justify them.
         let parts: Vec<Value> = (1..links.len()).map(|length| self.split_at(sum, &links[..length])).collect();
         let earliest = parts.into_iter().min_by_key(|part| self.ready_at(*part)).unwrap_or(sum);
@@ -395,8 +395,8 @@ mod tests {
 
     #[test]
     fn a_chain_that_is_affine_throughout_is_split_in_the_middle() {
-        // An observer of position and speed, iterated: r = v + 2 p (q − X) + m (x − X), X' = x + h r, V' = v + h (q −
-        // X).
+        // An observer of position and speed, iterated:
+        // r = v + 2 p (q − X) + m (x − X), X' = x + h r, V' = v + h (q − X).
         let func = built(|[p, q, m], [x, v]| {
             let (mut place, mut speed) = (x, v);
             for _ in 0..3 {
