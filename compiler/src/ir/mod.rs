@@ -326,8 +326,8 @@ impl Func {
         self.ops[value.index()]
     }
 
-    /// The values that must be in registers to compute an operation. The bits of a table entry are loaded directly, so
-    /// they only need the index.
+    /// The values that must be available to compute an operation. The bits of a table entry are loaded directly, so they
+    /// only need the index.
     pub fn reads(&self, op: Op) -> impl Iterator<Item = Value> + use<> {
         let mut operands = [None; 3];
         let mut n = 0;

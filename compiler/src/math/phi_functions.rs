@@ -24,7 +24,7 @@ const NEAR: [f64; 11] = [
     1.7245982496880484e-09,
 ];
 
-/// φ(q) within 2 ulp and φ2(q) within 8 ulp, for q ≤ 0. NaN gives NaN.
+/// φ(q) within 2 ulp and φ2(q) within 8 ulp, for q ≤ 0. NaN stays NaN.
 pub fn phis(q: Real) -> [Real; 2] {
     // Near 0, φ comes from the series of φ2. Elsewhere both come from the exponential, which is then far from 1, so
     // that the differences do not cancel.

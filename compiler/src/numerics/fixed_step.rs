@@ -328,8 +328,8 @@ impl<'a> Model<'a> {
     /// States are stepped after those that they depend on. The iteration depends on the shape of the rate:
     ///
     /// - Affine in its own state: r is the same for every X, so one evaluation at (t + h/2, x) is enough.
-    /// - Piecewise affine: the switching conditions are evaluated near the state's value in the middle of the step, x +
-    ///   h f/(2 − h a). The rest is as in the affine case.
+    /// - Piecewise affine: the switching conditions are evaluated near the state's value in the middle of the step, which
+    ///   is x + h f/(2 − h a). The rest is as in the affine case.
     /// - States that depend on each other and are jointly affine use the matrix exponential.
     fn expo(&self) -> Vec<Real<'a>> {
         let layout = &self.program.description.layout;
