@@ -1,8 +1,9 @@
 //! Guard reduction: removes redundant addends from the sum with which a step tests its guarded values for finiteness.
 //!
 //! In: a step function whose status is selected by one condition. Out: the same function, in which that condition needs
-//! fewer additions. A guard fails if a value is infinite or NaN; one test of the sum of all guarded values covers all
-//! of them. A value leaves the sum if its finiteness follows from that of another addend.
+//! fewer additions. Guards fail, among other reasons, if their value is infinite or NaN. One test covers all of them: the
+//! sum of the values is then infinite or NaN too. A value leaves the sum if its finiteness follows from that of another
+//! addend.
 //!
 //! The condition may also hold if no guard has failed, because a sum of finite values may overflow. That is harmless:
 //! the status itself comes from exact tests of each value, and they are evaluated when the condition holds.
