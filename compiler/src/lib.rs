@@ -14,6 +14,7 @@ pub mod frontend;
 pub mod ranges;
 pub mod lower;
 pub mod analysis;
+pub mod pipeline;
 pub mod rig;
 pub mod experiment;
 #[cfg(test)]
@@ -28,8 +29,9 @@ use abi::plan::Method;
 use abi::table::Code;
 use abi::{Function, Instance};
 use grammar::ast::Item;
-use grammar::diagnostic::Diagnostic;
+use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::FileId;
+use pipeline::{Depth, analyse};
 use std::sync::Arc;
 
 /// How to compile.
@@ -385,7 +387,7 @@ pub fn dissipation(
         };
         frontend::flatten::Override { path, value, file }
     });
-    let (system, types, diagnostics) = alone(loaded, sources, model, item.file, given.collect());
+    let (system, types, diagnostics) = alone(loaded, sources, (model, item.file), given.collect(), Depth::Causality);
     if diagnostics.iter().any(Diagnostic::is_error) {
         return None;
     }
@@ -423,7 +425,7 @@ pub fn explain_in(
     else {
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
-    let (system, types, diagnostics) = alone(loaded, sources, model, item.file, Vec::new());
+    let (system, types, diagnostics) = alone(loaded, sources, (model, item.file), Vec::new(), Depth::Causality);
     match diagnostics.iter().any(Diagnostic::is_error) {
         true => Err(once(diagnostics)),
         false => Ok(analysis::explain::explain(&system, &types, &loaded.files)),
@@ -445,7 +447,7 @@ pub fn stepping(
     let Some(model) = found else {
         return Err(vec![Diagnostic::error("E0201", format!("there is no model `{model}` in this file"))]);
     };
-    let (system, types, mut diagnostics) = alone(loaded, sources, model, loaded.root(), Vec::new());
+    let (system, types, mut diagnostics) = alone(loaded, sources, (model, loaded.root()), Vec::new(), Depth::Causality);
     frontend::delays::check(&system, &mut diagnostics);
     frontend::delays::fits(&system, step, None, &mut diagnostics);
     if diagnostics.iter().any(Diagnostic::is_error) {
@@ -516,10 +518,8 @@ fn sound<T>(
     warnings: &mut Vec<Diagnostic>,
     open: impl FnOnce(&mut frontend::system::System, &mut Vec<Diagnostic>) -> T,
 ) -> Result<(frontend::system::System, frontend::units::Types, T), Vec<Diagnostic>> {
-    let (system, types, mut diagnostics, opened) = opened(loaded, sources, model, file, overrides, open);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
-    }
+    let (system, types, mut diagnostics, opened) =
+        opened(loaded, sources, (model, file), overrides, Depth::Values, open);
     diagnostics.extend(std::mem::take(warnings));
     if diagnostics.iter().any(Diagnostic::is_error) {
         return Err(once(diagnostics));
@@ -532,11 +532,11 @@ fn sound<T>(
 fn alone(
     loaded: &Loaded,
     sources: &dyn Sources,
-    model: &grammar::ast::Model,
-    file: FileId,
+    (model, file): (&grammar::ast::Model, FileId),
     overrides: Vec<frontend::flatten::Override>,
+    depth: Depth,
 ) -> (frontend::system::System, frontend::units::Types, Vec<Diagnostic>) {
-    let (system, types, diagnostics, ()) = opened(loaded, sources, model, file, overrides, |_, _| ());
+    let (system, types, diagnostics, ()) = opened(loaded, sources, (model, file), overrides, depth, |_, _| ());
     (system, types, diagnostics)
 }
 
@@ -544,9 +544,9 @@ fn alone(
 fn opened<T>(
     loaded: &Loaded,
     sources: &dyn Sources,
-    model: &grammar::ast::Model,
-    file: FileId,
+    (model, file): (&grammar::ast::Model, FileId),
     overrides: Vec<frontend::flatten::Override>,
+    depth: Depth,
     open: impl FnOnce(&mut frontend::system::System, &mut Vec<Diagnostic>) -> T,
 ) -> (frontend::system::System, frontend::units::Types, Vec<Diagnostic>, T) {
     let request = frontend::flatten::Request {
@@ -559,10 +559,7 @@ fn opened<T>(
     let frontend::flatten::Flat { mut system, mut diagnostics, .. } =
         frontend::flatten::flatten(loaded, sources, &request);
     let opened = open(&mut system, &mut diagnostics);
-    let types = frontend::units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        frontend::causality::check(&system, &loaded.files, &mut diagnostics);
-    }
+    let types = analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
     (system, types, diagnostics, opened)
 }
 
@@ -593,11 +590,11 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                 }
             }
             // What calls a function that grows beyond all bounds does so too, each time anew.
-            Item::Function(_) if all.iter().any(|d| d.message.ends_with(GROWS)) => {}
+            Item::Function(_) if all.iter().any(|d| d.recurring == Some(Recurring::Operations)) => {}
             Item::Function(_) | Item::Const(_) | Item::Table(_) => {
                 let flat = frontend::flatten::flatten_item(loaded, sources, root, item);
                 let mut diagnostics = flat.diagnostics;
-                frontend::units::check(&flat.system, &loaded.files, &mut diagnostics);
+                analyse(&flat.system, &loaded.files, Depth::Units, &Diagnostic::is_error, &mut diagnostics);
                 all.extend(diagnostics);
             }
             Item::Fit(fit) => {
@@ -686,13 +683,8 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     let file = loaded.root();
     // What is proven of a text with gaps would rest on them.
     let whole = !loaded.has_errors();
-    let (system, types, mut diagnostics) = alone(loaded, sources, model, file, Vec::new());
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
-        if whole {
-            analysis::domains::check(&system, &types, &loaded.files, &mut diagnostics);
-        }
-    }
+    let depth = if whole { Depth::Domains } else { Depth::Values };
+    let (system, types, mut diagnostics) = alone(loaded, sources, (model, file), Vec::new(), depth);
     if whole && !diagnostics.iter().any(Diagnostic::is_error) {
         diagnostics.extend(analysis::lints::check(&system, &types, &loaded.files, physics));
     }
@@ -723,16 +715,8 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
         frame: None,
     };
     let frontend::flatten::Flat { system, mut diagnostics, .. } = frontend::flatten::flatten(loaded, sources, &request);
-    let types = frontend::units::check(&system, &loaded.files, &mut diagnostics);
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        frontend::causality::check(&system, &loaded.files, &mut diagnostics);
-    }
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
-        if !loaded.has_errors() {
-            analysis::domains::check(&system, &types, &loaded.files, &mut diagnostics);
-        }
-    }
+    let depth = if loaded.has_errors() { Depth::Values } else { Depth::Domains };
+    analyse(&system, &loaded.files, depth, &Diagnostic::is_error, &mut diagnostics);
     diagnostics.retain(Diagnostic::is_error);
     diagnostics
 }
@@ -747,17 +731,11 @@ fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::
         stated.then_some(Statement::Declaration(grammar::ast::Declaration { kind: DeclarationKind::Input, ..port }))
     };
     let model = Model { name, body: ports.into_iter().filter_map(port).collect(), doc, span };
-    let (system, types, mut diagnostics) = alone(loaded, sources, &model, loaded.root(), Vec::new());
-    if !diagnostics.iter().any(Diagnostic::is_error) {
-        analysis::parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
-        diagnostics.extend(with_defaults(loaded, sources, &model));
-    }
+    let (_, _, mut diagnostics) = alone(loaded, sources, (&model, loaded.root()), Vec::new(), Depth::Values);
+    diagnostics.extend(with_defaults(loaded, sources, &model));
     diagnostics.retain(Diagnostic::is_error);
     diagnostics
 }
-
-/// How the message about a program that grows without end ends.
-const GROWS: &str = " operations";
 
 /// One mistake, one message: in the order of the files, each code at each place once, warnings only without errors.
 pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
@@ -768,11 +746,7 @@ pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     diagnostics.retain(|diagnostic| {
         // A circle is met from each of its members; the first is where it was entered. What grows without end does so
         // wherever it is used.
-        let circle =
-            ["contains itself", "calls itself", "is defined by itself", GROWS, " quantities and parts", " deep"]
-                .into_iter()
-                .find(|end| diagnostic.message.ends_with(end));
-        let again = circle.is_some_and(|circle| !circles.insert(circle));
+        let again = diagnostic.recurring.is_some_and(|recurring| !circles.insert(recurring));
         seen.insert((diagnostic.code, diagnostic.span())) && !again
     });
     diagnostics.sort_by_key(|diagnostic| diagnostic.span());

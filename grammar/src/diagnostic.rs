@@ -11,6 +11,23 @@ pub enum Severity {
     Warning,
 }
 
+/// Mistakes that are met again at each place that leads to them. Of each kind one message is shown: the first.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Recurring {
+    /// A model contains itself.
+    Part,
+    /// A function calls itself.
+    Call,
+    /// A name is defined by itself.
+    Name,
+    /// Parts or functions are nested too deep.
+    Depth,
+    /// The program has too many quantities and parts.
+    Quantities,
+    /// The program has too many operations.
+    Operations,
+}
+
 /// One mistake: what is wrong, where, and what would mend it.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Diagnostic {
@@ -24,6 +41,8 @@ pub struct Diagnostic {
     pub labels: Vec<Label>,
     /// What to do, if possible as text to paste. May have several lines.
     pub help: Option<String>,
+    /// Its kind, if it recurs.
+    pub recurring: Option<Recurring>,
 }
 
 /// A marked place with a few words.
@@ -38,7 +57,8 @@ pub struct Label {
 impl Diagnostic {
     /// An error without a place yet: [`label`](Diagnostic::label) gives it one.
     pub fn error(code: &'static str, message: impl Into<String>) -> Diagnostic {
-        Diagnostic { code, severity: Severity::Error, message: message.into(), labels: Vec::new(), help: None }
+        let (severity, message) = (Severity::Error, message.into());
+        Diagnostic { code, severity, message, labels: Vec::new(), help: None, recurring: None }
     }
 
     /// A warning.
@@ -55,6 +75,12 @@ impl Diagnostic {
     /// Says what would mend it.
     pub fn help(mut self, help: impl Into<String>) -> Diagnostic {
         self.help = Some(help.into());
+        self
+    }
+
+    /// Marks it as one that recurs.
+    pub fn recurring(mut self, recurring: Recurring) -> Diagnostic {
+        self.recurring = Some(recurring);
         self
     }
 

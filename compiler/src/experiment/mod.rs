@@ -7,17 +7,18 @@ pub mod start_values;
 pub mod vary;
 
 use crate::analysis::linearise::{Opened, PortSlots, Ports, open};
-use crate::analysis::{domains, parameter_checks};
+use crate::analysis::parameter_checks;
 use crate::codegen::elementary::Alone;
+use crate::frontend::delays;
 use crate::frontend::flatten::{Instance, Override, OverrideValue, Request, flatten};
 use crate::frontend::resolve::Loaded;
 use crate::frontend::source::Sources;
 use crate::frontend::system::*;
 use crate::frontend::tables::columns as columns_of;
 use crate::frontend::units::{self, Types};
-use crate::frontend::{causality, delays};
 use crate::ir::{Binary, Unary};
 use crate::lower::{Lowered, MOST_DENSE, Wanted, evaluate, lower};
+use crate::pipeline::{Depth, analyse};
 use crate::rig::{self, Prepared};
 use abi::plan::{self, Formula, MeasureKind, Method, PARTS, Solver};
 use abi::unit::{Dimension, Unit};
@@ -603,14 +604,9 @@ fn variant(
             start_values::open(&mut system, &given.vary);
             let ports = given.ports.as_ref().map(|ports| open(&mut system, ports, &mut diagnostics));
             on_stage("check");
-            let types = units::check(&system, &loaded.files, &mut diagnostics);
-            if !diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d)) {
-                causality::check(&system, &loaded.files, &mut diagnostics);
-            }
-            if !diagnostics.iter().any(Diagnostic::is_error) {
-                parameter_checks::values(&system, &types, &loaded.files, &mut diagnostics);
-                domains::check_given(&system, &types, &loaded.files, parts.run.instance.span, &mut diagnostics);
-            }
+            let blocks = |d: &Diagnostic| d.is_error() && outside_of(parts.span, d);
+            let depth = Depth::Given(parts.run.instance.span);
+            let types = analyse(&system, &loaded.files, depth, &blocks, &mut diagnostics);
             (system, types, flat.observed, ports.unwrap_or_default(), None)
         }
     };

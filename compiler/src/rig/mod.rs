@@ -18,7 +18,6 @@ mod step_derivative;
 mod wires;
 
 use crate::analysis::parameter_checks;
-use crate::frontend::causality;
 use crate::frontend::flatten::{self, BusNode, Frame, Framed, Instance, Override, Scope, flatten};
 use crate::frontend::resolve::{ItemRef, Loaded, Lookup, Space};
 use crate::frontend::source::{Files, Sources};
@@ -26,6 +25,7 @@ use crate::frontend::system::*;
 use crate::frontend::units::{self, Types};
 use crate::ir::program::Program;
 use crate::lower::{Wanted, evaluate};
+use crate::pipeline::{Depth, analyse};
 use crate::rig::partition::{affine, lives, mentioned, nothing, one, pruned, solved};
 use abi::Slot;
 use abi::description::Kind as QuantityKind;
@@ -623,11 +623,8 @@ impl<'a> Reader<'a, '_> {
         }
         let plant = plant?;
         let mut found = Vec::new();
-        let control_types = units::check(&control, self.files, &mut found);
-        let plant_types = units::check(&plant.system, self.files, &mut found);
-        if !found.iter().any(Diagnostic::is_error) {
-            causality::check(&control, self.files, &mut found);
-        }
+        let plant_types = analyse(&plant.system, self.files, Depth::Units, &Diagnostic::is_error, &mut found);
+        let control_types = analyse(&control, self.files, Depth::Causality, &Diagnostic::is_error, &mut found);
         self.diagnostics.extend(found);
         for stop in &stops {
             if !control_types.boolean[stop.0 as usize] && control_types.nodes[stop.0 as usize].is_some() {
@@ -801,14 +798,8 @@ impl<'a> Reader<'a, '_> {
     /// The system before anything is crossed out: what is wrong with it is told as of any other.
     fn check_whole(&mut self, system: &System) -> Option<Types> {
         let mut found = Vec::new();
-        let types = units::check(system, self.files, &mut found);
+        let types = analyse(system, self.files, Depth::Values, &Diagnostic::is_error, &mut found);
         let failed = |found: &[Diagnostic]| found.iter().any(Diagnostic::is_error);
-        if !failed(&found) {
-            causality::check(system, self.files, &mut found);
-        }
-        if !failed(&found) {
-            parameter_checks::values(system, &types, self.files, &mut found);
-        }
         let stop = failed(&found) || self.errors() > 0 || self.loaded.has_errors();
         self.diagnostics.extend(found);
         (!stop).then_some(types)

@@ -410,6 +410,7 @@ impl<'a> Flattener<'a> {
                 }
                 if self.open_consts.contains(&item) {
                     let error = Diagnostic::error("E0211", format!("`{}` is defined by itself", name.text))
+                        .recurring(Recurring::Name)
                         .label(name.span, "used in its own value");
                     self.report(error);
                     return Some(self.error(name.span));
@@ -708,9 +709,11 @@ impl<'a> Flattener<'a> {
         if self.functions.contains(&item) || self.functions.len() >= DEEPEST {
             let error = match self.functions.contains(&item) {
                 true => Diagnostic::error("E0211", format!("`{}` calls itself", function.name.text))
+                    .recurring(Recurring::Call)
                     .label(function.name.span, "directly or by others")
                     .help("functions are not recursive: a step must take a bounded time"),
                 false => Diagnostic::error("E0211", format!("functions are nested more than {DEEPEST} deep"))
+                    .recurring(Recurring::Depth)
                     .label(function.name.span, "called from so deep")
                     .help("write some of them out"),
             };

@@ -458,6 +458,7 @@ impl<'a> Flattener<'a> {
         let (item, model) = self.model(instance_env.file, &instance.model)?;
         if self.models.len() >= DEEPEST && !self.models.contains(&item) {
             let error = Diagnostic::error("E0211", format!("parts are nested more than {DEEPEST} deep"))
+                .recurring(Recurring::Depth)
                 .label(instance.model.span, "one too deep")
                 .help("make parts of the same model side by side, as an array or by name");
             self.report(error);
@@ -465,6 +466,7 @@ impl<'a> Flattener<'a> {
         }
         if self.models.contains(&item) {
             let error = Diagnostic::error("E0211", format!("{} contains itself", model.name.text))
+                .recurring(Recurring::Part)
                 .label(instance.model.span, "here it is made again")
                 .help("a part cannot contain the model that it belongs to");
             self.report(error);

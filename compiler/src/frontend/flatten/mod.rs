@@ -15,7 +15,7 @@ use crate::frontend::source::Sources;
 use crate::frontend::system::*;
 use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::{self, BinaryOp, DeclarationKind, Expr, ExprKind, Item, Name, Statement, Target, UnaryOp};
-use grammar::diagnostic::Diagnostic;
+use grammar::diagnostic::{Diagnostic, Recurring};
 use grammar::span::{FileId, Span};
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -367,13 +367,14 @@ impl<'a> Flattener<'a> {
             return true; // Thousands of parts with the same mistake say no more than some.
         }
         let made = self.system.vars.len() + self.system.instances.len();
-        let (most, what) = match () {
-            () if made > MOST_VARS => (MOST_VARS, "quantities and parts"),
-            () if self.system.nodes.len() > self.most_nodes => (self.most_nodes, "operations"),
+        let (most, what, recurring) = match () {
+            () if made > MOST_VARS => (MOST_VARS, "quantities and parts", Recurring::Quantities),
+            () if self.system.nodes.len() > self.most_nodes => (self.most_nodes, "operations", Recurring::Operations),
             () => return false,
         };
         if !std::mem::replace(&mut self.too_large, true) {
             let error = Diagnostic::error("E0502", format!("more than {most} {what}"))
+                .recurring(recurring)
                 .label(span, "it is still growing here")
                 .help("a program of this size is refused: use fewer parts, or let each do more");
             self.report(error);
