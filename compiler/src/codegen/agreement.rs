@@ -1,11 +1,11 @@
-//! Every back end gives the bits of the interpreter; machine code is never writable and is given back.
+//! Tests that every back end returns the same bits as the interpreter.
 
-use super::jit::{compile, compile_prepared, cut_at};
+use super::jit::{compile, compile_prepared, compile_with};
 use super::target::{FunctionCompiler, with};
 use crate::codegen::emit::Facts;
 use crate::codegen::lanes::{self, Width};
-use crate::codegen::outline::{Lengths, cut};
-use crate::codegen::unswitch::unswitched;
+use crate::codegen::outline::{Lengths, outline};
+use crate::codegen::unswitch::unswitchable;
 use crate::ir::build::Build;
 use crate::ir::interpret::Interpreter;
 use crate::ir::random::{self, POOL_LEN, REALS, Random};
@@ -17,20 +17,20 @@ use abi::table::Interpret;
 use abi::{Code, Function, Layout, Slot};
 use std::sync::Arc;
 
-/// Equal to the bit, all NaN being one value.
+/// Whether two blocks are equal to the bit; all NaN count as equal.
 fn same(a: &[f64], b: &[f64]) -> bool {
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan())
 }
 
-/// Runs `func` as machine code and interpreted, each from the same block for `count` iterations.
+/// Runs `func` compiled and interpreted, from each block for `count` iterations, and compares blocks and statuses.
 #[track_caller]
 fn check(func: &Func, layout: &Layout, blocks: &[Vec<f64>], pool: &[f64], count: u64, what: &str) {
-    check_cut(func, layout, blocks, pool, count, Lengths::USUAL, what);
+    check_outlined(func, layout, blocks, pool, count, Lengths::USUAL, what);
 }
 
-/// The same, cut into pieces of these lengths.
+/// As `check`, with these lengths for outlining.
 #[track_caller]
-fn check_cut(
+fn check_outlined(
     func: &Func,
     layout: &Layout,
     blocks: &[Vec<f64>],
@@ -40,7 +40,7 @@ fn check_cut(
     what: &str,
 ) {
     let funcs = [(Function::Step, func.clone())];
-    let machine = Code::Machine(cut_at(&funcs, layout, pool.len(), lengths, false).unwrap().0);
+    let machine = Code::Machine(compile_with(&funcs, layout, pool.len(), lengths, false).unwrap().0);
     let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, layout, pool.len())));
     for start in blocks {
         let (mut found, mut expected) = (start.clone(), start.clone());
@@ -60,9 +60,9 @@ fn layout() -> Layout {
     Layout::new([0, 3, 4, 0, 0, 0, 0, 0, 0, 0])
 }
 
-/// A regime that is set to 0 or 1 whatever it was, and still is asked for what it was.
+/// A mode that each step sets to 0 or 1 without selecting its old value, which the step still compares.
 #[test]
-fn a_regime_is_read_before_it_is_set() {
+fn a_mode_is_read_before_it_is_set() {
     let layout = Layout::new([0, 2, 1, 0, 1, 0, 0, 0, 0, 0]);
     let (x, regime) = (layout.states.slot(0), layout.regimes.slot(0));
     let mut build = Build::new("step");
@@ -79,7 +79,7 @@ fn a_regime_is_read_before_it_is_set() {
     let set = build.select(less, one, zero);
     build.store(x, next);
     build.store(regime, set);
-    // −0 is 0, and what is set is not.
+    // −0 equals mode 0.
     let regimes = [0.0, -0.0, 1.0].into_iter().flat_map(|regime| [[2.0, 3.0, regime], [3.0, 2.0, regime]]);
     let blocks: Vec<Vec<f64>> = regimes.map(|[v, w, regime]| vec![0.0, 1.0, 0.0, v, w, 5.0, regime]).collect();
     check(&build.finish(), &layout, &blocks, &[], 1, "a regime that is set");
@@ -114,7 +114,7 @@ fn every_operation_on_reals_agrees_at_the_edges() {
     }
 }
 
-/// min and max as selects become one instruction; it must be the right one, also of zeros and NaN.
+/// min and max as selects become one instruction, which must also treat zeros and NaN as the select does.
 #[test]
 fn minimum_and_maximum_agree_at_the_edges() {
     let mut build = Build::new("extremes");
@@ -128,16 +128,16 @@ fn minimum_and_maximum_agree_at_the_edges() {
     check(&build.finish(), &layout(), &blocks, &[], 1, "extremes");
 }
 
-/// A sign is one instruction where there is AVX-512, of a single step and in lanes; and so is what it does not say of NaN.
+/// Back ends recognise the select form of the sign and replace it: also at ±0 and NaN.
 #[test]
 fn signs_agree_at_the_edges() {
     let layout = Layout::new([0, 0, 1, 0, 0, 3, 0, 0, 0, 0]);
     let mut build = Build::new("signs");
     let (x, two) = (build.load(Slot(3)), build.real(2.0));
-    // A state, so that there is a step to make.
+    // A state, so that iterations differ and the loop remains.
     let next = build.mul(x, two);
     build.store(Slot(3), next);
-    // Several, so that what they share lies in a register; some of what is read later, the last of what is not.
+    // Several signs: of operands that are also read elsewhere, some of them later, the last one not.
     for (slot, of) in [(4, x), (5, next)] {
         let sign = build.sign(of);
         build.store(Slot(slot), sign);
@@ -167,8 +167,8 @@ fn signs_agree_at_the_edges() {
     }
 }
 
-/// A function made of chance, a pool and a layout for it, and four blocks to begin with.
-fn of_chance(random: &mut Random) -> (Func, Vec<f64>, Layout, Vec<Vec<f64>>) {
+/// A random function with a pool and a layout, and four initial blocks.
+fn random_program(random: &mut Random) -> (Func, Vec<f64>, Layout, Vec<Vec<f64>>) {
     let len = 20 + random.below(120);
     let func = random::func(random, len);
     let pool = (0..POOL_LEN).map(|_| random.real()).collect();
@@ -179,11 +179,11 @@ fn of_chance(random: &mut Random) -> (Func, Vec<f64>, Layout, Vec<Vec<f64>>) {
 
 #[test]
 fn random_programs_agree() {
-    // 2,000 in the full run; the distribution says whether they are worth anything.
+    // The counts below show that the random programs are varied enough.
     let (mut stopped, mut nans, mut total) = (0, 0, 0);
     for seed in 0..2000 {
         let mut random = Random(seed);
-        let (func, pool, layout, blocks) = of_chance(&mut random);
+        let (func, pool, layout, blocks) = random_program(&mut random);
         let count = 1 + random.below(5) as u64;
         check(&func, &layout, &blocks, &pool, count, &format!("seed {seed}, {count} iterations"));
         let code = Interpreter::new(&[(Function::Step, func)], &layout, POOL_LEN);
@@ -197,32 +197,47 @@ fn random_programs_agree() {
     assert!(stopped > 200 && nans * 4 < total);
 }
 
-/// Wherever a function is cut, its bits stay; also where there is no room to keep what is computed once.
+/// The bits do not depend on where a function is cut, nor on whether the scratch area has room for the loop invariants.
 #[test]
-fn pieces_agree() {
+fn outlined_functions_agree() {
     let (mut pieces, mut crossing) = (0, 0);
     for seed in 0..1500 {
         let mut random = Random(seed);
-        let (func, pool, layout, blocks) = of_chance(&mut random);
+        let (func, pool, layout, blocks) = random_program(&mut random);
         let least = 1 + random.below(8);
         let facts = Facts::of(&func);
-        let lengths = Lengths { whole: 0, least, most: least + random.below(9), words: u32::MAX, fewest: 2 };
-        let all = cut(&func, &facts, lengths).expect("there is room");
-        let again = cut(&func, &facts, Lengths { words: all.words.saturating_sub(1), ..lengths });
-        let words = again.map_or(all.words, |cut| cut.words);
-        for words in [all.words, words] {
-            let what = format!("seed {seed}, {lengths:?} with {words} words");
-            check_cut(&func, &layout, &blocks, &pool, 1 + random.below(5) as u64, Lengths { words, ..lengths }, &what);
+        let lengths = Lengths {
+            max_function: 0,
+            min_piece: least,
+            max_piece: least + random.below(9),
+            max_scratch: u32::MAX,
+            min_repetitions: 2,
+        };
+        let all = outline(&func, &facts, lengths).expect("there is room");
+        let again = outline(&func, &facts, Lengths { max_scratch: all.scratch_len.saturating_sub(1), ..lengths });
+        let max_scratch = again.map_or(all.scratch_len, |outlined| outlined.scratch_len);
+        for max_scratch in [all.scratch_len, max_scratch] {
+            let what = format!("seed {seed}, {lengths:?} with {max_scratch} doubles of scratch");
+            check_outlined(
+                &func,
+                &layout,
+                &blocks,
+                &pool,
+                1 + random.below(5) as u64,
+                Lengths { max_scratch, ..lengths },
+                &what,
+            );
         }
         pieces += all.pieces.len();
-        crossing += all.homes.len();
+        crossing += all.scratch_slots.len();
     }
     println!("{pieces} pieces, {crossing} values that cross");
     assert!(pieces > 10_000 && crossing > 10_000);
 }
 
-/// So many copies of a function by chance, each on slots of its own, which lie in equal distances, and on some that all share
-/// or that are a neighbour's, half of their constants their own; what some of them compute is added up, and the first status that is not 0 is the status.
+/// A function of `copies` copies of a random function. Each copy has slots of its own, at constant strides; some slots
+/// are shared by all copies or with the next copy, and half of the constants differ between copies. One value of each
+/// copy is added to a sum; the first status that is not 0 is the status of the function.
 fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
     let one = random::layout();
     let len = 20 + random.below(60);
@@ -281,9 +296,9 @@ fn copies(random: &mut Random, copies: usize) -> (Func, Layout) {
     (build.finish(), layout)
 }
 
-/// What is repeated gives in a loop what it gives one by one.
+/// A rerolled loop returns the same bits as the straight line.
 #[test]
-fn repeats_agree() {
+fn rerolled_loops_agree() {
     let (mut loops, mut rows, mut stores, mut tables) = (0, 0, 0, 0);
     for seed in 0..1000 {
         let mut random = Random(seed);
@@ -292,20 +307,34 @@ fn repeats_agree() {
         let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
         let blocks: Vec<Vec<f64>> = (0..4).map(|_| (0..layout.size()).map(|_| random.real()).collect()).collect();
         let (least, most) = (1 + random.below(30), 31 + random.below(30));
-        let lengths = Lengths { whole: 0, least, most, words: u32::MAX, fewest: 2 + random.below(2) };
-        let cut = cut(&func, &Facts::of(&func), lengths).expect("there is room");
-        loops += cut.pieces.iter().filter(|piece| !piece.rows.is_empty()).count();
-        rows += cut.pieces.iter().map(|piece| piece.rows.len()).sum::<usize>();
-        stores += cut.pieces.iter().map(|piece| piece.row_stores.len()).sum::<usize>();
-        tables += cut.repeats.tables.len();
+        let lengths = Lengths {
+            max_function: 0,
+            min_piece: least,
+            max_piece: most,
+            max_scratch: u32::MAX,
+            min_repetitions: 2 + random.below(2),
+        };
+        let outlined = outline(&func, &Facts::of(&func), lengths).expect("there is room");
+        loops += outlined.pieces.iter().filter(|piece| !piece.rows.is_empty()).count();
+        rows += outlined.pieces.iter().map(|piece| piece.rows.len()).sum::<usize>();
+        stores += outlined.pieces.iter().map(|piece| piece.row_stores.len()).sum::<usize>();
+        tables += outlined.repeats.tables.len();
         let count = 1 + random.below(5) as u64;
-        check_cut(&func, &layout, &blocks, &pool, count, lengths, &format!("seed {seed}, {of} copies, {lengths:?}"));
+        check_outlined(
+            &func,
+            &layout,
+            &blocks,
+            &pool,
+            count,
+            lengths,
+            &format!("seed {seed}, {of} copies, {lengths:?}"),
+        );
     }
     println!("{loops} loops of {rows} rows, which store {stores} themselves; {tables} tables of constants");
     assert!(loops > 1000 && rows > 5000 && stores > 500 && tables > 300);
 }
 
-/// The loop in the code does what as many single calls do, and stops where they stop.
+/// A call for several iterations does the same as single calls, and stops after the same iteration.
 #[test]
 fn iterations_in_one_call_equal_single_calls() {
     for seed in 5000..5100 {
@@ -326,12 +355,12 @@ fn iterations_in_one_call_equal_single_calls() {
     }
 }
 
-/// A single step finds behind the block what its parameters lead to, and does what it does without.
+/// A single step with hoisted parameter expressions returns the same bits as one without.
 #[test]
-fn what_is_prepared_changes_nothing() {
+fn hoisted_parameter_expressions_agree() {
     let (mut numbers, mut most) = (0, 0);
     for seed in 6000..6300 {
-        let (func, pool, layout, blocks) = of_chance(&mut Random(seed));
+        let (func, pool, layout, blocks) = random_program(&mut Random(seed));
         let start = &blocks[0];
         let funcs = [(Function::Step, func.clone())];
         let code = compile_prepared(&funcs, &layout, POOL_LEN).unwrap().0;
@@ -341,7 +370,7 @@ fn what_is_prepared_changes_nothing() {
         let reference = Code::Interpreted(Arc::new(Interpreter::new(&funcs, &layout, POOL_LEN)));
         let (mut found, mut expected) = (start.clone(), start.clone());
         found.resize(start.len() + prepared.len, f64::NAN);
-        // A second step from another state, for which nothing is prepared again.
+        // The second step starts from another state and reuses the hoisted values.
         for there in [false, true] {
             let status = code.step_prepared(&mut found, &pool, there).expect("it has such a step");
             let of_reference = reference.call(Function::Step, &mut expected, &pool, 1);
@@ -349,7 +378,7 @@ fn what_is_prepared_changes_nothing() {
                 status == of_reference && same(&found[..start.len()], &expected),
                 "seed {seed}\n{func}\nfrom {start:?}\nfound {found:?} status {status}\n{expected:?} status {of_reference}"
             );
-            // What a function of chance does to parameters and counters, no step does.
+            // A random function may store parameters and counters, which a real step does not: restore them.
             for slot in layout.params.range().chain(0..Slot::FIXED as usize) {
                 (found[slot], expected[slot]) = (start[slot], start[slot]);
             }
@@ -359,7 +388,7 @@ fn what_is_prepared_changes_nothing() {
     assert!(numbers > 100);
 }
 
-/// The status is 1 where a number is not finite.
+/// Sets the status to 1 if a number is not finite.
 fn fails_unless_finite(build: &mut Build, number: Value) {
     let rest = build.sub(number, number);
     let fine = build.less_equal(rest, rest);
@@ -368,9 +397,10 @@ fn fails_unless_finite(build: &mut Build, number: Value) {
     build.status(status);
 }
 
-/// Beside a division a single step makes its constants: runs of ones anywhere, the least and the largest, and others.
+/// Constants of special bit patterns beside a division: runs of ones at any position, the smallest, the largest, and
+/// others.
 #[test]
-fn constants_beside_a_division_agree() {
+fn constants_of_special_bits_agree() {
     let runs = (0..64).flat_map(|from| [1, 2, 11, 40].map(|ones| (((1u128 << ones) - 1) << from) as u64));
     let others = [u64::MAX, 0, 1 << 63, 0x3ff8_0000_0000_0001, 0x8000_0000_0000_0001, 1.5f64.to_bits()];
     let layout = Layout::new([2, 1, 0, 0, 0, 1, 0, 0, 0, 0]);
@@ -395,9 +425,9 @@ fn constants_beside_a_division_agree() {
     }
 }
 
-/// Parameters that lie side by side are read two at a time, where the first of them is asked for alone too.
+/// Parameters in adjacent slots, some of which are also read alone.
 #[test]
-fn parameters_read_in_pairs_agree() {
+fn adjacent_parameters_agree() {
     let layout = Layout::new([5, 1, 1, 0, 0, 2, 0, 0, 0, 0]);
     let mut build = Build::new("pairs");
     let p: [Value; 5] = std::array::from_fn(|k| build.load(layout.params.slot(k)));
@@ -432,15 +462,15 @@ fn parameters_read_in_pairs_agree() {
     }
 }
 
-/// A function that keeps time as a step does: operations on time, parameters and inputs by chance, then others by chance
-/// that take some of these for what they load.
-fn on_time(random: &mut Random) -> Func {
+/// A random function that advances time as a step does: random operations on time, parameters and inputs, then other
+/// random operations that read some of these instead of their own loads.
+fn function_of_time(random: &mut Random) -> Func {
     let layout = random::layout();
     let len = 60 + random.below(80);
     let mut func = Func { stores: Vec::new(), writes: Vec::new(), status: None, ..random::func(random, len) };
     for op in &mut func.ops {
         match *op {
-            // What a ring holds depends on states.
+            // A ring may hold samples of states.
             Op::Ring { .. } => *op = Op::Load(Slot::TIME),
             Op::Load(slot) if !layout.params.contains(slot) && !layout.inputs.contains(slot) => {
                 *op = Op::Load([Slot::TIME, Slot::COUNT][random.below(2)]);
@@ -482,13 +512,13 @@ fn on_time(random: &mut Random) -> Func {
     func
 }
 
-/// What goes ahead of the steps is what they would compute, in any number of steps, with a status on the way and without.
+/// Loop distribution returns the same bits for any number of steps, whether a guard ends the loop early or not.
 #[test]
-fn what_goes_ahead_agrees() {
+fn loop_distribution_agrees() {
     let (mut ahead, mut stopped, mut odd) = (0, 0, 0);
     for seed in 0..1500 {
         let mut random = Random(seed);
-        let func = on_time(&mut random);
+        let func = function_of_time(&mut random);
         let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
         let layout = random::layout();
         let funcs = [(Function::Step, func.clone())];
@@ -518,9 +548,10 @@ fn what_goes_ahead_agrees() {
     assert!(Width::here().is_none() || ahead > 300 && stopped > 200 && odd > 200);
 }
 
-/// Every lane ends with the bits and the status of an instance alone, up to the step at which the first of them stops.
+/// Every lane ends with the bits and the status of a single instance, up to the step at which the first of the lanes
+/// stops.
 #[test]
-fn lanes_agree_with_instances_alone() {
+fn lanes_agree_with_single_instances() {
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let mut counts = vec![[0; 3]; widths.len()];
     for seed in 0..6000 {
@@ -566,9 +597,9 @@ fn lanes_agree_with_instances_alone() {
     }
 }
 
-/// Pairs are for every processor: their code can be made for one of another kind, too, and needs nothing but itself.
+/// Code for lanes of two can be compiled for any target and has no unresolved references.
 #[test]
-fn pairs_can_be_made_for_any_processor() {
+fn lanes_of_two_compile_for_any_target() {
     for target in [Target::X86_64, Target::Aarch64] {
         let isa = with(target, &[]);
         let mut coder = FunctionCompiler::new(&isa);
@@ -582,9 +613,9 @@ fn pairs_can_be_made_for_any_processor() {
     }
 }
 
-/// e^x has instructions of its own in the widest lanes: the same bits from the least to the greatest argument.
+/// AVX-512 has an instruction sequence of its own for e^x: same bits from the smallest to the largest argument.
 #[test]
-fn exponentials_in_lanes_agree_with_instances_alone() {
+fn exponentials_in_lanes_agree_with_single_instances() {
     let layout = Layout::new([0, 0, 1, 0, 0, 2, 0, 0, 0, 0]);
     let slot = layout.states.slot(0);
     let mut build = Build::new("exponentials").with_pool(math::pool().into());
@@ -624,9 +655,10 @@ fn exponentials_in_lanes_agree_with_instances_alone() {
     }
 }
 
-/// What is left of an output in one regime may be there already: inside a side of a choice, or as the bits of a table.
+/// The residual output of a mode may be a value that is already computed: inside an arm of a select, or as the bits of
+/// a table entry.
 #[test]
-fn what_a_regime_leaves_may_be_there_already() {
+fn a_residual_output_may_be_computed_already() {
     let layout = Layout::new([0, 1, 5, 0, 0, 0, 0, 0, 0, 0]);
     let mut build = Build::new("regimes");
     let (x, regime) = (build.load(Slot(3)), build.load(Slot(4)));
@@ -669,8 +701,8 @@ fn what_a_regime_leaves_may_be_there_already() {
     }
 }
 
-/// Springs that slide at ±1, by three regimes each, at a speed in slot 3: their states come first, then their regimes, then the
-/// sum of their forces, which is watched.
+/// Springs with three modes each (stuck, and sliding at ±1) at the speed in slot 3. The layout has their states, then
+/// their modes, then the sum of their forces, which a guard tests.
 fn springs(number: u32) -> (Func, Layout) {
     let layout = Layout::new([0, 1, number, 0, number, 1, 0, 0, 0, 0]);
     let mut build = Build::new("springs");
@@ -707,13 +739,14 @@ fn springs(number: u32) -> (Func, Layout) {
     (build.finish(), layout)
 }
 
-/// Whatever number stands where a regime does, −0 and none of its own too: of one automaton, and of four in copies for the direction.
+/// Any number may stand in the slot of a mode, also −0 and numbers of no mode: for one automaton, and for four with an
+/// unswitched direction.
 #[test]
-fn any_number_of_a_regime_agrees() {
+fn any_number_in_the_slot_of_a_mode_agrees() {
     let numbers = [0.0, -0.0, 1.0, 2.0, 7.0, f64::NAN];
     for count in [1, 4] {
         let (func, layout) = springs(count);
-        assert_eq!(unswitched(&func).is_some(), count > 1);
+        assert_eq!(unswitchable(&func).is_some(), count > 1);
         let mut blocks = Vec::new();
         for v in [-0.7, -0.0, 0.0, 0.7, f64::NAN, f64::INFINITY] {
             for f in [-1.5, -0.5, 0.0, 0.5, 1.5, f64::NAN] {
@@ -721,7 +754,7 @@ fn any_number_of_a_regime_agrees() {
                     let count = count as usize;
                     let mut block = vec![0.0, 1e-3, 0.0, v];
                     block.extend(std::iter::repeat_n(f, count));
-                    // Behind the first any of the others.
+                    // The automata after the first are in any of the modes.
                     block
                         .extend((0..count).map(|later| if later == 0 { number } else { numbers[(k + 2 * later) % 4] }));
                     block.push(0.0);
@@ -735,7 +768,7 @@ fn any_number_of_a_regime_agrees() {
     }
 }
 
-/// More states than registers can hold travel through the block.
+/// A loop carries more states than there are registers through the block.
 #[test]
 fn many_states_agree() {
     let layout = Layout::new([0, 0, 60, 0, 0, 2, 0, 0, 0, 0]);
@@ -744,7 +777,7 @@ fn many_states_agree() {
     let half = build.real(0.5);
     for k in 0..60 {
         let mixed = build.fma(states[(k + 7) % 60], half, states[k]);
-        // Some change places only.
+        // Some states only exchange places.
         build.store(layout.states.slot(k), if k % 9 == 0 { states[(k + 1) % 60] } else { mixed });
     }
     build.store(layout.outputs.slot(0), states[3]);

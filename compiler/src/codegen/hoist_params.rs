@@ -1,8 +1,11 @@
-//! Takes out of a step what hangs on parameters and the length of the step alone.
+//! Hoists expressions of parameters and step length out of the step (loop-invariant code motion).
 //!
-//! In: a sound, expanded function. Out: [`Hoisted`]: the rest of it, which finds these numbers behind the block, and a
-//! function that puts them there. A loop computes them once, before its first iteration; who makes one step at a time
-//! computes them when a parameter changes. They are the same operations either way: the same bits.
+//! In: a verified, expanded step. Out: [`Hoisted`]: a function that computes these expressions and stores them after
+//! the block, and the step that loads them from there. Used for callers that make one step per call: they recompute the
+//! expressions when a parameter changes. A loop over many steps hoists its invariants itself. The operations are the
+//! same in both cases, hence the bits too.
+//!
+//! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 9.5.
 
 use crate::ir::build::{Build, prune};
 use crate::ir::verify::types;
@@ -10,46 +13,46 @@ use crate::ir::{Func, Op, Type, Value};
 use abi::{Layout, Slot};
 use std::collections::HashMap;
 
-/// A function in two parts.
+/// A step, divided into its invariant and its remaining operations.
 pub struct Hoisted {
-    /// Writes the numbers, each to a slot behind the block.
+    /// Computes the hoisted values and stores each to a slot after the block.
     pub prepare: Func,
-    /// All else.
+    /// The remaining step.
     pub step: Func,
 }
 
 impl Hoisted {
-    /// Takes a function on blocks of this layout apart.
+    /// Divides a step that works on blocks of this layout.
     pub fn of(func: &Func, layout: &Layout) -> Hoisted {
         let types = types(func).expect("the function is sound");
-        let mut fixed: Vec<bool> = Vec::with_capacity(func.ops.len());
+        let mut is_invariant: Vec<bool> = Vec::with_capacity(func.ops.len());
         for op in &func.ops {
-            fixed.push(match op {
+            is_invariant.push(match op {
                 Op::Load(slot) => layout.params.contains(*slot) || *slot == Slot::STEP,
                 Op::Ring { .. } => false,
                 op => {
                     let mut all = true;
-                    op.each_operand(|operand| all &= fixed[operand.index()]);
+                    op.each_operand(|operand| all &= is_invariant[operand.index()]);
                     all
                 }
             });
         }
-        // A sign costs less than to read another number, and bits cost what reading those would.
+        // Neg and Abs cost less than a load; ToBits costs as much as loading the bits.
         let is_free = |op: &Op| op.effort() == 0 || matches!(op, Op::Neg(_) | Op::Abs(_) | Op::ToBits(_));
-        let is_prepared = |at: usize| fixed[at] && types[at] != Type::Bool && !is_free(&func.ops[at]);
-        let all: Vec<usize> = (0..func.ops.len()).filter(|at| is_prepared(*at)).collect();
+        let is_hoisted = |at: usize| is_invariant[at] && types[at] != Type::Bool && !is_free(&func.ops[at]);
+        let all: Vec<usize> = (0..func.ops.len()).filter(|at| is_hoisted(*at)).collect();
         let first = Slot(layout.size() as u32);
-        let mut rest = func.clone();
-        all.iter().for_each(|at| rest.ops[*at] = Op::Load(first));
-        // What only other prepared numbers need is not kept.
-        let live = rest.live();
+        let mut remaining = func.clone();
+        all.iter().for_each(|at| remaining.ops[*at] = Op::Load(first));
+        // Values that only other hoisted values need are not stored.
+        let live = remaining.live();
         let kept: Vec<usize> = all.into_iter().filter(|at| live[*at]).collect();
         let slots: HashMap<usize, Slot> =
             kept.iter().enumerate().map(|(k, at)| (*at, Slot(first.0 + k as u32))).collect();
         let (mut prepare, mut stores, mut step) = (Build::of(func), Vec::new(), Build::new(&func.name));
         for at in kept {
             let value = Value(at as u32);
-            // An integer lies there as the real of the same bits.
+            // An integer is stored as the real with the same bits.
             let number = if types[at] == Type::Int { prepare.from_bits(value) } else { value };
             stores.push((slots[&at], number));
         }
@@ -74,8 +77,8 @@ mod tests {
     use crate::ir::interpret::run_once;
 
     #[test]
-    fn what_hangs_on_parameters_alone_is_prepared_and_nothing_else() {
-        // A parameter and an input, a state; at 3, 4 and 5.
+    fn only_expressions_of_parameters_are_hoisted() {
+        // A parameter in slot 3, an input in slot 4, a state in slot 5.
         let layout = Layout::new([1, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("step");
         let [p, u, x] = [3, 4, 5].map(|slot| build.load(Slot(slot)));
@@ -92,14 +95,14 @@ mod tests {
         let Hoisted { prepare, step } = Hoisted::of(&func, &layout);
         assert_eq!(prepare.stores.iter().map(|(slot, _)| slot.0).collect::<Vec<_>>(), [6], "{prepare}");
         assert_eq!(prepare.loads(), [Slot::STEP, Slot(3)], "{prepare}");
-        // The truth that hangs on it is no number: it is found out in the step, from what is prepared.
+        // A boolean is not stored: the step computes it from hoisted values.
         assert_eq!(step.loads(), [3, 4, 5, 6].map(Slot), "{step}");
         assert!(!step.ops.iter().any(|op| matches!(op, Op::Div(..) | Op::Sqrt(_))), "{step}");
     }
 
     #[test]
-    fn an_integer_is_prepared_as_the_real_of_its_bits() {
-        // A parameter and an input, at 3 and 4; a state.
+    fn a_hoisted_integer_is_stored_as_the_real_with_its_bits() {
+        // A parameter in slot 3, an input in slot 4, a state in slot 5.
         let layout = Layout::new([1, 1, 1, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("step");
         let [p, u] = [3, 4].map(|slot| build.load(Slot(slot)));

@@ -1,7 +1,8 @@
-//! Machine code in memory, made for the processor it runs on.
+//! Machine code in the memory of this process, for the processor it runs on.
 //!
-//! The memory is written first and made executable afterwards, never both at once, and is given back when the last
-//! clone of the code goes. The code has no symbols, calls nothing but its own pieces and needs no relocation.
+//! In: verified, expanded functions. Out: a [`Machine`]. The memory is written first and then made executable, never
+//! both at once, and is freed when the last clone of the code is dropped. The code has no symbols, calls nothing except
+//! its own pieces and needs no relocation at run time.
 
 use super::target::{Bytes, FunctionCompiler, here};
 use crate::codegen::emit::signature;
@@ -17,36 +18,34 @@ use std::sync::Arc;
 
 pub use super::unsupported::Unsupported;
 
-/// Size of the code made.
+/// Size of the compiled code.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Stats {
-    /// For each function, in the order given: which, its operations, its bytes.
+    /// For each function, in the given order: the function, its number of operations, its number of bytes.
     pub functions: Vec<(Function, usize, usize)>,
 }
 
-/// Makes machine code of functions that work on blocks of this layout with a pool of this length.
+/// Compiles functions that work on blocks of this layout and a pool of `pool_len` doubles.
 ///
-/// # Panics
-/// If a function is not sound or not expanded: a mistake of the passes before.
+/// # Panics If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Result<(Machine, Stats), Unsupported> {
-    cut_at(funcs, layout, pool_len, Lengths::USUAL, false)
+    compile_with(funcs, layout, pool_len, Lengths::USUAL, false)
 }
 
-/// The same for whoever makes single steps and has room behind the block for what they find
-/// [prepared](abi::table::Prepared): an [`Instance`](abi::Instance).
+/// Compiles as [`compile`] does, and also a single step with [hoisted parameter expressions](abi::table::Prepared). For
+/// callers that reserve room for those after the block, as [`Instance`](abi::Instance) does.
 ///
-/// # Panics
-/// As `compile`.
+/// # Panics As `compile`.
 pub fn compile_prepared(
     funcs: &[(Function, Func)],
     layout: &Layout,
     pool_len: usize,
 ) -> Result<(Machine, Stats), Unsupported> {
-    cut_at(funcs, layout, pool_len, Lengths::USUAL, true)
+    compile_with(funcs, layout, pool_len, Lengths::USUAL, true)
 }
 
-/// The same, with functions cut into pieces of these lengths.
-pub(super) fn cut_at(
+/// Compiles with given lengths for outlining; `prepares`: also a single step with hoisted parameter expressions.
+pub(super) fn compile_with(
     funcs: &[(Function, Func)],
     layout: &Layout,
     pool_len: usize,
@@ -54,18 +53,19 @@ pub(super) fn cut_at(
     prepares: bool,
 ) -> Result<(Machine, Stats), Unsupported> {
     let (entries, prepared, memory, stats) = generate(funcs, layout, pool_len, lengths, prepares)?;
-    // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and
-    // every table in the pool, the index of a table is held inside it, and code without calls does not unwind.
+    // SAFETY: the entries live as long as `memory`; `verify` has checked that every slot lies in the layout and every
+    // table in the pool, table indices are clamped to the table, and code without calls does not unwind.
     let machine = unsafe { Machine::new(entries, layout.size(), pool_len, Arc::new(memory)) };
     let machine = match prepared {
-        // SAFETY: it is the step again, from the same memory; what it accesses behind the block is counted.
+        // SAFETY: it is the same step, from the same memory; `len` counts what it accesses after the block.
         Some(prepared) => unsafe { machine.with_prepared(prepared) },
         None => machine,
     };
-    // A step in pieces goes ahead no faster: its instants would be one long line again.
-    let step = funcs.iter().find(|(function, func)| *function == Function::Step && func.ops.len() <= lengths.whole);
+    // Loop distribution does not pay for an outlined step: its leading loop would again be one long straight line.
+    let step =
+        funcs.iter().find(|(function, func)| *function == Function::Step && func.ops.len() <= lengths.max_function);
     let machine = match step.and_then(|(_, step)| loop_distribution::compile(step, layout, pool_len)) {
-        // SAFETY: it is the step again, in two parts.
+        // SAFETY: it is the same step, distributed over two loops.
         Some(ahead) => unsafe { machine.with_ahead(ahead) },
         None => machine,
     };
@@ -85,7 +85,7 @@ fn generate(
     let mut memory = Memory::new(isa);
     let module = memory.module();
     let mut coder = FunctionCompiler::new(isa);
-    coder.cut_at(lengths);
+    coder.set_lengths(lengths);
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     let mut single = None;
@@ -103,7 +103,7 @@ fn generate(
                 let id = define(&prepared.bytes)?;
                 let prepare = prepared.prepare.as_ref().map(&mut define).transpose()?;
                 single = Some((id, prepare, prepared.len));
-                (id, prepared.many, prepared.bytes.code.len())
+                (id, prepared.loop_offset, prepared.bytes.code.len())
             }
             None => {
                 let bytes = coder.function(func)?;
@@ -117,7 +117,7 @@ fn generate(
     module.finalize_definitions().map_err(failed)?;
     let entry = |id, at: usize| {
         let address = module.get_finalized_function(id).wrapping_add(at);
-        // SAFETY: `address` is the beginning of code that was compiled with the signature of `Entry`.
+        // SAFETY: `address` is the start of code that was compiled with the signature of `Entry`.
         unsafe { std::mem::transmute::<*const u8, Entry>(address) }
     };
     let mut entries = [None; Function::ALL.len()];
@@ -136,7 +136,7 @@ mod tests {
     use crate::ir::build::Build;
     use abi::Slot;
 
-    /// Ranges of this process's memory whose permissions are these.
+    /// Address ranges of this process with the given permissions.
     fn mapped(permissions: &str) -> Vec<std::ops::Range<usize>> {
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         let range = |line: &str| {
@@ -148,7 +148,8 @@ mod tests {
         maps.lines().filter_map(range).collect()
     }
 
-    /// Makes code and gives it back; whether it is nowhere then. Tests beside this one may get the same memory for theirs.
+    /// Compiles code and drops it; returns whether its memory is no longer executable then. Tests that run at the same
+    /// time may have mapped the same address again.
     fn is_given_back() -> bool {
         let layout = Layout::new([0, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("f");
@@ -160,7 +161,7 @@ mod tests {
         assert_eq!(stats.functions.len(), 1);
         let address = entries[Function::Step as usize].unwrap() as usize;
         let executable = || mapped("r-xp").iter().any(|range| range.contains(&address));
-        // SAFETY: these are the entries that `compile` hands over.
+        // SAFETY: these are the entries that `compile` would pass.
         let machine = unsafe { Machine::new(entries, layout.size(), 0, Arc::new(memory)) };
         assert!(executable());
         assert_eq!(mapped("rwxp"), []);

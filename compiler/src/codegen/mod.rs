@@ -1,6 +1,23 @@
-//! Runs the straight-line program: an interpreter that says what is right, and machine code that agrees to the bit.
+//! Code generation: machine code and C from the straight-line functions of the IR.
 //!
-//! Cranelift is known to `clif`, `pieces`, `target`, `memory`, `jit` and `lanes::pairs` only.
+//! In: functions that [`opt`](crate::opt) has optimised and [`math`](crate::math) has expanded to arithmetic. Out:
+//! machine code in the memory of this process, an image for another processor, or C source. Every back end returns the
+//! same bits as [`ir::interpret`](crate::ir::interpret); the tests in `agreement` check that. Only `emit`,
+//! `emit_outlined`, `emit_f64x2`, `target`, `jit` and `executable_memory` know Cranelift.
+//!
+//! The passes in the order in which they run:
+//!
+//! ```text
+//! tiering             interprets a function first; calls jit once it has run often enough
+//! jit, image → target one function after the other:
+//!   one iteration       drop the step counter → hoist_params (jit only) → unswitch → specialise_modes
+//!                       → sink, select_to_branch → emit → Cranelift
+//!   any count           emit: a loop, its invariants hoisted, with select_to_branch → Cranelift
+//!   long functions      outline, which calls reroll → emit_outlined → Cranelift; instead of the two above
+//! jit                 loop_distribution: the step as a vectorised loop and a remaining one
+//! lanes               isel → schedule → regalloc → assembler, or emit_f64x2 → Cranelift
+//! c                   C source, directly from the expanded functions
+//! ```
 
 pub mod unsupported;
 mod specialise_modes;

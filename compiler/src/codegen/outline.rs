@@ -1,61 +1,67 @@
-//! Cuts a long line into pieces, since the time to find registers grows faster than a function does.
+//! Outlining: divides a long function into pieces, because the time of register allocation grows faster than the length
+//! of a function.
 //!
-//! In: a sound, expanded function. Out: a [`Outlined`]: which operations each piece computes, which values it leaves for later
-//! pieces and where, and when each slot may be stored. What [repeats](crate::codegen::reroll) itself is one piece, a loop. It knows
-//! nothing of processors.
+//! In: a verified, expanded function. Out: [`Outlined`]: the operations of each piece, the scratch slots through which
+//! pieces pass values, and the piece in which each slot of the block is stored. Operations that can be
+//! [rerolled](crate::codegen::reroll) form a piece of their own, a loop. It knows nothing of processors.
 //!
 //! ```text
-//! before  what no iteration changes, once a call
-//! each    everything else, once an iteration; stores as soon as nothing reads the slot any more
-//! failed  what only the status needs, where the test for it says so
+//! invariant   what no iteration changes; once a call
+//! iteration   everything else; each slot is stored as soon as nothing reads it any more
+//! failure     what only the status needs, run when the test for it says so
 //! ```
-//! Values that cross a cut lie in words of a scratch area. Few do: what a result needs stands in one place, operands
-//! first, and of the places to cut that come into question it is the one that the fewest values cross.
+//! Values that cross a cut go through a scratch area. The order of operations keeps these few: the operations that one
+//! result needs are adjacent, and each cut is placed, within the allowed lengths, where the fewest values cross.
+//!
+//! Compare Zhao, Amaral, *Function Outlining and Partial Inlining*, SBAC-PAD 2005.
 
-use crate::codegen::emit::{Facts, Watch};
-use crate::codegen::reroll::{Repeats, equal_distances, repeats};
+use crate::codegen::emit::{ExitCondition, Facts};
+use crate::codegen::reroll::{Repeats, arithmetic_progression, repeats};
 use crate::ir::{Func, Op, Value, Write};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::ops::Range;
 
-/// How long functions and their pieces are, in operations.
+/// Limits for outlining; lengths in operations.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Lengths {
-    /// Functions that are longer are cut.
-    pub whole: usize,
-    /// The least of a piece but the last.
-    pub least: usize,
-    /// The most of a piece.
-    pub most: usize,
-    /// Words of the scratch area at most.
-    pub words: u32,
-    /// Repetitions from which on they are a loop.
-    pub fewest: usize,
+    /// Longer functions are outlined.
+    pub max_function: usize,
+    /// Minimum length of a piece, the last excepted.
+    pub min_piece: usize,
+    /// Maximum length of a piece.
+    pub max_piece: usize,
+    /// Maximum size of the scratch area, in doubles.
+    pub max_scratch: u32,
+    /// Minimum number of repetitions that become a loop.
+    pub min_repetitions: usize,
 }
 
 impl Lengths {
-    /// Pieces for which registers are found quickly, and an area that is part of what a thread in real time touches ahead.
-    pub const USUAL: Lengths = Lengths { whole: 2000, least: 600, most: 1200, words: 32_768, fewest: 8 };
+    /// Pieces of a length for which register allocation is fast, and a scratch area of at most 256 KiB, part of the
+    /// stack that a real-time thread touches before it starts.
+    pub const USUAL: Lengths =
+        Lengths { max_function: 2000, min_piece: 600, max_piece: 1200, max_scratch: 32_768, min_repetitions: 8 };
 }
 
-/// Consecutive operations, compiled together.
+/// Operations that are compiled as one function.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Piece {
-    /// What it computes, in this order; loads and constants are not among it: each piece makes its own.
+    /// The operations, in order. Constants are not among them, nor most loads: each piece rematerialises those it
+    /// reads.
     pub ops: Vec<Value>,
-    /// What it stores at its end, all values taken before the first store.
+    /// Stores at the end of the piece; all values are read before the first store.
     pub stores: Vec<(Slot, Value)>,
-    /// What it writes to rings after that.
+    /// Writes to rings after the stores.
     pub writes: Vec<Write>,
-    /// It is a loop over rows of operations; then it has nothing of the above.
+    /// If not empty, the piece is a loop over these rows and the fields above are empty.
     pub rows: Vec<usize>,
-    /// Rows whose values each repetition stores at its end: the slot of the first, the distance to the next, the row.
+    /// Rows that the loop stores to slots of the block, a member in each repetition: first slot, stride, row.
     pub row_stores: Vec<(Slot, i64, usize)>,
 }
 
 impl Piece {
-    /// What it computes, of a loop in all its repetitions.
+    /// The operations of the piece; of a loop those of all repetitions.
     fn values<'a>(&'a self, repeats: &'a Repeats) -> impl Iterator<Item = Value> + 'a {
         let rows = self.rows.iter().flat_map(|row| &repeats.rows[*row].members);
         self.ops.iter().chain(rows).copied()
@@ -65,31 +71,33 @@ impl Piece {
 /// A function in pieces.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Outlined {
-    /// Rows of operations that are repeated.
+    /// The rows of the loops.
     pub repeats: Repeats,
-    /// In the order in which they run.
+    /// The pieces in execution order.
     pub pieces: Vec<Piece>,
-    /// Of the pieces: those that run in each iteration. What stands before runs once, what stands behind if a guard failed.
-    pub each: Range<usize>,
-    /// Where a value lies between pieces, as words from the beginning of the scratch area.
-    pub homes: HashMap<Value, u32>,
-    /// Where the tables of what is repeated lie, likewise; the first piece writes them.
+    /// The pieces that run in each iteration. Those before them run once a call, those after them when a guard has
+    /// failed.
+    pub iteration: Range<usize>,
+    /// The scratch slot of each value that crosses a cut.
+    pub scratch_slots: HashMap<Value, u32>,
+    /// First scratch slot of each constant table of the loops; the first piece fills them.
     pub tables: Vec<u32>,
-    /// Words of the scratch area.
-    pub words: u32,
+    /// Size of the scratch area, in doubles.
+    pub scratch_len: u32,
 }
 
-/// The function in pieces; none if the scratch area has no room for what crosses them.
-pub fn cut(func: &Func, facts: &Facts, lengths: Lengths) -> Option<Outlined> {
-    // What is computed once a call lies in the area through all of it: where that is too much, it is computed each time.
+/// Outlines a function; none if the values that cross the cuts do not fit into the scratch area.
+pub fn outline(func: &Func, facts: &Facts, lengths: Lengths) -> Option<Outlined> {
+    // Loop invariants occupy their scratch slots through the whole call. If there are too many, each iteration computes
+    // them.
     [true, false]
         .into_iter()
-        .map(|once| Line::new(func, facts, once).cut(lengths))
-        .find(|cut| cut.words <= lengths.words)
+        .map(|once| Line::new(func, facts, once).outline(lengths))
+        .find(|cut| cut.scratch_len <= lengths.max_scratch)
 }
 
-/// Whether each piece makes the value itself where it needs it.
-fn made_anew(func: &Func, value: Value) -> bool {
+/// Whether each piece that reads the value rematerialises it.
+fn is_rematerialised(func: &Func, value: Value) -> bool {
     match func.op(value) {
         Op::Real(_) | Op::Int(_) | Op::Bool(_) | Op::Load(_) => true,
         Op::Pool { index, .. } => matches!(func.op(index), Op::Int(_)),
@@ -97,24 +105,26 @@ fn made_anew(func: &Func, value: Value) -> bool {
     }
 }
 
-/// The operations of a function in the order in which pieces compute them.
+/// The operations of a function in the order in which the pieces compute them.
 struct Line<'a> {
     func: &'a Func,
-    watch: Watch,
-    before: Vec<Value>,
-    each: Vec<Value>,
-    failed: Vec<Value>,
+    exit_condition: ExitCondition,
+    invariant: Vec<Value>,
+    iteration: Vec<Value>,
+    failure: Vec<Value>,
 }
 
 impl<'a> Line<'a> {
     fn new(func: &'a Func, facts: &Facts, once: bool) -> Line<'a> {
-        let (watch, late) = Watch::of(func);
+        let (exit_condition, cold) = ExitCondition::of(func);
         let stored: HashMap<Slot, Value> = func.stores.iter().copied().collect();
-        // Loads that are not made anew, since something reads them after their slot may have been stored.
-        let mut kept = vec![false; func.ops.len()];
-        for value in values(func).filter(|value| late[value.index()]) {
+        // Loads that cannot be rematerialised, because the failure pieces read them after their slot may have been
+        // stored.
+        let mut needed_on_failure = vec![false; func.ops.len()];
+        for value in values(func).filter(|value| cold[value.index()]) {
             for read in func.reads(func.op(value)) {
-                kept[read.index()] |= matches!(func.op(read), Op::Load(slot) if stored.contains_key(&slot));
+                needed_on_failure[read.index()] |=
+                    matches!(func.op(read), Op::Load(slot) if stored.contains_key(&slot));
             }
         }
         let loads = func.loads();
@@ -125,48 +135,49 @@ impl<'a> Line<'a> {
             order.visit(value, Some(group));
         }
         let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
-        // What a failed guard tells of the block is read before the block changes.
-        let read = values(func).filter(|value| kept[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
-        let (tested, detail) = watch.asked();
+        // The failure pieces need these from before the stores, so they are read in the iteration.
+        let read =
+            values(func).filter(|value| needed_on_failure[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
+        let (tested, detail) = exit_condition.values();
         for root in rest.into_iter().map(|(_, value)| value).chain(written).chain(tested).chain(read) {
             order.visit(root, None);
         }
-        let own = |value: &Value| kept[value.index()] || !made_anew(func, *value);
-        let (mut each, mut before) = (Vec::new(), Vec::new());
+        let own = |value: &Value| needed_on_failure[value.index()] || !is_rematerialised(func, *value);
+        let (mut iteration, mut invariant) = (Vec::new(), Vec::new());
         for value in order.take().filter(own) {
-            if once && !facts.varies[value.index()] { &mut before } else { &mut each }.push(value);
+            if once && !facts.is_variant[value.index()] { &mut invariant } else { &mut iteration }.push(value);
         }
         detail.into_iter().for_each(|detail| order.visit(detail, None));
-        let failed = order.take().filter(own).collect();
-        Line { func, watch, before, each, failed }
+        let failure = order.take().filter(own).collect();
+        Line { func, exit_condition, invariant, iteration, failure }
     }
 
-    fn cut(&self, lengths: Lengths) -> Outlined {
-        let lists = [&self.before[..], &self.each, &self.failed];
-        let results = self.func.results().chain(self.outcomes());
-        let repeats = repeats(self.func, lists, results, lengths.fewest);
-        let [mut pieces, mut each, mut failed] = lists.map(|ops| self.pieces(ops, &repeats, lengths));
-        // There is a last piece of each iteration, which stores what is left.
-        if each.last().is_none_or(|piece| !piece.rows.is_empty()) {
-            each.push(Piece::default());
+    fn outline(&self, lengths: Lengths) -> Outlined {
+        let lists = [&self.invariant[..], &self.iteration, &self.failure];
+        let results = self.func.results().chain(self.tested());
+        let repeats = repeats(self.func, lists, results, lengths.min_repetitions);
+        let [mut pieces, mut iteration, mut failure] = lists.map(|ops| self.pieces(ops, &repeats, lengths));
+        // The iteration ends with a piece that is no loop; it takes the remaining stores.
+        if iteration.last().is_none_or(|piece| !piece.rows.is_empty()) {
+            iteration.push(Piece::default());
         }
         if !repeats.tables.is_empty() && pieces.first().is_none_or(|piece| !piece.rows.is_empty()) {
             pieces.insert(0, Piece::default());
         }
-        let range = pieces.len()..pieces.len() + each.len();
-        pieces.append(&mut each);
-        pieces.append(&mut failed);
+        let range = pieces.len()..pieces.len() + iteration.len();
+        pieces.append(&mut iteration);
+        pieces.append(&mut failure);
         self.store(&mut pieces, &range, &repeats);
-        let (homes, mut words) = self.homes(&pieces, &range, &repeats);
-        let lie = |table: &Vec<Value>| {
-            words += table.len() as u32;
-            words - table.len() as u32
+        let (scratch_slots, mut len) = self.assign_scratch(&pieces, &range, &repeats);
+        let place = |table: &Vec<Value>| {
+            len += table.len() as u32;
+            len - table.len() as u32
         };
-        let tables = repeats.tables.iter().map(lie).collect();
-        Outlined { repeats, pieces, each: range, homes, tables, words }
+        let tables = repeats.tables.iter().map(place).collect();
+        Outlined { repeats, pieces, iteration: range, scratch_slots, tables, scratch_len: len }
     }
 
-    /// The operations in pieces: what is not repeated in parts, what is in loops, in turn.
+    /// Divides operations into pieces: alternately straight pieces and loops, level by level.
     fn pieces(&self, ops: &[Value], repeats: &Repeats, lengths: Lengths) -> Vec<Piece> {
         let mut order = ops.to_vec();
         order.sort_by_key(|value| repeats.level(*value));
@@ -181,7 +192,7 @@ impl<'a> Line<'a> {
                 loops.entry(repeats.rows[row].members.len()).or_default().push(row);
             }
             pieces.extend(loops.into_values().map(|mut rows| {
-                // Operands stand first.
+                // Operands come first.
                 rows.sort_unstable_by_key(|row| repeats.rows[*row].members[0]);
                 rows.dedup();
                 Piece { rows, ..Piece::default() }
@@ -190,32 +201,33 @@ impl<'a> Line<'a> {
         pieces
     }
 
-    /// The operations in parts, cut where the fewest values cross.
+    /// Divides operations into parts of the allowed lengths, cut where the fewest values cross.
     fn parts(&self, ops: &[Value], lengths: Lengths) -> Vec<Vec<Value>> {
-        let place: HashMap<Value, usize> = ops.iter().enumerate().map(|(place, value)| (*value, place)).collect();
+        let position: HashMap<Value, usize> =
+            ops.iter().enumerate().map(|(position, value)| (*value, position)).collect();
         let mut last: Vec<usize> = (0..ops.len()).collect();
         for (user, value) in ops.iter().enumerate() {
             for read in self.func.reads(self.func.op(*value)) {
-                if let Some(place) = place.get(&read) {
-                    last[*place] = user;
+                if let Some(position) = position.get(&read) {
+                    last[*position] = user;
                 }
             }
         }
-        // Values that cross a cut before each operation.
+        // Number of values that cross a cut before each operation.
         let mut crossing = vec![0i64; ops.len() + 1];
-        for (place, last) in last.into_iter().enumerate() {
-            crossing[place + 1] += 1;
+        for (position, last) in last.into_iter().enumerate() {
+            crossing[position + 1] += 1;
             crossing[last + 1] -= 1;
         }
-        for place in 1..crossing.len() {
-            crossing[place] += crossing[place - 1];
+        for position in 1..crossing.len() {
+            crossing[position] += crossing[position - 1];
         }
         let mut parts = Vec::new();
         let mut begin = 0;
-        while ops.len() - begin > lengths.most {
-            let cuts = begin + lengths.least..=begin + lengths.most;
-            // The longest of equals.
-            let end = cuts.rev().min_by_key(|place| crossing[*place]).expect("a range that is not empty");
+        while ops.len() - begin > lengths.max_piece {
+            let cuts = begin + lengths.min_piece..=begin + lengths.max_piece;
+            // Of equally good cuts the one that makes the longest part.
+            let end = cuts.rev().min_by_key(|position| crossing[*position]).expect("a range that is not empty");
             parts.push(ops[begin..end].to_vec());
             begin = end;
         }
@@ -225,28 +237,29 @@ impl<'a> Line<'a> {
         parts
     }
 
-    /// Puts each store into the first piece of an iteration at whose end its value is there and its slot is read no more.
-    fn store(&self, pieces: &mut [Piece], each: &Range<usize>, repeats: &Repeats) {
-        let last = each.end - 1;
-        let mut made: Vec<Option<usize>> = vec![None; self.func.ops.len()];
+    /// Assigns each store to the first piece of the iteration at whose end its value is computed and its slot is read
+    /// no more.
+    fn store(&self, pieces: &mut [Piece], iteration: &Range<usize>, repeats: &Repeats) {
+        let last = iteration.end - 1;
+        let mut computed_in: Vec<Option<usize>> = vec![None; self.func.ops.len()];
         let mut read: HashMap<Slot, usize> = HashMap::new();
-        for (number, piece) in pieces.iter().enumerate().take(each.end) {
+        for (number, piece) in pieces.iter().enumerate().take(iteration.end) {
             for value in piece.values(repeats) {
-                made[value.index()] = Some(number);
+                computed_in[value.index()] = Some(number);
                 read.extend(self.slots_read(value).map(|slot| (slot, number)));
             }
         }
-        // What is only moved, and what is written to rings, is taken at the very end.
+        // The last piece loads values that are only moved between slots, written to rings or tested.
         let moved = self.func.stores.iter().map(|(_, value)| *value);
         let written = self.func.writes.iter().flat_map(|write| [write.index, write.value]);
-        for slot in moved.chain(written).chain(self.outcomes()).filter_map(|value| self.slot(value)) {
+        for slot in moved.chain(written).chain(self.tested()).filter_map(|value| self.slot(value)) {
             read.insert(slot, last);
         }
         let mut slots: HashMap<Value, Vec<Slot>> = HashMap::new();
         for (slot, value) in &self.func.stores {
             slots.entry(*value).or_default().push(*slot);
         }
-        for number in each.clone() {
+        for number in iteration.clone() {
             let row_stores: Vec<(Slot, i64, usize)> = (pieces[number].rows.iter())
                 .filter_map(|row| self.row_store(&pieces[number], number, *row, &slots, &read, repeats))
                 .collect();
@@ -256,17 +269,18 @@ impl<'a> Line<'a> {
             pieces[number].row_stores = row_stores;
         }
         for (slot, value) in self.func.stores.iter().filter(|(_, value)| slots.contains_key(value)) {
-            let ready = if self.slot(*value).is_some() { last } else { made[value.index()].unwrap_or(0) };
-            let number = ready.max(read.get(slot).copied().unwrap_or(0)).max(each.start);
-            // A loop stores only rows.
-            let number = (number..each.end).find(|number| pieces[*number].rows.is_empty()).expect("the last is none");
+            let ready = if self.slot(*value).is_some() { last } else { computed_in[value.index()].unwrap_or(0) };
+            let number = ready.max(read.get(slot).copied().unwrap_or(0)).max(iteration.start);
+            // A loop stores rows only.
+            let number =
+                (number..iteration.end).find(|number| pieces[*number].rows.is_empty()).expect("the last is none");
             pieces[number].stores.push((*slot, *value));
         }
         pieces[last].writes.clone_from(&self.func.writes);
     }
 
-    /// The store of a row by its own loop, if each of its values goes to one slot, these lie in equal distances, and what a
-    /// repetition stores is read by no other and not later.
+    /// The store of a row by its own loop: slots at a constant stride, one for each member. None if the slots are
+    /// irregular, or if another repetition or a later piece reads one of them.
     fn row_store(
         &self,
         piece: &Piece,
@@ -280,10 +294,10 @@ impl<'a> Line<'a> {
             Some([slot]) => Some(i64::from(slot.0)),
             _ => None,
         };
-        let (first, distance) = equal_distances(repeats.rows[row].members.iter().map(slot))?;
+        let (first, stride) = arithmetic_progression(repeats.rows[row].members.iter().map(slot))?;
         let repetition = |slot: Slot| {
-            let on = (i64::from(slot.0) - first) / distance;
-            let hit = first + on * distance == i64::from(slot.0) && on >= 0;
+            let on = (i64::from(slot.0) - first) / stride;
+            let hit = first + on * stride == i64::from(slot.0) && on >= 0;
             usize::try_from(on).ok().filter(|on| hit && *on < repeats.rows[row].members.len())
         };
         let later = read.iter().any(|(slot, last)| *last > number && repetition(*slot).is_some());
@@ -293,7 +307,7 @@ impl<'a> Line<'a> {
                 .into_iter()
                 .any(|(k, member)| self.slots_read(*member).filter_map(repetition).any(|repetition| repetition != k))
         });
-        (!later && !by_another).then_some((Slot(first as u32), distance, row))
+        (!later && !by_another).then_some((Slot(first as u32), stride, row))
     }
 
     /// The slots that an operation reads, or that a value is loaded from.
@@ -309,39 +323,45 @@ impl<'a> Line<'a> {
         }
     }
 
-    /// What is asked after an iteration.
-    fn outcomes(&self) -> impl Iterator<Item = Value> {
-        let (first, second) = self.watch.asked();
+    /// The values that are tested after an iteration.
+    fn tested(&self) -> impl Iterator<Item = Value> {
+        let (first, second) = self.exit_condition.values();
         first.into_iter().chain(second)
     }
 
-    /// A word for each value that something reads outside its piece, and how many these are; those of rows lie side by side.
-    /// A word is used again when nothing reads it any more.
-    fn homes(&self, pieces: &[Piece], each: &Range<usize>, repeats: &Repeats) -> (HashMap<Value, u32>, u32) {
-        let mut made: Vec<Option<usize>> = vec![None; self.func.ops.len()];
+    /// Assigns a scratch slot to each value that another piece reads; also returns the number of slots. The members of
+    /// a row get consecutive slots. A slot is reused after the last read of its value.
+    fn assign_scratch(
+        &self,
+        pieces: &[Piece],
+        iteration: &Range<usize>,
+        repeats: &Repeats,
+    ) -> (HashMap<Value, u32>, u32) {
+        let mut computed_in: Vec<Option<usize>> = vec![None; self.func.ops.len()];
         let mut last: Vec<Option<usize>> = vec![None; self.func.ops.len()];
         for (number, piece) in pieces.iter().enumerate() {
-            piece.values(repeats).for_each(|value| made[value.index()] = Some(number));
+            piece.values(repeats).for_each(|value| computed_in[value.index()] = Some(number));
             let stored = piece.stores.iter().map(|(_, value)| *value);
             let written = piece.writes.iter().flat_map(|write| [write.index, write.value]);
             let read = piece.values(repeats).flat_map(|value| self.func.reads(self.func.op(value)));
             for value in read.chain(stored).chain(written) {
-                let ends = match made[value.index()] {
-                    // What was made before the loop is read again in the next iteration.
-                    Some(made) if made < each.start && number >= each.start => pieces.len(),
+                let ends = match computed_in[value.index()] {
+                    // An invariant is read again in the next iteration.
+                    Some(made) if made < iteration.start && number >= iteration.start => pieces.len(),
                     Some(made) if made < number => number,
                     _ => continue,
                 };
                 last[value.index()] = last[value.index()].max(Some(ends));
             }
         }
-        for value in self.outcomes().filter(|value| made[value.index()].is_some()) {
+        for value in self.tested().filter(|value| computed_in[value.index()].is_some()) {
             last[value.index()] = Some(pieces.len());
         }
-        // By the piece with which they begin: values whose words lie side by side, and the last piece that reads one.
+        // Values that need consecutive slots, with the last piece that reads one of them; by the piece that computes
+        // the first.
         let mut arrays: Vec<Vec<(&[Value], usize)>> = vec![Vec::new(); pieces.len()];
         for array in repeats.rows.iter().map(|row| &row.members).chain(&repeats.arrays) {
-            let begins = array.iter().filter_map(|value| made[value.index()]).min();
+            let begins = array.iter().filter_map(|value| computed_in[value.index()]).min();
             let ends = array.iter().filter_map(|value| last[value.index()]).max();
             if let (Some(begins), Some(ends)) = (begins, ends) {
                 arrays[begins].push((array, ends));
@@ -349,41 +369,42 @@ impl<'a> Line<'a> {
         }
         let single: HashSet<Value> = repeats.arrays.iter().flatten().copied().collect();
         let single = |value: &Value| !single.contains(value);
-        let mut homes = HashMap::new();
-        // Words that are free again, by how many of them lie side by side.
+        let mut scratch_slots = HashMap::new();
+        // Free slots, by the number of consecutive ones.
         let mut free: HashMap<usize, Vec<u32>> = HashMap::new();
-        let mut words = 0;
+        let mut len = 0;
         let mut ending: Vec<Vec<(usize, u32)>> = vec![Vec::new(); pieces.len() + 1];
         for (number, piece) in pieces.iter().enumerate() {
             let alone = piece.ops.iter().filter(|value| single(value));
             let alone = alone.filter_map(|value| Some((std::slice::from_ref(value), last[value.index()]?)));
             for (values, last) in std::mem::take(&mut arrays[number]).into_iter().chain(alone) {
                 let home = free.get_mut(&values.len()).and_then(Vec::pop).unwrap_or_else(|| {
-                    words += values.len() as u32;
-                    words - values.len() as u32
+                    len += values.len() as u32;
+                    len - values.len() as u32
                 });
-                homes.extend(values.iter().copied().zip(home..));
+                scratch_slots.extend(values.iter().copied().zip(home..));
                 ending[last].push((values.len(), home));
             }
             for (len, home) in std::mem::take(&mut ending[number]) {
                 free.entry(len).or_default().push(home);
             }
         }
-        (homes, words)
+        (scratch_slots, len)
     }
 }
 
-/// An order in which what a result needs stands in one place, operands first.
+/// Orders operations such that those which one result needs are adjacent, operands first.
 struct Order<'a> {
     func: &'a Func,
-    /// For each value that has been visited, where it belongs.
+    /// The group of each value that has been visited.
     groups: Vec<Option<usize>>,
     values: Vec<(usize, Value)>,
 }
 
 impl Order<'_> {
-    /// Puts what a result needs and nothing needed before into a group of its own, or, if there is `none`, right behind
-    /// what it needs of others: so an output of a part stands beside the states of that part.
+    /// Appends the operations that `root` needs and that have not been visited, in postorder. They belong to `group`;
+    /// if that is `None`, each belongs to the last group among its operands, so that an output of a component is
+    /// adjacent to the states of that component.
     fn visit(&mut self, root: Value, group: Option<usize>) {
         let mut open = vec![(root, false)];
         while let Some((value, ready)) = open.pop() {
@@ -399,13 +420,13 @@ impl Order<'_> {
                 continue;
             }
             open.push((value, true));
-            // The last pushed is done first.
+            // The operand that is pushed last is visited first.
             let operands: Vec<Value> = operands.collect();
             open.extend(operands.into_iter().rev().map(|operand| (operand, false)));
         }
     }
 
-    /// What was visited since it was last asked.
+    /// The values visited since the last call, by group.
     fn take(&mut self) -> impl Iterator<Item = Value> + use<> {
         let mut values = std::mem::take(&mut self.values);
         values.sort_by_key(|(group, _)| *group);

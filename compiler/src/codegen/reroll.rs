@@ -1,52 +1,55 @@
-//! Finds what a long line repeats: the same operations on other numbers, as those of a thousand parts of one model.
+//! Rerolling: finds isomorphic operations in a straight line, such as those of a thousand equal components of a model,
+//! that can become a loop.
 //!
-//! In: a sound, expanded function, and which of its operations are computed together. Out: [`Repeats`]: rows of operations
-//! that differ only in what they take, and where it lies: numbers in equal distances, so that a loop finds them. What has
-//! one shape is found from the results down; constants that differ are put into tables; what else does not lie in equal
-//! distances is left out. It knows nothing of processors.
+//! In: a verified, expanded function, and which of its operations are computed together. Out: [`Repeats`]: rows of
+//! isomorphic operations, with the place of each operand. The search goes from results to operands. Operands must be
+//! the same for all repetitions, or lie in memory at a constant stride; constants that differ are put into tables.
+//! Operations with other operands are not repeated. It knows nothing of processors.
+//!
+//! Compare Rocha et al., *Loop Rolling for Code Size Reduction*, CGO 2022, and LLVM's `LoopReroll`.
 
 use crate::ir::{Func, Op, Value};
 use abi::Slot;
 use std::collections::HashMap;
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 
-/// One operation as often as it is repeated.
+/// Isomorphic operations, one for each repetition.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Row {
-    /// The values, by repetition; none: it could not be repeated.
+    /// The values, by repetition; empty if the row has turned out not to be repeatable.
     pub members: Vec<Value>,
-    /// What it takes, operand by operand; of a load, where it takes it from.
+    /// The source of each operand; of a load, the source of the loaded value.
     pub sources: Vec<Source>,
-    /// Odd; even are operations that are not repeated. What it needs of what is computed together with it is of lower
-    /// levels, or of its own: then that of the same repetition.
+    /// Order of computation within a list. Rows have odd levels, operations that are not repeated even ones. Operands
+    /// from the same list have lower levels, or the same level: then the loop computes them in the same repetition.
     pub level: usize,
 }
 
-/// Where repetitions take an operand from.
+/// Where the repetitions find an operand.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Source {
     /// The same value for all.
     Same(Value),
-    /// Slots in equal distances: the first, and the distance.
+    /// Slots of the block at a constant stride: the first slot, and the stride.
     Slots(Slot, i64),
-    /// Values whose words lie in equal distances: those of the first and of the second repetition.
-    Words(Value, Value),
-    /// Constants, of the table of this number.
+    /// Values in scratch slots at a constant stride: the values of the first and of the second repetition.
+    Scratch(Value, Value),
+    /// Constants in the table with this index.
     Table(usize),
 }
 
-/// What is repeated.
+/// The rows of a function.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Repeats {
     /// All rows.
     pub rows: Vec<Row>,
-    /// Values that are not repeated, whose words must lie side by side.
+    /// Groups of values that are not repeated and must occupy consecutive scratch slots.
     pub arrays: Vec<Vec<Value>>,
-    /// Constants that repetitions take, each its own.
+    /// Tables of constants, an entry for each repetition.
     pub tables: Vec<Vec<Value>>,
-    /// By value: its row and its place there.
+    /// For each value, its row and its repetition.
     places: Vec<Option<(usize, usize)>>,
-    /// By value: the level of what is not repeated.
+    /// For each value that is not repeated, its level.
     levels: Vec<usize>,
 }
 
@@ -56,7 +59,7 @@ impl Repeats {
         self.places[value.index()].map(|(row, _)| row)
     }
 
-    /// On which level a value is computed.
+    /// The level on which a value is computed.
     pub fn level(&self, value: Value) -> usize {
         match self.row(value) {
             Some(row) => self.rows[row].level,
@@ -65,11 +68,16 @@ impl Repeats {
     }
 }
 
-/// What is repeated at least so many times among the operations of `lists`, of which each is computed before the next;
-/// `results` are read by something else than operations.
-pub fn repeats(func: &Func, lists: [&[Value]; 3], results: impl Iterator<Item = Value>, fewest: usize) -> Repeats {
+/// Finds rows of at least `min_repetitions` operations in `lists`, which are computed one after the other. `results`:
+/// values that are read by anything except operations.
+pub fn repeats(
+    func: &Func,
+    lists: [&[Value]; 3],
+    results: impl Iterator<Item = Value>,
+    min_repetitions: usize,
+) -> Repeats {
     let mut search = Search::new(func, lists);
-    search.families(results, fewest);
+    search.families(results, min_repetitions);
     search.sources();
     search.levels();
     search.repeats
@@ -77,17 +85,17 @@ pub fn repeats(func: &Func, lists: [&[Value]; 3], results: impl Iterator<Item = 
 
 struct Search<'a> {
     func: &'a Func,
-    /// Number of the list that computes a value.
+    /// For each value, the index of the list that computes it.
     list: Vec<Option<usize>>,
     /// All listed values, operands first.
     values: Vec<Value>,
-    /// A number that values of one shape have in common, whatever slots they are made of, and one for which their real
-    /// constants may differ too.
+    /// Hashes of the expression tree of each value. `exact` ignores the slots of loads; `shape` also ignores the values
+    /// of real constants.
     exact: Vec<u64>,
     shape: Vec<u64>,
-    /// Operations from a value down to a leaf, at most.
+    /// Height of the expression tree of each value.
     depth: Vec<u32>,
-    /// By row, what its members take: operand by operand.
+    /// By row and operand, the operands of all members.
     operands: Vec<Vec<Vec<Value>>>,
     repeats: Repeats,
 }
@@ -107,8 +115,8 @@ impl<'a> Search<'a> {
             let hash = |kind: Op, known: &[u64]| {
                 let mut operands = Vec::new();
                 op.each_operand(|operand| operands.push(known[operand.index()]));
-                if let Some(exchangeable) = exchangeable(*op) {
-                    operands[..exchangeable].sort_unstable();
+                if let Some(commutative) = commutative(*op) {
+                    operands[..commutative].sort_unstable();
                 }
                 hasher.hash_one((kind, operands, list))
             };
@@ -130,24 +138,24 @@ impl<'a> Search<'a> {
         self.list[value.index()]
     }
 
-    /// Whether two values are of one shape.
+    /// Whether the expression trees of two values have the same shape.
     fn alike(&self, a: Value, b: Value) -> bool {
         let of = |value: Value| (self.shape[value.index()], self.depth[value.index()], kind(self.func.op(value)));
         of(a) == of(b)
     }
 
-    /// Makes rows, from those values of one shape that are read by what is not repeated down to what they need.
-    fn families(&mut self, results: impl Iterator<Item = Value>, fewest: usize) {
+    /// Finds rows: first values of equal shape that results or operations without repetition read, then their operands.
+    fn families(&mut self, results: impl Iterator<Item = Value>, min_repetitions: usize) {
         let mut alike: HashMap<u64, usize> = HashMap::new();
         for value in &self.values {
             *alike.entry(self.shape[value.index()]).or_default() += 1;
         }
         let mut top = vec![false; self.func.ops.len()];
         results.for_each(|value| top[value.index()] = true);
-        for value in self.values.iter().filter(|value| alike[&self.shape[value.index()]] < fewest) {
+        for value in self.values.iter().filter(|value| alike[&self.shape[value.index()]] < min_repetitions) {
             self.func.reads(self.func.op(*value)).for_each(|operand| top[operand.index()] = true);
         }
-        // Those of equal constants are a family of their own if they are enough.
+        // Values that are also equal in their constants form a family of their own if they are numerous enough.
         let top: Vec<Value> = self.values.iter().copied().filter(|value| top[value.index()]).collect();
         let mut equal: HashMap<u64, usize> = HashMap::new();
         for value in &top {
@@ -156,22 +164,23 @@ impl<'a> Search<'a> {
         let mut families: HashMap<(u64, Option<u64>), Vec<Value>> = HashMap::new();
         for value in top {
             let (shape, exact) = (self.shape[value.index()], self.exact[value.index()]);
-            let own = (equal[&exact] >= fewest).then_some(exact);
+            let own = (equal[&exact] >= min_repetitions).then_some(exact);
             families.entry((shape, own)).or_default().push(value);
         }
-        let mut families: Vec<Vec<Value>> = families.into_values().filter(|family| family.len() >= fewest).collect();
+        let mut families: Vec<Vec<Value>> =
+            families.into_values().filter(|family| family.len() >= min_repetitions).collect();
         let depth = |family: &Vec<Value>| self.depth[family[0].index()];
         families.sort_unstable_by(|a, b| (b.len(), depth(b), a[0]).cmp(&(a.len(), depth(a), b[0])));
         for mut family in families {
             let first = family[0];
             family.retain(|value| self.repeats.row(*value).is_none() && self.alike(first, *value));
-            if family.len() >= fewest {
+            if family.len() >= min_repetitions {
                 self.descend(family);
             }
         }
     }
 
-    /// A row of these values, and of what they need in turn.
+    /// Makes a row of these values, and rows of their operands as far as these are isomorphic.
     fn descend(&mut self, family: Vec<Value>) {
         let mut open = vec![family];
         while let Some(members) = open.pop() {
@@ -183,10 +192,10 @@ impl<'a> Search<'a> {
                 self.repeats.places[member.index()] = Some((row, k));
             }
             let operands = self.aligned(&members);
-            for of_all in &operands {
-                let alike = |value: &Value| self.of_list(*value).is_some() && self.alike(of_all[0], *value);
-                if of_all.iter().all(alike) && distinct(of_all) {
-                    open.push(of_all.clone());
+            for operand_row in &operands {
+                let alike = |value: &Value| self.of_list(*value).is_some() && self.alike(operand_row[0], *value);
+                if operand_row.iter().all(alike) && distinct(operand_row) {
+                    open.push(operand_row.clone());
                 }
             }
             self.operands.push(operands);
@@ -194,23 +203,24 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// What operations of one kind take, operand by operand; operands that may be exchanged so that they fit the first's.
+    /// The operands of isomorphic operations, operand by operand. Commutative operands are exchanged to match the first
+    /// member.
     fn aligned(&self, members: &[Value]) -> Vec<Vec<Value>> {
         let of = |member: Value| -> Vec<Value> { self.func.reads(self.func.op(member)).collect() };
         let first = of(members[0]);
         let mut all: Vec<Vec<Value>> = first.iter().map(|operand| vec![*operand]).collect();
-        let exchangeable = exchangeable(self.func.op(members[0])).is_some();
+        let commutative = commutative(self.func.op(members[0])).is_some();
         for member in &members[1..] {
             let mut operands = of(*member);
-            if exchangeable && self.exchanged([&all[0], &all[1]], [operands[0], operands[1]]) {
+            if commutative && self.exchanged([&all[0], &all[1]], [operands[0], operands[1]]) {
                 operands.swap(0, 1);
             }
-            all.iter_mut().zip(operands).for_each(|(of_all, operand)| of_all.push(operand));
+            all.iter_mut().zip(operands).for_each(|(operand_row, operand)| operand_row.push(operand));
         }
         all
     }
 
-    /// Whether the two operands of the next member fit those of the members before better the other way round.
+    /// Whether the two operands of the next member match those of the earlier members better when exchanged.
     fn exchanged(&self, [first, second]: [&[Value]; 2], [a, b]: [Value; 2]) -> bool {
         let equal = |before: &[Value], value: Value| self.exact[before[0].index()] == self.exact[value.index()];
         let fits = |before: &[Value], value: Value| self.alike(before[0], value);
@@ -226,8 +236,9 @@ impl<'a> Search<'a> {
         if same[0] != same[1] {
             return same[1];
         }
-        // By where they lie: as far on as between the two members before, or, of the second member, as near as can be.
-        let strain = |before: &[Value], value: Value| {
+        // Compare positions: best is the continuation of the stride between the last two members; for the second
+        // member, the position nearest to the first.
+        let irregularity = |before: &[Value], value: Value| {
             let at = |value: Value| match (self.repeats.places[value.index()], self.func.op(value)) {
                 (Some((_, place)), _) => place as i64,
                 (None, Op::Load(slot)) => i64::from(slot.0),
@@ -238,15 +249,17 @@ impl<'a> Search<'a> {
                 _ => (at(value) - at(before[0])).abs(),
             }
         };
-        strain(first, b) + strain(second, a) < strain(first, a) + strain(second, b)
+        irregularity(first, b) + irregularity(second, a) < irregularity(first, a) + irregularity(second, b)
     }
 
-    /// Finds where rows take their operands from, lowest first; what does not lie in equal distances is not repeated.
+    /// Finds the source of each operand, rows of the lowest expression trees first. A row with an operand at irregular
+    /// positions is dissolved.
     fn sources(&mut self) {
         let mut order: Vec<usize> = (0..self.repeats.rows.len()).collect();
         order.sort_by_key(|row| self.depth[self.repeats.rows[*row].members[0].index()]);
         let mut of_array = vec![None; self.list.len()];
-        // A loop knows an operand by what it is in the first repetition.
+        // The loop body is emitted with the values of the first repetition, so each of these must have a single source
+        // per loop.
         let mut known: HashMap<(usize, Value), Source> = HashMap::new();
         for row in order {
             let members = &self.repeats.rows[row].members;
@@ -255,15 +268,16 @@ impl<'a> Search<'a> {
                 let constant = matches!(self.func.op(operand), Op::Real(_));
                 constant || *known.entry((count, operand)).or_insert(source) == source
             };
-            // A load is its own operand.
+            // A row of loads has the loaded values as its operands.
             let loads = matches!(self.func.op(members[0]), Op::Load(_)).then(|| members.clone());
             let operands = std::mem::take(&mut self.operands[row]);
             let sources: Option<Vec<Source>> = loads
                 .iter()
                 .chain(&operands)
-                .map(|of_all| {
-                    let source = if loads.is_some() { self.slots(of_all) } else { self.source(of_all, &mut of_array) };
-                    source.filter(|source| known(of_all[0], *source))
+                .map(|operand_row| {
+                    let source =
+                        if loads.is_some() { self.slots(operand_row) } else { self.source(operand_row, &mut of_array) };
+                    source.filter(|source| known(operand_row[0], *source))
                 })
                 .collect();
             self.operands[row] = operands;
@@ -277,54 +291,54 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Slots in equal distances.
+    /// Slots at a constant stride.
     fn slots(&self, loads: &[Value]) -> Option<Source> {
         let slot = |load: &Value| match self.func.op(*load) {
             Op::Load(slot) => Some(i64::from(slot.0)),
             _ => None,
         };
-        let (first, distance) = equal_distances(loads.iter().map(slot))?;
-        Some(Source::Slots(Slot(u32::try_from(first).ok()?), distance))
+        let (first, stride) = arithmetic_progression(loads.iter().map(slot))?;
+        Some(Source::Slots(Slot(u32::try_from(first).ok()?), stride))
     }
 
-    fn source(&mut self, of_all: &[Value], of_array: &mut [Option<(usize, usize)>]) -> Option<Source> {
-        let [first, second] = [of_all[0], of_all[1]];
-        if of_all.iter().all(|value| *value == first) {
+    fn source(&mut self, operand_row: &[Value], of_array: &mut [Option<(usize, usize)>]) -> Option<Source> {
+        let [first, second] = [operand_row[0], operand_row[1]];
+        if operand_row.iter().all(|value| *value == first) {
             return Some(Source::Same(first));
         }
-        if of_all.iter().all(|value| matches!(self.func.op(*value), Op::Real(_))) {
-            let known = self.repeats.tables.iter().position(|table| table == of_all);
+        if operand_row.iter().all(|value| matches!(self.func.op(*value), Op::Real(_))) {
+            let known = self.repeats.tables.iter().position(|table| table == operand_row);
             return Some(Source::Table(known.unwrap_or_else(|| {
-                self.repeats.tables.push(of_all.to_vec());
+                self.repeats.tables.push(operand_row.to_vec());
                 self.repeats.tables.len() - 1
             })));
         }
-        if of_all.iter().all(|value| self.of_list(*value).is_none()) {
-            return self.slots(of_all);
+        if operand_row.iter().all(|value| self.of_list(*value).is_none()) {
+            return self.slots(operand_row);
         }
-        let words = Source::Words(first, second);
+        let scratch = Source::Scratch(first, second);
         let within = |places: &[Option<(usize, usize)>]| {
-            let (whole, _) = places[first.index()]?;
-            let place = |value: &Value| places[value.index()].filter(|(of, _)| *of == whole).map(|(_, k)| k as i64);
-            equal_distances(of_all.iter().map(place)).map(|_| words)
+            let (group, _) = places[first.index()]?;
+            let place = |value: &Value| places[value.index()].filter(|(of, _)| *of == group).map(|(_, k)| k as i64);
+            arithmetic_progression(operand_row.iter().map(place)).map(|_| scratch)
         };
-        if let Some(words) = within(&self.repeats.places).or_else(|| within(of_array)) {
-            return Some(words);
+        if let Some(scratch) = within(&self.repeats.places).or_else(|| within(of_array)) {
+            return Some(scratch);
         }
         let free = |value: &Value| {
             self.of_list(*value).is_some() && self.repeats.row(*value).is_none() && of_array[value.index()].is_none()
         };
-        if !of_all.iter().all(free) || !distinct(of_all) {
+        if !operand_row.iter().all(free) || !distinct(operand_row) {
             return None;
         }
-        for (k, value) in of_all.iter().enumerate() {
+        for (k, value) in operand_row.iter().enumerate() {
             of_array[value.index()] = Some((self.repeats.arrays.len(), k));
         }
-        self.repeats.arrays.push(of_all.to_vec());
-        Some(words)
+        self.repeats.arrays.push(operand_row.to_vec());
+        Some(scratch)
     }
 
-    /// Says when everything is computed: rows and what is not repeated in turn.
+    /// Assigns levels, so that rows and operations without repetition alternate.
     fn levels(&mut self) {
         let mut order = self.values.clone();
         order.sort_by_key(|value| self.depth[value.index()]);
@@ -343,10 +357,12 @@ impl<'a> Search<'a> {
                 continue;
             }
             let mut level = 1;
-            for of_all in &self.operands[row] {
-                let together =
-                    self.repeats.row(of_all[0]).is_some_and(|other| self.repeats.rows[other].members == *of_all);
-                for (below, row) in of_all.iter().filter_map(|operand| below(*operand)) {
+            for operand_row in &self.operands[row] {
+                let together = self
+                    .repeats
+                    .row(operand_row[0])
+                    .is_some_and(|other| self.repeats.rows[other].members == *operand_row);
+                for (below, row) in operand_row.iter().filter_map(|operand| below(*operand)) {
                     level = level.max(match row {
                         None => below + 1,
                         Some(_) if together => below,
@@ -359,7 +375,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// An operation apart from what it takes: of a load, from where.
+/// An operation without its operands, or a load without its slot.
 fn kind(op: Op) -> Op {
     match op {
         Op::Load(_) => Op::Load(Slot(0)),
@@ -367,9 +383,9 @@ fn kind(op: Op) -> Op {
     }
 }
 
-/// How many of its first operands an operation takes in any order.
-fn exchangeable(op: Op) -> Option<usize> {
-    let exchangeable = matches!(
+/// The number of leading operands that commute.
+fn commutative(op: Op) -> Option<usize> {
+    let commutative = matches!(
         op,
         Op::Add(..)
             | Op::Mul(..)
@@ -384,7 +400,7 @@ fn exchangeable(op: Op) -> Option<usize> {
             | Op::IntXor(..)
             | Op::IntEqual(..)
     );
-    exchangeable.then_some(2)
+    commutative.then_some(2)
 }
 
 fn distinct(values: &[Value]) -> bool {
@@ -393,20 +409,21 @@ fn distinct(values: &[Value]) -> bool {
     sorted.windows(2).all(|pair| pair[0] != pair[1])
 }
 
-/// The first number and the distance, if all are there and in equal distances other than 0.
-pub fn equal_distances(numbers: impl Iterator<Item = Option<i64>>) -> Option<(i64, i64)> {
+/// The first number and the stride, if the numbers are an arithmetic progression with a stride other than 0 and none is
+/// missing.
+pub fn arithmetic_progression(numbers: impl Iterator<Item = Option<i64>>) -> Option<(i64, i64)> {
     let mut numbers = numbers;
     let first = numbers.next()??;
     let mut last = numbers.next()??;
-    let distance = last - first;
+    let stride = last - first;
     for number in numbers {
         let number = number?;
-        if number - last != distance {
+        if number - last != stride {
             return None;
         }
         last = number;
     }
-    (distance != 0).then_some((first, distance))
+    (stride != 0).then_some((first, stride))
 }
 
 #[cfg(test)]
@@ -414,15 +431,15 @@ mod tests {
     use super::*;
     use crate::ir::build::Build;
 
-    /// Four parts, each with a stiffness, a state and an output, that pull at one mass.
+    /// Four components, each with a stiffness, a state and an output, that pull at one mass.
     #[test]
-    fn parts_of_one_shape_are_rows() {
+    fn components_of_one_shape_are_rows() {
         let mut build = Build::new("step");
         let (v, mut sum) = (build.load(Slot(3)), build.real(0.0));
         let mut forces = Vec::new();
         for k in 0..4 {
             let [stiffness, z] = [10 + 2 * k, 20 + k].map(|slot| build.load(Slot(slot)));
-            // Built later, the product would take them the other way round.
+            // The product is built with exchanged operands.
             let force = if k == 2 { build.mul(z, stiffness) } else { build.mul(stiffness, z) };
             let moved = build.fma(force, v, z);
             build.store(Slot(20 + k), moved);
@@ -438,7 +455,7 @@ mod tests {
         let [moved, force] = &found.rows[..] else { panic!("{:?}", found.rows) };
         let (first, second) = (force.members[0], force.members[1]);
         assert_eq!(force.sources, [Source::Slots(Slot(10), 2), Source::Slots(Slot(20), 1)]);
-        let of_moved = [Source::Same(v), Source::Words(first, second), Source::Slots(Slot(20), 1)];
+        let of_moved = [Source::Same(v), Source::Scratch(first, second), Source::Slots(Slot(20), 1)];
         assert_eq!((&moved.sources[..], moved.level, force.level), (&of_moved[..], 1, 1));
         let (_, sum) = *func.stores.last().unwrap();
         assert_eq!((found.row(sum), found.level(sum)), (None, 2));

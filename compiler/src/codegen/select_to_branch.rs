@@ -1,109 +1,115 @@
-//! Which operations only one side of a choice needs.
+//! Turns selects with expensive arms into branches (reverse if-conversion).
 //!
-//! In: a list of operations, each behind its operands. Out: [`BranchRegions`], by which code computes of a choice only the side that is
-//! chosen. It knows nothing of processors.
+//! In: a list of operations in topological order. Out: [`BranchRegions`]: which operations only one arm of a select
+//! needs, so that generated code computes only the arm that is taken. It knows nothing of processors.
+//!
+//! Source: Warter, Mahlke, Hwu, Rau, *Reverse If-Conversion*, PLDI 1993.
 
 use crate::ir::{Op, Value};
 use std::collections::{HashMap, HashSet};
 
-/// Which operations of a list only one side of a choice needs: these are written where that side is taken. A choice whose
-/// sides are short stays one operation: it costs less than to foresee the side.
+/// Regions of a list of operations: each arm of a select that becomes a branch is a region, with the operations that
+/// only this arm needs. A select with cheap arms stays one operation, which costs less than a mispredicted branch.
 pub struct BranchRegions {
-    /// The operations of each side, in order; first those of no side.
+    /// The operations of each region, in order; region 0 holds those that run unconditionally.
     pub members: Vec<Vec<Value>>,
-    /// The two sides of a choice that is taken apart.
-    pub of_choice: HashMap<Value, [usize; 2]>,
-    /// Choices that stand behind each other and ask the same are taken apart together: those of the first of them.
-    pub together: HashMap<Value, Vec<Value>>,
+    /// The regions of the true and the false arm of a select that becomes a branch.
+    pub arms: HashMap<Value, [usize; 2]>,
+    /// Adjacent selects on the same condition share one branch: by the first of them, all of them.
+    pub merged: HashMap<Value, Vec<Value>>,
 }
 
-/// Operations, by their cost, from which on a side is long.
-const LONG_SIDE: u32 = 4;
-/// Choices within choices, at most.
-const DEEPEST: usize = 24;
+/// Minimum cost of an expensive arm, as [`Op::effort`].
+const EXPENSIVE_ARM: u32 = 4;
+/// Maximum depth of nested branches.
+const MAX_DEPTH: usize = 24;
 
 impl BranchRegions {
-    /// Of a list of operations, of which `outputs` are read elsewhere.
+    /// The regions of a list of operations, of which `outputs` are read elsewhere.
     pub fn of(ops: &[Op], list: &[Value], outputs: &[Value]) -> BranchRegions {
         let op = |value: Value| ops[value.index()];
-        // A side has its choice, and which of its operands it is; 0 is no side.
-        struct Side {
-            choice: Value,
+        // A region belongs to one arm of a select; region 0 to none.
+        struct Region {
+            select: Value,
             within: usize,
             depth: usize,
             cost: u32,
         }
-        let mut sides = vec![Side { choice: Value(0), within: 0, depth: 0, cost: 0 }];
-        let mut of_choice: HashMap<Value, [usize; 2]> = HashMap::new();
-        // The innermost side that holds all uses so far of a value; none: no use yet.
-        let mut side_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
-        let common = |sides: &[Side], mut a: usize, mut b: usize| {
+        let mut regions = vec![Region { select: Value(0), within: 0, depth: 0, cost: 0 }];
+        let mut arms: HashMap<Value, [usize; 2]> = HashMap::new();
+        // The innermost region that contains all uses of a value seen so far; none: no use yet.
+        let mut region_of: HashMap<Value, Option<usize>> = list.iter().map(|value| (*value, None)).collect();
+        let common = |regions: &[Region], mut a: usize, mut b: usize| {
             while a != b {
-                if sides[a].depth >= sides[b].depth { a = sides[a].within } else { b = sides[b].within }
+                if regions[a].depth >= regions[b].depth { a = regions[a].within } else { b = regions[b].within }
             }
             a
         };
-        // What is read elsewhere belongs to no side.
+        // Values that are read elsewhere are computed unconditionally.
         for output in outputs {
-            if let Some(side) = side_of.get_mut(output) {
-                *side = Some(0);
+            if let Some(region) = region_of.get_mut(output) {
+                *region = Some(0);
             }
         }
-        let (together, mut followers) = (together(ops, list), HashSet::new());
-        followers.extend(together.values().flat_map(|choices| &choices[1..]).copied());
+        let (merged, mut followers) = (merged(ops, list), HashSet::new());
+        followers.extend(merged.values().flat_map(|selects| &selects[1..]).copied());
         for value in list.iter().rev() {
             if followers.contains(value) {
                 continue;
             }
-            let choices = together.get(value).map_or(std::slice::from_ref(value), |choices| choices);
-            let uses = choices.iter().filter_map(|choice| side_of[choice]);
-            let own = uses.reduce(|a, b| common(&sides, a, b)).unwrap_or(0);
-            for choice in choices {
-                side_of.insert(*choice, Some(own));
-                sides[own].cost += op(*choice).effort();
+            let selects = merged.get(value).map_or(std::slice::from_ref(value), |selects| selects);
+            let uses = selects.iter().filter_map(|select| region_of[select]);
+            let own = uses.reduce(|a, b| common(&regions, a, b)).unwrap_or(0);
+            for select in selects {
+                region_of.insert(*select, Some(own));
+                regions[own].cost += op(*select).effort();
             }
-            let mut used = |operand: Value, at: usize, sides: &[Side]| {
-                if let Some(known) = side_of.get_mut(&operand) {
-                    *known = Some(known.map_or(at, |known| common(sides, known, at)));
+            let mut used = |operand: Value, at: usize, regions: &[Region]| {
+                if let Some(known) = region_of.get_mut(&operand) {
+                    *known = Some(known.map_or(at, |known| common(regions, known, at)));
                 }
             };
             match op(*value) {
                 Op::Select(when, yes, no)
-                    if sides[own].depth < DEEPEST && (choices.len() > 1 || yes != no && when != yes && when != no) =>
+                    if regions[own].depth < MAX_DEPTH
+                        && (selects.len() > 1 || yes != no && when != yes && when != no) =>
                 {
-                    let depth = sides[own].depth + 1;
-                    let first = sides.len();
-                    sides.extend([(); 2].map(|()| Side { choice: *value, within: own, depth, cost: 0 }));
-                    of_choice.insert(*value, [first, first + 1]);
-                    used(when, own, &sides);
-                    for choice in choices {
-                        let Op::Select(_, yes, no) = op(*choice) else { unreachable!("it is a choice") };
-                        used(yes, first, &sides);
-                        used(no, first + 1, &sides);
+                    let depth = regions[own].depth + 1;
+                    let first = regions.len();
+                    regions.extend([(); 2].map(|()| Region { select: *value, within: own, depth, cost: 0 }));
+                    arms.insert(*value, [first, first + 1]);
+                    used(when, own, &regions);
+                    for select in selects {
+                        let Op::Select(_, yes, no) = op(*select) else { unreachable!("it is a select") };
+                        used(yes, first, &regions);
+                        used(no, first + 1, &regions);
                     }
                 }
-                Op::Select(when, ..) if choices.len() > 1 => {
-                    used(when, own, &sides);
-                    for choice in choices {
-                        op(*choice).each_operand(|operand| used(operand, own, &sides));
+                Op::Select(when, ..) if selects.len() > 1 => {
+                    used(when, own, &regions);
+                    for select in selects {
+                        op(*select).each_operand(|operand| used(operand, own, &regions));
                     }
                 }
-                other => other.each_operand(|operand| used(operand, own, &sides)),
+                other => other.each_operand(|operand| used(operand, own, &regions)),
             }
         }
-        // Short sides are no sides: what they hold belongs to what they lie in. Inner sides stand behind outer ones.
-        for side in (1..sides.len()).rev() {
-            let (within, cost) = (sides[side].within, sides[side].cost);
-            sides[within].cost += cost;
+        // Cheap arms are dissolved: their operations move to the enclosing region. Inner regions have higher numbers
+        // than outer ones.
+        for region in (1..regions.len()).rev() {
+            let (within, cost) = (regions[region].within, regions[region].cost);
+            regions[within].cost += cost;
         }
-        let long = |side: usize| sides[side].cost >= LONG_SIDE;
-        // What asks several questions is taken apart in any case: a jump for each costs less than to put them together.
-        let compound = |choice: Value| match op(choice) {
+        let is_expensive = |region: usize| regions[region].cost >= EXPENSIVE_ARM;
+        // A select on a compound condition always becomes a branch: short-circuit branches cost less than combining the
+        // tests.
+        let is_compound = |select: Value| match op(select) {
             Op::Select(when, ..) => matches!(op(when), Op::And(..) | Op::Or(..)),
             _ => false,
         };
-        // So is each question by which a place in a table is found: most often it is where it was, and nothing waits for it.
-        let seeks = |choice: Value| match op(choice) {
+        // So does a select that searches for an index in a table: the index rarely changes between steps, so the branch
+        // is predicted and the search is off the critical path.
+        let is_search = |select: Value| match op(select) {
             Op::Select(_, yes, no) => match (op(yes), op(no)) {
                 (Op::Int(_), Op::Int(_)) => true,
                 (Op::IntAdd(from, _), _) => from == no,
@@ -111,44 +117,46 @@ impl BranchRegions {
             },
             _ => false,
         };
-        of_choice.retain(|choice, pair| compound(*choice) || seeks(*choice) || pair.iter().any(|side| long(*side)));
-        let kept = |mut side: usize| {
-            while side != 0 && !of_choice.contains_key(&sides[side].choice) {
-                side = sides[side].within;
+        arms.retain(|select, pair| {
+            is_compound(*select) || is_search(*select) || pair.iter().any(|region| is_expensive(*region))
+        });
+        let enclosing = |mut region: usize| {
+            while region != 0 && !arms.contains_key(&regions[region].select) {
+                region = regions[region].within;
             }
-            side
+            region
         };
-        let mut members = vec![Vec::new(); sides.len()];
+        let mut members = vec![Vec::new(); regions.len()];
         for value in list {
-            members[kept(side_of[value].unwrap_or(0))].push(*value);
+            members[enclosing(region_of[value].unwrap_or(0))].push(*value);
         }
-        BranchRegions { members, of_choice, together }
+        BranchRegions { members, arms, merged }
     }
 }
 
-/// Choices of a list that stand behind each other and ask the same, if none chooses another: by the first of them.
-fn together(ops: &[Op], list: &[Value]) -> HashMap<Value, Vec<Value>> {
-    let mut together: HashMap<Value, Vec<Value>> = HashMap::new();
+/// Runs of adjacent selects on the same condition, none of which reads another of its run: by the first of the run.
+fn merged(ops: &[Op], list: &[Value]) -> HashMap<Value, Vec<Value>> {
+    let mut merged: HashMap<Value, Vec<Value>> = HashMap::new();
     let mut run: Vec<Value> = Vec::new();
-    let mut asked = None;
+    let mut condition = None;
     for value in list {
         let now = match ops[value.index()] {
             Op::Select(when, yes, no) if when != yes && when != no => {
-                let apart = ![yes, no].iter().any(|side| run.contains(side));
-                (apart || run.is_empty()).then_some(when)
+                let is_independent = ![yes, no].iter().any(|arm| run.contains(arm));
+                (is_independent || run.is_empty()).then_some(when)
             }
             _ => None,
         };
-        if now.is_none() || now != asked {
+        if now.is_none() || now != condition {
             run.clear();
         }
-        asked = now;
+        condition = now;
         if now.is_some() {
             run.push(*value);
             if run.len() > 1 {
-                together.insert(run[0], run.clone());
+                merged.insert(run[0], run.clone());
             }
         }
     }
-    together
+    merged
 }

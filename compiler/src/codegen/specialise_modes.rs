@@ -1,8 +1,12 @@
-//! Takes a step apart by the regimes of its automata: for each regime, the operations that are left of it.
+//! Specialises a step by the modes of its automata: for each mode, the residual operations.
 //!
-//! In: a sound, expanded function. Out: the same with more operations, and for each slot that is only compared with
-//! constants and chosen what it needs for each of these constants. What depends on several of them, and what depends on none
-//! but is needed elsewhere too, stays one list. It knows nothing of processors.
+//! In: a verified, expanded function. Out: [`Specialised`]: the function with residual operations appended, and a
+//! multi-way branch for each automaton. An automaton is a slot that the function only selects and compares with
+//! constants, its modes. Operations that depend on several automata, and operations that depend on none and are needed
+//! in more than one place, stay common to all modes. It knows nothing of processors.
+//!
+//! Method: polyvariant specialisation, Jones, Gomard, Sestoft, *Partial Evaluation and Automatic Program Generation*,
+//! 1993.
 
 use crate::ir::build::Build;
 use crate::ir::partial_eval::{known, partial_eval, slice};
@@ -11,26 +15,26 @@ use abi::Slot;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
 
-/// A function whose operations are taken apart.
+/// A function with its operations grouped by automaton and mode.
 pub struct Specialised {
-    /// The function; behind its own operations those of single regimes.
+    /// The function; the residual operations of single modes follow its own operations.
     pub func: Func,
-    /// What depends on no regime, in order.
-    pub before: Vec<Value>,
-    /// What depends on one each.
+    /// Operations that depend on no automaton, in topological order.
+    pub common: Vec<Value>,
+    /// Operations that depend on one automaton each.
     pub automata: Vec<Automaton>,
-    /// What depends on several.
-    pub behind: Vec<Value>,
+    /// Operations that depend on several automata, or on one that is too small to specialise; in topological order.
+    pub joint: Vec<Value>,
 }
 
 impl Specialised {
-    /// Behind which automaton, by its number, the values are there that depend on automata.
+    /// For each value that depends on automata, the index of the last automaton that it needs.
     pub fn stages(&self) -> HashMap<Value, usize> {
         let mut stages = HashMap::new();
         for (k, automaton) in self.automata.iter().enumerate() {
             stages.extend(automaton.outputs.iter().map(|output| (*output, k)));
         }
-        for value in &self.behind {
+        for value in &self.joint {
             let mut last = None;
             self.func.op(*value).each_operand(|operand| last = last.max(stages.get(&operand).copied()));
             stages.extend(last.map(|last| (*value, last)));
@@ -38,10 +42,11 @@ impl Specialised {
         stages
     }
 
-    /// What is read behind the automaton of this number: of what depends on several, by these.
-    pub fn read_behind(&self, number: usize, by: impl Fn(Value) -> bool) -> Read {
+    /// Everything read after automaton `number`: by those `joint` operations for which `by` holds, by writes to rings,
+    /// and by later automata.
+    pub fn read_after(&self, number: usize, by: impl Fn(Value) -> bool) -> Read {
         let mut read = Read::default();
-        for value in self.behind.iter().filter(|value| by(**value)) {
+        for value in self.joint.iter().filter(|value| by(**value)) {
             read.operation(self.func.op(*value));
         }
         read.values.extend(self.func.writes.iter().flat_map(|write| [write.index, write.value]));
@@ -51,9 +56,9 @@ impl Specialised {
             cases.for_each(|case| {
                 case.each(&mut |case| {
                     case.list.iter().for_each(|value| read.operation(self.func.op(*value)));
-                    match &case.then {
-                        Then::Outputs(outputs) => read.values.extend(outputs),
-                        Then::Ask(when, _) => _ = read.values.insert(*when),
+                    match &case.terminator {
+                        Terminator::Outputs(outputs) => read.values.extend(outputs),
+                        Terminator::Branch(when, _) => _ = read.values.insert(*when),
                     }
                 });
             });
@@ -62,12 +67,12 @@ impl Specialised {
     }
 }
 
-/// What is read somewhere.
+/// A set of slots and values that are read.
 #[derive(Default)]
 pub struct Read {
     /// Slots of the block.
     pub slots: HashSet<Slot>,
-    /// Operands.
+    /// Values read as operands.
     pub values: HashSet<Value>,
 }
 
@@ -80,102 +85,104 @@ impl Read {
     }
 }
 
-/// What depends on what one slot holds.
+/// The operations that depend on the mode in one slot.
 pub struct Automaton {
-    /// The slot.
+    /// The slot that holds the mode.
     pub slot: Slot,
-    /// Its values that something else needs.
+    /// Its values that other operations or results read.
     pub outputs: Vec<Value>,
-    /// For numbers that the slot may hold, by their bits: what is computed then.
+    /// The residual operations for each mode, which is given by the bits of its number.
     pub cases: Vec<(u64, Case)>,
-    /// And for all others.
+    /// The operations for any other number in the slot, not specialised.
     pub general: Case,
 }
 
-/// Operations for one regime, each behind its operands, and what comes of them.
+/// Residual operations for one mode and how they end.
 pub struct Case {
-    /// What is computed, in order.
+    /// Operations in topological order.
     pub list: Vec<Value>,
-    /// What then is done.
-    pub then: Then,
+    /// How the case ends.
+    pub terminator: Terminator,
 }
 
-/// How a case goes on.
-pub enum Then {
-    /// It ends: for each output of the automaton what it is.
+/// The end of a case.
+pub enum Terminator {
+    /// The value of each output of the automaton.
     Outputs(Vec<Value>),
-    /// A truth that much hangs on is asked once; what is left where it is true, and where it is not.
-    Ask(Value, Box<[Case; 2]>),
+    /// A branch on a boolean that many operations depend on: the case where it is true, and the case where it is false.
+    Branch(Value, Box<[Case; 2]>),
 }
 
 impl Case {
-    /// The case and all those in it.
+    /// Visits the case and all nested cases.
     pub fn each(&self, each: &mut impl FnMut(&Case)) {
         each(self);
-        if let Then::Ask(_, sides) = &self.then {
+        if let Terminator::Branch(_, sides) = &self.terminator {
             sides.iter().for_each(|side| side.each(each));
         }
     }
 }
 
-/// Most regimes of an automaton that are told apart.
-const MOST: usize = 4;
-/// Fewest operations that are worth a jump.
-const FEWEST: usize = 6;
-/// Fewest operations of a case that is taken apart by what it asks.
-const FEWEST_ASKED: usize = 4;
-/// Most operations of a case that is taken apart by what it asks: they stand twice then.
-const LONGEST: usize = 200;
-/// Questions within questions, at most.
-const DEEPEST: usize = 4;
+/// Maximum number of modes of an automaton that is specialised.
+const MAX_MODES: usize = 4;
+/// Minimum number of operations that are worth a branch.
+const MIN_OPS: usize = 6;
+/// Minimum number of operations of a case that is split by its most frequent condition.
+const MIN_SPLIT_OPS: usize = 4;
+/// Maximum number of operations of a case that is split, since a split duplicates them.
+const MAX_SPLIT_OPS: usize = 200;
+/// Maximum depth of nested branches in a case.
+const MAX_DEPTH: usize = 4;
 
-/// Where an operation stands.
+/// Where an operation is computed.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Place {
-    Before,
+    Common,
     Within(usize),
-    Behind,
-    /// In each regime that needs it.
-    Each,
-    /// It is computed elsewhere, or never.
-    Elsewhere,
+    Joint,
+    /// Rematerialised in each mode that needs it.
+    Rematerialised,
+    /// Not here: it is cold.
+    Cold,
 }
 
-/// Numbers that slots are asked for, and that are known to be those of regimes: their bits.
-pub type Numbers = HashMap<Slot, Vec<u64>>;
+/// The modes of each automaton, by slot: the bits of the constants that the slot is compared with.
+pub type Modes = HashMap<Slot, Vec<u64>>;
 
-/// Those of a function.
-pub fn numbers(func: &Func) -> Numbers {
-    let of_load = |(load, numbers)| match func.op(load) {
-        Op::Load(slot) => (slot, numbers),
+/// The modes of all automata of a function.
+pub fn modes(func: &Func) -> Modes {
+    let of_load = |(load, modes)| match func.op(load) {
+        Op::Load(slot) => (slot, modes),
         _ => unreachable!("it is a load"),
     };
-    automata(func, &Numbers::new()).into_iter().map(of_load).collect()
+    automata(func, &Modes::new()).into_iter().map(of_load).collect()
 }
 
-/// Takes a function apart, which may be a copy in which not all `numbers` are asked for; `late` are operations that are not
-/// wanted, `watched` is the truth that ends the step.
-pub fn specialise(func: &Func, numbers: &Numbers, late: &[bool], watched: Option<Value>) -> Specialised {
+/// Specialises a function.
+///
+/// `modes`: the modes of the function before unswitching, since a copy may no longer compare a slot with all of them.
+/// `cold`: operations to leave out. `guard`: the boolean that ends the step.
+pub fn specialise(func: &Func, modes: &Modes, cold: &[bool], guard: Option<Value>) -> Specialised {
     let all = || (0..func.ops.len()).map(|i| Value(i as u32));
-    let slots = automata(func, numbers);
-    let mut places = dependent(func, late, &slots);
-    watch_behind(func, watched, &mut places);
+    let slots = automata(func, modes);
+    let mut places = dependences(func, cold, &slots);
+    move_guards_after(func, guard, &mut places);
     for k in 0..slots.len() {
         let members = places.iter().filter(|place| **place == Place::Within(k)).count();
-        if members < FEWEST {
-            places.iter_mut().filter(|place| **place == Place::Within(k)).for_each(|place| *place = Place::Behind);
+        if members < MIN_OPS {
+            places.iter_mut().filter(|place| **place == Place::Within(k)).for_each(|place| *place = Place::Joint);
         }
     }
-    // What depends on no regime but is needed in one alone is computed there.
+    // An operation that depends on no mode but is needed by one automaton only is computed there.
     let mut users: Vec<Option<Place>> = vec![None; func.ops.len()];
     let used = |value: Value, by: Place, users: &mut Vec<Option<Place>>| {
         let known = &mut users[value.index()];
-        *known = Some(known.map_or(by, |known| if known == by { known } else { Place::Before }));
+        *known = Some(known.map_or(by, |known| if known == by { known } else { Place::Common }));
     };
-    func.results().for_each(|value| used(value, Place::Before, &mut users));
+    func.results().for_each(|value| used(value, Place::Common, &mut users));
     for value in all().rev() {
         let i = value.index();
-        if let (Place::Before, Some(Place::Within(k))) = (places[i], users[i])
+        if let (Place::Common, Some(Place::Within(k))) = (places[i], users[i])
             && !func.ops[i].is_constant()
         {
             places[i] = Place::Within(k);
@@ -183,7 +190,7 @@ pub fn specialise(func: &Func, numbers: &Numbers, late: &[bool], watched: Option
         let by = places[i];
         func.ops[i].each_operand(|operand| used(operand, by, &mut users));
     }
-    leave_to_each(func, &mut places);
+    rematerialise_cheap(func, &mut places);
     let mut wanted: Vec<HashSet<Value>> = vec![HashSet::new(); slots.len()];
     let mut note = |value: Value, by: Place| {
         if let Place::Within(k) = places[value.index()]
@@ -192,40 +199,42 @@ pub fn specialise(func: &Func, numbers: &Numbers, late: &[bool], watched: Option
             wanted[k].insert(value);
         }
     };
-    func.results().for_each(|value| note(value, Place::Before));
+    func.results().for_each(|value| note(value, Place::Common));
     for value in all() {
         func.op(value).each_operand(|operand| note(operand, places[value.index()]));
     }
     let listed = |place: Place| -> Vec<Value> { all().filter(|value| places[value.index()] == place).collect() };
     let mut build = Build::of(func);
-    let mut there: HashSet<Value> = listed(Place::Before).into_iter().collect();
+    let mut available: HashSet<Value> = listed(Place::Common).into_iter().collect();
     let automata = slots.iter().zip(wanted).enumerate().filter(|(_, (_, wanted))| !wanted.is_empty());
     let automata = automata
-        .map(|(k, ((load, numbers), wanted))| {
+        .map(|(k, ((load, modes), wanted))| {
             let members = listed(Place::Within(k));
             let mut outputs: Vec<Value> = wanted.into_iter().collect();
             outputs.sort_unstable();
             let Op::Load(slot) = func.op(*load) else { unreachable!("it is a load") };
             let next = func.stores.iter().find(|(stored, _)| *stored == slot).map(|(_, value)| *value);
             let next = outputs.iter().position(|output| Some(*output) == next);
-            let case = |bits: &u64| (*bits, case(&mut build, &mut there, (*load, *bits), &members, (&outputs, next)));
-            let cases = numbers.iter().map(case).collect();
-            let general = Case { list: slice(&build, &there, &outputs), then: Then::Outputs(outputs.clone()) };
+            let case =
+                |bits: &u64| (*bits, case(&mut build, &mut available, (*load, *bits), &members, (&outputs, next)));
+            let cases = modes.iter().map(case).collect();
+            let general =
+                Case { list: slice(&build, &available, &outputs), terminator: Terminator::Outputs(outputs.clone()) };
             Automaton { slot, outputs, cases, general }
         })
         .collect();
     let ops = build.into_ops();
     Specialised {
         func: Func { ops, ..func.clone() },
-        before: listed(Place::Before),
+        common: listed(Place::Common),
         automata,
-        behind: listed(Place::Behind),
+        joint: listed(Place::Joint),
     }
 }
 
-/// Operations that automata read, and how many do, of those that are `wanted`.
-pub fn automata_that_ask(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, usize)> {
-    let places = dependent(func, &vec![false; func.ops.len()], &automata(func, &Numbers::new()));
+/// Of the values for which `wanted` holds, those that automata read, each with the number of automata that read it.
+pub fn shared_operands(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value, usize)> {
+    let places = dependences(func, &vec![false; func.ops.len()], &automata(func, &Modes::new()));
     let mut readers: BTreeMap<Value, HashSet<usize>> = BTreeMap::new();
     for (op, place) in func.ops.iter().zip(places) {
         let Place::Within(k) = place else { continue };
@@ -238,14 +247,14 @@ pub fn automata_that_ask(func: &Func, wanted: impl Fn(Op) -> bool) -> Vec<(Value
     readers.into_iter().map(|(value, readers)| (value, readers.len())).collect()
 }
 
-/// Loads that are only compared with constants and chosen, and these constants, by their bits, with those that are known
-/// besides.
-fn automata(func: &Func, known: &Numbers) -> Vec<(Value, Vec<u64>)> {
+/// The automata of a function: loads that are only selected and compared with constants; and their modes: these
+/// constants and those in `known`, as bits.
+fn automata(func: &Func, known: &Modes) -> Vec<(Value, Vec<u64>)> {
     let mut found: HashMap<Value, Option<Vec<u64>>> = HashMap::new();
     for op in &func.ops {
         if let Some((load, _, bits)) = number_asked(*op, |value| func.op(value)) {
-            let numbers = found.entry(load).or_insert_with(|| Some(Vec::new()));
-            numbers.iter_mut().filter(|numbers| !numbers.contains(&bits)).for_each(|numbers| numbers.push(bits));
+            let modes = found.entry(load).or_insert_with(|| Some(Vec::new()));
+            modes.iter_mut().filter(|modes| !modes.contains(&bits)).for_each(|modes| modes.push(bits));
         } else if !matches!(op, Op::Select(..)) {
             op.each_operand(|operand| {
                 if matches!(func.op(operand), Op::Load(_)) {
@@ -254,71 +263,74 @@ fn automata(func: &Func, known: &Numbers) -> Vec<(Value, Vec<u64>)> {
             });
         }
     }
-    for (load, numbers) in &mut found {
-        let (Some(numbers), Op::Load(slot)) = (numbers, func.op(*load)) else { continue };
-        let more = known.get(&slot).into_iter().flatten().filter(|bits| !numbers.contains(bits));
+    for (load, modes) in &mut found {
+        let (Some(modes), Op::Load(slot)) = (modes, func.op(*load)) else { continue };
+        let more = known.get(&slot).into_iter().flatten().filter(|bits| !modes.contains(bits));
         let more: Vec<u64> = more.copied().collect();
-        numbers.extend(more);
+        modes.extend(more);
     }
-    let told = |(load, numbers): (Value, Option<Vec<u64>>)| Some((load, numbers.filter(|it| it.len() <= MOST)?));
-    let mut found: Vec<(Value, Vec<u64>)> = found.into_iter().filter_map(told).collect();
+    let within_limit =
+        |(load, modes): (Value, Option<Vec<u64>>)| Some((load, modes.filter(|it| it.len() <= MAX_MODES)?));
+    let mut found: Vec<(Value, Vec<u64>)> = found.into_iter().filter_map(within_limit).collect();
     found.sort_unstable();
     found
 }
 
-/// On which automata operations depend: on none, one or several.
-fn dependent(func: &Func, late: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<Place> {
+/// For each operation, whether it depends on no automaton, on one or on several.
+fn dependences(func: &Func, cold: &[bool], automata: &[(Value, Vec<u64>)]) -> Vec<Place> {
     let number: HashMap<Value, usize> = automata.iter().enumerate().map(|(k, (load, _))| (*load, k)).collect();
     let mut of: Vec<Place> = Vec::with_capacity(func.ops.len());
     for op in &func.ops {
-        let mut place = Place::Before;
+        let mut place = Place::Common;
         op.each_operand(|operand| {
             let of = number.get(&operand).map_or(of[operand.index()], |k| Place::Within(*k));
             place = match (place, of) {
-                (Place::Before, of) => of,
-                (place, Place::Before) => place,
+                (Place::Common, of) => of,
+                (place, Place::Common) => place,
                 (place, of) if place == of => place,
-                _ => Place::Behind,
+                _ => Place::Joint,
             };
         });
         of.push(place);
     }
-    for (place, _) in of.iter_mut().zip(late).filter(|(_, late)| **late) {
-        *place = Place::Elsewhere;
+    for (place, _) in of.iter_mut().zip(cold).filter(|(_, cold)| **cold) {
+        *place = Place::Cold;
     }
     of
 }
 
-/// Leaves to each regime what several need and nothing else does, if it is next to nothing: what it reads of the block, a sign.
-fn leave_to_each(func: &Func, places: &mut [Place]) {
-    let mut beyond = vec![false; func.ops.len()];
-    func.results().for_each(|value| beyond[value.index()] = true);
+/// Rematerialises cheap operations that only modes need in each of these modes: loads of slots that are not stored, and
+/// changes of sign.
+fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
+    let mut needed_elsewhere = vec![false; func.ops.len()];
+    func.results().for_each(|value| needed_elsewhere[value.index()] = true);
     for (i, op) in func.ops.iter().enumerate().rev() {
-        let little = match op {
+        let is_cheap = match op {
             Op::Load(slot) => func.stores.iter().all(|(stored, _)| stored != slot),
             op => matches!(op, Op::Neg(_) | Op::Abs(_)),
         };
-        if places[i] == Place::Before && !beyond[i] && little {
-            places[i] = Place::Each;
+        if places[i] == Place::Common && !needed_elsewhere[i] && is_cheap {
+            places[i] = Place::Rematerialised;
         }
-        if !matches!(places[i], Place::Within(_) | Place::Each) {
-            op.each_operand(|operand| beyond[operand.index()] = true);
+        if !matches!(places[i], Place::Within(_) | Place::Rematerialised) {
+            op.each_operand(|operand| needed_elsewhere[operand.index()] = true);
         }
     }
 }
 
-/// Puts what only watches, on what is stored anyway, behind all regimes: it is the same in each.
-fn watch_behind(func: &Func, watched: Option<Value>, places: &mut [Place]) {
+/// Moves operations that only guards need after all automata if they read no values of a mode except stored ones: they
+/// are the same in each mode.
+fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
     let mut stored = vec![false; func.ops.len()];
     func.stores.iter().for_each(|(_, value)| stored[value.index()] = true);
     let mut needed = stored.clone();
     for write in &func.writes {
         [write.index, write.value].iter().for_each(|value| needed[value.index()] = true);
     }
-    if let Some(status) = func.status.filter(|_| watched.is_none()) {
+    if let Some(status) = func.status.filter(|_| guard.is_none()) {
         needed[status.index()] = true;
     }
-    for i in (0..func.ops.len()).rev().filter(|i| places[*i] != Place::Elsewhere) {
+    for i in (0..func.ops.len()).rev().filter(|i| places[*i] != Place::Cold) {
         if needed[i] {
             func.ops[i].each_operand(|operand| needed[operand.index()] = true);
         }
@@ -328,74 +340,74 @@ fn watch_behind(func: &Func, watched: Option<Value>, places: &mut [Place]) {
         op.each_operand(|operand| {
             let operand = operand.index();
             same &= stored[operand] || !matches!(places[operand], Place::Within(_));
-            behind |= places[operand] == Place::Behind;
+            behind |= places[operand] == Place::Joint;
         });
         if matches!(places[i], Place::Within(_)) && (same || behind) {
-            places[i] = Place::Behind;
+            places[i] = Place::Joint;
         }
     }
 }
 
-/// What is left of the members where the slot holds this number; `there` is what stands before. Of the outputs this one, if
-/// any, is what the slot holds next.
+/// The residual operations for the mode `bits` of the slot that `load` reads. `available`: values computed before.
+/// `next`: which of the outputs is the next mode, if any is.
 fn case(
     build: &mut Build,
-    there: &mut HashSet<Value>,
+    available: &mut HashSet<Value>,
     (load, bits): (Value, u64),
     members: &[Value],
     (outputs, next): (&[Value], Option<usize>),
 ) -> Case {
     let held = build.op(Op::Real(bits));
     let outputs = partial_eval(build, members, &[(load, held)], outputs);
-    divided(build, there, outputs, next.map(|next| (next, held)), 0)
+    split_case(build, available, outputs, next.map(|next| (next, held)), 0)
 }
 
-/// What computes the outputs, taken apart by the truth that is asked most often, if that leaves less to do, and by the one at
-/// which the slot no longer holds what it holds: as a rule it does.
-fn divided(
+/// Splits a case by the condition that most operations test, if both sides together then have less to do; or else by the
+/// condition under which the mode changes, which happens rarely.
+fn split_case(
     build: &mut Build,
-    there: &mut HashSet<Value>,
+    available: &mut HashSet<Value>,
     outputs: Vec<Value>,
     next: Option<(usize, Value)>,
     depth: usize,
 ) -> Case {
-    let list = slice(build, there, &outputs);
-    if depth == DEEPEST || list.len() > LONGEST {
-        return Case { list, then: Then::Outputs(outputs) };
+    let list = slice(build, available, &outputs);
+    if depth == MAX_DEPTH || list.len() > MAX_SPLIT_OPS {
+        return Case { list, terminator: Terminator::Outputs(outputs) };
     }
-    let often = asked_most(build, &list).filter(|_| list.len() >= FEWEST_ASKED);
-    let turns = next.and_then(|(next, held)| match build.get(outputs[next]) {
+    let frequent = most_tested(build, &list).filter(|_| list.len() >= MIN_SPLIT_OPS);
+    let changes_mode = next.and_then(|(next, held)| match build.get(outputs[next]) {
         Op::Select(when, yes, no) if [yes, no].contains(&held) => Some(when),
         _ => None,
     });
-    for asked in often.into_iter().chain(turns) {
-        let first = slice(build, there, &[asked]);
+    for condition in frequent.into_iter().chain(changes_mode) {
+        let first = slice(build, available, &[condition]);
         let sides = [true, false].map(|truth| {
-            let known = known(build, asked, truth);
+            let known = known(build, condition, truth);
             partial_eval(build, &list, &known, &outputs)
         });
-        there.extend(&first);
-        let shorter = |build: &Build, there: &HashSet<Value>| {
-            let lengths = sides.each_ref().map(|outputs| slice(build, there, outputs).len());
-            // What is put together from several questions is asked by jumps in any case.
-            let jump = if matches!(build.get(asked), Op::And(..) | Op::Or(..)) { 0 } else { 2 };
+        available.extend(&first);
+        let shorter = |build: &Build, available: &HashSet<Value>| {
+            let lengths = sides.each_ref().map(|outputs| slice(build, available, outputs).len());
+            // A compound condition becomes short-circuit branches in any case, so the split adds no branch.
+            let jump = if matches!(build.get(condition), Op::And(..) | Op::Or(..)) { 0 } else { 2 };
             first.len() + lengths.iter().sum::<usize>().div_ceil(2) + jump < list.len()
         };
-        let case = (turns == Some(asked) || shorter(build, there)).then(|| {
-            let sides = sides.map(|outputs| divided(build, there, outputs, next, depth + 1));
-            Case { list: first.clone(), then: Then::Ask(asked, Box::new(sides)) }
+        let case = (changes_mode == Some(condition) || shorter(build, available)).then(|| {
+            let sides = sides.map(|outputs| split_case(build, available, outputs, next, depth + 1));
+            Case { list: first.clone(), terminator: Terminator::Branch(condition, Box::new(sides)) }
         });
-        first.iter().for_each(|value| _ = there.remove(value));
+        first.iter().for_each(|value| _ = available.remove(value));
         if let Some(case) = case {
             return case;
         }
     }
-    Case { list, then: Then::Outputs(outputs) }
+    Case { list, terminator: Terminator::Outputs(outputs) }
 }
 
-/// The truth that most operations of a list take, if more than one does; of several the first.
-fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
-    let mut asked: HashMap<Value, usize> = HashMap::new();
+/// The boolean that most operations of a list read, if more than one does; the first of several.
+fn most_tested(build: &Build, list: &[Value]) -> Option<Value> {
+    let mut counts: HashMap<Value, usize> = HashMap::new();
     for value in list {
         let op = build.get(*value);
         if matches!(op, Op::Not(_)) {
@@ -404,11 +416,11 @@ fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
         op.each_operand(|operand| {
             let operand = if let Op::Not(of) = build.get(operand) { of } else { operand };
             if build.type_of(operand) == Type::Bool {
-                *asked.entry(operand).or_default() += 1;
+                *counts.entry(operand).or_default() += 1;
             }
         });
     }
-    let most = asked.into_iter().filter(|(_, times)| *times > 1);
+    let most = counts.into_iter().filter(|(_, times)| *times > 1);
     most.max_by_key(|(value, times)| (*times, Reverse(*value))).map(|(value, _)| value)
 }
 
@@ -416,9 +428,10 @@ fn asked_most(build: &Build, list: &[Value]) -> Option<Value> {
 mod tests {
     use super::*;
 
-    /// A spring in slot 3 that moves while slot 4, its regime, is 0, and is `held` by slot 5 in any other.
+    /// A spring in slot 3 that moves while slot 4, its mode, is 0; in mode 1 it takes a product, in any other it keeps
+    /// its value.
     #[test]
-    fn each_regime_has_only_what_is_left_of_it() {
+    fn each_mode_has_only_its_residual_operations() {
         let mut build = Build::new("step");
         let [x, regime, v, w] = [3, 4, 5, 6].map(|slot| build.load(Slot(slot)));
         let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
@@ -433,29 +446,33 @@ mod tests {
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let apart = specialise(&func, &Numbers::new(), &vec![false; func.ops.len()], None);
-        let [automaton] = &apart.automata[..] else { panic!("one automaton") };
-        assert_eq!((automaton.slot, &apart.behind[..]), (Slot(4), &[][..]));
+        let specialised = specialise(&func, &Modes::new(), &vec![false; func.ops.len()], None);
+        let [automaton] = &specialised.automata[..] else { panic!("one automaton") };
+        assert_eq!((automaton.slot, &specialised.joint[..]), (Slot(4), &[][..]));
         let shown = |case: &Case| -> Vec<String> {
-            case.list.iter().map(|value| apart.func.op(*value).to_string()).map(|op| op[..3].to_string()).collect()
+            case.list
+                .iter()
+                .map(|value| specialised.func.op(*value).to_string())
+                .map(|op| op[..3].to_string())
+                .collect()
         };
         let cases: Vec<(f64, Vec<String>)> =
             automaton.cases.iter().map(|(bits, case)| (f64::from_bits(*bits), shown(case))).collect();
-        let words = |text: &str| text.split(' ').map(String::from).collect::<Vec<_>>();
-        assert_eq!(cases, [(0.0, words("loa loa loa mul fma les")), (1.0, words("loa loa mul"))]);
+        let names = |text: &str| text.split(' ').map(String::from).collect::<Vec<_>>();
+        assert_eq!(cases, [(0.0, names("loa loa loa mul fma les")), (1.0, names("loa loa mul"))]);
         assert_eq!(shown(&automaton.general).iter().filter(|op| *op == "sel").count(), 3);
-        // What the slot holds next is asked, not chosen; on either side nothing is left to do.
-        let Then::Ask(_, sides) = &automaton.cases[0].1.then else { panic!("it asks") };
-        let next = sides.each_ref().map(|side| match (&side.list[..], &side.then) {
-            ([], Then::Outputs(outputs)) => outputs.last().map(|output| apart.func.op(*output)),
+        // The next mode is branched on, not selected; neither side has any operations left.
+        let Terminator::Branch(_, sides) = &automaton.cases[0].1.terminator else { panic!("it branches") };
+        let next = sides.each_ref().map(|side| match (&side.list[..], &side.terminator) {
+            ([], Terminator::Outputs(outputs)) => outputs.last().map(|output| specialised.func.op(*output)),
             _ => panic!("it ends"),
         });
         assert_eq!(next, [1f64, 0.0].map(|number| Some(Op::Real(number.to_bits()))));
     }
 
-    /// Slot 4 is a regime; at rest, 0, it asks four times whether a force in slot 5 is above one in slot 6.
+    /// Slot 4 is a mode; in mode 0 the step tests four times whether the force in slot 5 is above the one in slot 6.
     #[test]
-    fn what_is_asked_often_is_asked_once() {
+    fn a_condition_tested_often_is_tested_once() {
         let mut build = Build::new("step");
         let [x, regime, v, w] = [3, 4, 5, 6].map(|slot| build.load(Slot(slot)));
         let [zero, one] = [0.0, 1.0].map(|number| build.real(number));
@@ -463,20 +480,23 @@ mod tests {
         let below = build.not(above);
         let (leaves, stays) = (build.and(rests, above), build.and(rests, below));
         let mut next = x;
-        for (asked, other) in [(leaves, v), (stays, w), (leaves, w), (stays, v)] {
+        for (condition, other) in [(leaves, v), (stays, w), (leaves, w), (stays, v)] {
             let moved = build.mul(next, other);
-            next = build.select(asked, moved, next);
+            next = build.select(condition, moved, next);
         }
         let changed = build.select(leaves, one, regime);
         build.store(Slot(3), next);
         build.store(Slot(4), changed);
         let func = build.finish();
-        let apart = specialise(&func, &Numbers::new(), &vec![false; func.ops.len()], None);
-        let Then::Ask(asked, sides) = &apart.automata[0].cases[0].1.then else { panic!("it asks") };
-        assert!(matches!(apart.func.op(*asked), Op::Less(..)));
+        let specialised = specialise(&func, &Modes::new(), &vec![false; func.ops.len()], None);
+        let Terminator::Branch(condition, sides) = &specialised.automata[0].cases[0].1.terminator else {
+            panic!("it branches")
+        };
+        assert!(matches!(specialised.func.op(*condition), Op::Less(..)));
         for side in sides.iter() {
-            let products = side.list.iter().filter(|value| matches!(apart.func.op(**value), Op::Mul(..))).count();
-            let choices = side.list.iter().filter(|value| matches!(apart.func.op(**value), Op::Select(..))).count();
+            let products = side.list.iter().filter(|value| matches!(specialised.func.op(**value), Op::Mul(..))).count();
+            let choices =
+                side.list.iter().filter(|value| matches!(specialised.func.op(**value), Op::Select(..))).count();
             assert_eq!((products, choices), (2, 0));
         }
     }

@@ -1,14 +1,14 @@
-//! What processor code is made for, and the code of one function for it.
+//! Compiles one function for one target with Cranelift.
 //!
-//! In: a sound, expanded function. Out: bytes that can lie anywhere: no symbols, no calls but of its own pieces, no
-//! relocation left.
+//! In: a verified, expanded function. Out: position-independent bytes: without symbols, without calls except to the
+//! function's own pieces, all relocations resolved. It does not know where the bytes will be placed.
 
 use super::unsupported::Unsupported;
 use crate::codegen::emit::{self, Facts};
 use crate::codegen::emit_f64x2;
 use crate::codegen::emit_outlined;
 use crate::codegen::hoist_params::Hoisted;
-use crate::codegen::outline::{Lengths, cut};
+use crate::codegen::outline::{Lengths, outline};
 use crate::ir::Func;
 use crate::ir::build::prune;
 use abi::image::{Feature, Target};
@@ -21,7 +21,7 @@ use cranelift_codegen::{CodegenError, Context, FinalizedMachReloc, FinalizedRelo
 use cranelift_frontend::FunctionBuilderContext;
 use std::sync::OnceLock;
 
-/// Makes code, function by function; what it needs on the way is kept for the next.
+/// Compiles functions one after the other; keeps Cranelift's buffers from one to the next.
 pub struct FunctionCompiler<'a> {
     isa: &'a dyn TargetIsa,
     context: Context,
@@ -29,35 +29,36 @@ pub struct FunctionCompiler<'a> {
     lengths: Lengths,
 }
 
-/// Code of a function, and the power of two at a multiple of which it must begin.
+/// Machine code of a function, and its alignment.
 pub struct Bytes {
-    /// The instructions, and constants behind them.
+    /// The instructions, followed by their constants.
     pub code: Vec<u8>,
-    /// In bytes.
+    /// In bytes, a power of two.
     pub alignment: usize,
 }
 
-/// Code of a function that begins with what makes one iteration, where what can be is [prepared](Coder::prepared).
+/// Machine code of a step whose entry runs a single iteration with [hoisted](FunctionCompiler::prepared) parameter
+/// expressions.
 pub struct PreparedBytes {
-    /// Of the whole.
+    /// The code of all parts.
     pub bytes: Bytes,
-    /// At which byte what makes any number of iterations begins, which needs nothing prepared.
-    pub many: usize,
-    /// What prepares, if there is anything to.
+    /// Offset in bytes of the entry that runs any number of iterations; it needs no hoisted values.
+    pub loop_offset: usize,
+    /// Computes the hoisted values; none if there are none.
     pub prepare: Option<Bytes>,
-    /// How many numbers lie behind the block.
+    /// Number of hoisted values, stored after the block.
     pub len: usize,
 }
 
-/// The code of a function, of one or several parts.
+/// The code of a function, linked from one or more parts.
 struct Parts {
     all: Bytes,
-    /// At which byte what makes any number of iterations begins.
-    many: usize,
+    /// Offset in bytes of the entry that runs any number of iterations.
+    loop_offset: usize,
 }
 
 impl<'a> FunctionCompiler<'a> {
-    /// For this processor or target.
+    /// A compiler for this processor or target.
     pub fn new(isa: &'a OwnedTargetIsa) -> FunctionCompiler<'a> {
         FunctionCompiler {
             isa: &**isa,
@@ -67,45 +68,46 @@ impl<'a> FunctionCompiler<'a> {
         }
     }
 
-    /// Other lengths of functions and pieces than the usual.
-    pub(super) fn cut_at(&mut self, lengths: Lengths) {
+    /// Sets the lengths from which functions are outlined, instead of [`Lengths::USUAL`].
+    pub(super) fn set_lengths(&mut self, lengths: Lengths) {
         self.lengths = lengths;
     }
 
-    /// The code of a function with the signature of [`abi::table::Entry`], which is its beginning.
+    /// Compiles a function; its entry, with the signature of [`abi::table::Entry`], is at offset 0.
     ///
-    /// # Panics
-    /// If the code calls anything but its own pieces: a mistake of `clif`.
+    /// # Panics If the code calls anything except its own pieces: a mistake of `emit`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
         let single = self.single(func);
         Ok(self.parts(func, single.as_ref(), true)?.all)
     }
 
-    /// The code of a function on blocks of this layout whose single iterations find prepared what hangs on parameters and
-    /// the length of the step alone; none where single iterations have no code of their own.
+    /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted: see
+    /// [`hoist_params`](crate::codegen::hoist_params). `layout`: of the blocks. None if single iterations have no code
+    /// of their own.
     pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
         let Some(single) = self.single(func) else { return Ok(None) };
         let Hoisted { prepare, step } = Hoisted::of(&single, layout);
         let len = prepare.stores.len();
-        let Parts { all: bytes, many } = self.parts(func, Some(&step), false)?;
-        let prepare = if len > 0 { Some(self.plain(&prepare, None)?) } else { None };
-        Ok(Some(PreparedBytes { bytes, many, prepare, len }))
+        let Parts { all: bytes, loop_offset } = self.parts(func, Some(&step), false)?;
+        let prepare = if len > 0 { Some(self.compile_loop(&prepare, None)?) } else { None };
+        Ok(Some(PreparedBytes { bytes, loop_offset, prepare, len }))
     }
 
-    /// The code of a function for any number of iterations, in one piece, as Cranelift makes it.
-    fn plain(&mut self, func: &Func, ahead: Option<emit::Distributed>) -> Result<Bytes, Unsupported> {
+    /// Compiles the loop over any number of iterations as one Cranelift function, without outlining.
+    fn compile_loop(&mut self, func: &Func, ahead: Option<emit::Distributed>) -> Result<Bytes, Unsupported> {
         self.context.clear();
         emit::emit(func, ahead, &mut self.context.func, &mut self.builder, self.isa);
-        self.bytes(func)
+        self.compile_context(func)
     }
 
-    /// All parts of the code of a function: of one iteration, if that has code of its own, and of any number. If it `asks`, that
-    /// of one iteration leaves all other counts to the other.
-    fn parts(&mut self, func: &Func, single: Option<&Func>, asks: bool) -> Result<Parts, Unsupported> {
+    /// Compiles and links all parts of a function: the code of a single iteration (`single`), if there is any, then the
+    /// code of any number of iterations. `checks_count`: the single-iteration entry calls the second part when the
+    /// count is not 1.
+    fn parts(&mut self, func: &Func, single: Option<&Func>, checks_count: bool) -> Result<Parts, Unsupported> {
         let mut all = Bytes { code: Vec::new(), alignment: 1 };
         let mut begins: Vec<usize> = Vec::new();
         let mut calls: Vec<(usize, Call)> = Vec::new();
-        self.each_part(func, single, asks, |_, isa, context| {
+        self.each_part(func, single, checks_count, |_, isa, context| {
             let compiled =
                 context.compile(isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
             let alignment = compiled.buffer.alignment as usize;
@@ -123,34 +125,35 @@ impl<'a> FunctionCompiler<'a> {
             Ok(())
         })?;
         for (at, call) in calls {
-            // What calls lies first.
+            // The caller is always the first part.
             call.resolve(&mut all.code, at, begins[call.piece + 1]).ok_or_else(|| too_large(func))?;
         }
-        Ok(Parts { all, many: if single.is_some() { begins[1] } else { 0 } })
+        Ok(Parts { all, loop_offset: if single.is_some() { begins[1] } else { 0 } })
     }
 
-    /// The same with the signature of [`abi::ahead::RestEntry`]: what it loads from slots behind the `size` of a block are
-    /// numbers that `lanes` steps have each its own of.
+    /// Compiles the remaining loop of a distributed step, with the signature of [`abi::ahead::RestEntry`]. Loads from
+    /// slots at or after `size`, the size of the block, read values that the vectorised loop has computed, one for each
+    /// of `lanes` steps.
     pub fn rest(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
-        self.plain(func, Some(emit::Distributed { first: Slot(size as u32), lanes }))
+        self.compile_loop(func, Some(emit::Distributed { first: Slot(size as u32), lanes }))
     }
 
-    /// The code of a function for lanes, and the numbers it needs behind the blocks.
+    /// Compiles a function for lanes of two; also returns how many doubles it uses after the blocks.
     pub fn pairs(&mut self, func: &Func, layout: &Layout, vectors: usize) -> Result<(Bytes, usize), Unsupported> {
         self.context.clear();
         let scratch = emit_f64x2::emit(func, layout, vectors, &mut self.context.func, &mut self.builder, self.isa)?;
-        Ok((self.bytes(func)?, scratch))
+        Ok((self.compile_context(func)?, scratch))
     }
 
-    /// Of what was just written and calls nothing.
-    fn bytes(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
+    /// Compiles what the context holds; it must not contain calls.
+    fn compile_context(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
         let FunctionCompiler { isa, context, .. } = self;
         let compiled = context.compile(*isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;
         assert!(compiled.buffer.relocs().is_empty(), "{} needs relocations", func.name);
         Ok(Bytes { code: compiled.code_buffer().to_vec(), alignment: compiled.buffer.alignment as usize })
     }
 
-    /// The function as Cranelift's own IR.
+    /// The Cranelift IR of a function.
     pub fn clif(&mut self, func: &Func) -> Result<String, Unsupported> {
         let (single, mut text) = (self.single(func), String::new());
         self.each_part(func, single.as_ref(), true, |what, _, context| {
@@ -161,7 +164,7 @@ impl<'a> FunctionCompiler<'a> {
         Ok(text)
     }
 
-    /// The function as assembly, as Cranelift writes it.
+    /// The assembly of a function, as Cranelift prints it.
     pub fn assembly(&mut self, func: &Func) -> Result<String, Unsupported> {
         let (single, mut text) = (self.single(func), String::new());
         self.each_part(func, single.as_ref(), true, |what, isa, context| {
@@ -174,26 +177,27 @@ impl<'a> FunctionCompiler<'a> {
         Ok(text)
     }
 
-    /// What makes a single iteration of a function, if that has code of its own.
+    /// The function to compile for a single iteration, if single iterations get code of their own.
     fn single(&self, func: &Func) -> Option<Func> {
-        (func.ops.len() <= self.lengths.whole && emit::has_single(func)).then(|| uncounted(func))
+        (func.ops.len() <= self.lengths.max_function && emit::has_single(func)).then(|| uncounted(func))
     }
 
-    /// Gives the function as Cranelift's own: whole, after its single iteration if there is one, or cut: then the loop first and
-    /// the pieces in their order. Of several parts each has a line that says what it is.
+    /// Emits each part of a function as Cranelift IR and passes it to `part`. The parts are the single iteration, if
+    /// there is one, and the loop; or, of an outlined function, the loop and then the pieces in order. The text given
+    /// to `part` is a comment line that names the part, empty if there is only one.
     fn each_part(
         &mut self,
         func: &Func,
         single: Option<&Func>,
-        asks: bool,
+        checks_count: bool,
         mut part: impl FnMut(String, &dyn TargetIsa, &mut Context) -> Result<(), Unsupported>,
     ) -> Result<(), Unsupported> {
         let FunctionCompiler { isa, context, builder, lengths } = self;
-        if func.ops.len() <= lengths.whole {
+        if func.ops.len() <= lengths.max_function {
             if let Some(single) = single {
                 context.clear();
-                emit::emit_single(single, asks, &mut context.func, builder, *isa);
-                part(title(ONE), *isa, context)?;
+                emit::emit_single(single, checks_count, &mut context.func, builder, *isa);
+                part(title(SINGLE_TITLE), *isa, context)?;
             }
             let several = if single.is_some() { title("any number of iterations") } else { String::new() };
             context.clear();
@@ -201,22 +205,22 @@ impl<'a> FunctionCompiler<'a> {
             return part(several, *isa, context);
         }
         let facts = Facts::of(func);
-        let cut = cut(func, &facts, *lengths).ok_or_else(|| too_large(func))?;
+        let outlined = outline(func, &facts, *lengths).ok_or_else(|| too_large(func))?;
         context.clear();
-        emit_outlined::emit_loop(func, &facts, &cut, &mut context.func, builder, *isa);
+        emit_outlined::emit_loop(func, &facts, &outlined, &mut context.func, builder, *isa);
         part(title("the loop around its pieces"), *isa, context)?;
         let mut values = Vec::new();
-        for number in 0..cut.pieces.len() {
+        for number in 0..outlined.pieces.len() {
             context.clear();
-            emit_outlined::emit_piece(func, &facts, (&cut, number), &mut values, &mut context.func, builder, *isa);
+            emit_outlined::emit_piece(func, &facts, (&outlined, number), &mut values, &mut context.func, builder, *isa);
             part(title(&format!("piece {number}")), *isa, context)?;
         }
         Ok(())
     }
 }
 
-/// The function for a single iteration, which leaves the count to its caller unless something else takes part in it: see
-/// [`abi::table::Entry`].
+/// The function without the step counter, which the caller of a single iteration keeps, see [`abi::table::Entry`];
+/// unchanged if something else reads the counter.
 fn uncounted(func: &Func) -> Func {
     let mut uncounted = func.clone();
     uncounted.stores.retain(|(slot, _)| *slot != Slot::COUNT);
@@ -224,15 +228,15 @@ fn uncounted(func: &Func) -> Func {
     if uncounted.loads().contains(&Slot::COUNT) { func.clone() } else { uncounted }
 }
 
-/// A line that says what follows.
+/// A comment line before a part of a listing.
 fn title(what: &str) -> String {
     format!("; {what}\n")
 }
 
-/// What comes first of a function of several parts.
-const ONE: &str = "one iteration, or go on to more";
+/// Title of the part for a single iteration.
+const SINGLE_TITLE: &str = "one iteration, or go on to more";
 
-/// A call of a piece.
+/// A call of a piece, to be resolved.
 struct Call {
     kind: Reloc,
     piece: usize,
@@ -240,7 +244,7 @@ struct Call {
 }
 
 impl Call {
-    /// The call that a relocation stands for, if it does for one.
+    /// The call that a relocation stands for; none if it is no call.
     fn of(relocation: &FinalizedMachReloc, func: &cranelift::Function) -> Option<Call> {
         let FinalizedRelocTarget::ExternalName(ExternalName::User(name)) = relocation.target else { return None };
         let piece = func.params.user_named_funcs()[name].index as usize;
@@ -248,14 +252,14 @@ impl Call {
         known.then_some(Call { kind: relocation.kind, piece, addend: relocation.addend })
     }
 
-    /// Puts the distance from the call at byte `at` to what begins at byte `to` into the code; none if it is too far.
+    /// Writes the distance from the call at byte `at` to byte `to` into the code; none if it is out of range.
     fn resolve(&self, code: &mut [u8], at: usize, to: usize) -> Option<()> {
         let distance = to as i64 + self.addend - at as i64;
         let field = &mut code[at..at + 4];
         let instruction = u32::from_le_bytes(field.try_into().expect("four bytes"));
         let resolved = match self.kind {
             Reloc::X86CallPCRel4 => i32::try_from(distance).ok()? as u32,
-            // 26 bits, in words.
+            // A 26-bit field that counts instructions of 4 bytes.
             _ => {
                 let words = distance / 4;
                 (-(1 << 25)..1 << 25).contains(&words).then_some(())?;
@@ -278,14 +282,14 @@ fn refused(func: &Func, error: &CodegenError) -> Unsupported {
     }
 }
 
-/// The processor this program runs on, with all it has.
+/// The processor that this program runs on, with all features it has.
 pub fn here() -> Result<&'static OwnedTargetIsa, Unsupported> {
     static ISA: OnceLock<Result<OwnedTargetIsa, Unsupported>> = OnceLock::new();
     ISA.get_or_init(native).as_ref().map_err(Clone::clone)
 }
 
 fn native() -> Result<OwnedTargetIsa, Unsupported> {
-    // Without them fma, floor and nearest would be calls.
+    // Without these features fma, floor and nearest would become library calls.
     #[cfg(target_arch = "x86_64")]
     for feature in [Feature::Fma, Feature::Sse41] {
         if !feature.here() {
@@ -296,7 +300,7 @@ fn native() -> Result<OwnedTargetIsa, Unsupported> {
     native.finish(flags()).map_err(|what| Unsupported(what.to_string()))
 }
 
-/// A target with more than it needs.
+/// A target with features beyond those it requires.
 pub fn with(target: Target, more: &[Feature]) -> OwnedTargetIsa {
     let triple = match target {
         Target::X86_64 => "x86_64-unknown-linux-gnu",
@@ -325,11 +329,11 @@ pub fn with(target: Target, more: &[Feature]) -> OwnedTargetIsa {
 fn flags() -> Flags {
     let mut flags = builder();
     for (flag, setting) in [
-        // Our own passes have shared, folded and ordered. Else Cranelift makes one value of equal constants and computes
-        // things where their result is used: this fills the registers, and what does not fit goes through memory.
+        // Our own passes have already shared, folded and ordered the operations. With its optimiser on, Cranelift
+        // merges equal constants and moves computations to their uses: that raises register pressure and causes spills.
         ("opt_level", "none"),
         ("is_pic", "false"),
-        // A frame larger than a page is touched page by page, in line.
+        // A frame larger than a page is probed page by page, inline.
         ("enable_probestack", "true"),
         ("probestack_strategy", "inline"),
         ("unwind_info", "false"),

@@ -1,33 +1,39 @@
-//! What several automata of a step ask alike is asked once, and the step goes on in a copy for each answer.
+//! Unswitching: a condition that several automata of a step test is tested once, and the step is duplicated for each
+//! answer.
 //!
-//! In: a sound, expanded function. Out: [`unswitched`], and what is [`assuming`] the answer. Four springs that slide ask for the
-//! direction of one motion, each as often as it has regimes. It knows nothing of processors.
+//! In: a verified, expanded function. Out: the condition to [unswitch](unswitchable), and the residual function when
+//! its answer is [known](assuming). Example: four sliding springs test the direction of the same motion, each once per
+//! mode. It knows nothing of processors.
+//!
+//! Source: Allen, Cocke, *A Catalogue of Optimizing Transformations*, 1972, there for loops.
 
-use crate::codegen::specialise_modes::automata_that_ask;
+use crate::codegen::specialise_modes::shared_operands;
 use crate::ir::build::Build;
 use crate::ir::partial_eval::{known, partial_eval, slice};
 use crate::ir::{Func, Op, Value};
 use std::collections::HashSet;
 
-/// Fewest automata for which a copy is worth its room.
-const FEWEST: usize = 3;
-/// Most operations of a function that is copied.
-const LARGEST: usize = 400;
+/// Minimum number of automata that must share a condition for a copy to be worth its size.
+const MIN_AUTOMATA: usize = 3;
+/// Maximum number of operations of a function that is duplicated.
+const MAX_OPS: usize = 400;
 
-/// The comparison of numbers that the step finds, or that are written down, which most automata ask, if several do.
-pub fn unswitched(func: &Func) -> Option<Value> {
-    if func.ops.len() > LARGEST {
+/// The condition to unswitch: the comparison that most automata share, if at least three do. Only comparisons of
+/// constants and of slots that the step does not store come into question: they are available before all other
+/// operations.
+pub fn unswitchable(func: &Func) -> Option<Value> {
+    if func.ops.len() > MAX_OPS {
         return None;
     }
     let stored =
         |value: Value| matches!(func.op(value), Op::Load(slot) if func.stores.iter().any(|(of, _)| *of == slot));
-    let is_found = |value: Value| matches!(func.op(value), Op::Load(_) | Op::Real(_)) && !stored(value);
-    let asks = automata_that_ask(func, |op| match op {
-        Op::Less(a, b) | Op::LessEqual(a, b) => is_found(a) && is_found(b),
+    let is_available = |value: Value| matches!(func.op(value), Op::Load(_) | Op::Real(_)) && !stored(value);
+    let shared = shared_operands(func, |op| match op {
+        Op::Less(a, b) | Op::LessEqual(a, b) => is_available(a) && is_available(b),
         _ => false,
     });
     let mut most: Option<(Value, usize)> = None;
-    for (value, count) in asks.into_iter().filter(|(_, count)| *count >= FEWEST) {
+    for (value, count) in shared.into_iter().filter(|(_, count)| *count >= MIN_AUTOMATA) {
         if most.is_none_or(|(_, known)| count > known) {
             most = Some((value, count));
         }
@@ -35,10 +41,10 @@ pub fn unswitched(func: &Func) -> Option<Value> {
     most.map(|(value, _)| value)
 }
 
-/// What is left of a function where this is true, or false.
-pub fn assuming(func: &Func, asked: Value, truth: bool) -> Func {
+/// The residual function when the boolean `condition` has the value `truth`.
+pub fn assuming(func: &Func, condition: Value, truth: bool) -> Func {
     let mut build = Build::of(func);
-    let known = known(&mut build, asked, truth);
+    let known = known(&mut build, condition, truth);
     let results: Vec<Value> = func.results().collect();
     let list = slice(&build, &HashSet::new(), &results);
     let all: Vec<Value> = (0..func.ops.len()).map(|i| Value(i as u32)).collect();
@@ -51,7 +57,8 @@ mod tests {
     use super::*;
     use abi::Slot;
 
-    /// Springs in slots 10, 12 …, each with its regime behind it, that move with slot 3 while that is above 0, else keep.
+    /// Springs in slots 10, 12 …, the mode of each in the slot after it: they move with slot 3 while that is above 0,
+    /// and keep their value otherwise.
     fn springs(number: u32) -> Func {
         let mut build = Build::new("step");
         let v = build.load(Slot(3));
@@ -70,26 +77,26 @@ mod tests {
     }
 
     #[test]
-    fn what_three_automata_ask_is_asked_once() {
-        let asked = |number: u32| {
+    fn a_condition_of_three_automata_is_unswitched() {
+        let found = |number: u32| {
             let func = springs(number);
-            unswitched(&func).map(|value| func.op(value))
+            unswitchable(&func).map(|value| func.op(value))
         };
-        assert_eq!(asked(2), None);
-        assert!(matches!(asked(3), Some(Op::Less(..))));
+        assert_eq!(found(2), None);
+        assert!(matches!(found(3), Some(Op::Less(..))));
     }
 
     #[test]
-    fn a_copy_does_not_ask_again() {
+    fn a_copy_does_not_test_again() {
         let func = springs(4);
-        let asked = unswitched(&func).unwrap();
-        let [moves, rests] = [true, false].map(|truth| assuming(&func, asked, truth));
+        let condition = unswitchable(&func).unwrap();
+        let [moves, rests] = [true, false].map(|truth| assuming(&func, condition, truth));
         let count = |func: &Func, what: fn(&Op) -> bool| func.ops.iter().filter(|op| what(op)).count();
         let is_comparison = |op: &Op| matches!(op, Op::Less(..));
         let is_choice = |op: &Op| matches!(op, Op::Select(..));
         assert_eq!((count(&moves, is_comparison), count(&moves, is_choice)), (0, 8), "{moves}");
         assert_eq!((count(&rests, is_comparison), count(&rests, is_choice)), (0, 0), "{rests}");
         assert_eq!(moves.stores.len(), 8);
-        assert_eq!(unswitched(&moves), None);
+        assert_eq!(unswitchable(&moves), None);
     }
 }
