@@ -1,9 +1,9 @@
-//! A model as readable C11, with the bits of every other back end.
+//! C11 source of a model, readable, and with the bits of every other back end.
 //!
-//! In: expanded functions and what the model says of itself. Out: one file that needs the standard headers only and
-//! compiles without warnings under `gcc -std=c11 -Wall -Wextra -pedantic`. It must be compiled without fusing products
-//! and sums (`-ffp-contract=off`, which `-std=c11` implies with gcc): where the model fuses, `fma` is written out.
-//! What is used once stands where it is used; what is used again, or stored, has a name.
+//! In: expanded functions and the description of the model. Out: one file that includes only standard headers and
+//! compiles without warnings under `gcc -std=c11 -Wall -Wextra -pedantic`. It must be compiled without contraction of
+//! products and sums (`-ffp-contract=off`, which `-std=c11` implies with gcc): where the model contracts, `fma` is
+//! explicit. A value that is used once is written inline; a value that is used more often, or stored, gets a name.
 
 use crate::ir::{Func, Op, Type, Value, verify};
 use abi::description::Kind;
@@ -12,13 +12,12 @@ use abi::{Description, Function, Slot};
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fmt::Write;
 
-/// Longest expression that is written inside another.
+/// Maximum length of an inline expression, in characters.
 const LONGEST: usize = 72;
 
-/// The file: `functions` are expanded, `params` are the defaults of the parameters in SI.
+/// The file. `functions`: expanded; `params`: the defaults of the parameters in SI units.
 ///
-/// # Panics
-/// If a function is not sound or not expanded: a mistake of the passes before.
+/// # Panics If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn source(functions: &[(Function, Func)], description: &Description, params: &[f64]) -> String {
     let names = Names::new(description);
     let mut helpers = BTreeSet::new();
@@ -56,7 +55,7 @@ pub fn source(functions: &[(Function, Func)], description: &Description, params:
     out + "}\n" + &bodies
 }
 
-/// What a function is for, in the file's comments.
+/// The purpose of a function, for a comment in the file.
 fn purpose(function: Function) -> &'static str {
     match function {
         Function::Start => "Parameters and inputs -> states, memory and regimes at t = 0.",
@@ -84,7 +83,7 @@ fn signature(prefix: &str, function: Function) -> String {
     }
 }
 
-/// What stands before the code: how to use it, and where the numbers lie; of a timeless model no step keeps the time.
+/// The head of the file: how to use the code, and the layout of the block. `timeless`: no step stores the time.
 fn heading(description: &Description, names: &Names, timeless: bool) -> String {
     let prefix = &names.prefix;
     let mut out = format!(
@@ -138,12 +137,12 @@ fn kind(kind: Kind) -> &'static str {
     }
 }
 
-/// A text that does not end the comment it stands in.
+/// Text without the markers that begin or end a C comment.
 fn comment(text: &str) -> String {
     text.replace("*/", "* /").replace("/*", "/ *").replace(['\n', '\r'], " ")
 }
 
-/// Names of the places of a block, and of the functions.
+/// C names of the slots of a block, and the prefix of all functions.
 struct Names {
     prefix: String,
     slots: Vec<String>,
@@ -170,7 +169,7 @@ impl Names {
                 wanted[rate.index()] = Some(format!("d_{name}"));
             }
         }
-        // Names that differ in the text may not differ here.
+        // Different paths may have become the same identifier.
         let mut taken = HashSet::from(["slots".to_string()]);
         let name = |(at, wanted): (usize, Option<String>)| {
             let wanted = wanted.unwrap_or_else(|| format!("slot_{at}"));
@@ -190,13 +189,13 @@ impl Names {
         format!("{}_slots", self.prefix.to_uppercase())
     }
 
-    /// The name of what a slot gets.
+    /// Name of the variable for the next value of a slot.
     fn next(&self, slot: Slot) -> String {
         self.slots[slot.index()].replacen(&self.prefix.to_uppercase(), "new", 1)
     }
 }
 
-/// Letters and digits of ASCII stay; Greek letters are spelled; everything else is an underscore.
+/// A C identifier: ASCII letters and digits stay, Greek letters are spelled out, all others become underscores.
 fn identifier(path: &str) -> String {
     const GREEK: [(char, &str); 12] = [
         ('α', "alpha"),
@@ -237,7 +236,7 @@ fn table(base: u32, len: u32) -> String {
     format!("table_{base}_{len}")
 }
 
-/// Functions that stand before the code if it needs them.
+/// C functions that are emitted only if the code calls them.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Helper {
     ToBits,
@@ -290,18 +289,18 @@ impl Helper {
     }
 }
 
-/// Writes one function.
+/// Generates one C function.
 struct Writer<'a> {
     func: &'a Func,
     names: &'a Names,
     types: Vec<Type>,
     uses: Vec<usize>,
-    /// The names of what is stored.
+    /// Names of values that are stored.
     stored: HashMap<Value, String>,
-    /// What has a name wherever it is used: what rings are written with, which is computed before anything is stored, and
-    /// what gcc looks into wrongly or warns of.
+    /// Values that always get a name: those written to rings, which must be computed before anything is stored, and
+    /// those that gcc miscompiles or warns about when they are inline.
     apart: HashSet<Value>,
-    /// How each value is written where it is used.
+    /// The text for each value where it is used.
     text: Vec<String>,
     helpers: &'a mut BTreeSet<Helper>,
     tables: &'a mut BTreeSet<(u32, u32)>,
@@ -326,8 +325,9 @@ impl<'a> Writer<'a> {
             stored.entry(*value).or_insert_with(|| names.next(*slot));
         }
         let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
-        // gcc 12 takes `0.0 - x` for `-x` where it sees that x is never -0, as of `fabs(y)` or `c ? 1.0 : 0.0`: so it gets
-        // -0 of 0. And it warns of `71 == (2 & n)`, which cannot be. It does not look behind a name.
+        // gcc 12 turns `0.0 - x` into `-x` where it sees that x is never −0, as with `fabs(y)` or `c ? 1.0 : 0.0`; for
+        // x = 0 that returns −0. It also warns about `71 == (2 & n)`, which is always false. It does not see through a
+        // named variable.
         let op = |value: Value| func.ops[value.index()];
         let seen_into = func.ops.iter().flat_map(|of| match *of {
             Op::Sub(a, b) if op(a) == Op::Real(0.0f64.to_bits()) => vec![b],
@@ -374,7 +374,7 @@ impl<'a> Writer<'a> {
         }
         let status = self.func.status.map(|status| self.text[status.index()].clone());
         if let Some(status) = &status {
-            // Before the stores: what it reads is what was there.
+            // Before the stores: the status depends on the values before them.
             writeln!(body, "{indent}const uint64_t status = {status};").expect("writing to a string does not fail");
         }
         for (slot, value) in &self.func.stores {
@@ -476,7 +476,7 @@ impl<'a> Writer<'a> {
     }
 }
 
-/// Whether an expression is one call as a whole.
+/// Whether an expression is a single call.
 fn called(text: &str) -> bool {
     let Some(open) = text.find('(') else { return false };
     open > 0
@@ -484,12 +484,12 @@ fn called(text: &str) -> bool {
         && closes(text, open) == Some(text.len() - 1)
 }
 
-/// Without the parentheses around the whole: an argument needs none.
+/// An expression without parentheses around the whole, for use as an argument.
 fn bare(text: &str) -> &str {
     if text.starts_with('(') && closes(text, 0) == Some(text.len() - 1) { &text[1..text.len() - 1] } else { text }
 }
 
-/// Where the parenthesis at `open` is closed.
+/// The position of the parenthesis that closes the one at `open`.
 fn closes(text: &str, open: usize) -> Option<usize> {
     let mut depth = 0;
     text.bytes().enumerate().skip(open).find_map(|(at, byte)| {

@@ -1,13 +1,13 @@
-//! Elementary functions by themselves: for code outside a model that needs the same bits on every machine.
+//! Elementary functions outside a model, with the same bits on every machine.
 //!
-//! In: the name of a function. Out: something that evaluates it, by the interpreter.
+//! In: a function of the IR. Out: an object that evaluates it with the interpreter.
 
 use crate::ir::build::Build;
 use crate::ir::interpret::run_once;
 use crate::ir::{Binary, Func, Unary, Value};
 use abi::Slot;
 
-/// One such function.
+/// A single elementary function.
 #[derive(Clone)]
 pub struct Alone(Func);
 
@@ -22,7 +22,7 @@ impl Alone {
         Alone::unary(Unary::Log)
     }
 
-    /// Of one number.
+    /// A function of one argument.
     pub fn unary(function: Unary) -> Alone {
         Alone::of(|build| {
             let x = build.load(Slot(0));
@@ -30,7 +30,7 @@ impl Alone {
         })
     }
 
-    /// Of two.
+    /// A function of two arguments.
     pub fn binary(function: Binary) -> Alone {
         Alone::of(|build| {
             let (x, y) = (build.load(Slot(0)), build.load(Slot(1)));
@@ -45,12 +45,12 @@ impl Alone {
         Alone(crate::math::expand(&build.finish()))
     }
 
-    /// Its value.
+    /// Evaluates a function of one argument.
     pub fn at(&self, x: f64) -> f64 {
         self.of_both(x, 0.0)
     }
 
-    /// Its value, of a function of two numbers.
+    /// Evaluates a function of two arguments.
     pub fn of_both(&self, x: f64, y: f64) -> f64 {
         let mut block = [x, y];
         run_once(&self.0, &mut block, crate::math::pool());

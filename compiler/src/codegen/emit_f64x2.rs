@@ -1,9 +1,9 @@
-//! Lanes in vectors of two numbers, which every processor has that there is machine code for, through Cranelift.
+//! Emits lanes in vectors of two doubles as Cranelift IR, for any processor that there is machine code for.
 //!
-//! In: an expanded function. Out: a function of Cranelift's with the signature of [`LanesEntry`](abi::lanes::LanesEntry),
-//! built as the other widths are (see [`super`]). It is to be compiled in its order: several vectors stand side by side there,
-//! and must stay so. Loads and constants are read from memory where they are used, as operands of instructions, for there
-//! are only 16 registers.
+//! In: an expanded function. Out: a Cranelift function with the signature of [`LanesEntry`](abi::lanes::LanesEntry),
+//! with the same structure as the code for the other widths, see `lanes`. Cranelift must keep the order of the
+//! instructions, which interleaves the vectors. Loads and constants are memory operands of the instructions that read
+//! them, because there are only 16 registers.
 
 use crate::codegen::emit::signature;
 use crate::codegen::unsupported::Unsupported;
@@ -16,16 +16,16 @@ use cranelift_codegen::isa::TargetIsa;
 use cranelift_frontend::{FunctionBuilder, FunctionBuilderContext};
 use std::collections::{HashMap, HashSet};
 
-/// Numbers of a vector.
+/// Doubles of a vector.
 pub const LANES: usize = 2;
 /// Bytes of a vector.
 const BYTES: usize = 8 * LANES;
 const SIGN: u64 = 1 << 63;
 
-/// Writes the step for `vectors` vectors into the empty `target`; gives the numbers it needs behind the blocks.
+/// Emits the step for `vectors` interleaved vectors into the empty `target`; returns the number of doubles it needs
+/// after the blocks.
 ///
-/// # Errors
-/// If the function has a ring.
+/// # Errors If the function has a ring, or is too large.
 pub fn emit(
     func: &Func,
     layout: &Layout,
@@ -65,7 +65,7 @@ pub fn emit(
         constants: Vec::new(),
     };
     line.b.switch_to_block(prepare);
-    line.write(&plan.before, &[], |value| plan.once_place(value).into_iter().collect());
+    line.write(&plan.prologue, &[], |value| plan.hoisted_place(value).into_iter().collect());
     for index in 0..plan.carried.len() {
         for k in 0..vectors {
             let number = line.load(types::F64X2, Place::Block(plan.carried[index].0), k);
@@ -90,7 +90,7 @@ pub fn emit(
     line.values.clear();
     (line.before, line.after) = (before, after);
     let carried: Vec<Value> = plan.carried.iter().map(|(_, value)| *value).collect();
-    line.write(&plan.fast, &carried, |value| {
+    line.write(&plan.body, &carried, |value| {
         let of = plan.carried.iter().enumerate().filter(|(_, (_, next))| *next == value);
         of.map(|(index, _)| Place::After(index)).collect()
     });
@@ -114,8 +114,8 @@ pub fn emit(
     line.b.switch_to_block(last);
     line.before = before;
     line.values.clear();
-    let rest: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
-    line.write(&plan.full, &rest, |value| {
+    let results: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
+    line.write(&plan.final_order, &results, |value| {
         let stores = func.stores.iter().filter(|(_, stored)| *stored == value);
         let mut places: Vec<Place> = stores.map(|(slot, _)| Place::Block(*slot)).collect();
         places.extend((func.status == Some(value)).then_some(Place::Statuses));
@@ -124,7 +124,7 @@ pub fn emit(
     let done = line.b.ins().iadd_imm_s(done, 1);
     line.b.ins().return_(&[done]);
 
-    // All constants are known now.
+    // Only now are all constants known.
     line.b.switch_to_block(constants);
     for (number, bits) in line.constants.clone().into_iter().enumerate() {
         let constant = line.constant(types::I64X2, bits);
@@ -140,35 +140,38 @@ pub fn emit(
     Ok(size / 8 - layout.size() * vectors * LANES)
 }
 
-/// A group of vectors in memory.
+/// The place of a group of vectors in memory.
 #[derive(Clone, Copy)]
 enum Place {
+    /// A slot of the block.
     Block(Slot),
-    /// What one step hands to the next: in the first or second area, in the one it is read from, in the one it goes to.
+    /// A carried slot in the first or second area: area, index.
     Area(usize, usize),
+    /// A carried slot in the area that the step reads.
     Before(usize),
+    /// A carried slot in the area that the step writes.
     After(usize),
-    /// What no step changes.
-    Once(usize),
-    /// One vector.
+    /// A hoisted value.
+    Hoisted(usize),
+    /// A constant: one vector.
     Constant(usize),
     Statuses,
 }
 
-/// What is computed when, and what lies where.
+/// The schedule of each part and the layout of the memory after the block.
 struct Plan<'a> {
     func: &'a Func,
     types: Vec<Type>,
     vectors: usize,
     carried: Vec<(Slot, Value)>,
     failed: Option<Value>,
-    once: Vec<Value>,
-    before: Vec<Value>,
-    fast: Vec<Value>,
-    full: Vec<Value>,
-    /// In bytes from the beginning of the block.
+    hoisted: Vec<Value>,
+    prologue: Vec<Value>,
+    body: Vec<Value>,
+    final_order: Vec<Value>,
+    /// Offsets in bytes from the start of the block.
     areas: [usize; 2],
-    once_at: usize,
+    hoisted_at: usize,
     constants_at: usize,
 }
 
@@ -182,53 +185,66 @@ impl<'a> Plan<'a> {
             Some((when, true, _)) => when,
             _ => status,
         });
-        // A step that hands nothing on is done once, and nothing before it.
-        let mut varies = vec![carried.is_empty(); func.ops.len()];
+        // Without carried slots a single iteration is enough, so nothing is hoisted.
+        let mut variant = vec![carried.is_empty(); func.ops.len()];
         for (i, op) in func.ops.iter().enumerate() {
-            varies[i] |= matches!(op, Op::Load(slot) if stored.contains(slot));
-            op.each_operand(|operand| varies[i] |= varies[operand.index()]);
+            variant[i] |= matches!(op, Op::Load(slot) if stored.contains(slot));
+            op.each_operand(|operand| variant[i] |= variant[operand.index()]);
         }
         let roots: Vec<Value> = carried.iter().map(|(_, value)| *value).chain(failed).collect();
-        let fast = order(func, &roots, &varies);
+        let body = order(func, &roots, &variant);
         let roots: Vec<Value> = func.stores.iter().map(|(_, value)| *value).chain(func.status).collect();
-        let full = order(func, &roots, &varies);
-        let read = fast.iter().chain(&full).flat_map(|value| operands(func, *value));
-        let left = func.stores.iter().map(|(_, value)| *value).chain(func.status).chain(failed);
+        let final_order = order(func, &roots, &variant);
+        let read = body.iter().chain(&final_order).flat_map(|value| operands(func, *value));
+        let results = func.stores.iter().map(|(_, value)| *value).chain(func.status).chain(failed);
         let mut seen = HashSet::new();
-        let once: Vec<Value> = read
-            .chain(left)
-            .filter(|value| !varies[value.index()] && !is_leaf(func.op(*value)) && seen.insert(*value))
+        let hoisted: Vec<Value> = read
+            .chain(results)
+            .filter(|value| !variant[value.index()] && !is_leaf(func.op(*value)) && seen.insert(*value))
             .collect();
-        let before = order(func, &once, &varies.iter().map(|varies| !varies).collect::<Vec<_>>());
+        let prologue = order(func, &hoisted, &variant.iter().map(|variant| !variant).collect::<Vec<_>>());
         let vector = vectors * BYTES;
         let areas = [0, 1].map(|area| (layout.size() + area * carried.len()) * vector);
-        let once_at = areas[1] + carried.len() * vector;
-        let constants_at = once_at + once.len() * vector;
+        let hoisted_at = areas[1] + carried.len() * vector;
+        let constants_at = hoisted_at + hoisted.len() * vector;
         let types = verify::types(func).expect("the function is sound");
-        Plan { func, types, vectors, carried, failed, once, before, fast, full, areas, once_at, constants_at }
+        Plan {
+            func,
+            types,
+            vectors,
+            carried,
+            failed,
+            hoisted,
+            prologue,
+            body,
+            final_order,
+            areas,
+            hoisted_at,
+            constants_at,
+        }
     }
 
-    fn once_place(&self, value: Value) -> Option<Place> {
-        self.once.iter().position(|known| *known == value).map(Place::Once)
+    fn hoisted_place(&self, value: Value) -> Option<Place> {
+        self.hoisted.iter().position(|known| *known == value).map(Place::Hoisted)
     }
 }
 
-/// What is read from memory where it is used.
+/// Whether the value is read from memory at each use.
 fn is_leaf(op: Op) -> bool {
     matches!(op, Op::Load(_) | Op::Real(_) | Op::Int(_) | Op::Bool(_))
 }
 
-/// Whether an operation chooses the less or the greater of two reals.
-fn is_extreme(func: &Func, op: Op) -> bool {
+/// Whether a select is the minimum or maximum of two reals.
+fn is_min_or_max(func: &Func, op: Op) -> bool {
     let Op::Select(when, a, b) = op else { return false };
     matches!(func.op(when), Op::Less(x, y) if (x, y) == (a, b) || (x, y) == (b, a))
 }
 
-/// What the instruction for an operation reads: a sign belongs to the fused product that it enters, a comparison to the
-/// choice of the less or the greater.
+/// The operands of the instruction for an operation: a fused multiply-add absorbs negations, a minimum or maximum its
+/// comparison.
 fn operands(func: &Func, value: Value) -> Vec<Value> {
     if let op @ Op::Select(_, a, b) = func.op(value)
-        && is_extreme(func, op)
+        && is_min_or_max(func, op)
     {
         return vec![a, b];
     }
@@ -243,14 +259,14 @@ fn operands(func: &Func, value: Value) -> Vec<Value> {
     operands
 }
 
-/// What roots need of the operations that are wanted: each root's own in one piece, operands first, so that what is computed
-/// is soon used.
+/// Orders those of the `wanted` operations that `roots` need. The operations of each root are adjacent, operands first,
+/// to keep live ranges short.
 fn order(func: &Func, roots: &[Value], wanted: &[bool]) -> Vec<Value> {
     let is_read = |value: Value| !wanted[value.index()] || is_leaf(func.op(value));
     topological_order(roots, func.ops.len(), Value::index, is_read, |value| operands(func, value))
 }
 
-/// A straight line being written.
+/// A straight line that is being emitted.
 struct Line<'a> {
     plan: &'a Plan<'a>,
     b: FunctionBuilder<'a>,
@@ -259,26 +275,26 @@ struct Line<'a> {
     before: clif::Value,
     after: clif::Value,
     statuses: clif::Value,
-    /// Whether there is an instruction that chooses by the first bit of a mask.
+    /// Whether the target has an instruction that selects lanes by the top bit of a mask.
     blend: bool,
-    /// What has been computed, vector by vector.
+    /// The values computed so far, by vector.
     values: HashMap<Value, Vec<clif::Value>>,
-    /// Constants of a step that is repeated, by their bits, in the order of their first use.
+    /// Constants that the loop reads from memory, as bits, in the order of their first use.
     constants: Vec<u64>,
 }
 
 fn vector_of(of: Type) -> clif::Type {
     match of {
         Type::Real => types::F64X2,
-        // A truth is a mask of all ones or zeros a lane.
+        // A boolean is a mask with all bits of a lane set or cleared.
         Type::Int | Type::Bool => types::I64X2,
     }
 }
 
 impl Line<'_> {
-    /// Writes operations; `places` says where a value goes as soon as it is there. Values of `rest` that are not computed
-    /// here go there at the end.
-    fn write(&mut self, order: &[Value], rest: &[Value], places: impl Fn(Value) -> Vec<Place>) {
+    /// Emits operations; `places` says where a value is to be stored as soon as it is computed. Values of `stored_last`
+    /// that are not among the operations are stored at the end.
+    fn write(&mut self, order: &[Value], stored_last: &[Value], places: impl Fn(Value) -> Vec<Place>) {
         for value in order {
             for k in 0..self.plan.vectors {
                 let result = self.operation(*value, k);
@@ -289,7 +305,7 @@ impl Line<'_> {
             }
         }
         let mut seen: HashSet<Value> = order.iter().copied().collect();
-        for value in rest {
+        for value in stored_last {
             if seen.insert(*value) {
                 for k in 0..self.plan.vectors {
                     let result = self.get(*value, k);
@@ -299,41 +315,41 @@ impl Line<'_> {
         }
     }
 
-    /// Base and distance of a vector.
+    /// Base address and offset of a vector.
     fn address(&self, place: Place, k: usize) -> (clif::Value, i32) {
         let group = |index: usize| (index * self.plan.vectors + k) * BYTES;
-        let (base, distance) = match place {
+        let (base, offset) = match place {
             Place::Block(slot) => (self.block, group(slot.index())),
             Place::Area(area, index) => (self.block, self.plan.areas[area] + group(index)),
             Place::Before(index) => (self.before, group(index)),
             Place::After(index) => (self.after, group(index)),
-            Place::Once(index) => (self.block, self.plan.once_at + group(index)),
+            Place::Hoisted(index) => (self.block, self.plan.hoisted_at + group(index)),
             Place::Constant(number) => (self.block, self.plan.constants_at + number * BYTES),
             Place::Statuses => (self.statuses, group(0)),
         };
-        // What is too large is refused in the end.
-        (base, distance as i32)
+        // Larger code is refused at the end of `emit`.
+        (base, offset as i32)
     }
 
     fn load(&mut self, of: clif::Type, place: Place, k: usize) -> clif::Value {
-        let (base, distance) = self.address(place, k);
-        self.b.ins().load(of, MemFlagsData::trusted(), base, distance)
+        let (base, offset) = self.address(place, k);
+        self.b.ins().load(of, MemFlagsData::trusted(), base, offset)
     }
 
     fn store(&mut self, value: clif::Value, place: Place, k: usize) {
-        let (base, distance) = self.address(place, k);
-        self.b.ins().store(MemFlagsData::trusted(), value, base, distance);
+        let (base, offset) = self.address(place, k);
+        self.b.ins().store(MemFlagsData::trusted(), value, base, offset);
     }
 
-    /// A constant in both lanes, made here.
+    /// A constant in both lanes, built here.
     fn constant(&mut self, of: clif::Type, bits: u64) -> clif::Value {
         let bytes: Vec<u8> = [bits; LANES].into_iter().flat_map(u64::to_le_bytes).collect();
         let constant = self.b.func.dfg.constants.insert(bytes.into());
         self.b.ins().vconst(of, constant)
     }
 
-    /// A constant in both lanes: of a step that is repeated it lies in memory, from where an instruction can take it.
-    fn number(&mut self, of: clif::Type, bits: u64) -> clif::Value {
+    /// A constant in both lanes. In a loop it is in memory, where an instruction can read it directly.
+    fn constant_operand(&mut self, of: clif::Type, bits: u64) -> clif::Value {
         if self.plan.carried.is_empty() {
             return self.constant(of, bits);
         }
@@ -351,15 +367,15 @@ impl Line<'_> {
             return *known;
         }
         match self.plan.func.op(value) {
-            Op::Real(bits) => self.number(of, bits),
-            Op::Int(n) => self.number(of, n as u64),
-            Op::Bool(truth) => self.number(of, if truth { u64::MAX } else { 0 }),
+            Op::Real(bits) => self.constant_operand(of, bits),
+            Op::Int(n) => self.constant_operand(of, n as u64),
+            Op::Bool(truth) => self.constant_operand(of, if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => {
                 let carried = self.plan.carried.iter().position(|(known, _)| *known == slot);
                 self.load(of, carried.map_or(Place::Block(slot), Place::Before), k)
             }
             op => {
-                let place = self.plan.once_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));
+                let place = self.plan.hoisted_place(value).unwrap_or_else(|| panic!("{op:?} has not been computed"));
                 self.load(of, place, k)
             }
         }
@@ -373,7 +389,7 @@ impl Line<'_> {
         if self.b.func.dfg.value_type(x) == to { x } else { self.b.ins().bitcast(to, MemFlagsData::new(), x) }
     }
 
-    /// The same of each lane.
+    /// Applies a scalar operation to each lane.
     fn by_lane(&mut self, to: clif::Type, mut lane: impl FnMut(&mut Self, u8) -> clif::Value) -> clif::Value {
         let [first, second] = [0, 1].map(|number| lane(self, number));
         let vector = self.b.ins().scalar_to_vector(to, first);
@@ -389,10 +405,10 @@ impl Line<'_> {
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Ring { .. } => unreachable!("refused"),
             Op::Pool { base, len, index } => {
-                let inside = self.inside(index, len);
+                let in_range = self.is_in_range(index, len);
                 self.by_lane(of, |line, lane| {
                     let mut index = line.b.ins().extractlane(x[0], lane);
-                    if !inside {
+                    if !in_range {
                         let last = line.b.ins().iconst(types::I64, i64::from(len) - 1);
                         index = line.b.ins().umin(index, last);
                     }
@@ -410,12 +426,12 @@ impl Line<'_> {
             Op::Floor(_) => self.b.ins().floor(x[0]),
             Op::Nearest(_) => self.b.ins().nearest(x[0]),
             Op::Neg(_) => {
-                let sign = self.number(types::F64X2, SIGN);
+                let sign = self.constant_operand(types::F64X2, SIGN);
                 self.b.ins().bxor(x[0], sign)
             }
             Op::Abs(_) => {
-                let rest = self.number(types::F64X2, !SIGN);
-                self.b.ins().band(x[0], rest)
+                let magnitude = self.constant_operand(types::F64X2, !SIGN);
+                self.b.ins().band(x[0], magnitude)
             }
             Op::Fma(a, b, c) => {
                 for (x, operand) in x.iter_mut().zip([a, b, c]) {
@@ -431,11 +447,11 @@ impl Line<'_> {
             Op::And(..) | Op::IntAnd(..) => self.b.ins().band(x[0], x[1]),
             Op::Or(..) | Op::IntOr(..) => self.b.ins().bor(x[0], x[1]),
             Op::Not(_) => {
-                let ones = self.number(of, u64::MAX);
+                let ones = self.constant_operand(of, u64::MAX);
                 self.b.ins().bxor(x[0], ones)
             }
-            // One instruction, of NaN and zeros too, where there is one.
-            Op::Select(when, a, _) if is_extreme(self.plan.func, op) => {
+            // On x86-64 a single MINPD or MAXPD, exact also for NaN and zeros.
+            Op::Select(when, a, _) if is_min_or_max(self.plan.func, op) => {
                 let Op::Less(first, _) = self.plan.func.op(when) else { unreachable!("it compares") };
                 let (low, high) = if first == a { (x[0], x[1]) } else { (x[1], x[0]) };
                 let mask = self.b.ins().fcmp(FloatCC::LessThan, low, high);
@@ -469,8 +485,8 @@ impl Line<'_> {
         }
     }
 
-    /// Whether an index cannot leave a table.
-    fn inside(&self, index: Value, len: u32) -> bool {
+    /// Whether an index is known to be within a table.
+    fn is_in_range(&self, index: Value, len: u32) -> bool {
         let masked = |value: Value| match self.plan.func.op(value) {
             Op::Int(mask) => (0..i64::from(len)).contains(&mask),
             _ => false,

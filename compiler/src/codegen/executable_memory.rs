@@ -1,6 +1,7 @@
-//! Memory of this process that holds machine code.
+//! Memory of this process for machine code.
 //!
-//! It is written first and made executable afterwards, never both at once, and is given back when its last owner goes.
+//! In: bytes. Out: their executable address. The memory is written first and then made executable, never both at once,
+//! and is freed when its last owner is dropped.
 
 use super::target::here;
 use super::unsupported::Unsupported;
@@ -10,17 +11,17 @@ use cranelift_jit::{JITBuilder, JITModule};
 use cranelift_module::Module;
 use std::sync::Mutex;
 
-/// The memory of code.
+/// Memory for machine code, freed on drop.
 pub struct Memory(Mutex<Option<JITModule>>);
 
 impl Memory {
-    /// For code of this processor, none yet.
+    /// Empty memory for code of this processor.
     pub fn new(isa: &OwnedTargetIsa) -> Memory {
         let no_calls = Box::new(|call| unreachable!("the code calls nothing, so not {call:?}"));
         Memory(Mutex::new(Some(JITModule::new(JITBuilder::with_isa(isa.clone(), no_calls)))))
     }
 
-    /// Where code is declared and written before it can be executed.
+    /// The Cranelift module to which functions are added before they become executable.
     pub fn module(&mut self) -> &mut JITModule {
         self.0.get_mut().expect("nothing panics here").as_mut().expect("taken by drop only")
     }
@@ -36,14 +37,14 @@ impl Drop for Memory {
     }
 }
 
-/// Code that was made elsewhere, where it can be executed; given back with its last owner.
+/// Executable code that was generated without Cranelift's module; freed on drop.
 pub struct Executable {
     _memory: Memory,
     address: usize,
 }
 
 impl Executable {
-    /// The code, beginning at a multiple of `alignment` bytes.
+    /// Makes code executable, at a multiple of `alignment` bytes.
     pub fn new(code: &[u8], alignment: u64) -> Result<Executable, Unsupported> {
         let isa = here()?;
         let mut memory = Memory::new(isa);
@@ -56,7 +57,7 @@ impl Executable {
         Ok(Executable { _memory: memory, address })
     }
 
-    /// Where it begins.
+    /// The start of the code.
     pub fn address(&self) -> *const u8 {
         self.address as *const u8
     }

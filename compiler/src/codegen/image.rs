@@ -1,7 +1,7 @@
-//! A model as one position-independent image, for a processor of any make from a machine of any make.
+//! A model as one position-independent image, for any supported processor and from any machine.
 //!
-//! In: the functions of a model. Out: an [`Image`]: their code one behind the other, with nothing left to be resolved.
-//! The code reads its tables through the pointer to the pool that each call is given.
+//! In: the functions of a model. Out: an [`Image`]: their code one after the other, with all references resolved. The
+//! code reads its tables through the pointer to the pool that is passed with each call.
 
 use super::target::{FunctionCompiler, with};
 use super::unsupported::Unsupported;
@@ -10,11 +10,11 @@ use crate::ir::verify::{Stage, verify};
 use abi::image::{Feature, Image, Target};
 use abi::{Description, Function};
 
-/// The image of a model: `params` are the defaults of its parameters, SI, as many as its layout has. `more`: what its code
-/// uses besides what any code for the target needs.
+/// Compiles the image of a model. `params`: the defaults of its parameters in SI units, as many as its layout has.
+/// `more`: features of the processor that the code may use beyond those that the target requires.
 ///
-/// # Panics
-/// If the target has no such features, or a function is not sound or not expanded: a mistake of the passes before.
+/// # Panics If the target has no such features, or a function does not verify or is not expanded: a mistake of an
+/// earlier pass.
 pub fn image(
     functions: &[(Function, Func)],
     description: &Description,
@@ -31,14 +31,14 @@ pub fn image(
         verify(func, &description.layout, description.pool.len(), Stage::Expanded)
             .unwrap_or_else(|fault| panic!("{fault}"));
         let bytes = coder.function(func)?;
-        // A line of the cache for each function; the gaps trap on x86-64 and are undefined on 64-bit Arm.
+        // Functions begin at cache lines. The padding traps on x86-64 and is an undefined instruction on 64-bit Arm.
         let gap = if target == Target::X86_64 { 0xcc } else { 0 };
         code.resize(code.len().next_multiple_of(bytes.alignment.max(64)), gap);
         entries[*function as usize] = Some(code.len() as u64);
         code.extend(bytes.code);
     }
     let (description, params) = (description.clone(), params.to_vec());
-    // In the order of their bits: what is read again is what was written.
+    // In the order of their bits, so that an image that is read back is equal.
     let uses = |feature: &Feature| target.needs().contains(feature) || more.contains(feature);
     let features = Feature::ALL.into_iter().filter(uses).collect();
     Ok(Image { target, features, description, params, code, entries })

@@ -82,7 +82,7 @@ impl<'a> FunctionCompiler<'a> {
     }
 
     /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted: see
-    /// [`hoist_params`](crate::codegen::hoist_params). `layout`: of the blocks. None if single iterations have no code
+    /// `hoist_params`. `layout`: of the blocks. None if single iterations have no code
     /// of their own.
     pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
         let Some(single) = self.single(func) else { return Ok(None) };

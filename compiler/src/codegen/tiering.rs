@@ -1,7 +1,10 @@
-//! Runnable code of a program: what a method needs of it, made at once or when it is first called.
+//! Executable code of a program, compiled at once or function by function when it pays (tiered compilation).
 //!
-//! In: a [`Program`] and how it is stepped. Out: [`Code`]. Whatever makes it, the bits are the same, so *when* a
-//! function becomes machine code can be told from the clock alone.
+//! In: a [`Program`] and its method. Out: [`Code`]. The bits do not depend on when a function is compiled; only the run
+//! time does.
+//!
+//! Compare Arnold, Fink, Grove, Hind, Sweeney, *A Survey of Adaptive Optimization in Virtual Machines*, Proc. IEEE,
+//! 2005.
 
 use crate::codegen::lanes::{self, Width};
 use crate::codegen::{jit, target};
@@ -23,7 +26,7 @@ pub fn functions(program: &Program, method: Method) -> Vec<(Function, Func)> {
     Function::ALL.into_iter().filter_map(|which| Some((which, function(program, method, which)?))).collect()
 }
 
-/// One function, expanded to arithmetic, if the method needs it.
+/// One function, expanded to arithmetic; none if the method does not need it.
 fn function(program: &Program, method: Method, which: Function) -> Option<Func> {
     if !needs(program, method, which) {
         return None;
@@ -42,18 +45,17 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
     }
 }
 
-/// A fixed step before elementary functions are expanded: what lanes are made of.
+/// An optimised fixed step whose elementary functions are not yet expanded, as lanes need it.
 ///
-/// # Panics
-/// For the adaptive method, which is no fixed step.
+/// # Panics For the adaptive method, which has no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
     opt::optimise(fixed_step::step(program, method), Context::of(program))
 }
 
-/// The function that makes a method's steps, for as many instances at once as fill the widest vectors of this processor;
-/// none if it has none, or the model no such function: then each instance runs for itself, with the same bits.
+/// Compiles the steps of a method for many instances, in the widest vectors of this processor. None if there are no
+/// such vectors, or no such function for the model; then each instance runs alone, with the same bits.
 pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
-    // The many operations of an adaptive step leave fewer registers to more vectors.
+    // An adaptive step has so many operations that more vectors would be spilled.
     let vectors = |width: Width| match (method, width) {
         (Method::Adaptive, Width::Pairs | Width::Avx512) => 2,
         (Method::Adaptive, Width::Avx | Width::Avx2) => 3,
@@ -62,7 +64,7 @@ pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
 }
 
-/// The function that makes a method's steps before elementary functions are expanded: what lanes are made of.
+/// The function that lanes execute for a method, its elementary functions not yet expanded.
 pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
     match method {
         Method::Adaptive => Some((Function::Rosenbrock, rosenbrock::rosenbrock(program)?)),
@@ -70,13 +72,13 @@ pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
     }
 }
 
-/// The same in so many vectors of this width.
+/// As [`lanes`](lanes()), with a given width and number of interleaved vectors.
 pub fn lanes_of(program: &Program, method: Method, width: Width, vectors: usize) -> Option<Lanes> {
     let (_, func) = of_lanes(program, method)?;
     lanes::compile(&func, &program.description.layout, program.description.pool.len(), width, vectors).ok()
 }
 
-/// Whether a method needs a function, if there can be such.
+/// Whether a method needs a function and the program can have it.
 fn needs(program: &Program, method: Method, which: Function) -> bool {
     let adaptive = method == Method::Adaptive;
     match which {
@@ -90,7 +92,7 @@ fn needs(program: &Program, method: Method, which: Function) -> bool {
     }
 }
 
-/// Machine code of functions, or the interpreter where there can be none, which is noted.
+/// Compiles functions; falls back to the interpreter where that fails, with a note for the user.
 pub fn code(functions: &[(Function, Func)], description: &Description, interpret: bool) -> (Code, Vec<String>) {
     let (layout, pool) = (&description.layout, description.pool.len());
     let interpreted = || Code::Interpreted(Arc::new(Interpreter::new(functions, layout, pool)));
@@ -103,32 +105,34 @@ pub fn code(functions: &[(Function, Func)], description: &Description, interpret
     }
 }
 
-/// Code for runs that nobody waits for in real time: each function is made when it is first called, and compiled once
-/// it has been called often enough to pay. So a text is at its first step before any machine code is made, and what
-/// runs once, as the start does, never costs its compiling.
+/// Tiered code, for runs that are not in real time: each function is built at its first call and compiled once it has
+/// run so often that compiling pays. So a model makes its first step before anything is compiled, and functions that
+/// run once, such as the start, are never compiled.
 pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<String>) {
     let size = program.derivatives.ops.len() + program.outputs.ops.len() + program.start.ops.len();
     match target::here() {
-        // What may be too large for machine code is made at once, so that it is told at once.
+        // A program that may be too large for machine code is compiled at once, so that the note about it comes at
+        // once.
         Ok(_) if !interpret && size <= LARGE => (on_demand(program, method, false), Vec::new()),
         _ => code(&functions(program, method), &program.description, interpret),
     }
 }
 
-/// As [`late`], of any size: for runs that are made at most on request. Where there can be no machine code it is interpreted.
+/// Like [`late`], for a program of any size: for runs that happen only on request. It is interpreted where there can be no
+/// machine code.
 pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
     let interpret = interpret || target::here().is_err();
     Code::Interpreted(Arc::new(Tiered { program: program.clone(), method, interpret, made: Default::default() }))
 }
 
-/// Operations of a program, before elementary functions are expanded, that surely become machine code.
+/// Maximum number of operations, before elementary functions are expanded, for which compilation surely succeeds.
 const LARGE: usize = 5_000;
 
-/// Runs of a function that cost about as much as to compile it: an operation is interpreted in some 10 ns and compiled
-/// in some 2 µs.
+/// Number of runs of a function that take about as long as compiling it: interpreting an operation takes some 10 ns,
+/// compiling it some 2 µs.
 const TIER_UP_CALLS: u64 = 200;
 
-/// The code of a program, function by function.
+/// The functions of a program, each in the tier it has reached.
 struct Tiered {
     program: Program,
     method: Method,
@@ -137,25 +141,25 @@ struct Tiered {
     made: [Made; Function::ALL.len()],
 }
 
-/// What there is of a function.
+/// The forms of one function, each built when it is first needed.
 #[derive(Default)]
 struct Made {
     func: OnceLock<Option<(Function, Func)>>,
     interpreter: OnceLock<Interpreter>,
-    /// None: too large.
+    /// None inside: the function is too large.
     machine: OnceLock<Option<Machine>>,
-    /// Runs so far.
+    /// Number of iterations run so far.
     runs: AtomicU64,
 }
 
 impl Tiered {
-    /// The function as arithmetic.
+    /// The function, expanded to arithmetic.
     fn func(&self, which: Function) -> Option<&(Function, Func)> {
         let make = || Some((which, function(&self.program, self.method, which)?));
         self.made[which as usize].func.get_or_init(make).as_ref()
     }
 
-    /// What a back end makes of one function.
+    /// Passes one function to a back end.
     fn make<T>(&self, which: Function, back_end: impl FnOnce(&[(Function, Func)], &Layout, usize) -> T) -> T {
         let func = self.func(which).unwrap_or_else(|| panic!("the code has no function `{}`", which.name()));
         back_end(std::slice::from_ref(func), &self.program.description.layout, self.program.description.pool.len())
@@ -208,7 +212,7 @@ mod tests {
         built.map_err(|found| format!("{found:?}")).expect("it compiles").program
     }
 
-    /// Blocks after each of some calls.
+    /// The block after each of a number of calls.
     fn course(code: Code, program: &Program) -> Vec<Vec<u64>> {
         let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
         assert_eq!(instance.start(1e-3), 0);
@@ -217,7 +221,7 @@ mod tests {
         counts
             .enumerate()
             .map(|(k, count)| {
-                // Now and then a parameter changes, before the code is there and behind.
+                // Parameters change now and then, before the code is compiled and afterwards.
                 if k % 7 == 3 {
                     instance.set(program.description.layout.params.slot(0), 1.0 + 0.1 * k as f64);
                 }

@@ -1,8 +1,8 @@
-//! Why something has no machine code.
+//! The reason why something cannot be compiled to machine code.
 
 use std::fmt;
 
-/// Why there is no machine code: run the interpreter, and say so.
+/// The reason why there is no machine code. Callers run the interpreter instead, and report the reason.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Unsupported(pub String);
 

@@ -1,12 +1,13 @@
-//! Vector instructions of x86-64 as bytes: VEX with 128 and 256 bits, EVEX with 512 bits.
+//! Assembler for vector instructions of x86-64: VEX encoding with 128 and 256 bits, EVEX with 512 bits.
 //!
-//! In: an instruction, its registers, a register or a place in memory. Out: bytes, with constants behind the code that
-//! is reached relative to the instruction. Knows nothing of programs.
+//! In: instructions with registers, memory operands and constants. Out: bytes, followed by the constants, which are
+//! addressed relative to the instruction pointer. It knows nothing of programs.
+//!
 //! Source: Intel 64 and IA-32 Architectures Software Developer's Manual, volume 2, sections 2.3 and 2.7.
 
 use std::collections::HashMap;
 
-/// Which vectors.
+/// Kind of vector.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Vectors {
     /// Two lanes of 64 bits in 16 registers: AVX and FMA.
@@ -32,7 +33,7 @@ impl Vectors {
         8 * self.lanes() as i32
     }
 
-    /// Vector registers.
+    /// Number of vector registers.
     pub fn registers(self) -> u8 {
         match self {
             Vectors::Avx | Vectors::Avx2 => 16,
@@ -41,7 +42,7 @@ impl Vectors {
     }
 }
 
-/// A general register that holds an address.
+/// A general register that holds an address; the number is that of the register.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Base {
     /// rdi: the block.
@@ -50,9 +51,9 @@ pub enum Base {
     Pool = 6,
     /// rcx: the statuses.
     Statuses = 1,
-    /// r8: what an iteration begins with.
+    /// r8: the carried slots at the start of an iteration.
     Before = 8,
-    /// r9: what it ends with.
+    /// r9: the carried slots at its end.
     After = 9,
 }
 
@@ -61,16 +62,16 @@ pub enum Base {
 pub enum Place {
     /// A vector or mask register.
     Register(u8),
-    /// A vector in memory.
+    /// A vector in memory, at an offset in bytes.
     Memory(Base, i32),
     /// A constant in every lane, by its bits.
     Constant(u64),
-    /// A vector of constants, by its number; see [`Assembler::row`].
+    /// A vector of eight constants, by its index; see [`Assembler::row`].
     Row(usize),
 }
 
-/// Instruction: mandatory prefix (0: none, 1: 66, 2: F3, 3: F2), map (1: 0F, 2: 0F 38, 3: 0F 3A), W of the EVEX form and
-/// of the VEX form, opcode.
+/// An instruction: mandatory prefix (0: none, 1: 66, 2: F3, 3: F2), opcode map (1: 0F, 2: 0F 38, 3: 0F 3A), W bit of
+/// the EVEX and of the VEX form, opcode. In the comments d is the destination, v the second and rm the last operand.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
 
@@ -78,92 +79,94 @@ pub struct Instruction(pub u8, pub u8, pub [u8; 2], pub u8);
 #[allow(missing_docs)]
 pub mod instructions {
     use super::Instruction;
-    pub const ADD: Instruction = Instruction(1, 1, [1, 0], 0x58);
-    pub const MUL: Instruction = Instruction(1, 1, [1, 0], 0x59);
-    pub const SUB: Instruction = Instruction(1, 1, [1, 0], 0x5c);
-    pub const MIN: Instruction = Instruction(1, 1, [1, 0], 0x5d);
-    pub const DIV: Instruction = Instruction(1, 1, [1, 0], 0x5e);
-    pub const MAX: Instruction = Instruction(1, 1, [1, 0], 0x5f);
-    pub const SQRT: Instruction = Instruction(1, 1, [1, 0], 0x51);
-    pub const AND: Instruction = Instruction(1, 1, [1, 0], 0x54);
+    pub const VADDPD: Instruction = Instruction(1, 1, [1, 0], 0x58);
+    pub const VMULPD: Instruction = Instruction(1, 1, [1, 0], 0x59);
+    pub const VSUBPD: Instruction = Instruction(1, 1, [1, 0], 0x5c);
+    pub const VMINPD: Instruction = Instruction(1, 1, [1, 0], 0x5d);
+    pub const VDIVPD: Instruction = Instruction(1, 1, [1, 0], 0x5e);
+    pub const VMAXPD: Instruction = Instruction(1, 1, [1, 0], 0x5f);
+    pub const VSQRTPD: Instruction = Instruction(1, 1, [1, 0], 0x51);
+    pub const VANDPD: Instruction = Instruction(1, 1, [1, 0], 0x54);
     /// ¬v ∧ rm
-    pub const AND_NOT: Instruction = Instruction(1, 1, [1, 0], 0x55);
-    pub const OR: Instruction = Instruction(1, 1, [1, 0], 0x56);
-    pub const XOR: Instruction = Instruction(1, 1, [1, 0], 0x57);
-    pub const COMPARE: Instruction = Instruction(1, 1, [1, 0], 0xc2);
-    pub const LOAD: Instruction = Instruction(1, 1, [1, 0], 0x28);
-    pub const STORE: Instruction = Instruction(1, 1, [1, 0], 0x29);
-    pub const BROADCAST: Instruction = Instruction(1, 2, [1, 0], 0x19);
-    /// VRNDSCALEPD as EVEX, VROUNDPD as VEX.
-    pub const ROUND: Instruction = Instruction(1, 3, [1, 0], 0x09);
+    pub const VANDNPD: Instruction = Instruction(1, 1, [1, 0], 0x55);
+    pub const VORPD: Instruction = Instruction(1, 1, [1, 0], 0x56);
+    pub const VXORPD: Instruction = Instruction(1, 1, [1, 0], 0x57);
+    pub const VCMPPD: Instruction = Instruction(1, 1, [1, 0], 0xc2);
+    pub const VMOVAPD_LOAD: Instruction = Instruction(1, 1, [1, 0], 0x28);
+    pub const VMOVAPD_STORE: Instruction = Instruction(1, 1, [1, 0], 0x29);
+    pub const VBROADCASTSD: Instruction = Instruction(1, 2, [1, 0], 0x19);
+    /// VRNDSCALEPD in its EVEX form.
+    pub const VROUNDPD: Instruction = Instruction(1, 3, [1, 0], 0x09);
     /// d = d · rm + v
-    pub const FMA_132: Instruction = Instruction(1, 2, [1, 1], 0x98);
+    pub const VFMADD132PD: Instruction = Instruction(1, 2, [1, 1], 0x98);
     /// d = v · d + rm
-    pub const FMA_213: Instruction = Instruction(1, 2, [1, 1], 0xa8);
+    pub const VFMADD213PD: Instruction = Instruction(1, 2, [1, 1], 0xa8);
     /// d = v · rm + d
-    pub const FMA_231: Instruction = Instruction(1, 2, [1, 1], 0xb8);
-    pub const GATHER: Instruction = Instruction(1, 2, [1, 1], 0x93);
-    pub const INT_ADD: Instruction = Instruction(1, 1, [1, 0], 0xd4);
-    pub const INT_SUB: Instruction = Instruction(1, 1, [1, 0], 0xfb);
-    /// By a constant: /2 right, /4 right with the sign (as opcode 72), /6 left.
+    pub const VFMADD231PD: Instruction = Instruction(1, 2, [1, 1], 0xb8);
+    pub const VGATHERQPD: Instruction = Instruction(1, 2, [1, 1], 0x93);
+    pub const VPADDQ: Instruction = Instruction(1, 1, [1, 0], 0xd4);
+    pub const VPSUBQ: Instruction = Instruction(1, 1, [1, 0], 0xfb);
+    /// By a constant: VPSRLQ with reg field 2, VPSLLQ with reg field 6.
     pub const SHIFT: Instruction = Instruction(1, 1, [1, 0], 0x73);
-    pub const SHIFT_SIGNED: Instruction = Instruction(1, 1, [1, 0], 0x72);
+    /// By a constant; the reg field is 4.
+    pub const VPSRAQ: Instruction = Instruction(1, 1, [1, 0], 0x72);
     /// VEX only.
-    pub const INSERT_HALF: Instruction = Instruction(1, 3, [0, 0], 0x18);
-    /// Of each two lanes the first, or the second: v's, then rm's.
-    pub const FIRST_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x14);
-    pub const SECOND_OF_TWO: Instruction = Instruction(1, 1, [1, 0], 0x15);
-    /// Of one number, from memory.
-    pub const LOAD_FIRST: Instruction = Instruction(3, 1, [0, 0], 0x10);
-    pub const LOAD_SECOND: Instruction = Instruction(1, 1, [0, 0], 0x16);
-    pub const INT_EQUAL: Instruction = Instruction(1, 2, [1, 0], 0x29);
-    pub const INT_GREATER: Instruction = Instruction(1, 2, [1, 0], 0x37);
-    pub const BLEND_BY_SIGN: Instruction = Instruction(1, 3, [0, 0], 0x4b);
+    pub const VINSERTF128: Instruction = Instruction(1, 3, [0, 0], 0x18);
+    /// The low lane of each pair, from v and from rm.
+    pub const VUNPCKLPD: Instruction = Instruction(1, 1, [1, 0], 0x14);
+    pub const VUNPCKHPD: Instruction = Instruction(1, 1, [1, 0], 0x15);
+    /// A single double from memory, into the low lane.
+    pub const VMOVSD: Instruction = Instruction(3, 1, [0, 0], 0x10);
+    pub const VMOVHPD: Instruction = Instruction(1, 1, [0, 0], 0x16);
+    pub const VPCMPEQQ: Instruction = Instruction(1, 2, [1, 0], 0x29);
+    pub const VPCMPGTQ: Instruction = Instruction(1, 2, [1, 0], 0x37);
+    pub const VBLENDVPD: Instruction = Instruction(1, 3, [0, 0], 0x4b);
     /// EVEX only.
-    pub const BLEND: Instruction = Instruction(1, 2, [1, 0], 0x65);
-    /// By what kind of number v is, as the bits of rm say for each kind. The immediate is 0: no exceptions.
-    pub const BY_KIND: Instruction = Instruction(1, 3, [1, 0], 0x54);
+    pub const VBLENDMPD: Instruction = Instruction(1, 2, [1, 0], 0x65);
+    /// Replaces v by kind, by the response table in rm. The immediate is 0: no exceptions.
+    pub const VFIXUPIMMPD: Instruction = Instruction(1, 3, [1, 0], 0x54);
     /// v · 2^⌊rm⌋
-    pub const SCALE: Instruction = Instruction(1, 2, [1, 0], 0x2c);
-    /// From the two vectors d and rm, d first, by the low bits of v.
-    pub const PERMUTE_TWO: Instruction = Instruction(1, 2, [1, 0], 0x7f);
-    /// A mask: where v and rm have a bit in common.
-    pub const INT_TEST: Instruction = Instruction(1, 2, [1, 0], 0x27);
-    pub const INT_MUL: Instruction = Instruction(1, 2, [1, 0], 0x40);
-    pub const INT_MIN_UNSIGNED: Instruction = Instruction(1, 2, [1, 0], 0x3b);
-    pub const INT_COMPARE: Instruction = Instruction(1, 3, [1, 0], 0x1f);
-    pub const TO_INT: Instruction = Instruction(1, 1, [1, 0], 0x7a);
-    pub const TO_REAL: Instruction = Instruction(2, 1, [1, 0], 0xe6);
-    /// Of masks, as VEX; the number is L.
-    pub const MASK_AND: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x41), 1);
-    pub const MASK_AND_NOT: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x42), 1);
-    pub const MASK_NOT: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x44), 0);
-    pub const MASK_OR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x45), 1);
-    pub const MASK_NOT_XOR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x46), 1);
-    pub const MASK_XOR: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x47), 1);
-    pub const MASK_TEST: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x98), 0);
-    pub const MASK_LOAD: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x90), 0);
-    pub const MASK_STORE: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x91), 0);
+    pub const VSCALEFPD: Instruction = Instruction(1, 2, [1, 0], 0x2c);
+    /// Permutes the lanes of the two tables d and rm, d first, by the low bits of v.
+    pub const VPERMT2PD: Instruction = Instruction(1, 2, [1, 0], 0x7f);
+    /// A mask: whether v and rm have a set bit in common.
+    pub const VPTESTMQ: Instruction = Instruction(1, 2, [1, 0], 0x27);
+    pub const VPMULLQ: Instruction = Instruction(1, 2, [1, 0], 0x40);
+    pub const VPMINUQ: Instruction = Instruction(1, 2, [1, 0], 0x3b);
+    pub const VPCMPQ: Instruction = Instruction(1, 3, [1, 0], 0x1f);
+    pub const VCVTTPD2QQ: Instruction = Instruction(1, 1, [1, 0], 0x7a);
+    pub const VCVTQQ2PD: Instruction = Instruction(2, 1, [1, 0], 0xe6);
+    /// Instructions on mask registers, in VEX encoding; the number is the L bit.
+    pub const KANDB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x41), 1);
+    pub const KANDNB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x42), 1);
+    pub const KNOTB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x44), 0);
+    pub const KORB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x45), 1);
+    pub const KXNORB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x46), 1);
+    pub const KXORB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x47), 1);
+    pub const KORTESTB: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x98), 0);
+    pub const KMOVB_LOAD: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x90), 0);
+    pub const KMOVB_STORE: (Instruction, u8) = (Instruction(1, 1, [0, 0], 0x91), 0);
 }
 
-/// Code under way.
+/// Code and constants emitted so far.
 pub struct Assembler {
     width: Vectors,
     bytes: Vec<u8>,
-    /// Constants in the order of their first use, and where each is wanted: the place of a distance, and the end of its
-    /// instruction.
+    /// Constants in the order of their first use; references to them: position of the displacement, end of the
+    /// instruction, index.
     constants: Vec<u64>,
-    numbers: HashMap<u64, usize>,
-    wanted: Vec<(usize, usize, usize)>,
-    /// The same of vectors of constants.
+    indices: HashMap<u64, usize>,
+    references: Vec<(usize, usize, usize)>,
+    /// The same for vectors of constants.
     rows: Vec<[u64; 8]>,
-    wanted_rows: Vec<(usize, usize, usize)>,
-    /// Tables behind the code, and where the distance to them is wanted, if r11 is to hold their address.
+    row_references: Vec<(usize, usize, usize)>,
+    /// Tables after the constants, and the position of the displacement that addresses them, if r11 holds their
+    /// address.
     tables: Vec<Vec<u64>>,
-    wanted_tables: Option<usize>,
+    table_reference: Option<usize>,
 }
 
-/// Beside the number of a mask register: where that does not hold, the result is 0, and not what it was.
+/// Added to the number of a mask register: lanes that are masked off become 0 instead of keeping their content.
 pub const ZEROING: u8 = 1 << 7;
 
 impl Assembler {
@@ -172,115 +175,123 @@ impl Assembler {
             width,
             bytes: Vec::new(),
             constants: Vec::new(),
-            numbers: HashMap::new(),
-            wanted: Vec::new(),
+            indices: HashMap::new(),
+            references: Vec::new(),
             rows: Vec::new(),
-            wanted_rows: Vec::new(),
+            row_references: Vec::new(),
             tables: Vec::new(),
-            wanted_tables: None,
+            table_reference: None,
         }
     }
 
-    /// An instruction without a mask: `reg` and `second` as their operands stand in the manual.
-    pub fn vector(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>) {
-        self.masked(what, reg, second, last, immediate, 0);
+    /// Emits an instruction without a mask. `reg` and `second`: the operands in the order of the manual.
+    pub fn vector(&mut self, instruction: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>) {
+        self.masked(instruction, reg, second, last, immediate, 0);
     }
 
-    /// An instruction with a mask register, perhaps with [`ZEROING`]; 0: none. VEX has no masks.
-    pub fn masked(&mut self, what: Instruction, reg: u8, second: u8, last: Place, immediate: Option<u8>, mask: u8) {
+    /// Emits an instruction with a mask register, perhaps with [`ZEROING`]; 0 means no mask. VEX has no masks.
+    pub fn masked(
+        &mut self,
+        instruction: Instruction,
+        reg: u8,
+        second: u8,
+        last: Place,
+        immediate: Option<u8>,
+        mask: u8,
+    ) {
         match self.width {
             Vectors::Avx512 => {
-                self.evex(what, reg, second, last, mask);
+                self.evex(instruction, reg, second, last, mask);
                 self.operand(reg, last, immediate, self.width.bytes());
             }
             Vectors::Avx | Vectors::Avx2 => {
                 assert_eq!(mask, 0, "VEX has no masks");
-                self.vex(what, reg, second, last, u8::from(self.width == Vectors::Avx2));
+                self.vex(instruction, reg, second, last, u8::from(self.width == Vectors::Avx2));
                 self.operand(reg, last, immediate, 1);
             }
         }
     }
 
-    /// An instruction on mask registers.
-    pub fn mask(&mut self, (what, l): (Instruction, u8), reg: u8, second: u8, last: Place) {
-        self.vex(what, reg, second, last, l);
+    /// Emits an instruction on mask registers.
+    pub fn mask(&mut self, (instruction, l): (Instruction, u8), reg: u8, second: u8, last: Place) {
+        self.vex(instruction, reg, second, last, l);
         self.operand(reg, last, None, 1);
     }
 
-    /// Entries of the table at `offset` bytes of the pool, at the indices in a vector, where a mask register is set. EVEX
-    /// only; the mask is used up.
+    /// Gathers entries of the table at `offset` bytes of the pool, at the indices in a vector, in lanes where a mask is
+    /// set. The instruction clears the mask. EVEX only.
     pub fn gather(&mut self, to: u8, index: u8, mask: u8, offset: i32) {
-        let Instruction(pp, map, w, opcode) = instructions::GATHER;
+        let Instruction(pp, map, w, opcode) = instructions::VGATHERQPD;
         let bit = |register: u8, n: u8| (!register >> n) & 1;
         let p0 = bit(to, 3) << 7 | bit(index, 3) << 6 | 1 << 5 | bit(to, 4) << 4 | map;
         let p1 = w[0] << 7 | 0xf << 3 | 1 << 2 | pp;
         let p2 = 2 << 5 | bit(index, 4) << 3 | mask;
         self.bytes.extend([0x62, p0, p1, p2, opcode]);
-        self.entry_of(to, index, offset);
+        self.gather_operand(to, index, offset);
     }
 
-    /// Entries of a table of the pool, `distance` bytes behind its beginning, at the numbers in a vector in memory, each
-    /// times `scale` bytes; `half` is overwritten. VEX only, and lane by lane through r10: its gathering instruction takes
-    /// longer.
-    pub fn look_up(&mut self, to: u8, numbers: (Base, i32), scale: u8, distance: i32, half: u8) {
-        let pool = (Base::Pool as u8, scale, distance);
+    /// Loads entries of a table of the pool, `displacement` bytes after its start, at the indices in a vector in memory; an
+    /// index is multiplied by `scale` bytes. Overwrites `half`. VEX only, lane by lane through r10, which is faster
+    /// than the gather instruction.
+    pub fn look_up(&mut self, to: u8, indices: (Base, i32), scale: u8, displacement: i32, half: u8) {
+        let pool = (Base::Pool as u8, scale, displacement);
         for (upper, into) in [to, half].into_iter().enumerate().take(self.width.lanes() / 2) {
-            self.number(numbers, 2 * upper);
-            self.entry(instructions::LOAD_FIRST, into, 0, 0, pool);
-            self.number(numbers, 2 * upper + 1);
-            self.entry(instructions::LOAD_SECOND, into, into, 0, pool);
+            self.load_index(indices, 2 * upper);
+            self.table_entry(instructions::VMOVSD, into, 0, 0, pool);
+            self.load_index(indices, 2 * upper + 1);
+            self.table_entry(instructions::VMOVHPD, into, into, 0, pool);
         }
         if self.width == Vectors::Avx2 {
-            self.vector(instructions::INSERT_HALF, to, to, Place::Register(half), Some(1));
+            self.vector(instructions::VINSERTF128, to, to, Place::Register(half), Some(1));
         }
     }
 
-    /// Entries of the two tables that lie side by side `distance` bytes behind r11, at half the numbers in a vector in memory;
-    /// `half` is overwritten. VEX only, after [`Assembler::reach_tables`].
-    pub fn look_up_two(&mut self, [first, second]: [u8; 2], numbers: (Base, i32), distance: i32, half: u8) {
-        let table = (11, 8, distance);
+    /// Loads entries of two interleaved tables, `displacement` bytes after r11, at the indices in a vector in memory, which are
+    /// already multiplied by 2. Overwrites `half`. VEX only, after [`Assembler::load_table_address`].
+    pub fn look_up_two(&mut self, [first, second]: [u8; 2], indices: (Base, i32), displacement: i32, half: u8) {
+        let table = (11, 8, displacement);
         for (lane, into) in [half, second].into_iter().enumerate() {
-            self.number(numbers, lane);
-            self.entry(instructions::LOAD, into, 0, 0, table);
+            self.load_index(indices, lane);
+            self.table_entry(instructions::VMOVAPD_LOAD, into, 0, 0, table);
             if self.width == Vectors::Avx2 {
-                self.number(numbers, lane + 2);
-                self.entry(instructions::INSERT_HALF, into, into, 1, table);
+                self.load_index(indices, lane + 2);
+                self.table_entry(instructions::VINSERTF128, into, into, 1, table);
                 self.bytes.push(1);
             }
         }
-        self.vector(instructions::FIRST_OF_TWO, first, half, Place::Register(second), None);
-        self.vector(instructions::SECOND_OF_TWO, second, half, Place::Register(second), None);
+        self.vector(instructions::VUNPCKLPD, first, half, Place::Register(second), None);
+        self.vector(instructions::VUNPCKHPD, second, half, Place::Register(second), None);
     }
 
-    /// A number of a vector in memory, to r10.
-    fn number(&mut self, (base, offset): (Base, i32), lane: usize) {
+    /// Loads one lane of a vector in memory, an index, into r10.
+    fn load_index(&mut self, (base, offset): (Base, i32), lane: usize) {
         self.bytes.extend([0x4c | base as u8 >> 3, 0x8b]);
-        self.address(2 << 3, base, offset + 8 * lane as i32, 1);
+        self.memory_operand(2 << 3, base, offset + 8 * lane as i32, 1);
     }
 
-    /// A VEX instruction on the entry of a table, behind a register and a distance, whose number r10 holds.
-    fn entry(
+    /// Emits a VEX instruction on the table entry at a base register, plus a displacement, plus r10 times the scale.
+    fn table_entry(
         &mut self,
         Instruction(pp, map, w, opcode): Instruction,
         reg: u8,
         second: u8,
         l: u8,
-        (base, scale, distance): (u8, u8, i32),
+        (base, scale, displacement): (u8, u8, i32),
     ) {
         let p0 = (!reg >> 3 & 1) << 7 | (!base >> 3 & 1) << 5 | map;
         self.bytes.extend([0xc4, p0, w[1] << 7 | (!second & 15) << 3 | l << 2 | pp, opcode]);
         let (reg, index) = ((reg & 7) << 3, (scale.trailing_zeros() as u8) << 6 | 2 << 3 | base & 7);
-        match i8::try_from(distance) {
-            Ok(distance) => self.bytes.extend([0x44 | reg, index, distance as u8]),
+        match i8::try_from(displacement) {
+            Ok(displacement) => self.bytes.extend([0x44 | reg, index, displacement as u8]),
             Err(_) => {
                 self.bytes.extend([0x84 | reg, index]);
-                self.bytes.extend(distance.to_le_bytes());
+                self.bytes.extend(displacement.to_le_bytes());
             }
         }
     }
 
-    /// The operand: base and index scaled by 8, with a distance of 32 bits.
-    fn entry_of(&mut self, reg: u8, index: u8, offset: i32) {
+    /// Encodes a memory operand in the pool: a vector of indices scaled by 8, and a displacement of 32 bits.
+    fn gather_operand(&mut self, reg: u8, index: u8, offset: i32) {
         self.bytes.extend([0x84 | (reg & 7) << 3, 0xc0 | (index & 7) << 3 | Base::Pool as u8]);
         self.bytes.extend(offset.to_le_bytes());
     }
@@ -291,7 +302,7 @@ impl Assembler {
             Place::Register(register) => (bit(register, 4), bit(register, 3), 0),
             Place::Memory(base, _) => (1, bit(base as u8, 3), 0),
             Place::Constant(_) => {
-                (1, 1, u8::from(self.width == Vectors::Avx512 && opcode != instructions::BROADCAST.3))
+                (1, 1, u8::from(self.width == Vectors::Avx512 && opcode != instructions::VBROADCASTSD.3))
             }
             Place::Row(_) => (1, 1, 0),
         };
@@ -315,31 +326,32 @@ impl Assembler {
         }
     }
 
-    /// The last operand, and what follows it. A short distance counts in units.
+    /// Encodes the last operand and the immediate. `unit`: bytes that a displacement of 8 bits counts (disp8·N in EVEX,
+    /// 1 in VEX).
     fn operand(&mut self, reg: u8, last: Place, immediate: Option<u8>, unit: i32) {
         let reg = (reg & 7) << 3;
         match last {
             Place::Register(register) => self.bytes.push(0xc0 | reg | register & 7),
-            Place::Memory(base, offset) => self.address(reg, base, offset, unit),
+            Place::Memory(base, offset) => self.memory_operand(reg, base, offset, unit),
             Place::Constant(bits) => {
                 let next = self.constants.len();
-                let number = *self.numbers.entry(bits).or_insert(next);
+                let number = *self.indices.entry(bits).or_insert(next);
                 if number == next {
                     self.constants.push(bits);
                 }
-                let at = self.distance(reg);
-                self.wanted.push((at, at + 4 + usize::from(immediate.is_some()), number));
+                let at = self.rip_relative(reg);
+                self.references.push((at, at + 4 + usize::from(immediate.is_some()), number));
             }
             Place::Row(number) => {
-                let at = self.distance(reg);
-                self.wanted_rows.push((at, at + 4 + usize::from(immediate.is_some()), number));
+                let at = self.rip_relative(reg);
+                self.row_references.push((at, at + 4 + usize::from(immediate.is_some()), number));
             }
         }
         self.bytes.extend(immediate);
     }
 
-    /// An operand at a distance from a base: none, or one byte of units, or four bytes.
-    fn address(&mut self, reg: u8, base: Base, offset: i32, unit: i32) {
+    /// Encodes a memory operand: no displacement, one byte in units of `unit`, or four bytes.
+    fn memory_operand(&mut self, reg: u8, base: Base, offset: i32, unit: i32) {
         let base = base as u8 & 7;
         match i8::try_from(offset / unit) {
             Ok(0) if offset == 0 => self.bytes.push(reg | base),
@@ -351,14 +363,14 @@ impl Assembler {
         }
     }
 
-    /// An operand behind the code; gives where its distance stands.
-    fn distance(&mut self, reg: u8) -> usize {
+    /// Encodes an operand relative to the instruction pointer; returns the position of its displacement.
+    fn rip_relative(&mut self, reg: u8) -> usize {
         self.bytes.push(0x05 | reg);
         self.bytes.extend([0; 4]);
         self.bytes.len() - 4
     }
 
-    /// A vector of eight constants behind the code.
+    /// Adds a vector of eight constants after the code.
     pub fn row(&mut self, row: [u64; 8]) -> Place {
         let known = self.rows.iter().position(|known| *known == row);
         Place::Row(known.unwrap_or_else(|| {
@@ -367,7 +379,7 @@ impl Assembler {
         }))
     }
 
-    /// A table behind the code; gives its distance from the first.
+    /// Adds a table after the code; returns its offset in bytes from the first table.
     pub fn table(&mut self, table: Vec<u64>) -> i32 {
         let known = self.tables.iter().position(|known| *known == table);
         let number = known.unwrap_or_else(|| {
@@ -377,48 +389,49 @@ impl Assembler {
         8 * self.tables[..number].iter().map(Vec::len).sum::<usize>() as i32
     }
 
-    /// Lets r11 be the address of the first table.
-    pub fn reach_tables(&mut self) {
-        self.plain(&[0x4c, 0x8d, 0x1d]); // lea r11, [rip + distance]
-        self.wanted_tables = Some(self.bytes.len());
-        self.plain(&[0; 4]);
+    /// Loads the address of the first table into r11.
+    pub fn load_table_address(&mut self) {
+        self.raw(&[0x4c, 0x8d, 0x1d]); // lea r11, [rip + displacement]
+        self.table_reference = Some(self.bytes.len());
+        self.raw(&[0; 4]);
     }
 
-    /// Instructions without vectors, as bytes.
-    pub fn plain(&mut self, bytes: &[u8]) {
+    /// Emits the bytes of scalar instructions.
+    pub fn raw(&mut self, bytes: &[u8]) {
         self.bytes.extend(bytes);
     }
 
-    /// Where the next instruction begins.
-    pub fn here(&self) -> usize {
+    /// The current position.
+    pub fn position(&self) -> usize {
         self.bytes.len()
     }
 
-    /// A jump whose target is not yet known; `opcode` takes a distance of 32 bits.
+    /// Emits a jump with an open target; `opcode` takes a displacement of 32 bits. Returns the position of the
+    /// displacement.
     pub fn jump(&mut self, opcode: &[u8]) -> usize {
         self.bytes.extend(opcode);
         self.bytes.extend([0; 4]);
         self.bytes.len() - 4
     }
 
-    /// Lets a jump lead to a place.
-    pub fn lead(&mut self, jump: usize, to: usize) {
-        let distance = i32::try_from(to as i64 - (jump as i64 + 4)).expect("code is shorter than 2 GiB");
-        self.bytes[jump..jump + 4].copy_from_slice(&distance.to_le_bytes());
+    /// Sets the target of a jump.
+    pub fn bind(&mut self, jump: usize, to: usize) {
+        let displacement = i32::try_from(to as i64 - (jump as i64 + 4)).expect("code is shorter than 2 GiB");
+        self.bytes[jump..jump + 4].copy_from_slice(&displacement.to_le_bytes());
     }
 
-    /// The code and, behind it, its constants: to lie at a multiple of 64.
+    /// The code followed by its constants; must be placed at a multiple of 64 bytes.
     pub fn finish(mut self) -> Vec<u8> {
-        // EVEX spreads one number over the lanes as it reads it.
+        // EVEX broadcasts one double from memory; VEX needs a full vector.
         let copies = match self.width {
             Vectors::Avx512 => 1,
             width => width.lanes(),
         };
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
         let begin = self.bytes.len();
-        for (at, end, number) in std::mem::take(&mut self.wanted) {
-            let distance = i32::try_from(begin + 8 * copies * number - end).expect("code is shorter than 2 GiB");
-            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        for (at, end, number) in std::mem::take(&mut self.references) {
+            let displacement = i32::try_from(begin + 8 * copies * number - end).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&displacement.to_le_bytes());
         }
         for bits in &self.constants {
             for _ in 0..copies {
@@ -427,14 +440,14 @@ impl Assembler {
         }
         self.bytes.resize(self.bytes.len().next_multiple_of(64), 0xcc);
         let begin = self.bytes.len();
-        for (at, end, number) in std::mem::take(&mut self.wanted_rows) {
-            let distance = i32::try_from(begin + 64 * number - end).expect("code is shorter than 2 GiB");
-            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        for (at, end, number) in std::mem::take(&mut self.row_references) {
+            let displacement = i32::try_from(begin + 64 * number - end).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&displacement.to_le_bytes());
         }
         self.bytes.extend(self.rows.iter().flatten().flat_map(|bits| bits.to_le_bytes()));
-        if let Some(at) = self.wanted_tables {
-            let distance = i32::try_from(self.bytes.len() - (at + 4)).expect("code is shorter than 2 GiB");
-            self.bytes[at..at + 4].copy_from_slice(&distance.to_le_bytes());
+        if let Some(at) = self.table_reference {
+            let displacement = i32::try_from(self.bytes.len() - (at + 4)).expect("code is shorter than 2 GiB");
+            self.bytes[at..at + 4].copy_from_slice(&displacement.to_le_bytes());
         }
         self.bytes.extend(self.tables.iter().flatten().flat_map(|bits| bits.to_le_bytes()));
         self.bytes
@@ -453,9 +466,9 @@ mod tests {
         assert_eq!(code.bytes, expected, "{:02x?}", code.bytes);
     }
 
-    /// Against the GNU assembler's bytes.
+    /// Expected bytes are from the GNU assembler.
     #[test]
-    fn instructions_have_the_bytes_of_the_manual() {
+    fn instructions_have_the_bytes_of_gnu_as() {
         let look_up = [
             [0x4c, 0x8b, 0x97, 0, 1, 0, 0].as_slice(),
             &[0xc4, 0x21, 0x7b, 0x10, 0x4c, 0x96, 0x40],
@@ -480,35 +493,35 @@ mod tests {
         // vaddpd zmm17, zmm2, zmm30
         check(
             Vectors::Avx512,
-            |c| c.vector(ADD, 17, 2, Place::Register(30), None),
+            |c| c.vector(VADDPD, 17, 2, Place::Register(30), None),
             &[0x62, 0x81, 0xed, 0x48, 0x58, 0xce],
         );
         // vfmadd231pd ymm9, ymm1, [r8+0x100]
         check(
             Vectors::Avx2,
-            |c| c.vector(FMA_231, 9, 1, Place::Memory(Base::Before, 0x100), None),
+            |c| c.vector(VFMADD231PD, 9, 1, Place::Memory(Base::Before, 0x100), None),
             &[0xc4, 0x42, 0xf5, 0xb8, 0x88, 0, 1, 0, 0],
         );
         // vaddpd ymm9, ymm1, [r8]; vmovapd [rcx-0x20], ymm1; vaddpd zmm1, zmm2, [r8+0x1fc0]
         check(
             Vectors::Avx2,
-            |c| c.vector(ADD, 9, 1, Place::Memory(Base::Before, 0), None),
+            |c| c.vector(VADDPD, 9, 1, Place::Memory(Base::Before, 0), None),
             &[0xc4, 0x41, 0x75, 0x58, 0x08],
         );
         check(
             Vectors::Avx2,
-            |c| c.vector(STORE, 1, 0, Place::Memory(Base::Statuses, -0x20), None),
+            |c| c.vector(VMOVAPD_STORE, 1, 0, Place::Memory(Base::Statuses, -0x20), None),
             &[0xc5, 0xfd, 0x29, 0x49, 0xe0],
         );
         check(
             Vectors::Avx512,
-            |c| c.vector(ADD, 1, 2, Place::Memory(Base::Before, 0x1fc0), None),
+            |c| c.vector(VADDPD, 1, 2, Place::Memory(Base::Before, 0x1fc0), None),
             &[0x62, 0xd1, 0xed, 0x48, 0x58, 0x48, 0x7f],
         );
         // vblendmpd zmm1{k3}, zmm2, zmm4
         check(
             Vectors::Avx512,
-            |c| c.masked(BLEND, 1, 2, Place::Register(4), None, 3),
+            |c| c.masked(VBLENDMPD, 1, 2, Place::Register(4), None, 3),
             &[0x62, 0xf2, 0xed, 0x4b, 0x65, 0xcc],
         );
         // mov r10, [rdi+0x100]; vmovsd xmm9, [rsi+r10*4+0x40]; mov r10, [rdi+0x108]; vmovhpd xmm9, xmm9, [rsi+r10*4+0x40];
@@ -522,30 +535,30 @@ mod tests {
         // vrndscalepd zmm3, zmm20, 9
         check(
             Vectors::Avx512,
-            |c| c.vector(ROUND, 3, 0, Place::Register(20), Some(9)),
+            |c| c.vector(VROUNDPD, 3, 0, Place::Register(20), Some(9)),
             &[0x62, 0xb3, 0xfd, 0x48, 0x09, 0xdc, 0x09],
         );
-        // vpsraq zmm18, zmm5, 7: the register it goes to stands where the second operand does.
+        // vpsraq zmm18, zmm5, 7: the destination is encoded where other instructions have the second operand.
         check(
             Vectors::Avx512,
-            |c| c.vector(SHIFT_SIGNED, 4, 18, Place::Register(5), Some(7)),
+            |c| c.vector(VPSRAQ, 4, 18, Place::Register(5), Some(7)),
             &[0x62, 0xf1, 0xed, 0x40, 0x72, 0xe5, 0x07],
         );
         // vblendvpd ymm1, ymm2, ymm3, ymm4
         check(
             Vectors::Avx2,
-            |c| c.vector(BLEND_BY_SIGN, 1, 2, Place::Register(3), Some(4 << 4)),
+            |c| c.vector(VBLENDVPD, 1, 2, Place::Register(3), Some(4 << 4)),
             &[0xc4, 0xe3, 0x6d, 0x4b, 0xcb, 0x40],
         );
         // kandnb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_AND_NOT, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x42, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(KANDNB, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x42, 0xcb]);
         // vcvtqq2pd zmm1, zmm2
         check(
             Vectors::Avx512,
-            |c| c.vector(TO_REAL, 1, 0, Place::Register(2), None),
+            |c| c.vector(VCVTQQ2PD, 1, 0, Place::Register(2), None),
             &[0x62, 0xf1, 0xfe, 0x48, 0xe6, 0xca],
         );
         // korb k1, k2, k3
-        check(Vectors::Avx512, |c| c.mask(MASK_OR, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x45, 0xcb]);
+        check(Vectors::Avx512, |c| c.mask(KORB, 1, 2, Place::Register(3)), &[0xc5, 0xed, 0x45, 0xcb]);
     }
 }

@@ -1,8 +1,11 @@
-//! Operations of a function as vector instructions.
+//! Instruction selection for vectors of x86-64.
 //!
-//! In: an expanded function. Out: nodes that are each one instruction or a fixed few, in the order of the function. A
-//! comparison whose result a selection takes from becomes a minimum or maximum, what is negated enters the fused
-//! product, bits and numbers are one.
+//! In: an expanded function. Out: [`Nodes`], each of them one instruction or a fixed few, in the order of the function,
+//! without duplicates. A select on a comparison of its own arms becomes a minimum or maximum; negations are absorbed by
+//! fused multiply-adds; reals and integers share registers, so bit casts disappear. It does not know how many registers
+//! there are.
+//!
+//! Source: Aho, Lam, Sethi, Ullman, *Compilers*, 2007, sec. 8.9.
 
 use crate::codegen::lanes::assembler::{Instruction, Vectors, instructions as i};
 use crate::codegen::unsupported::Unsupported;
@@ -11,7 +14,7 @@ use crate::math::{self, exponential, tables};
 use abi::Slot;
 use std::collections::HashMap;
 
-/// The node of this number.
+/// Index of a node.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct Node(pub u32);
 
@@ -21,7 +24,7 @@ impl Node {
     }
 }
 
-/// Signs of a fused product, by what they add to the opcode.
+/// Signs of a fused multiply-add; the number is added to the opcode.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Signs {
     /// a b + c
@@ -34,7 +37,7 @@ pub enum Signs {
     NegatedLess = 6,
 }
 
-/// Of a comparison of reals, by its number in the manual.
+/// Predicate of a comparison of reals; the number is the immediate of VCMPPD.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Predicate {
     Equal = 0,
@@ -52,7 +55,7 @@ pub enum Predicate {
 }
 
 impl Predicate {
-    /// What holds where it does not, of NaN too.
+    /// The complement, also for NaN.
     pub fn not(self) -> Predicate {
         match self {
             Predicate::Equal => Predicate::NotEqual,
@@ -70,8 +73,8 @@ impl Predicate {
         }
     }
 
-    /// The same with its operands exchanged.
-    pub fn turned(self) -> Predicate {
+    /// The same predicate with its operands exchanged.
+    pub fn with_operands_exchanged(self) -> Predicate {
         match self {
             Predicate::Equal => Predicate::Equal,
             Predicate::NotEqual => Predicate::NotEqual,
@@ -88,17 +91,18 @@ impl Predicate {
     }
 }
 
-/// What a node computes. A mask is a mask register, or without those a vector of all ones or zeros a lane.
+/// The operation of a node. A mask is a mask register or, where there are none, a vector with all bits set or cleared
+/// in each lane.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum MachineOp {
-    /// The value of a slot when an iteration begins.
+    /// The value of a slot at the start of the iteration.
     Load(Slot),
-    /// The same number in every lane, by its bits.
+    /// A constant in every lane, by its bits.
     Constant(u64),
-    /// An instruction of two operands; whether they can be exchanged.
-    Two(Instruction, bool, Node, Node),
-    /// An instruction of one operand, with an immediate.
-    One(Instruction, Option<u8>, Node),
+    /// An instruction with two operands, and whether these commute.
+    Binary(Instruction, bool, Node, Node),
+    /// An instruction with one operand and perhaps an immediate.
+    Unary(Instruction, Option<u8>, Node),
     /// ±a · b ± c
     Fma {
         signs: Signs,
@@ -106,48 +110,48 @@ pub enum MachineOp {
         b: Node,
         c: Node,
     },
-    /// Left, right, or right with the sign, by a constant.
+    /// Shift by a constant.
     Shift(Direction, Node, u8),
-    /// Comparison of reals, quiet.
+    /// Comparison of reals; quiet: without an exception for NaN.
     Compare(Predicate, Node, Node),
     /// Comparison of integers: equal (0) or less (1).
     CompareInt(u8, Node, Node),
-    /// A mask: whether two integers have a bit in common. AVX-512 only.
+    /// A mask: whether two integers have a set bit in common. AVX-512 only.
     TestBits(Node, Node),
-    /// A mask that is the same in every lane.
+    /// A constant mask, the same in every lane.
     Mask(bool),
     MaskAnd(Node, Node),
     MaskOr(Node, Node),
     MaskNot(Node),
-    /// Lanes of the second where the first is true, else of the third.
+    /// The second operand in lanes where the first is true, else the third.
     Select(Node, Node, Node),
-    /// The same of masks.
+    /// As `Select`, of masks.
     MaskSelect(Node, Node, Node),
-    /// Where the first, a mask, holds: the second times 2 to the power of the third, down to a whole number; else 0. AVX-512 only.
+    /// b · 2^⌊c⌋ in lanes where the mask a is set, else 0, for operands a, b, c. AVX-512 only.
     Scale(Node, Node, Node),
-    /// Entries of the table at `base`, at indices that lie inside.
+    /// Entries of the table at `base` of the pool; indices are in range.
     Gather {
         base: u32,
         len: u32,
         index: Node,
     },
-    /// Half a table: the same in every vector. AVX-512 only.
-    Row(TableQuarter, bool),
-    /// Entries of sixteen, in two rows, by the low four bits of an integer. AVX-512 only.
+    /// Eight entries of a table: the first half of a quarter, or the second. The same in every vector. AVX-512 only.
+    TableRow(TableQuarter, bool),
+    /// Entries of a table of sixteen, which two rows hold, by the low four bits of an integer. AVX-512 only.
     Permute(Node, Node, Node),
 }
 
-/// A quarter of a table for exponentials: i begins with 16 times the number.
+/// A quarter of a table of 64 entries for e^x: the entries from i = 16 · number.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum TableQuarter {
     /// 2^(i/64)
     Power(u8),
-    /// What that is more than its rounded value, relative.
+    /// 2^(i/64) minus its rounded value, relative to that.
     Tail(u8),
 }
 
 impl TableQuarter {
-    /// Its first or second half, by the bits of the entries.
+    /// The bits of its first or second eight entries.
     pub fn row(self, second: bool) -> [u64; 8] {
         let (TableQuarter::Power(quarter) | TableQuarter::Tail(quarter)) = self;
         let entry = |place: usize| {
@@ -161,7 +165,7 @@ impl TableQuarter {
     }
 }
 
-/// Of a shift.
+/// Kind of shift.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Direction {
     Left,
@@ -173,12 +177,12 @@ impl MachineOp {
     /// Operands from left to right.
     pub fn operands(self) -> impl Iterator<Item = Node> {
         let all = match self {
-            MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::Row(..) | MachineOp::Mask(_) => [None; 3],
-            MachineOp::One(_, _, a)
+            MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::TableRow(..) | MachineOp::Mask(_) => [None; 3],
+            MachineOp::Unary(_, _, a)
             | MachineOp::Shift(_, a, _)
             | MachineOp::MaskNot(a)
             | MachineOp::Gather { index: a, .. } => [Some(a), None, None],
-            MachineOp::Two(_, _, a, b)
+            MachineOp::Binary(_, _, a, b)
             | MachineOp::Compare(_, a, b)
             | MachineOp::CompareInt(_, a, b)
             | MachineOp::TestBits(a, b)
@@ -193,17 +197,17 @@ impl MachineOp {
         all.into_iter().flatten()
     }
 
-    /// Whether it lies in memory from the beginning.
+    /// Whether the value is in memory before the code runs.
     pub fn is_leaf(self) -> bool {
         matches!(self, MachineOp::Load(_)) || self.is_shared()
     }
 
-    /// Whether it is the same in every vector, and lies in memory from the beginning.
+    /// Whether the value is a constant in memory, which all vectors share.
     pub fn is_shared(self) -> bool {
-        matches!(self, MachineOp::Constant(_) | MachineOp::Row(..))
+        matches!(self, MachineOp::Constant(_) | MachineOp::TableRow(..))
     }
 
-    /// Whether it lies in a mask register.
+    /// Whether the value is in a mask register.
     pub fn is_mask(self, width: Vectors) -> bool {
         match self {
             MachineOp::Compare(..) | MachineOp::CompareInt(..) => width == Vectors::Avx512,
@@ -215,39 +219,38 @@ impl MachineOp {
             | MachineOp::MaskSelect(..) => true,
             MachineOp::Load(_)
             | MachineOp::Constant(_)
-            | MachineOp::Two(..)
-            | MachineOp::One(..)
+            | MachineOp::Binary(..)
+            | MachineOp::Unary(..)
             | MachineOp::Fma { .. }
             | MachineOp::Shift(..)
             | MachineOp::Select(..)
             | MachineOp::Scale(..)
             | MachineOp::Gather { .. }
-            | MachineOp::Row(..)
+            | MachineOp::TableRow(..)
             | MachineOp::Permute(..) => false,
         }
     }
 }
 
-/// A function as nodes.
+/// A function after instruction selection.
 pub struct Nodes {
     pub nodes: Vec<MachineOp>,
-    /// What is stored.
+    /// Stores to slots of the block.
     pub stores: Vec<(Slot, Node)>,
-    /// The status, an integer a lane.
+    /// The status, an integer per lane.
     pub status: Option<Node>,
-    /// A mask without which the status is 0.
+    /// A mask; in lanes where it is not set the status is 0.
     pub failed: Option<Node>,
     /// Whether the pool begins with the tables of the elementary functions.
     pub pooled: bool,
 }
 
-/// The bit of a real's sign.
+/// The sign bit of a real.
 pub const SIGN: u64 = 1 << 63;
 
-/// `pooled`: the pool begins with the tables of the elementary functions.
+/// Selects instructions for a function. `pooled`: the pool begins with the tables of the elementary functions.
 ///
-/// # Errors
-/// If a width has no instructions for an operation.
+/// # Errors If the width has no instruction for an operation.
 pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupported> {
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
@@ -278,20 +281,21 @@ struct Selection {
     known: HashMap<MachineOp, Node>,
 }
 
-/// For each kind of number, of quiet NaN first, what becomes of it: a quiet NaN (2), itself (1), −1 (9) or 1 (10). The kinds are
-/// quiet and signalling NaN, ±0, 1, −∞, ∞, below 0, above 0.
-const SIGN_BY_KIND: u64 = 0xa9a9_a122;
+/// Response table of VFIXUPIMMPD for the sign of a real, four bits per kind of source: 2 is a quiet NaN, 1 the source
+/// itself, 9 is −1, 10 is 1. The kinds from the lowest bits up: quiet NaN, signalling NaN, ±0, 1, −∞, ∞, negative,
+/// positive.
+const SIGN_RESPONSES: u64 = 0xa9a9_a122;
 
 impl Selection {
     fn new(width: Vectors) -> Selection {
         Selection { width, nodes: Vec::new(), known: HashMap::new() }
     }
 
-    fn operations(&mut self, func: &Func, wanted: &[bool]) -> Result<Vec<Node>, Unsupported> {
+    fn operations(&mut self, func: &Func, live: &[bool]) -> Result<Vec<Node>, Unsupported> {
         let types = verify::types(func).expect("the function is sound");
         let mut of: Vec<Node> = Vec::with_capacity(func.ops.len());
         for (k, op) in func.ops.iter().enumerate() {
-            let node = if wanted[k] { self.node(func, *op, types[k], &of)? } else { Node(u32::MAX) };
+            let node = if live[k] { self.node(func, *op, types[k], &of)? } else { Node(u32::MAX) };
             of.push(node);
         }
         Ok(of)
@@ -315,16 +319,17 @@ impl Selection {
         match (self.nodes[mask.index()], self.width) {
             (MachineOp::Compare(predicate, a, b), _) => MachineOp::Compare(predicate.not(), a, b),
             (_, Vectors::Avx512) => MachineOp::MaskNot(mask),
-            _ => MachineOp::Two(i::XOR, true, mask, self.constant(u64::MAX)),
+            _ => MachineOp::Binary(i::VXORPD, true, mask, self.constant(u64::MAX)),
         }
     }
 
-    /// `a` where a mask is set, `b` elsewhere. Without mask registers a mask has all bits or none.
-    fn choose(&mut self, when: Node, a: Node, b: Node) -> MachineOp {
+    /// `a` in lanes where a mask is set, `b` elsewhere. Without mask registers, if one of them is 0, a bitwise
+    /// operation with the mask is enough.
+    fn select_lanes(&mut self, when: Node, a: Node, b: Node) -> MachineOp {
         let zero = MachineOp::Constant(0);
         match (self.width, self.nodes[a.index()], self.nodes[b.index()]) {
-            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => MachineOp::Two(i::AND_NOT, false, when, b),
-            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => MachineOp::Two(i::AND, true, when, a),
+            (Vectors::Avx | Vectors::Avx2, a, _) if a == zero => MachineOp::Binary(i::VANDNPD, false, when, b),
+            (Vectors::Avx | Vectors::Avx2, _, b) if b == zero => MachineOp::Binary(i::VANDPD, true, when, a),
             _ => MachineOp::Select(when, a, b),
         }
     }
@@ -335,31 +340,31 @@ impl Selection {
 
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[Node]) -> Result<Node, Unsupported> {
         let at = |value: Value| of[value.index()];
-        let wide = self.width == Vectors::Avx512;
+        let has_masks = self.width == Vectors::Avx512;
         if let Some(x) = sign_of(op, |value| func.op(value)) {
             return Ok(self.sign(at(x)));
         }
         let what = match op {
             Op::Real(bits) => MachineOp::Constant(bits),
             Op::Int(n) => MachineOp::Constant(n as u64),
-            Op::Bool(truth) if wide => MachineOp::Mask(truth),
-            // Without mask registers a mask is a vector of all ones or zeros a lane.
+            Op::Bool(truth) if has_masks => MachineOp::Mask(truth),
+            // Without mask registers a mask is a vector with all bits set or cleared in each lane.
             Op::Bool(truth) => MachineOp::Constant(if truth { u64::MAX } else { 0 }),
             Op::Load(slot) => MachineOp::Load(slot),
             Op::Pool { base, len, index } => {
-                let index = self.inside(func, index, len, of);
+                let index = self.clamped_index(func, index, len, of);
                 MachineOp::Gather { base, len, index }
             }
             Op::Ring { .. } => return Err(Unsupported("a ring of samples (delay) has no lanes".into())),
-            Op::Add(a, b) => MachineOp::Two(i::ADD, true, at(a), at(b)),
-            Op::Sub(a, b) => MachineOp::Two(i::SUB, false, at(a), at(b)),
-            Op::Mul(a, b) => MachineOp::Two(i::MUL, true, at(a), at(b)),
-            Op::Div(a, b) => MachineOp::Two(i::DIV, false, at(a), at(b)),
-            Op::Neg(a) => MachineOp::Two(i::XOR, true, at(a), self.constant(SIGN)),
-            Op::Abs(a) => MachineOp::Two(i::AND, true, at(a), self.constant(!SIGN)),
-            Op::Sqrt(a) => MachineOp::One(i::SQRT, None, at(a)),
+            Op::Add(a, b) => MachineOp::Binary(i::VADDPD, true, at(a), at(b)),
+            Op::Sub(a, b) => MachineOp::Binary(i::VSUBPD, false, at(a), at(b)),
+            Op::Mul(a, b) => MachineOp::Binary(i::VMULPD, true, at(a), at(b)),
+            Op::Div(a, b) => MachineOp::Binary(i::VDIVPD, false, at(a), at(b)),
+            Op::Neg(a) => MachineOp::Binary(i::VXORPD, true, at(a), self.constant(SIGN)),
+            Op::Abs(a) => MachineOp::Binary(i::VANDPD, true, at(a), self.constant(!SIGN)),
+            Op::Sqrt(a) => MachineOp::Unary(i::VSQRTPD, None, at(a)),
             Op::Fma(a, b, c) => {
-                // (−a) b + c, a b − c and (−a) b − c are one instruction each, of the same rounding.
+                // (−a) b + c, a b − c and (−a) b − c are single instructions with the same rounding.
                 let plain = |value: Value| match func.op(value) {
                     Op::Neg(inner) => (true, at(inner)),
                     _ => (false, at(value)),
@@ -373,9 +378,9 @@ impl Selection {
                 };
                 MachineOp::Fma { signs, a, b, c }
             }
-            // Without an exception for what is not exact.
-            Op::Floor(a) => MachineOp::One(i::ROUND, Some(9), at(a)),
-            Op::Nearest(a) => MachineOp::One(i::ROUND, Some(8), at(a)),
+            // Bit 3 of the immediate suppresses the exception for inexact results.
+            Op::Floor(a) => MachineOp::Unary(i::VROUNDPD, Some(9), at(a)),
+            Op::Nearest(a) => MachineOp::Unary(i::VROUNDPD, Some(8), at(a)),
             Op::Unary(Unary::Exp, x) => {
                 return Ok(self.exp(at(x), is_not_positive(x, |value| func.op(value))));
             }
@@ -383,42 +388,43 @@ impl Selection {
             Op::Less(a, b) => MachineOp::Compare(Predicate::Less, at(a), at(b)),
             Op::LessEqual(a, b) => MachineOp::Compare(Predicate::LessEqual, at(a), at(b)),
             Op::Equal(a, b) => MachineOp::Compare(Predicate::Equal, at(a), at(b)),
-            Op::And(a, b) if wide => MachineOp::MaskAnd(at(a), at(b)),
-            Op::Or(a, b) if wide => MachineOp::MaskOr(at(a), at(b)),
-            Op::And(a, b) => MachineOp::Two(i::AND, true, at(a), at(b)),
-            Op::Or(a, b) => MachineOp::Two(i::OR, true, at(a), at(b)),
+            Op::And(a, b) if has_masks => MachineOp::MaskAnd(at(a), at(b)),
+            Op::Or(a, b) if has_masks => MachineOp::MaskOr(at(a), at(b)),
+            Op::And(a, b) => MachineOp::Binary(i::VANDPD, true, at(a), at(b)),
+            Op::Or(a, b) => MachineOp::Binary(i::VORPD, true, at(a), at(b)),
             Op::Not(a) => self.not(at(a)),
             Op::Select(when, a, b) => match (func.op(when), of_type) {
-                (_, Type::Bool) if wide => MachineOp::MaskSelect(at(when), at(a), at(b)),
-                // a < b ? a : b and a > b ? a : b, of NaN and zeros too.
-                (Op::Less(x, y), Type::Real) if (x, y) == (a, b) => MachineOp::Two(i::MIN, false, at(a), at(b)),
-                (Op::Less(x, y), Type::Real) if (x, y) == (b, a) => MachineOp::Two(i::MAX, false, at(a), at(b)),
-                (Op::Not(not), _) => self.choose(at(not), at(b), at(a)),
-                _ => self.choose(at(when), at(a), at(b)),
+                (_, Type::Bool) if has_masks => MachineOp::MaskSelect(at(when), at(a), at(b)),
+                // a < b ? a : b and a > b ? a : b are exactly MIN and MAX, also for NaN and zeros.
+                (Op::Less(x, y), Type::Real) if (x, y) == (a, b) => MachineOp::Binary(i::VMINPD, false, at(a), at(b)),
+                (Op::Less(x, y), Type::Real) if (x, y) == (b, a) => MachineOp::Binary(i::VMAXPD, false, at(a), at(b)),
+                (Op::Not(not), _) => self.select_lanes(at(not), at(b), at(a)),
+                _ => self.select_lanes(at(when), at(a), at(b)),
             },
-            Op::IntAdd(a, b) => MachineOp::Two(i::INT_ADD, true, at(a), at(b)),
-            Op::IntSub(a, b) => MachineOp::Two(i::INT_SUB, false, at(a), at(b)),
-            Op::IntMul(a, b) if wide => MachineOp::Two(i::INT_MUL, true, at(a), at(b)),
+            Op::IntAdd(a, b) => MachineOp::Binary(i::VPADDQ, true, at(a), at(b)),
+            Op::IntSub(a, b) => MachineOp::Binary(i::VPSUBQ, false, at(a), at(b)),
+            Op::IntMul(a, b) if has_masks => MachineOp::Binary(i::VPMULLQ, true, at(a), at(b)),
             Op::IntMul(..) => return Err(self.missing("product of integers")),
-            Op::IntAnd(a, b) => MachineOp::Two(i::AND, true, at(a), at(b)),
-            Op::IntOr(a, b) => MachineOp::Two(i::OR, true, at(a), at(b)),
-            Op::IntXor(a, b) => MachineOp::Two(i::XOR, true, at(a), at(b)),
+            Op::IntAnd(a, b) => MachineOp::Binary(i::VANDPD, true, at(a), at(b)),
+            Op::IntOr(a, b) => MachineOp::Binary(i::VORPD, true, at(a), at(b)),
+            Op::IntXor(a, b) => MachineOp::Binary(i::VXORPD, true, at(a), at(b)),
             Op::ShiftLeft(a, n) => MachineOp::Shift(Direction::Left, at(a), n),
             Op::ShiftRight(a, n) => MachineOp::Shift(Direction::Right, at(a), n),
-            Op::ShiftRightSigned(a, n) if wide => MachineOp::Shift(Direction::RightSigned, at(a), n),
+            Op::ShiftRightSigned(a, n) if has_masks => MachineOp::Shift(Direction::RightSigned, at(a), n),
             Op::ShiftRightSigned(a, n) => {
-                // The sign bit after the shift, taken up to the top: ((x >> n) ^ s) − s.
+                // Arithmetic shift by a logical one: sign extension of the shifted value by ((x >> n) ^ s) − s.
                 let shifted = self.add(MachineOp::Shift(Direction::Right, at(a), n));
                 let sign = self.constant(SIGN >> n);
-                let flipped = self.add(MachineOp::Two(i::XOR, true, shifted, sign));
-                MachineOp::Two(i::INT_SUB, false, flipped, sign)
+                let flipped = self.add(MachineOp::Binary(i::VXORPD, true, shifted, sign));
+                MachineOp::Binary(i::VPSUBQ, false, flipped, sign)
             }
             Op::IntLess(a, b) => MachineOp::CompareInt(1, at(a), at(b)),
             Op::IntEqual(a, b) => MachineOp::CompareInt(0, at(a), at(b)),
             Op::ToBits(a) | Op::FromBits(a) => return Ok(at(a)),
-            Op::ToInt(a) if wide => {
-                // What is too large or NaN becomes the least integer: right for what is too small only.
-                let raw = self.add(MachineOp::One(i::TO_INT, None, at(a)));
+            Op::ToInt(a) if has_masks => {
+                // The instruction returns the smallest integer for NaN and all values out of range; right only for
+                // those that are too small.
+                let raw = self.add(MachineOp::Unary(i::VCVTTPD2QQ, None, at(a)));
                 let limit = self.constant(9223372036854775808f64.to_bits());
                 let large = self.add(MachineOp::Compare(Predicate::LessEqual, limit, at(a)));
                 let most = self.constant(i64::MAX as u64);
@@ -427,67 +433,69 @@ impl Selection {
                 MachineOp::Select(number, held, self.constant(0))
             }
             Op::ToInt(_) => return Err(self.missing("conversion to integers")),
-            Op::ToReal(a) if wide => MachineOp::One(i::TO_REAL, None, at(a)),
+            Op::ToReal(a) if has_masks => MachineOp::Unary(i::VCVTQQ2PD, None, at(a)),
             Op::ToReal(_) => return Err(self.missing("conversion from integers")),
         };
         Ok(self.add(what))
     }
 
-    /// ±1 with the sign of x, unless x is neither above nor below 0.
+    /// ±1 with the sign of x; x itself if it is ±0 or NaN.
     fn sign(&mut self, x: Node) -> Node {
         if self.width == Vectors::Avx512 {
-            let kinds = self.constant(SIGN_BY_KIND);
-            return self.add(MachineOp::Two(i::BY_KIND, false, x, kinds));
+            let kinds = self.constant(SIGN_RESPONSES);
+            return self.add(MachineOp::Binary(i::VFIXUPIMMPD, false, x, kinds));
         }
         let [sign, one, zero] = [SIGN, 1f64.to_bits(), 0].map(|bits| self.constant(bits));
-        let negative = self.add(MachineOp::Two(i::AND, true, x, sign));
-        let unit = self.add(MachineOp::Two(i::OR, true, negative, one));
+        let negative = self.add(MachineOp::Binary(i::VANDPD, true, x, sign));
+        let unit = self.add(MachineOp::Binary(i::VORPD, true, negative, one));
         let moves = self.add(MachineOp::Compare(Predicate::LessOrGreater, x, zero));
-        let what = self.choose(moves, unit, x);
+        let what = self.select_lanes(moves, unit, x);
         self.add(what)
     }
 
-    /// e^x by the algorithm of [`exponential::exp`], to the bit, in fewer instructions: the power of two enters last, by one
-    /// that rounds once more where the result is too small for all digits, as the algorithm does, and knows overflow.
-    /// `falls`: x is not above 0. AVX-512 only.
-    fn exp(&mut self, x: Node, falls: bool) -> Node {
+    /// e^x with the bits of [`exponential::exp`], in fewer instructions. The power of two is applied last, by
+    /// VSCALEFPD: it rounds a second time where the result is subnormal, as the algorithm does, and handles overflow.
+    /// `not_positive`: x is known to be ≤ 0 or NaN. AVX-512 only.
+    fn exp(&mut self, x: Node, not_positive: bool) -> Node {
         let number = |own: &mut Self, x: f64| own.constant(x.to_bits());
-        // Below this the result is 0, and whatever is on the way is not looked at: to find out that a result is too small for any digit
-        // may take a processor two hundred cycles. NaN is not below.
+        // Below this bound the result is 0, and a mask excludes the lane from VSCALEFPD, which may take two hundred
+        // cycles for an underflow. NaN is not excluded.
         let least = number(self, -746.0);
-        let counts = self.add(MachineOp::Compare(Predicate::NotLess, x, least));
-        // Beyond this it is infinite, and nothing on the way may be. Of NaN the second is taken.
+        let is_not_zero = self.add(MachineOp::Compare(Predicate::NotLess, x, least));
+        // Above this bound the result is infinite; the minimum keeps intermediate values finite. VMINPD returns its
+        // second operand if one is NaN.
         let mut x = x;
-        if !falls {
+        if !not_positive {
             let most = number(self, 746.0);
-            x = self.add(MachineOp::Two(i::MIN, false, most, x));
+            x = self.add(MachineOp::Binary(i::VMINPD, false, most, x));
         }
         let fused =
             |own: &mut Self, signs: Signs, a: Node, b: Node, c: Node| own.add(MachineOp::Fma { signs, a, b, c });
-        // Of ln 2, not of its 64th parts: k is the exponent at once. Its last digits, which tell the part, are the same.
+        // Here k counts multiples of ln 2 in steps of 1/64, where the algorithm counts multiples of ln 2 / 64. So the
+        // floor of k is the exponent. The low six bits of `rounded` are the table index in both.
         let parts = f64::from(tables::EXP_LEN);
         let [steps, round] = [exponential::STEPS, exponential::ROUND].map(|x| number(self, x / parts));
         let rounded = fused(self, Signs::Plain, x, steps, round);
-        let k = self.add(MachineOp::Two(i::SUB, false, rounded, round));
+        let k = self.add(MachineOp::Binary(i::VSUBPD, false, rounded, round));
         let [first, rest] = [exponential::STEP.0, exponential::STEP.1].map(|part| number(self, parts * part));
         let high = fused(self, Signs::Negated, k, first, x);
         let r = fused(self, Signs::Negated, k, rest, high);
-        let scale = self.sixty_four(TableQuarter::Power, rounded);
-        let tail = self.sixty_four(TableQuarter::Tail, rounded);
+        let scale = self.table_of_64(TableQuarter::Power, rounded);
+        let tail = self.table_of_64(TableQuarter::Tail, rounded);
         let [c0, c1, c2, c3] = exponential::EXP.map(|c| number(self, c));
         let (low, top) = (fused(self, Signs::Plain, r, c1, c0), fused(self, Signs::Plain, r, c3, c2));
-        let square = self.add(MachineOp::Two(i::MUL, true, r, r));
+        let square = self.add(MachineOp::Binary(i::VMULPD, true, r, r));
         let q = fused(self, Signs::Plain, square, top, low);
-        let sum = self.add(MachineOp::Two(i::ADD, true, r, tail));
+        let sum = self.add(MachineOp::Binary(i::VADDPD, true, r, tail));
         let p = fused(self, Signs::Plain, square, q, sum);
         let mantissa = fused(self, Signs::Plain, scale, p, scale);
-        self.add(MachineOp::Scale(counts, mantissa, k))
+        self.add(MachineOp::Scale(is_not_zero, mantissa, k))
     }
 
     /// Entries of a table of 64 by the low six bits of an integer.
-    fn sixty_four(&mut self, quarter: fn(u8) -> TableQuarter, index: Node) -> Node {
+    fn table_of_64(&mut self, quarter: fn(u8) -> TableQuarter, index: Node) -> Node {
         let [mut a, b, mut c, d] = [0, 1, 2, 3].map(|number| {
-            let [first, second] = [false, true].map(|second| self.add(MachineOp::Row(quarter(number), second)));
+            let [first, second] = [false, true].map(|second| self.add(MachineOp::TableRow(quarter(number), second)));
             self.add(MachineOp::Permute(first, second, index))
         });
         let [sixteen, thirty_two] = [16, 32].map(|bit| {
@@ -499,27 +507,27 @@ impl Selection {
         self.add(MachineOp::Select(thirty_two, c, a))
     }
 
-    /// An index that lies inside a table: as it is, or the last where it is beyond.
-    fn inside(&mut self, func: &Func, index: Value, len: u32, of: &[Node]) -> Node {
-        let masked = |value: Value| match func.op(value) {
+    /// A table index that is clamped to the last entry, unless it is known to be in range.
+    fn clamped_index(&mut self, func: &Func, index: Value, len: u32, of: &[Node]) -> Node {
+        let is_masked = |value: Value| match func.op(value) {
             Op::Int(mask) => (0..i64::from(len)).contains(&mask),
             _ => false,
         };
         let node = of[index.index()];
         let safe = match func.op(index) {
-            Op::IntAnd(a, b) => masked(a) || masked(b),
-            _ => masked(index),
+            Op::IntAnd(a, b) => is_masked(a) || is_masked(b),
+            _ => is_masked(index),
         };
         if safe {
             return node;
         }
         let last = self.constant(u64::from(len) - 1);
         if self.width == Vectors::Avx512 {
-            return self.add(MachineOp::Two(i::INT_MIN_UNSIGNED, true, node, last));
+            return self.add(MachineOp::Binary(i::VPMINUQ, true, node, last));
         }
-        // Without a sign: with the top bit flipped, signed comparison is unsigned comparison.
+        // Unsigned comparison by a signed one: flip the top bits.
         let sign = self.constant(SIGN);
-        let flipped = self.add(MachineOp::Two(i::XOR, true, node, sign));
+        let flipped = self.add(MachineOp::Binary(i::VXORPD, true, node, sign));
         let limit = self.constant((u64::from(len) - 1) ^ SIGN);
         let less = self.add(MachineOp::CompareInt(1, flipped, limit));
         self.add(MachineOp::Select(less, node, last))

@@ -1,9 +1,12 @@
-//! Nodes as instructions, several vectors side by side, with registers given out on the way.
+//! Linear register allocation for a straight line, together with the emission of its instructions.
 //!
-//! The line is straight, so it is known when each value is read next: where registers run out, the one that is read last
-//! gives way (Belady), sooner if it need not be stored. Loads, constants and what was computed before the loop lie in memory;
-//! most instructions read one operand from there, and what is read again, as constants are by each vector, is loaded while
-//! registers are free.
+//! In: selected nodes and their order. Out: instructions in an [`Assembler`], for several interleaved vectors. The next
+//! use of each value is known, so if no register is free, the value with the furthest next use is evicted, preferably
+//! one that is in memory already. Loads, constants and hoisted values are in memory; most instructions can read one
+//! operand from there. A memory operand that is read again, as constants are by each vector, is loaded into a register
+//! if one is free.
+//!
+//! Source: Belady, *A Study of Replacement Algorithms for a Virtual-Storage Computer*, 1966.
 
 use crate::codegen::lanes::assembler::{Assembler, Base, Instruction, Place, Vectors, ZEROING, instructions as i};
 use crate::codegen::lanes::isel::{Direction, MachineOp, Node, Nodes, Signs};
@@ -11,7 +14,7 @@ use crate::math;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Where a node's vectors lie in memory: the `index`-th group of vectors behind `begin` bytes.
+/// The place of a node's vectors in memory: group `index` of vectors after `begin` bytes.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Home {
     pub base: Base,
@@ -19,15 +22,15 @@ pub struct Home {
     pub index: usize,
 }
 
-/// What the vectors of one node have in memory.
+/// The memory operand for vector `k` of the group `index` after `begin` bytes.
 pub fn place_in(base: Base, begin: usize, index: usize, vectors: usize, k: usize, width: Vectors) -> Place {
     Place::Memory(base, (begin + (index * vectors + k) * width.bytes() as usize) as i32)
 }
 
-/// One vector of a node; what is the same in every vector has but the first.
+/// One vector of a node: node index · number of vectors + vector. Nodes that all vectors share have the first one only.
 type VirtualRegister = usize;
 
-/// A straight line being written.
+/// Register allocation and emission of one straight line.
 pub struct RegisterAllocator<'a> {
     code: &'a mut Assembler,
     nodes: &'a Nodes,
@@ -35,26 +38,27 @@ pub struct RegisterAllocator<'a> {
     homes: &'a HashMap<Node, Home>,
     width: Vectors,
     vectors: usize,
-    /// For each node the places of the order where it is read, ascending.
+    /// For each node the positions in the order where it is read, ascending.
     uses: HashMap<Node, Vec<usize>>,
-    /// Register of each copy.
+    /// The register of each virtual register that has one.
     register: HashMap<VirtualRegister, u8>,
-    /// Numbers of the places in memory of those that had to give way.
+    /// The spill slot of each virtual register that has one.
     spills: HashMap<VirtualRegister, usize>,
     free_spills: Vec<usize>,
-    left_spills: Vec<usize>,
+    freed_by_instruction: Vec<usize>,
     spilled: usize,
     spills_at: usize,
     vector_of: Vec<Option<VirtualRegister>>,
     mask_of: Vec<Option<VirtualRegister>>,
-    /// Registers that the instruction being written needs.
+    /// Registers that the current instruction needs, as (is a mask, register).
     locked: Vec<(bool, u8)>,
-    /// The place in the order, and the vector.
+    /// The current position in the order, and the current vector.
     now: (usize, usize),
 }
 
 impl<'a> RegisterAllocator<'a> {
-    /// An empty one; registers that give way are stored behind `spills_at` bytes of the block.
+    /// An allocator without any values in registers. Spill slots begin at `spills_at` bytes after the start of the
+    /// block.
     pub fn new(
         code: &'a mut Assembler,
         nodes: &'a Nodes,
@@ -81,7 +85,7 @@ impl<'a> RegisterAllocator<'a> {
             register: HashMap::new(),
             spills: HashMap::new(),
             free_spills: Vec::new(),
-            left_spills: Vec::new(),
+            freed_by_instruction: Vec::new(),
             spilled: 0,
             spills_at,
             vector_of: vec![None; width.registers() as usize],
@@ -91,19 +95,19 @@ impl<'a> RegisterAllocator<'a> {
         }
     }
 
-    /// Keeps a node to the end.
+    /// Keeps a node live to the end of the line.
     pub fn pin(&mut self, node: Node) {
         self.uses.entry(node).or_default().push(self.order.len() + 1);
     }
 
-    /// Most vectors that lay in memory at a time.
+    /// The largest number of spill slots used at a time.
     pub fn spilled(&self) -> usize {
         self.spilled
     }
 
-    /// Writes all nodes of the order; `stores` says where a node goes as soon as it is there. Nodes of `rest` that are not
-    /// in the order go there at the end.
-    pub fn write(&mut self, stores: &dyn Fn(Node) -> Vec<Home>, rest: &[Node]) {
+    /// Emits all nodes in order. `stores` says where a node is to be stored as soon as it is computed. Nodes of
+    /// `stored_last` that are not in the order are stored at the end.
+    pub fn write(&mut self, stores: &dyn Fn(Node) -> Vec<Home>, stored_last: &[Node]) {
         let order = self.order;
         for (at, node) in order.iter().enumerate() {
             let homes = stores(*node);
@@ -114,11 +118,11 @@ impl<'a> RegisterAllocator<'a> {
                     let register = self.in_register(*node);
                     self.store(*node, register, self.at_home(*home, k));
                 }
-                self.done(*node);
+                self.end_instruction(*node);
             }
         }
         let mut seen: Vec<Node> = order.to_vec();
-        for node in rest {
+        for node in stored_last {
             if seen.contains(node) {
                 continue;
             }
@@ -129,13 +133,14 @@ impl<'a> RegisterAllocator<'a> {
                 for home in stores(*node) {
                     self.store(*node, register, self.at_home(home, k));
                 }
-                self.done(*node);
+                self.end_instruction(*node);
             }
         }
     }
 
-    /// A jump that is taken if a mask has a lane; its target is open. It ends the line.
-    pub fn test(&mut self, mask: Node) -> usize {
+    /// Emits a jump that is taken if any lane of a mask is set, at the end of the line; the target is still open.
+    /// Returns the position of its displacement.
+    pub fn branch_if_any(&mut self, mask: Node) -> usize {
         self.now = (self.order.len(), 0);
         let all = self.in_register(mask);
         for k in 1..self.vectors {
@@ -143,44 +148,44 @@ impl<'a> RegisterAllocator<'a> {
             match self.width {
                 Vectors::Avx512 => {
                     let more = self.in_register(mask);
-                    self.code.mask(i::MASK_OR, all, all, Place::Register(more));
+                    self.code.mask(i::KORB, all, all, Place::Register(more));
                 }
                 Vectors::Avx | Vectors::Avx2 => {
-                    let more = self.place(mask);
-                    self.code.vector(i::OR, all, all, more, None);
+                    let more = self.operand(mask);
+                    self.code.vector(i::VORPD, all, all, more, None);
                 }
             }
             self.locked.truncate(1);
         }
         match self.width {
-            Vectors::Avx512 => self.code.mask(i::MASK_TEST, all, 0, Place::Register(all)),
+            Vectors::Avx512 => self.code.mask(i::KORTESTB, all, 0, Place::Register(all)),
             Vectors::Avx | Vectors::Avx2 => {
                 let l = u8::from(self.width == Vectors::Avx2);
-                self.code.plain(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
-                self.code.plain(&[0x45, 0x85, 0xd2]); // test r10d, r10d
+                self.code.raw(&[0xc4, 0x41 | (!all >> 3 & 1) << 5, 0x79 | l << 2, 0x50, 0xd0 | all & 7]);
+                self.code.raw(&[0x45, 0x85, 0xd2]); // test r10d, r10d
             }
         }
         self.code.jump(&[0x0f, 0x85])
     }
 
-    fn copy(&self, node: Node) -> VirtualRegister {
-        node.index() * self.vectors + if self.what(node).is_shared() { 0 } else { self.now.1 }
+    fn virtual_register(&self, node: Node) -> VirtualRegister {
+        node.index() * self.vectors + if self.op(node).is_shared() { 0 } else { self.now.1 }
     }
 
-    fn what(&self, node: Node) -> MachineOp {
+    fn op(&self, node: Node) -> MachineOp {
         self.nodes.nodes[node.index()]
     }
 
     fn is_mask(&self, node: Node) -> bool {
-        self.what(node).is_mask(self.width)
+        self.op(node).is_mask(self.width)
     }
 
-    /// When a copy is read next, after now; later is larger.
-    fn next_use(&self, copy: VirtualRegister) -> Option<usize> {
-        let (node, k) = (Node((copy / self.vectors) as u32), copy % self.vectors);
+    /// Position of the next use of a virtual register after the current instruction; larger is later.
+    fn next_use(&self, virtual_register: VirtualRegister) -> Option<usize> {
+        let (node, k) = (Node((virtual_register / self.vectors) as u32), virtual_register % self.vectors);
         let (at, now) = self.now;
         let uses = self.uses.get(&node)?;
-        if self.what(node).is_shared() {
+        if self.op(node).is_shared() {
             let first = uses.partition_point(|place| *place < at || *place == at && now + 1 == self.vectors);
             return uses.get(first).map(|place| place * self.vectors + if *place == at { now + 1 } else { 0 });
         }
@@ -192,120 +197,122 @@ impl<'a> RegisterAllocator<'a> {
         place_in(home.base, home.begin, home.index, self.vectors, k, self.width)
     }
 
-    /// The number of a place in memory that nobody needs.
-    fn spill_number(&mut self) -> usize {
+    /// A free spill slot.
+    fn free_spill_slot(&mut self) -> usize {
         self.free_spills.pop().unwrap_or_else(|| {
             self.spilled += 1;
             self.spilled - 1
         })
     }
 
-    fn spill_place(&self, number: usize) -> Place {
+    fn spill_operand(&self, number: usize) -> Place {
         Place::Memory(Base::Block, (self.spills_at + number * self.width.bytes() as usize) as i32)
     }
 
-    /// Where a node can be read: its register, or memory. What is read again is loaded, for the processor adds faster than it
-    /// reads, if there is a register that nobody needs before.
-    fn place(&mut self, node: Node) -> Place {
-        let copy = self.copy(node);
+    /// A register or memory operand for a node. A value in memory that is read again is loaded first, if a register is
+    /// free until then: processors execute more arithmetic instructions than loads per cycle.
+    fn operand(&mut self, node: Node) -> Place {
+        let virtual_register = self.virtual_register(node);
         let mask = self.is_mask(node);
-        if let Some(register) = self.register.get(&copy) {
+        if let Some(register) = self.register.get(&virtual_register) {
             let register = *register;
             self.locked.push((mask, register));
             return Place::Register(register);
         }
-        let place = self.memory(node);
-        if mask || !self.next_use(copy).is_some_and(|next| self.is_room_until(next)) {
+        let place = self.memory_operand(node);
+        if mask || !self.next_use(virtual_register).is_some_and(|next| self.is_room_until(next)) {
             return place;
         }
-        Place::Register(self.loaded(node, place))
+        Place::Register(self.load_into_register(node, place))
     }
 
-    /// A register for a node that lies somewhere else.
-    fn loaded(&mut self, node: Node, place: Place) -> u8 {
+    /// Loads a node from memory into a register.
+    fn load_into_register(&mut self, node: Node, place: Place) -> u8 {
         let mask = self.is_mask(node);
         let register = self.allocate(mask);
         self.load(node, register, place);
-        let copy = self.copy(node);
-        self.own(copy, mask, register);
+        let virtual_register = self.virtual_register(node);
+        self.assign(virtual_register, mask, register);
         register
     }
 
-    /// Whether a vector register is free, or holds what lies in memory too and is read later.
+    /// Whether a vector register is free, or holds a value that is in memory too and has a later next use than `next`.
     fn is_room_until(&self, next: usize) -> bool {
         (0..self.vector_of.len()).any(|register| {
-            let later =
-                |copy: VirtualRegister| self.is_in_memory(copy) && self.next_use(copy).is_none_or(|other| other > next);
+            let later = |virtual_register: VirtualRegister| {
+                self.is_in_memory(virtual_register) && self.next_use(virtual_register).is_none_or(|other| other > next)
+            };
             !self.locked.contains(&(false, register as u8)) && self.vector_of[register].is_none_or(later)
         })
     }
 
-    /// Whether a copy can be read from memory.
-    fn is_in_memory(&self, copy: VirtualRegister) -> bool {
-        let node = Node((copy / self.vectors) as u32);
-        self.what(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&copy)
+    /// Whether a virtual register can be read from memory.
+    fn is_in_memory(&self, virtual_register: VirtualRegister) -> bool {
+        let node = Node((virtual_register / self.vectors) as u32);
+        self.op(node).is_shared() || self.homes.contains_key(&node) || self.spills.contains_key(&virtual_register)
     }
 
-    fn memory(&mut self, node: Node) -> Place {
-        match self.what(node) {
+    fn memory_operand(&mut self, node: Node) -> Place {
+        match self.op(node) {
             MachineOp::Constant(bits) => return Place::Constant(bits),
-            MachineOp::Row(table, second) => return self.code.row(table.row(second)),
+            MachineOp::TableRow(table, second) => return self.code.row(table.row(second)),
             _ => {}
         }
-        if let Some(number) = self.spills.get(&self.copy(node)) {
-            return self.spill_place(*number);
+        if let Some(number) = self.spills.get(&self.virtual_register(node)) {
+            return self.spill_operand(*number);
         }
-        let home = self.homes.get(&node).unwrap_or_else(|| panic!("{:?} lies nowhere", self.what(node)));
+        let home = self.homes.get(&node).unwrap_or_else(|| panic!("{:?} lies nowhere", self.op(node)));
         self.at_home(*home, self.now.1)
     }
 
-    /// The node's register, loaded if it lies in memory.
+    /// The register of a node, which is loaded if necessary.
     fn in_register(&mut self, node: Node) -> u8 {
-        match self.place(node) {
+        match self.operand(node) {
             Place::Register(register) => register,
-            place => self.loaded(node, place),
+            place => self.load_into_register(node, place),
         }
     }
 
     fn load(&mut self, node: Node, register: u8, place: Place) {
         match place {
-            _ if self.is_mask(node) => self.code.mask(i::MASK_LOAD, register, 0, place),
+            _ if self.is_mask(node) => self.code.mask(i::KMOVB_LOAD, register, 0, place),
             Place::Constant(_) if self.width == Vectors::Avx512 => {
-                self.code.vector(i::BROADCAST, register, 0, place, None);
+                self.code.vector(i::VBROADCASTSD, register, 0, place, None);
             }
-            place => self.code.vector(i::LOAD, register, 0, place, None),
+            place => self.code.vector(i::VMOVAPD_LOAD, register, 0, place, None),
         }
     }
 
     fn store(&mut self, node: Node, register: u8, place: Place) {
         if self.is_mask(node) {
-            self.code.mask(i::MASK_STORE, register, 0, place);
+            self.code.mask(i::KMOVB_STORE, register, 0, place);
         } else {
-            self.code.vector(i::STORE, register, 0, place, None);
+            self.code.vector(i::VMOVAPD_STORE, register, 0, place, None);
         }
     }
 
-    fn own(&mut self, copy: VirtualRegister, mask: bool, register: u8) {
-        self.register.insert(copy, register);
+    fn assign(&mut self, virtual_register: VirtualRegister, mask: bool, register: u8) {
+        self.register.insert(virtual_register, register);
         let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
-        table[register as usize] = Some(copy);
+        table[register as usize] = Some(virtual_register);
     }
 
-    /// A register that nobody owns; locked until the instruction is done.
+    /// A register without a value, after an eviction if necessary. It is locked to the end of the current instruction.
     fn allocate(&mut self, mask: bool) -> u8 {
         let table = if mask { &self.mask_of } else { &self.vector_of };
-        // Mask register 0 means no mask.
+        // Mask register 0 encodes "no mask".
         let first = usize::from(mask);
         let locked = |register: usize| self.locked.contains(&(mask, register as u8));
         let free = (first..table.len()).find(|register| table[*register].is_none() && !locked(*register));
         let register = free.unwrap_or_else(|| {
             let candidates = (first..table.len()).filter(|register| !locked(*register));
-            // What has to be stored first is worth more.
+            // Evicting a value that is in memory needs no store, so the distance to its next use counts double.
             let last = candidates.max_by_key(|register| {
-                let copy = table[*register].expect("none is free");
-                let wait =
-                    |next: usize| (next - self.now.0 * self.vectors) * if self.is_in_memory(copy) { 2 } else { 1 };
-                self.next_use(copy).map_or(usize::MAX, wait)
+                let virtual_register = table[*register].expect("none is free");
+                let wait = |next: usize| {
+                    (next - self.now.0 * self.vectors) * if self.is_in_memory(virtual_register) { 2 } else { 1 }
+                };
+                self.next_use(virtual_register).map_or(usize::MAX, wait)
             });
             last.expect("an instruction locks fewer registers than there are")
         });
@@ -316,81 +323,81 @@ impl<'a> RegisterAllocator<'a> {
         register as u8
     }
 
-    /// Frees a register; what is read later and lies nowhere else is stored.
+    /// Evicts a register; its value is stored if it is read later and not in memory.
     fn spill(&mut self, mask: bool, register: u8) {
         let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
-        let copy = table[register as usize].take().expect("somebody owns it");
-        self.register.remove(&copy);
-        let node = Node((copy / self.vectors) as u32);
-        if self.next_use(copy).is_some() && !self.is_in_memory(copy) {
-            let number = self.spill_number();
-            self.spills.insert(copy, number);
-            self.store(node, register, self.spill_place(number));
+        let virtual_register = table[register as usize].take().expect("a value is in it");
+        self.register.remove(&virtual_register);
+        let node = Node((virtual_register / self.vectors) as u32);
+        if self.next_use(virtual_register).is_some() && !self.is_in_memory(virtual_register) {
+            let number = self.free_spill_slot();
+            self.spills.insert(virtual_register, number);
+            self.store(node, register, self.spill_operand(number));
         }
     }
 
-    /// Frees the register and the memory of a copy that is not read any more.
+    /// Frees the register and the spill slot of a value that is not read any more.
     fn release(&mut self, node: Node) {
-        let copy = self.copy(node);
-        if self.next_use(copy).is_some() {
+        let virtual_register = self.virtual_register(node);
+        if self.next_use(virtual_register).is_some() {
             return;
         }
-        if let Some(register) = self.register.remove(&copy) {
+        if let Some(register) = self.register.remove(&virtual_register) {
             let mask = self.is_mask(node);
             let table = if mask { &mut self.mask_of } else { &mut self.vector_of };
             table[register as usize] = None;
             self.locked.retain(|locked| *locked != (mask, register));
         }
-        if let Some(number) = self.spills.remove(&copy) {
-            // The instruction may read it from there yet.
-            self.left_spills.push(number);
+        if let Some(number) = self.spills.remove(&virtual_register) {
+            // The current instruction may still read the slot.
+            self.freed_by_instruction.push(number);
         }
     }
 
-    /// The instruction for this copy is written.
-    fn done(&mut self, node: Node) {
+    /// Ends the current instruction.
+    fn end_instruction(&mut self, node: Node) {
         self.locked.clear();
         self.release(node);
-        self.free_spills.append(&mut self.left_spills);
+        self.free_spills.append(&mut self.freed_by_instruction);
     }
 
-    /// Registers for a result, those of operands that are not read any more among them.
+    /// A register for the result; it may be that of an operand that is not read any more.
     fn result(&mut self, node: Node) -> u8 {
-        self.what(node).operands().for_each(|operand| self.release(operand));
+        self.op(node).operands().for_each(|operand| self.release(operand));
         self.fresh_register(node)
     }
 
-    /// A register for a result, none of the operands' own.
+    /// A register for the result, different from those of the operands.
     fn fresh_register(&mut self, node: Node) -> u8 {
         let mask = self.is_mask(node);
         let register = self.allocate(mask);
-        let copy = self.copy(node);
-        self.own(copy, mask, register);
+        let virtual_register = self.virtual_register(node);
+        self.assign(virtual_register, mask, register);
         register
     }
 
-    /// What an instruction reads does not give way to what it loads.
+    /// Locks the registers of operands, so that loading another operand does not evict them.
     fn lock(&mut self, operands: impl Iterator<Item = Node>) {
         for operand in operands {
-            if let Some(register) = self.register.get(&self.copy(operand)) {
+            if let Some(register) = self.register.get(&self.virtual_register(operand)) {
                 self.locked.push((self.is_mask(operand), *register));
             }
         }
     }
 
     fn node(&mut self, node: Node) {
-        let what = self.what(node);
-        let copy = self.copy(node);
-        if self.register.contains_key(&copy) || self.spills.contains_key(&copy) {
-            // It came with another.
-            return what.operands().for_each(|operand| self.release(operand));
+        let op = self.op(node);
+        let virtual_register = self.virtual_register(node);
+        if self.register.contains_key(&virtual_register) || self.spills.contains_key(&virtual_register) {
+            // Already computed, together with an earlier node.
+            return op.operands().for_each(|operand| self.release(operand));
         }
-        self.lock(what.operands());
-        match what {
-            MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::Row(..) => unreachable!("they lie in memory"),
-            MachineOp::Two(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
-            MachineOp::One(instruction, immediate, a) => {
-                let last = self.place(a);
+        self.lock(op.operands());
+        match op {
+            MachineOp::Load(_) | MachineOp::Constant(_) | MachineOp::TableRow(..) => unreachable!("they lie in memory"),
+            MachineOp::Binary(instruction, exchange, a, b) => self.two(node, instruction, exchange, a, b),
+            MachineOp::Unary(instruction, immediate, a) => {
+                let last = self.operand(a);
                 let to = self.result(node);
                 self.code.vector(instruction, to, 0, last, immediate);
             }
@@ -401,100 +408,98 @@ impl<'a> RegisterAllocator<'a> {
                 let (instruction, digit) = match direction {
                     Direction::Left => (i::SHIFT, 6),
                     Direction::Right => (i::SHIFT, 2),
-                    Direction::RightSigned => (i::SHIFT_SIGNED, 4),
+                    Direction::RightSigned => (i::VPSRAQ, 4),
                 };
                 self.code.vector(instruction, digit, to, Place::Register(from), Some(n));
             }
             MachineOp::Compare(predicate, a, b) => {
-                let (first, last, predicate) = match (self.place(a), self.place(b)) {
+                let (first, last, predicate) = match (self.operand(a), self.operand(b)) {
                     (Place::Register(a), last) => (a, last, predicate),
-                    (last, Place::Register(b)) => (b, last, predicate.turned()),
+                    (last, Place::Register(b)) => (b, last, predicate.with_operands_exchanged()),
                     (_, last) => (self.in_register(a), last, predicate),
                 };
                 let to = self.result(node);
-                self.code.vector(i::COMPARE, to, first, last, Some(predicate as u8));
+                self.code.vector(i::VCMPPD, to, first, last, Some(predicate as u8));
             }
             MachineOp::CompareInt(predicate, a, b) if self.width == Vectors::Avx512 => {
                 let first = self.in_register(a);
-                let last = self.place(b);
+                let last = self.operand(b);
                 let to = self.result(node);
-                self.code.vector(i::INT_COMPARE, to, first, last, Some(predicate));
+                self.code.vector(i::VPCMPQ, to, first, last, Some(predicate));
             }
-            MachineOp::TestBits(a, b) => self.two(node, i::INT_TEST, true, a, b),
+            MachineOp::TestBits(a, b) => self.two(node, i::VPTESTMQ, true, a, b),
             MachineOp::CompareInt(predicate, a, b) => {
-                // a < b is b > a.
-                let instruction = if predicate == 0 { i::INT_EQUAL } else { i::INT_GREATER };
+                // There is no instruction for less: a < b is b > a.
+                let instruction = if predicate == 0 { i::VPCMPEQQ } else { i::VPCMPGTQ };
                 let first = self.in_register(b);
-                let last = self.place(a);
+                let last = self.operand(a);
                 let to = self.result(node);
                 self.code.vector(instruction, to, first, last, None);
             }
             MachineOp::Mask(truth) => {
                 let to = self.result(node);
-                let instruction = if truth { i::MASK_NOT_XOR } else { i::MASK_XOR };
+                let instruction = if truth { i::KXNORB } else { i::KXORB };
                 self.code.mask(instruction, to, to, Place::Register(to));
             }
             MachineOp::MaskAnd(a, b) | MachineOp::MaskOr(a, b) => {
                 let (a, b) = (self.in_register(a), self.in_register(b));
                 let to = self.result(node);
-                let instruction = if matches!(what, MachineOp::MaskAnd(..)) { i::MASK_AND } else { i::MASK_OR };
+                let instruction = if matches!(op, MachineOp::MaskAnd(..)) { i::KANDB } else { i::KORB };
                 self.code.mask(instruction, to, a, Place::Register(b));
             }
             MachineOp::MaskNot(a) => {
                 let from = self.in_register(a);
                 let to = self.result(node);
-                self.code.mask(i::MASK_NOT, to, 0, Place::Register(from));
+                self.code.mask(i::KNOTB, to, 0, Place::Register(from));
             }
             MachineOp::MaskSelect(when, a, b) => {
                 let [when, a, b] = [when, a, b].map(|operand| self.in_register(operand));
                 let other = self.allocate(true);
                 let to = self.fresh_register(node);
-                self.code.mask(i::MASK_AND_NOT, other, when, Place::Register(b));
-                self.code.mask(i::MASK_AND, to, when, Place::Register(a));
-                self.code.mask(i::MASK_OR, to, to, Place::Register(other));
-                what.operands().for_each(|operand| self.release(operand));
+                self.code.mask(i::KANDNB, other, when, Place::Register(b));
+                self.code.mask(i::KANDB, to, when, Place::Register(a));
+                self.code.mask(i::KORB, to, to, Place::Register(other));
+                op.operands().for_each(|operand| self.release(operand));
             }
             MachineOp::Scale(when, a, b) => {
                 let mask = self.in_register(when);
                 let first = self.in_register(a);
-                let last = self.place(b);
+                let last = self.operand(b);
                 let to = self.result(node);
-                self.code.masked(i::SCALE, to, first, last, None, mask | ZEROING);
+                self.code.masked(i::VSCALEFPD, to, first, last, None, mask | ZEROING);
             }
             MachineOp::Select(when, a, b) => {
                 let mask = self.in_register(when);
                 let other = self.in_register(b);
-                let chosen = self.place(a);
+                let chosen = self.operand(a);
                 let to = self.result(node);
                 match self.width {
-                    Vectors::Avx512 => self.code.masked(i::BLEND, to, other, chosen, None, mask),
-                    Vectors::Avx | Vectors::Avx2 => {
-                        self.code.vector(i::BLEND_BY_SIGN, to, other, chosen, Some(mask << 4))
-                    }
+                    Vectors::Avx512 => self.code.masked(i::VBLENDMPD, to, other, chosen, None, mask),
+                    Vectors::Avx | Vectors::Avx2 => self.code.vector(i::VBLENDVPD, to, other, chosen, Some(mask << 4)),
                 }
             }
             MachineOp::Permute(first, second, index) => {
                 let by = self.in_register(index);
-                let [first, second] = [first, second].map(|row| self.place(row));
+                let [first, second] = [first, second].map(|row| self.operand(row));
                 let to = self.fresh_register(node);
-                self.code.vector(i::LOAD, to, 0, first, None);
-                self.code.vector(i::PERMUTE_TWO, to, by, second, None);
-                what.operands().for_each(|operand| self.release(operand));
+                self.code.vector(i::VMOVAPD_LOAD, to, 0, first, None);
+                self.code.vector(i::VPERMT2PD, to, by, second, None);
+                op.operands().for_each(|operand| self.release(operand));
             }
             MachineOp::Gather { base, index, .. } if self.width == Vectors::Avx512 => {
                 let from = self.in_register(index);
                 let mask = self.allocate(true);
                 let to = self.fresh_register(node);
-                self.code.mask(i::MASK_NOT_XOR, mask, mask, Place::Register(mask));
-                // It keeps lanes that the mask leaves out, so it would wait for whatever was there.
-                self.code.vector(i::XOR, to, to, Place::Register(to), None);
+                self.code.mask(i::KXNORB, mask, mask, Place::Register(mask));
+                // Lanes that are masked off keep their old content. Clearing the register breaks this false dependency.
+                self.code.vector(i::VXORPD, to, to, Place::Register(to), None);
                 self.code.gather(to, from, mask, 8 * base as i32);
                 self.release(index);
             }
             MachineOp::Gather { index, .. } => {
-                // All tables that are read at the same place, at once.
+                // Up to four tables that are read at the same index are looked up together.
                 let same =
-                    |other: &&Node| matches!(self.what(**other), MachineOp::Gather { index: at, .. } if at == index);
+                    |other: &&Node| matches!(self.op(**other), MachineOp::Gather { index: at, .. } if at == index);
                 let all: Vec<Node> = self.order[self.now.0..].iter().filter(same).take(4).copied().collect();
                 self.look_up(&all, index);
                 self.release(index);
@@ -502,10 +507,11 @@ impl<'a> RegisterAllocator<'a> {
         }
     }
 
-    /// Entries of tables at the same place: of two tables of elementary functions, which are known here, both by one load.
+    /// Loads entries of tables at the same index. Two tables of elementary functions, whose contents are known here,
+    /// are interleaved, so that one load fetches both entries.
     fn look_up(&mut self, all: &[Node], index: Node) {
         let nodes = self.nodes;
-        let table = |node: &Node| match self.what(*node) {
+        let table = |node: &Node| match self.op(*node) {
             MachineOp::Gather { base, len, .. } => base as usize..(base + len) as usize,
             _ => unreachable!("all are alike"),
         };
@@ -517,23 +523,23 @@ impl<'a> RegisterAllocator<'a> {
         let scale = if tables.chunks(2).any(both) { 4 } else { 8 };
         let from = self.in_register(index);
         let half = self.allocate(false);
-        let number = self.spill_number();
-        let place = self.spill_place(number);
-        self.left_spills.push(number);
+        let number = self.free_spill_slot();
+        let place = self.spill_operand(number);
+        self.freed_by_instruction.push(number);
         let Place::Memory(base, offset) = place else { unreachable!("it lies in memory") };
         match scale {
             4 => {
-                self.code.vector(i::INT_ADD, half, from, Place::Register(from), None);
-                self.code.vector(i::STORE, half, 0, place, None);
+                self.code.vector(i::VPADDQ, half, from, Place::Register(from), None);
+                self.code.vector(i::VMOVAPD_STORE, half, 0, place, None);
             }
-            _ => self.code.vector(i::STORE, from, 0, place, None),
+            _ => self.code.vector(i::VMOVAPD_STORE, from, 0, place, None),
         }
         for (two, tables) in all.chunks(2).zip(tables.chunks(2)) {
             let to: Vec<u8> = two.iter().map(|node| self.fresh_register(*node)).collect();
             if let ([first, second], true) = (to.as_slice(), both(tables)) {
                 let entries = tables[0].clone().zip(tables[1].clone()).flat_map(|(a, b)| [a, b]);
-                let distance = self.code.table(entries.map(|at| math::POOL[at].to_bits()).collect());
-                self.code.look_up_two([*first, *second], (base, offset), distance, half);
+                let displacement = self.code.table(entries.map(|at| math::POOL[at].to_bits()).collect());
+                self.code.look_up_two([*first, *second], (base, offset), displacement, half);
             } else {
                 for (to, table) in to.into_iter().zip(tables) {
                     self.code.look_up(to, (base, offset), scale, 8 * table.start as i32, half);
@@ -543,7 +549,7 @@ impl<'a> RegisterAllocator<'a> {
     }
 
     fn two(&mut self, node: Node, instruction: Instruction, exchange: bool, a: Node, b: Node) {
-        let (first, last) = match (self.place(a), self.place(b)) {
+        let (first, last) = match (self.operand(a), self.operand(b)) {
             (Place::Register(a), last) => (a, last),
             (last, Place::Register(b)) if exchange => (b, last),
             _ if a == b => {
@@ -553,30 +559,32 @@ impl<'a> RegisterAllocator<'a> {
             (_, last) => (self.in_register(a), last),
         };
         let to = self.result(node);
-        if instruction == i::BY_KIND {
-            // It waits for what the result's register held: that is to be what it needs anyway.
+        if instruction == i::VFIXUPIMMPD {
+            // The instruction reads its destination. Copying the operand there avoids a false dependency on the old
+            // content.
             if to != first && last != Place::Register(to) {
-                self.code.vector(i::LOAD, to, 0, Place::Register(first), None);
+                self.code.vector(i::VMOVAPD_LOAD, to, 0, Place::Register(first), None);
             }
             return self.code.vector(instruction, to, first, last, Some(0));
         }
         self.code.vector(instruction, to, first, last, None);
     }
 
-    /// One of three operands is overwritten, one may lie in memory.
+    /// The instruction overwrites one of its three operands, and one of the others may be in memory.
     fn fma(&mut self, node: Node, signs: Signs, a: Node, b: Node, c: Node) {
         let all = [a, b, c];
-        let places = all.map(|operand| self.place(operand));
+        let places = all.map(|operand| self.operand(operand));
         let held = |k: usize| matches!(places[k], Place::Register(_));
-        let dies = |body: &Self, k: usize| held(k) && body.next_use(body.copy(all[k])).is_none();
-        // What is not read any more is overwritten; else what has to be loaded; else a copy.
+        let is_dead =
+            |allocator: &Self, k: usize| held(k) && allocator.next_use(allocator.virtual_register(all[k])).is_none();
+        // Overwrite an operand that is dead; else one that has to be loaded in any case; else a copy.
         let over = [2, 0, 1]
             .into_iter()
-            .find(|k| dies(self, *k))
+            .find(|k| is_dead(self, *k))
             .or_else(|| [2, 0, 1].into_iter().find(|k| !held(*k)))
             .unwrap_or(2);
         let others: [usize; 2] = [[1, 2], [0, 2], [0, 1]][over];
-        // Of the others one may stay in memory.
+        // One of the other two may stay in memory.
         let mut read = others.map(|k| places[k]);
         if !held(others[0]) && !held(others[1]) {
             read[0] = Place::Register(self.in_register(all[others[0]]));
@@ -585,11 +593,11 @@ impl<'a> RegisterAllocator<'a> {
             }
         }
         let (to, owned) = match places[over] {
-            Place::Register(register) if dies(self, over) => (register, true),
+            Place::Register(register) if is_dead(self, over) => (register, true),
             place => {
                 let to = self.allocate(false);
                 match place {
-                    Place::Register(_) => self.code.vector(i::LOAD, to, 0, place, None),
+                    Place::Register(_) => self.code.vector(i::VMOVAPD_LOAD, to, 0, place, None),
                     place => self.load(all[over], to, place),
                 }
                 (to, false)
@@ -602,7 +610,7 @@ impl<'a> RegisterAllocator<'a> {
         self.fused(node, signs, over, others, read, to, owned);
     }
 
-    /// The first of `read` is a register.
+    /// Emits the instruction; the first of `read` is a register.
     #[allow(clippy::too_many_arguments)]
     fn fused(
         &mut self,
@@ -616,16 +624,16 @@ impl<'a> RegisterAllocator<'a> {
     ) {
         let Place::Register(second) = read[0] else { unreachable!("one of two is a register") };
         let form = match (over, others[0]) {
-            (2, _) => i::FMA_231,
-            // The register is c.
-            (_, 2) => i::FMA_132,
-            (_, _) => i::FMA_213,
+            (2, _) => i::VFMADD231PD,
+            // The register operand is c.
+            (_, 2) => i::VFMADD132PD,
+            (_, _) => i::VFMADD213PD,
         };
         let form = Instruction(form.0, form.1, form.2, form.3 + signs as u8);
         self.code.vector(form, to, second, read[1], None);
-        self.what(node).operands().for_each(|operand| self.release(operand));
-        let copy = self.copy(node);
+        self.op(node).operands().for_each(|operand| self.release(operand));
+        let virtual_register = self.virtual_register(node);
         debug_assert!(!owned || self.vector_of[to as usize].is_none(), "the operand has been released");
-        self.own(copy, false, to);
+        self.assign(virtual_register, false, to);
     }
 }

@@ -1,16 +1,20 @@
-//! In which order operations are computed, so that few results wait at a time.
+//! Scheduling: orders the operations of a straight line such that few values are live at a time.
+//!
+//! In: selected nodes and the roots that are needed. Out: the order. It does not know how many registers there are.
+//!
+//! Source: Sethi, Ullman, *The Generation of Optimal Code for Arithmetic Expressions*, JACM, 1970.
 
 use crate::codegen::lanes::isel::{Node, Nodes};
 use crate::ir::scc::topological_order;
 
-/// What roots need of the nodes that are wanted, loads and constants apart: each root's own in one piece, operands first, of
-/// these the one that needs most registers, so that few others wait meanwhile (Sethi and Ullman, 1970).
+/// Orders those of the `wanted` nodes that `roots` need, loads and constants excepted. The nodes of each root are
+/// adjacent, operands first. Of several operands the one that needs most registers comes first.
 pub fn schedule(nodes: &Nodes, roots: &[Node], wanted: &[bool]) -> Vec<Node> {
     let is_read = |node: Node| !wanted[node.index()] || nodes.nodes[node.index()].is_leaf();
-    // Registers that a node takes while it is computed, if nothing is shared.
+    // Sethi–Ullman number: registers that computing a node takes, if no value is shared.
     let mut need = vec![0; nodes.nodes.len()];
     for (index, node) in nodes.nodes.iter().enumerate() {
-        // What stands behind it is a leaf.
+        // A node that is not wanted is in memory, as a leaf is, and takes none.
         let mut of: Vec<usize> = node.operands().map(|operand| need[operand.index()]).collect();
         of.sort_unstable_by(|a, b| b.cmp(a));
         let most = of.iter().enumerate().map(|(before, need)| need + before).max();
