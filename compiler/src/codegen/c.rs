@@ -13,11 +13,12 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fmt::Write;
 
 /// Maximum length of an inline expression, in characters.
-const LONGEST: usize = 72;
+const MAX_INLINE: usize = 72;
 
 /// The file. `functions`: expanded; `params`: the defaults of the parameters in SI units.
 ///
-/// # Panics If a function does not verify or is not expanded: a mistake of an earlier pass.
+/// # Panics
+/// If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn source(functions: &[(Function, Func)], description: &Description, params: &[f64]) -> String {
     let names = Names::new(description);
     let mut helpers = BTreeSet::new();
@@ -99,24 +100,24 @@ fn heading(description: &Description, names: &Names, timeless: bool) -> String {
     out += "#ifdef __FAST_MATH__\n#error \"-ffast-math would change the results\"\n#endif\n";
     out += "#if FLT_EVAL_METHOD != 0\n#error \"doubles must be computed as doubles\"\n#endif\n";
     out += "\n/* Places of the block. */\nenum {\n";
-    let mut told: HashMap<Slot, String> = HashMap::new();
+    let mut notes: HashMap<Slot, String> = HashMap::new();
     for quantity in &description.quantities {
         let doc = quantity.doc.as_ref().and_then(|doc| doc.lines().next()).unwrap_or_default();
         let unit = if quantity.boolean { "true 1, false 0".into() } else { Unit::si(quantity.unit.dimension).text };
         let what = [kind(quantity.kind), &unit, doc].map(str::trim).into_iter().filter(|part| !part.is_empty());
-        told.entry(quantity.slot).or_insert_with(|| comment(&what.collect::<Vec<_>>().join(", ")));
+        notes.entry(quantity.slot).or_insert_with(|| comment(&what.collect::<Vec<_>>().join(", ")));
     }
     let width = names.slots.iter().map(String::len).max().unwrap_or(0);
     for (at, name) in names.slots.iter().enumerate() {
-        let told = match Slot(at as u32) {
+        let notes = match Slot(at as u32) {
             Slot::TIME if timeless => Some("time, s: for you to keep, no equation reads it".to_string()),
             Slot::TIME => Some("time, s".to_string()),
             Slot::STEP => Some("fixed step, s".into()),
             Slot::COUNT => Some("steps since the start".into()),
-            slot => told.get(&slot).cloned(),
+            slot => notes.get(&slot).cloned(),
         };
-        match told {
-            Some(told) => writeln!(out, "    {name:<width$} = {at},  /* {told} */"),
+        match notes {
+            Some(notes) => writeln!(out, "    {name:<width$} = {at},  /* {notes} */"),
             None => writeln!(out, "    {name:<width$} = {at},"),
         }
         .expect("writing to a string does not fail");
@@ -221,7 +222,7 @@ fn identifier(path: &str) -> String {
     if name.is_empty() { "x".into() } else { name }
 }
 
-/// A real constant.
+/// The C literal of a real.
 fn real(x: f64) -> String {
     match x {
         x if x.is_nan() => "(double)NAN".into(),
@@ -299,7 +300,7 @@ struct Writer<'a> {
     stored: HashMap<Value, String>,
     /// Values that always get a name: those written to rings, which must be computed before anything is stored, and
     /// those that gcc miscompiles or warns about when they are inline.
-    apart: HashSet<Value>,
+    always_named: HashSet<Value>,
     /// The text for each value where it is used.
     text: Vec<String>,
     helpers: &'a mut BTreeSet<Helper>,
@@ -329,7 +330,7 @@ impl<'a> Writer<'a> {
         // x = 0 that returns −0. It also warns about `71 == (2 & n)`, which is always false. It does not see through a
         // named variable.
         let op = |value: Value| func.ops[value.index()];
-        let seen_into = func.ops.iter().flat_map(|of| match *of {
+        let misread_by_gcc = func.ops.iter().flat_map(|of| match *of {
             Op::Sub(a, b) if op(a) == Op::Real(0.0f64.to_bits()) => vec![b],
             Op::IntEqual(a, b) => {
                 let masked = |value: &Value| matches!(op(*value), Op::IntAnd(..) | Op::IntOr(..));
@@ -337,8 +338,18 @@ impl<'a> Writer<'a> {
             }
             _ => Vec::new(),
         });
-        let apart = written.chain(seen_into).collect();
-        Writer { func, names, types, uses, stored, apart, text: vec![String::new(); func.ops.len()], helpers, tables }
+        let always_named = written.chain(misread_by_gcc).collect();
+        Writer {
+            func,
+            names,
+            types,
+            uses,
+            stored,
+            always_named,
+            text: vec![String::new(); func.ops.len()],
+            helpers,
+            tables,
+        }
     }
 
     fn function(&mut self, function: Function) -> String {
@@ -350,15 +361,15 @@ impl<'a> Writer<'a> {
             let (value, op) = (Value(i as u32), self.func.ops[i]);
             let written = self.expression(op);
             let constant = matches!(op, Op::Real(_) | Op::Int(_) | Op::Bool(_));
-            let once = self.uses[i] == 1 || self.uses[i] == 0 && self.func.status == Some(value);
-            let named = self.stored.contains_key(&value) || self.apart.contains(&value);
-            let short = once && written.len() <= LONGEST && !named;
+            let is_used_once = self.uses[i] == 1 || self.uses[i] == 0 && self.func.status == Some(value);
+            let named = self.stored.contains_key(&value) || self.always_named.contains(&value);
+            let short = is_used_once && written.len() <= MAX_INLINE && !named;
             self.text[i] = if constant {
                 written
             } else if short || matches!(op, Op::Load(_)) && !named {
                 match op {
                     Op::Load(_) | Op::Pool { .. } | Op::Ring { .. } => written,
-                    _ if written.ends_with(')') && called(&written) => written,
+                    _ if written.ends_with(')') && is_call(&written) => written,
                     _ => format!("({written})"),
                 }
             } else {
@@ -406,7 +417,7 @@ impl<'a> Writer<'a> {
         out + "}\n"
     }
 
-    fn helped(&mut self, helper: Helper, call: String) -> String {
+    fn call_helper(&mut self, helper: Helper, call: String) -> String {
         self.helpers.insert(helper);
         call
     }
@@ -421,22 +432,27 @@ impl<'a> Writer<'a> {
             Op::Pool { base, len, index } => {
                 let (table, index) = (table(base, len), t(index));
                 self.tables.insert((base, len));
-                self.helped(Helper::Entry, format!("entry({table}, {}, {index})", len - 1))
+                self.call_helper(Helper::Entry, format!("entry({table}, {}, {index})", len - 1))
             }
             Op::Ring { base, len, index } => {
                 let (base, index) = (self.names.slot(base), t(index));
-                self.helped(Helper::Entry, format!("entry(block + {base}, {}, {index})", len - 1))
+                self.call_helper(Helper::Entry, format!("entry(block + {base}, {}, {index})", len - 1))
             }
             Op::Add(a, b) | Op::IntAdd(a, b) => format!("{} + {}", t(a), t(b)),
             Op::Sub(a, b) | Op::IntSub(a, b) => format!("{} - {}", t(a), t(b)),
             Op::Mul(a, b) | Op::IntMul(a, b) => format!("{} * {}", t(a), t(b)),
             Op::Div(a, b) => format!("{} / {}", t(a), t(b)),
             Op::Neg(a) => format!("-{}", t(a)),
-            Op::Abs(a) => format!("fabs({})", bare(&t(a))),
-            Op::Sqrt(a) => format!("sqrt({})", bare(&t(a))),
-            Op::Fma(a, b, c) => format!("fma({}, {}, {})", bare(&t(a)), bare(&t(b)), bare(&t(c))),
-            Op::Floor(a) => format!("floor({})", bare(&t(a))),
-            Op::Nearest(a) => format!("nearbyint({})", bare(&t(a))),
+            Op::Abs(a) => format!("fabs({})", without_parentheses(&t(a))),
+            Op::Sqrt(a) => format!("sqrt({})", without_parentheses(&t(a))),
+            Op::Fma(a, b, c) => format!(
+                "fma({}, {}, {})",
+                without_parentheses(&t(a)),
+                without_parentheses(&t(b)),
+                without_parentheses(&t(c))
+            ),
+            Op::Floor(a) => format!("floor({})", without_parentheses(&t(a))),
+            Op::Nearest(a) => format!("nearbyint({})", without_parentheses(&t(a))),
             Op::Unary(..) | Op::Binary(..) => unreachable!("elementary functions are expanded"),
             Op::Less(a, b) => format!("{} < {}", t(a), t(b)),
             Op::LessEqual(a, b) => format!("{} <= {}", t(a), t(b)),
@@ -449,48 +465,52 @@ impl<'a> Writer<'a> {
             Op::ShiftLeft(a, n) => format!("{} << {n}", t(a)),
             Op::ShiftRight(a, n) => format!("{} >> {n}", t(a)),
             Op::ShiftRightSigned(a, n) => {
-                let call = format!("shifted({}, {n})", bare(&t(a)));
-                self.helped(Helper::ShiftSigned, call)
+                let call = format!("shifted({}, {n})", without_parentheses(&t(a)));
+                self.call_helper(Helper::ShiftSigned, call)
             }
             Op::IntLess(a, b) => {
-                let call = format!("is_less({}, {})", bare(&t(a)), bare(&t(b)));
-                self.helped(Helper::Less, call)
+                let call = format!("is_less({}, {})", without_parentheses(&t(a)), without_parentheses(&t(b)));
+                self.call_helper(Helper::Less, call)
             }
             Op::ToBits(a) => {
-                let call = format!("bits_of({})", bare(&t(a)));
-                self.helped(Helper::ToBits, call)
+                let call = format!("bits_of({})", without_parentheses(&t(a)));
+                self.call_helper(Helper::ToBits, call)
             }
             Op::FromBits(a) => {
-                let call = format!("real_of({})", bare(&t(a)));
-                self.helped(Helper::FromBits, call)
+                let call = format!("real_of({})", without_parentheses(&t(a)));
+                self.call_helper(Helper::FromBits, call)
             }
             Op::ToInt(a) => {
-                let call = format!("truncated({})", bare(&t(a)));
-                self.helped(Helper::ToInt, call)
+                let call = format!("truncated({})", without_parentheses(&t(a)));
+                self.call_helper(Helper::ToInt, call)
             }
             Op::ToReal(a) => {
-                let call = format!("as_real({})", bare(&t(a)));
-                self.helped(Helper::ToReal, call)
+                let call = format!("as_real({})", without_parentheses(&t(a)));
+                self.call_helper(Helper::ToReal, call)
             }
         }
     }
 }
 
 /// Whether an expression is a single call.
-fn called(text: &str) -> bool {
+fn is_call(text: &str) -> bool {
     let Some(open) = text.find('(') else { return false };
     open > 0
         && text[..open].chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-        && closes(text, open) == Some(text.len() - 1)
+        && closing_parenthesis(text, open) == Some(text.len() - 1)
 }
 
 /// An expression without parentheses around the whole, for use as an argument.
-fn bare(text: &str) -> &str {
-    if text.starts_with('(') && closes(text, 0) == Some(text.len() - 1) { &text[1..text.len() - 1] } else { text }
+fn without_parentheses(text: &str) -> &str {
+    if text.starts_with('(') && closing_parenthesis(text, 0) == Some(text.len() - 1) {
+        &text[1..text.len() - 1]
+    } else {
+        text
+    }
 }
 
 /// The position of the parenthesis that closes the one at `open`.
-fn closes(text: &str, open: usize) -> Option<usize> {
+fn closing_parenthesis(text: &str, open: usize) -> Option<usize> {
     let mut depth = 0;
     text.bytes().enumerate().skip(open).find_map(|(at, byte)| {
         depth += match byte {

@@ -280,7 +280,7 @@ const MAX_SINGLE_OPS: usize = 2500;
 /// Maximum number of operations of a short function, see [`Emitter::short`].
 const MAX_SHORT_OPS: usize = 80;
 
-/// Emits one iteration without a loop at the current position of `b`, up to and including its return.
+/// Emits one iteration, specialised by mode, at the current position of `b`, up to and including its returns.
 fn single_body(
     specialised: &Specialised,
     exit_condition: ExitCondition,
@@ -547,9 +547,9 @@ fn upper_bound(func: &Func) -> Vec<Option<i64>> {
 struct JoinPoint {
     /// The Cranelift block.
     block: clif::Block,
-    /// For each output of the automaton, whether it is read there.
+    /// For each output of the automaton, whether the code after the join point reads it.
     outputs: Vec<bool>,
-    /// Slots that each case stores, with the index of the output.
+    /// Slots that each case stores, with the index of the stored output.
     stores: Vec<(Slot, usize)>,
     /// The slot of the automaton and the bits it holds in this case, where they are known.
     held: Option<(Slot, u64)>,
@@ -580,7 +580,7 @@ pub struct Emitter<'a> {
     /// instructions counts. In a longer one a limit by a constant becomes a conditional jump: where its prediction is
     /// right, the comparison is not on the critical path.
     short: bool,
-    /// Clamped indices of tables and rings: by index and length, the Cranelift block that computes it and the value.
+    /// Clamped indices of tables and rings: for an index and a length, the Cranelift block with the clamp, and its value.
     clamped: RefCell<HashMap<(Value, u32), (clif::Block, clif::Value)>>,
     /// Blocks that dominate the current one: those that end in a branch of this or an enclosing region.
     dominators: Vec<clif::Block>,
@@ -784,7 +784,7 @@ impl<'a> Emitter<'a> {
                 b.ins().jump(join.block, &read);
             }
             Terminator::Branch(when, sides) => {
-                // Values read by nested cases, or as their outputs.
+                // Values that nested cases read, as operands or as outputs.
                 let mut read = vec![*when];
                 for side in sides.iter() {
                     side.each(&mut |inner| {

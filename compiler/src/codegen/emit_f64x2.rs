@@ -25,7 +25,8 @@ const SIGN: u64 = 1 << 63;
 /// Emits the step for `vectors` interleaved vectors into the empty `target`; returns the number of doubles it needs
 /// after the blocks.
 ///
-/// # Errors If the function has a ring, or is too large.
+/// # Errors
+/// If the function has a ring, or is too large.
 pub fn emit(
     func: &Func,
     layout: &Layout,

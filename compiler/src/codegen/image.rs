@@ -13,8 +13,8 @@ use abi::{Description, Function};
 /// Compiles the image of a model. `params`: the defaults of its parameters in SI units, as many as its layout has.
 /// `more`: features of the processor that the code may use beyond those that the target requires.
 ///
-/// # Panics If the target has no such features, or a function does not verify or is not expanded: a mistake of an
-/// earlier pass.
+/// # Panics
+/// If the target has no such features, or a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn image(
     functions: &[(Function, Func)],
     description: &Description,

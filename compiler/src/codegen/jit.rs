@@ -27,7 +27,8 @@ pub struct Stats {
 
 /// Compiles functions that work on blocks of this layout and a pool of `pool_len` doubles.
 ///
-/// # Panics If a function does not verify or is not expanded: a mistake of an earlier pass.
+/// # Panics
+/// If a function does not verify or is not expanded: a mistake of an earlier pass.
 pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> Result<(Machine, Stats), Unsupported> {
     compile_with(funcs, layout, pool_len, Lengths::USUAL, false)
 }
@@ -35,7 +36,8 @@ pub fn compile(funcs: &[(Function, Func)], layout: &Layout, pool_len: usize) -> 
 /// Compiles as [`compile`] does, and also a single step with [hoisted parameter expressions](abi::table::Prepared). For
 /// callers that reserve room for those after the block, as [`Instance`](abi::Instance) does.
 ///
-/// # Panics As `compile`.
+/// # Panics
+/// As `compile`.
 pub fn compile_prepared(
     funcs: &[(Function, Func)],
     layout: &Layout,
@@ -84,8 +86,8 @@ fn generate(
     let isa = here()?;
     let mut memory = Memory::new(isa);
     let module = memory.module();
-    let mut coder = FunctionCompiler::new(isa);
-    coder.set_lengths(lengths);
+    let mut compiler = FunctionCompiler::new(isa);
+    compiler.set_lengths(lengths);
     let mut stats = Stats::default();
     let mut ids = Vec::new();
     let mut single = None;
@@ -97,7 +99,7 @@ fn generate(
             module.define_function_bytes(id, bytes.alignment as u64, &bytes.code, &[]).map_err(failed)?;
             Ok(id)
         };
-        let prepared = if prepares && *function == Function::Step { coder.prepared(func, layout)? } else { None };
+        let prepared = if prepares && *function == Function::Step { compiler.prepared(func, layout)? } else { None };
         let (id, at, len) = match prepared {
             Some(prepared) => {
                 let id = define(&prepared.bytes)?;
@@ -106,7 +108,7 @@ fn generate(
                 (id, prepared.loop_offset, prepared.bytes.code.len())
             }
             None => {
-                let bytes = coder.function(func)?;
+                let bytes = compiler.function(func)?;
                 (define(&bytes)?, 0, bytes.code.len())
             }
         };
@@ -150,7 +152,7 @@ mod tests {
 
     /// Compiles code and drops it; returns whether its memory is no longer executable then. Tests that run at the same
     /// time may have mapped the same address again.
-    fn is_given_back() -> bool {
+    fn is_freed() -> bool {
         let layout = Layout::new([0, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
         let mut build = Build::new("f");
         let x = build.load(Slot(3));
@@ -173,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn code_is_never_writable_and_is_given_back_with_its_last_clone() {
-        assert!((0..20).any(|_| is_given_back()), "nobody needs the code any more");
+    fn code_is_never_writable_and_executable_and_is_freed_with_its_last_clone() {
+        assert!((0..20).any(|_| is_freed()), "nobody needs the code any more");
     }
 }

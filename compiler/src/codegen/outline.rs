@@ -135,7 +135,7 @@ impl<'a> Line<'a> {
             order.visit(value, Some(group));
         }
         let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
-        // The failure pieces need these from before the stores, so they are read in the iteration.
+        // The failure pieces need these values from before the stores, so the iteration reads them.
         let read =
             values(func).filter(|value| needed_on_failure[value.index()] || matches!(func.op(*value), Op::Ring { .. }));
         let (tested, detail) = exit_condition.values();
@@ -310,7 +310,7 @@ impl<'a> Line<'a> {
         (!later && !by_another).then_some((Slot(first as u32), stride, row))
     }
 
-    /// The slots that an operation reads, or that a value is loaded from.
+    /// The slots whose loads are operands of a value, and its own slot if it is a load.
     fn slots_read(&self, value: Value) -> impl Iterator<Item = Slot> {
         self.func.reads(self.func.op(value)).chain([value]).filter_map(|read| self.slot(read))
     }
@@ -346,7 +346,7 @@ impl<'a> Line<'a> {
             let read = piece.values(repeats).flat_map(|value| self.func.reads(self.func.op(value)));
             for value in read.chain(stored).chain(written) {
                 let ends = match computed_in[value.index()] {
-                    // An invariant is read again in the next iteration.
+                    // An invariant is read again in the next iteration, so its slot stays in use.
                     Some(made) if made < iteration.start && number >= iteration.start => pieces.len(),
                     Some(made) if made < number => number,
                     _ => continue,

@@ -3,8 +3,8 @@
 //!
 //! In: a verified, expanded function, and which of its operations are computed together. Out: [`Repeats`]: rows of
 //! isomorphic operations, with the place of each operand. The search goes from results to operands. Operands must be
-//! the same for all repetitions, or lie in memory at a constant stride; constants that differ are put into tables.
-//! Operations with other operands are not repeated. It knows nothing of processors.
+//! the same for all repetitions, or lie in memory at a constant stride; constants that differ are put into tables. Rows
+//! with any other operand are dissolved. It knows nothing of processors.
 //!
 //! Compare Rocha et al., *Loop Rolling for Code Size Reduction*, CGO 2022, and LLVM's `LoopReroll`.
 

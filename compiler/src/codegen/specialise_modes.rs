@@ -21,7 +21,7 @@ pub struct Specialised {
     pub func: Func,
     /// Operations that depend on no automaton, in topological order.
     pub common: Vec<Value>,
-    /// Operations that depend on one automaton each.
+    /// The automata, each with the operations that depend on it alone.
     pub automata: Vec<Automaton>,
     /// Operations that depend on several automata, or on one that is too small to specialise; in topological order.
     pub joint: Vec<Value>,
@@ -91,7 +91,7 @@ pub struct Automaton {
     pub slot: Slot,
     /// Its values that other operations or results read.
     pub outputs: Vec<Value>,
-    /// The residual operations for each mode, which is given by the bits of its number.
+    /// For each mode, the bits of its number and its residual operations.
     pub cases: Vec<(u64, Case)>,
     /// The operations for any other number in the slot, not specialised.
     pub general: Case,

@@ -75,15 +75,15 @@ impl<'a> FunctionCompiler<'a> {
 
     /// Compiles a function; its entry, with the signature of [`abi::table::Entry`], is at offset 0.
     ///
-    /// # Panics If the code calls anything except its own pieces: a mistake of `emit`.
+    /// # Panics
+    /// If the code calls anything except its own pieces: a mistake of `emit`.
     pub fn function(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
         let single = self.single(func);
         Ok(self.parts(func, single.as_ref(), true)?.all)
     }
 
-    /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted: see
-    /// `hoist_params`. `layout`: of the blocks. None if single iterations have no code
-    /// of their own.
+    /// Compiles a step for single iterations whose expressions of parameters and step length are hoisted, see
+    /// `hoist_params`. `layout`: that of the blocks. None if single iterations have no code of their own.
     pub fn prepared(&mut self, func: &Func, layout: &Layout) -> Result<Option<PreparedBytes>, Unsupported> {
         let Some(single) = self.single(func) else { return Ok(None) };
         let Hoisted { prepare, step } = Hoisted::of(&single, layout);
@@ -94,9 +94,9 @@ impl<'a> FunctionCompiler<'a> {
     }
 
     /// Compiles the loop over any number of iterations as one Cranelift function, without outlining.
-    fn compile_loop(&mut self, func: &Func, ahead: Option<emit::Distributed>) -> Result<Bytes, Unsupported> {
+    fn compile_loop(&mut self, func: &Func, distributed: Option<emit::Distributed>) -> Result<Bytes, Unsupported> {
         self.context.clear();
-        emit::emit(func, ahead, &mut self.context.func, &mut self.builder, self.isa);
+        emit::emit(func, distributed, &mut self.context.func, &mut self.builder, self.isa);
         self.compile_context(func)
     }
 
@@ -134,7 +134,7 @@ impl<'a> FunctionCompiler<'a> {
     /// Compiles the remaining loop of a distributed step, with the signature of [`abi::ahead::RestEntry`]. Loads from
     /// slots at or after `size`, the size of the block, read values that the vectorised loop has computed, one for each
     /// of `lanes` steps.
-    pub fn rest(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
+    pub fn remaining_loop(&mut self, func: &Func, size: usize, lanes: usize) -> Result<Bytes, Unsupported> {
         self.compile_loop(func, Some(emit::Distributed { first: Slot(size as u32), lanes }))
     }
 

@@ -47,7 +47,8 @@ fn function(program: &Program, method: Method, which: Function) -> Option<Func> 
 
 /// An optimised fixed step whose elementary functions are not yet expanded, as lanes need it.
 ///
-/// # Panics For the adaptive method, which has no fixed step.
+/// # Panics
+/// For the adaptive method, which has no fixed step.
 pub fn step(program: &Program, method: Method) -> Func {
     opt::optimise(fixed_step::step(program, method), Context::of(program))
 }
@@ -113,7 +114,7 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
     match target::here() {
         // A program that may be too large for machine code is compiled at once, so that the note about it comes at
         // once.
-        Ok(_) if !interpret && size <= LARGE => (on_demand(program, method, false), Vec::new()),
+        Ok(_) if !interpret && size <= MAX_TIERED_OPS => (on_demand(program, method, false), Vec::new()),
         _ => code(&functions(program, method), &program.description, interpret),
     }
 }
@@ -122,11 +123,11 @@ pub fn late(program: &Program, method: Method, interpret: bool) -> (Code, Vec<St
 /// machine code.
 pub fn on_demand(program: &Program, method: Method, interpret: bool) -> Code {
     let interpret = interpret || target::here().is_err();
-    Code::Interpreted(Arc::new(Tiered { program: program.clone(), method, interpret, made: Default::default() }))
+    Code::Interpreted(Arc::new(Tiered { program: program.clone(), method, interpret, forms: Default::default() }))
 }
 
 /// Maximum number of operations, before elementary functions are expanded, for which compilation surely succeeds.
-const LARGE: usize = 5_000;
+const MAX_TIERED_OPS: usize = 5_000;
 
 /// Number of runs of a function that take about as long as compiling it: interpreting an operation takes some 10 ns,
 /// compiling it some 2 µs.
@@ -136,14 +137,14 @@ const TIER_UP_CALLS: u64 = 200;
 struct Tiered {
     program: Program,
     method: Method,
-    /// Whether none becomes machine code.
+    /// Whether no function becomes machine code.
     interpret: bool,
-    made: [Made; Function::ALL.len()],
+    forms: [Forms; Function::ALL.len()],
 }
 
 /// The forms of one function, each built when it is first needed.
 #[derive(Default)]
-struct Made {
+struct Forms {
     func: OnceLock<Option<(Function, Func)>>,
     interpreter: OnceLock<Interpreter>,
     /// None inside: the function is too large.
@@ -156,7 +157,7 @@ impl Tiered {
     /// The function, expanded to arithmetic.
     fn func(&self, which: Function) -> Option<&(Function, Func)> {
         let make = || Some((which, function(&self.program, self.method, which)?));
-        self.made[which as usize].func.get_or_init(make).as_ref()
+        self.forms[which as usize].func.get_or_init(make).as_ref()
     }
 
     /// Passes one function to a back end.
@@ -168,21 +169,21 @@ impl Tiered {
 
 impl Interpret for Tiered {
     fn call(&self, which: Function, block: &mut [f64], pool: &[f64], count: u64) -> u64 {
-        let made = &self.made[which as usize];
+        let forms = &self.forms[which as usize];
         let make = |funcs: &[_], layout: &Layout, pool| jit::compile_prepared(funcs, layout, pool).ok().map(|it| it.0);
         let compiled = || self.make(which, make);
-        let pays = || made.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > TIER_UP_CALLS;
+        let pays = || forms.runs.fetch_add(count, Ordering::Relaxed).saturating_add(count) > TIER_UP_CALLS;
         if !self.interpret
-            && (made.machine.get().is_some() || pays())
-            && let Some(machine) = made.machine.get_or_init(compiled)
+            && (forms.machine.get().is_some() || pays())
+            && let Some(machine) = forms.machine.get_or_init(compiled)
         {
             return machine.call(which, block, pool, count);
         }
-        made.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
+        forms.interpreter.get_or_init(|| self.make(which, Interpreter::new)).call(which, block, pool, count)
     }
 
     fn made(&self, which: Function) -> Option<&Machine> {
-        self.made[which as usize].machine.get()?.as_ref()
+        self.forms[which as usize].machine.get()?.as_ref()
     }
 
     fn has(&self, which: Function) -> bool {
@@ -213,7 +214,7 @@ mod tests {
     }
 
     /// The block after each of a number of calls.
-    fn course(code: Code, program: &Program) -> Vec<Vec<u64>> {
+    fn blocks_after_calls(code: Code, program: &Program) -> Vec<Vec<u64>> {
         let mut instance = Instance::new(Arc::new(program.description.clone()), code, &program.params);
         assert_eq!(instance.start(1e-3), 0);
         let counts = (0..2 * TIER_UP_CALLS).map(|_| 1).chain([TIER_UP_CALLS + 1, 3]);
@@ -233,22 +234,25 @@ mod tests {
     }
 
     #[test]
-    fn nobody_can_tell_when_a_function_was_compiled() {
+    fn the_bits_do_not_depend_on_when_a_function_is_compiled() {
         let program = program();
         let (interpreted, _) = late(&program, Method::Expo, true);
-        let expected = course(interpreted, &program);
-        assert_eq!(course(late(&program, Method::Expo, false).0, &program), expected);
-        assert_eq!(course(code(&functions(&program, Method::Expo), &program.description, false).0, &program), expected);
+        let expected = blocks_after_calls(interpreted, &program);
+        assert_eq!(blocks_after_calls(late(&program, Method::Expo, false).0, &program), expected);
+        assert_eq!(
+            blocks_after_calls(code(&functions(&program, Method::Expo), &program.description, false).0, &program),
+            expected
+        );
     }
 
     #[test]
-    fn a_function_is_there_before_it_is_made() {
+    fn tiered_code_has_the_same_functions() {
         let program = program();
         for method in [Method::Adaptive, Method::Expo] {
             let at_once = code(&functions(&program, method), &program.description, false).0;
-            let made_late = late(&program, method, false).0;
+            let tiered = late(&program, method, false).0;
             for function in Function::ALL {
-                assert_eq!(made_late.has(function), at_once.has(function), "{}", function.name());
+                assert_eq!(tiered.has(function), at_once.has(function), "{}", function.name());
             }
         }
     }

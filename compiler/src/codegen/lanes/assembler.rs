@@ -152,17 +152,19 @@ pub mod instructions {
 pub struct Assembler {
     width: Vectors,
     bytes: Vec<u8>,
-    /// Constants in the order of their first use; references to them: position of the displacement, end of the
-    /// instruction, index.
+    /// Constants in the order of their first use, as bits.
     constants: Vec<u64>,
+    /// The index of each constant.
     indices: HashMap<u64, usize>,
+    /// References to constants: position of the displacement, end of the instruction, index.
     references: Vec<(usize, usize, usize)>,
-    /// The same for vectors of constants.
+    /// Vectors of constants.
     rows: Vec<[u64; 8]>,
+    /// References to these, as above.
     row_references: Vec<(usize, usize, usize)>,
-    /// Tables after the constants, and the position of the displacement that addresses them, if r11 holds their
-    /// address.
+    /// Tables after the constants.
     tables: Vec<Vec<u64>>,
+    /// Position of the displacement in the instruction that loads the address of the tables, if there is one.
     table_reference: Option<usize>,
 }
 

@@ -250,7 +250,8 @@ pub const SIGN: u64 = 1 << 63;
 
 /// Selects instructions for a function. `pooled`: the pool begins with the tables of the elementary functions.
 ///
-/// # Errors If the width has no instruction for an operation.
+/// # Errors
+/// If the width has no instruction for an operation.
 pub fn select(func: &Func, width: Vectors, pooled: bool) -> Result<Nodes, Unsupported> {
     if !func.writes.is_empty() {
         return Err(Unsupported("a ring of samples (delay) has no lanes".into()));
@@ -301,13 +302,13 @@ impl Selection {
         Ok(of)
     }
 
-    fn add(&mut self, what: MachineOp) -> Node {
-        if let Some(known) = self.known.get(&what) {
+    fn add(&mut self, op: MachineOp) -> Node {
+        if let Some(known) = self.known.get(&op) {
             return *known;
         }
-        self.nodes.push(what);
+        self.nodes.push(op);
         let node = Node(self.nodes.len() as u32 - 1);
-        self.known.insert(what, node);
+        self.known.insert(op, node);
         node
     }
 
@@ -334,8 +335,8 @@ impl Selection {
         }
     }
 
-    fn missing(&self, what: &str) -> Unsupported {
-        Unsupported(format!("{:?} has no {what}", self.width))
+    fn missing(&self, name: &str) -> Unsupported {
+        Unsupported(format!("{:?} has no {name}", self.width))
     }
 
     fn node(&mut self, func: &Func, op: Op, of_type: Type, of: &[Node]) -> Result<Node, Unsupported> {
@@ -344,7 +345,7 @@ impl Selection {
         if let Some(x) = sign_of(op, |value| func.op(value)) {
             return Ok(self.sign(at(x)));
         }
-        let what = match op {
+        let machine_op = match op {
             Op::Real(bits) => MachineOp::Constant(bits),
             Op::Int(n) => MachineOp::Constant(n as u64),
             Op::Bool(truth) if has_masks => MachineOp::Mask(truth),
@@ -436,7 +437,7 @@ impl Selection {
             Op::ToReal(a) if has_masks => MachineOp::Unary(i::VCVTQQ2PD, None, at(a)),
             Op::ToReal(_) => return Err(self.missing("conversion from integers")),
         };
-        Ok(self.add(what))
+        Ok(self.add(machine_op))
     }
 
     /// ±1 with the sign of x; x itself if it is ±0 or NaN.
@@ -449,8 +450,8 @@ impl Selection {
         let negative = self.add(MachineOp::Binary(i::VANDPD, true, x, sign));
         let unit = self.add(MachineOp::Binary(i::VORPD, true, negative, one));
         let moves = self.add(MachineOp::Compare(Predicate::LessOrGreater, x, zero));
-        let what = self.select_lanes(moves, unit, x);
-        self.add(what)
+        let machine_op = self.select_lanes(moves, unit, x);
+        self.add(machine_op)
     }
 
     /// e^x with the bits of [`exponential::exp`], in fewer instructions. The power of two is applied last, by

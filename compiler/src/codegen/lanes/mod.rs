@@ -126,9 +126,11 @@ impl Vectors {
 /// Compiles a step for many instances, in the widest vectors of this processor that have instructions for all
 /// operations.
 ///
-/// # Errors The reason why the widest vectors do not, if no others do either.
+/// # Errors
+/// The reason why the widest vectors do not, if no others do either.
 ///
-/// # Panics As [`compile`].
+/// # Panics
+/// As [`compile`].
 pub fn widest(func: &Func, layout: &Layout, pool_len: usize) -> Result<Lanes, Unsupported> {
     let mut refused = None;
     for width in Width::here_all() {
@@ -142,9 +144,11 @@ pub fn widest(func: &Func, layout: &Layout, pool_len: usize) -> Result<Lanes, Un
 
 /// Compiles a step for `vectors` interleaved vectors of instances.
 ///
-/// # Errors If this processor does not have the width, or the width has no instruction for an operation.
+/// # Errors
+/// If this processor does not have the width, or the width has no instruction for an operation.
 ///
-/// # Panics As [`bytes`].
+/// # Panics
+/// As [`bytes`].
 pub fn compile(
     func: &Func,
     layout: &Layout,
@@ -178,9 +182,11 @@ pub struct Bytes {
 
 /// Generates the code of [`compile`], for any processor that has the width.
 ///
-/// # Errors If the width has no instruction for an operation.
+/// # Errors
+/// If the width has no instruction for an operation.
 ///
-/// # Panics If the function does not verify: a mistake of an earlier pass.
+/// # Panics
+/// If the function does not verify: a mistake of an earlier pass.
 pub fn bytes(
     func: &Func,
     layout: &Layout,

@@ -30,7 +30,7 @@ pub fn compile(step: &Func, layout: &Layout, pool_len: usize) -> Option<Ahead> {
             None => Some((None, leading)),
         }
     })?;
-    let bytes = FunctionCompiler::new(here().ok()?).rest(&remaining, layout.size(), leading.width()).ok()?;
+    let bytes = FunctionCompiler::new(here().ok()?).remaining_loop(&remaining, layout.size(), leading.width()).ok()?;
     let executable = Executable::new(&bytes.code, bytes.alignment as u64).ok()?;
     // SAFETY: `address` is the start of code with the signature of `RestEntry`.
     let entry = unsafe { std::mem::transmute::<*const u8, RestEntry>(executable.address()) };
