@@ -1034,11 +1034,11 @@ impl<'a> Emitter<'a> {
         self.values[value.index()] = Some(result);
     }
 
-    /// Address and offset of an entry of a table in the pool, or of a ring in the block (`whole`). The index is clamped
-    /// unless it is known to be in range.
+    /// Address and offset of an entry of a table in the pool, or of a ring in the block. `base_address`: that of pool or
+    /// block. The index is clamped unless it is known to be in range.
     fn entry(
         &self,
-        whole: clif::Value,
+        base_address: clif::Value,
         base: u32,
         len: u32,
         index: Value,
@@ -1058,6 +1058,6 @@ impl<'a> Emitter<'a> {
             clamped_index
         });
         let bytes = b.ins().ishl_imm_u(clamped_index, 3);
-        (b.ins().iadd(whole, bytes), offset(base))
+        (b.ins().iadd(base_address, bytes), offset(base))
     }
 }

@@ -230,13 +230,14 @@ fn reroll(
     }
     inputs.sort_unstable_by_key(|(_, _, value)| *value);
     inputs.dedup();
-    let kept: Vec<Value> =
+    let scratch_outputs: Vec<Value> =
         rows.iter().map(|row| row.members[0]).filter(|value| outlined.scratch_slots.contains_key(value)).collect();
-    let kept: Vec<_> = kept.into_iter().map(|value| (pointer(&mut pointers, scratch, 1), slot(value), value)).collect();
+    let scratch_outputs: Vec<_> =
+        scratch_outputs.into_iter().map(|value| (pointer(&mut pointers, scratch, 1), slot(value), value)).collect();
     let stores = piece.row_stores.iter().map(|(first, stride, row)| {
         (pointer(&mut pointers, block, *stride), first.0, outlined.repeats.rows[*row].members[0])
     });
-    let outputs: Vec<(usize, u32, Value)> = kept.into_iter().chain(stores).collect();
+    let outputs: Vec<(usize, u32, Value)> = scratch_outputs.into_iter().chain(stores).collect();
 
     let [body, after] = [(); 2].map(|()| b.create_block());
     let count = b.ins().iconst(types::I64, rows[0].members.len() as i64);

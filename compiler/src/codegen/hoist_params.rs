@@ -46,11 +46,11 @@ impl Hoisted {
         all.iter().for_each(|at| remaining.ops[*at] = Op::Load(first));
         // Values that only other hoisted values need are not stored.
         let live = remaining.live();
-        let kept: Vec<usize> = all.into_iter().filter(|at| live[*at]).collect();
+        let hoisted: Vec<usize> = all.into_iter().filter(|at| live[*at]).collect();
         let slots: HashMap<usize, Slot> =
-            kept.iter().enumerate().map(|(k, at)| (*at, Slot(first.0 + k as u32))).collect();
+            hoisted.iter().enumerate().map(|(k, at)| (*at, Slot(first.0 + k as u32))).collect();
         let (mut prepare, mut stores, mut step) = (Build::of(func), Vec::new(), Build::new(&func.name));
-        for at in kept {
+        for at in hoisted {
             let value = Value(at as u32);
             // An integer is stored as the real with the same bits.
             let number = if types[at] == Type::Int { prepare.from_bits(value) } else { value };

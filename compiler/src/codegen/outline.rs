@@ -6,9 +6,9 @@
 //! [rerolled](crate::codegen::reroll) form a piece of their own, a loop. It knows nothing of processors.
 //!
 //! ```text
-//! invariant   what no iteration changes; once a call
-//! iteration   everything else; each slot is stored as soon as nothing reads it any more
-//! failure     what only the status needs, run when the test for it says so
+//! invariant   loop invariants; once per call
+//! iteration   all other operations; each slot is stored as soon as nothing reads it any more
+//! failure     operations that only the status needs; when its test reports a failed guard
 //! ```
 //! Values that cross a cut go through a scratch area. The order of operations keeps these few: the operations that one
 //! result needs are adjacent, and each cut is placed, within the allowed lengths, where the fewest values cross.
@@ -75,7 +75,7 @@ pub struct Outlined {
     pub repeats: Repeats,
     /// The pieces in execution order.
     pub pieces: Vec<Piece>,
-    /// The pieces that run in each iteration. Those before them run once a call, those after them when a guard has
+    /// The pieces that run in each iteration. Those before them run once per call, those after them when a guard has
     /// failed.
     pub iteration: Range<usize>,
     /// The scratch slot of each value that crosses a cut.
@@ -375,9 +375,10 @@ impl<'a> Line<'a> {
         let mut len = 0;
         let mut ending: Vec<Vec<(usize, u32)>> = vec![Vec::new(); pieces.len() + 1];
         for (number, piece) in pieces.iter().enumerate() {
-            let alone = piece.ops.iter().filter(|value| single(value));
-            let alone = alone.filter_map(|value| Some((std::slice::from_ref(value), last[value.index()]?)));
-            for (values, last) in std::mem::take(&mut arrays[number]).into_iter().chain(alone) {
+            let single_values = piece.ops.iter().filter(|value| single(value));
+            let single_values =
+                single_values.filter_map(|value| Some((std::slice::from_ref(value), last[value.index()]?)));
+            for (values, last) in std::mem::take(&mut arrays[number]).into_iter().chain(single_values) {
                 let home = free.get_mut(&values.len()).and_then(Vec::pop).unwrap_or_else(|| {
                     len += values.len() as u32;
                     len - values.len() as u32
@@ -413,8 +414,8 @@ impl Order<'_> {
             }
             let operands = self.func.reads(self.func.op(value));
             if ready {
-                let behind = operands.filter_map(|operand| self.groups[operand.index()]).max().unwrap_or(0);
-                let group = group.unwrap_or(behind);
+                let last_group = operands.filter_map(|operand| self.groups[operand.index()]).max().unwrap_or(0);
+                let group = group.unwrap_or(last_group);
                 self.groups[value.index()] = Some(group);
                 self.values.push((group, value));
                 continue;

@@ -336,13 +336,13 @@ fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
         }
     }
     for (i, op) in func.ops.iter().enumerate().filter(|(i, _)| !needed[*i]) {
-        let (mut same, mut behind) = (true, false);
+        let (mut same, mut reads_joint) = (true, false);
         op.each_operand(|operand| {
             let operand = operand.index();
             same &= stored[operand] || !matches!(places[operand], Place::Within(_));
-            behind |= places[operand] == Place::Joint;
+            reads_joint |= places[operand] == Place::Joint;
         });
-        if matches!(places[i], Place::Within(_)) && (same || behind) {
+        if matches!(places[i], Place::Within(_)) && (same || reads_joint) {
             places[i] = Place::Joint;
         }
     }

@@ -145,7 +145,7 @@ impl<'a> FunctionCompiler<'a> {
         Ok((self.compile_context(func)?, scratch))
     }
 
-    /// Compiles what the context holds; it must not contain calls.
+    /// Compiles the function in the context, which must not contain calls.
     fn compile_context(&mut self, func: &Func) -> Result<Bytes, Unsupported> {
         let FunctionCompiler { isa, context, .. } = self;
         let compiled = context.compile(*isa, &mut Default::default()).map_err(|error| refused(func, &error.inner))?;

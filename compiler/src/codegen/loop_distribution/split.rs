@@ -165,12 +165,12 @@ fn passed(func: &Func, on: &[Dependence], types: &[Type]) -> Vec<Value> {
     let carried = |slot: &Slot| loaded.contains(slot) && ![Slot::TIME, Slot::COUNT].contains(slot);
     let states = func.stores.iter().filter(|(slot, _)| carried(slot)).map(|(_, value)| *value);
     let written = func.writes.iter().flat_map(|write| [write.index, write.value]);
-    let watched = func.status.map(|status| match func.op(status) {
+    let guard = func.status.map(|status| match func.op(status) {
         Op::Select(when, _, zero) if func.op(zero) == Op::Int(0) => when,
         _ => status,
     });
     let mut needed = vec![false; func.ops.len()];
-    states.chain(written).chain(watched).for_each(|value| needed[value.index()] = true);
+    states.chain(written).chain(guard).for_each(|value| needed[value.index()] = true);
     let mut passed = Vec::new();
     for i in (0..func.ops.len()).rev() {
         let op = func.ops[i];
