@@ -409,8 +409,8 @@ fn distinct(values: &[Value]) -> bool {
     sorted.windows(2).all(|pair| pair[0] != pair[1])
 }
 
-/// The first number and the stride, if the numbers are an arithmetic progression with a stride other than 0 and none is
-/// missing.
+/// The first number and the stride of an arithmetic progression; none if a number is missing, the distances differ, or
+/// the stride is 0.
 pub fn arithmetic_progression(numbers: impl Iterator<Item = Option<i64>>) -> Option<(i64, i64)> {
     let mut numbers = numbers;
     let first = numbers.next()??;

@@ -299,8 +299,8 @@ fn dependences(func: &Func, cold: &[bool], automata: &[(Value, Vec<u64>)]) -> Ve
     of
 }
 
-/// Rematerialises cheap operations that only modes need in each of these modes: loads of slots that are not stored, and
-/// changes of sign.
+/// Rematerialises cheap operations whose results only modes read, in each of these modes: loads of slots that are not
+/// stored, and changes of sign.
 fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
     let mut needed_elsewhere = vec![false; func.ops.len()];
     func.results().for_each(|value| needed_elsewhere[value.index()] = true);
@@ -318,8 +318,8 @@ fn rematerialise_cheap(func: &Func, places: &mut [Place]) {
     }
 }
 
-/// Moves operations that only guards need after all automata if they read no values of a mode except stored ones: they
-/// are the same in each mode.
+/// Moves operations that only guards need to the end, after all automata, if stored values are the only mode-dependent
+/// values that they read: they are the same in each mode.
 fn move_guards_after(func: &Func, guard: Option<Value>, places: &mut [Place]) {
     let mut stored = vec![false; func.ops.len()];
     func.stores.iter().for_each(|(_, value)| stored[value.index()] = true);

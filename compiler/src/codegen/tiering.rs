@@ -65,7 +65,7 @@ pub fn lanes(program: &Program, method: Method) -> Option<Lanes> {
     Width::here_all().find_map(|width| lanes_of(program, method, width, vectors(width)))
 }
 
-/// The function that lanes execute for a method, its elementary functions not yet expanded.
+/// The function that lanes execute for a method, before its elementary functions are expanded.
 pub fn of_lanes(program: &Program, method: Method) -> Option<(Function, Func)> {
     match method {
         Method::Adaptive => Some((Function::Rosenbrock, rosenbrock::rosenbrock(program)?)),
@@ -147,7 +147,7 @@ struct Tiered {
 struct Forms {
     func: OnceLock<Option<(Function, Func)>>,
     interpreter: OnceLock<Interpreter>,
-    /// None inside: the function is too large.
+    /// Machine code; the inner `None` means that the function is too large.
     machine: OnceLock<Option<Machine>>,
     /// Number of iterations run so far.
     runs: AtomicU64,

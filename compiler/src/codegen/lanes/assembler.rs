@@ -123,7 +123,8 @@ pub mod instructions {
     pub const VBLENDVPD: Instruction = Instruction(1, 3, [0, 0], 0x4b);
     /// EVEX only.
     pub const VBLENDMPD: Instruction = Instruction(1, 2, [1, 0], 0x65);
-    /// Replaces v by kind, by the response table in rm. The immediate is 0: no exceptions.
+    /// Replaces v according to its class (NaN, zero, infinity, sign), by the response table in rm. The immediate is 0:
+    /// no exceptions.
     pub const VFIXUPIMMPD: Instruction = Instruction(1, 3, [1, 0], 0x54);
     /// v · 2^⌊rm⌋
     pub const VSCALEFPD: Instruction = Instruction(1, 2, [1, 0], 0x2c);

@@ -413,7 +413,7 @@ impl Selection {
             Op::ShiftRight(a, n) => MachineOp::Shift(Direction::Right, at(a), n),
             Op::ShiftRightSigned(a, n) if has_masks => MachineOp::Shift(Direction::RightSigned, at(a), n),
             Op::ShiftRightSigned(a, n) => {
-                // Arithmetic shift by a logical one: sign extension of the shifted value by ((x >> n) ^ s) − s.
+                // Arithmetic shift from a logical one: ((x >> n) ^ s) − s extends the sign bit s of the shifted value.
                 let shifted = self.add(MachineOp::Shift(Direction::Right, at(a), n));
                 let sign = self.constant(SIGN >> n);
                 let flipped = self.add(MachineOp::Binary(i::VXORPD, true, shifted, sign));
@@ -526,7 +526,7 @@ impl Selection {
         if self.width == Vectors::Avx512 {
             return self.add(MachineOp::Binary(i::VPMINUQ, true, node, last));
         }
-        // Unsigned comparison by a signed one: flip the top bits.
+        // With the top bits flipped, a signed comparison compares unsigned numbers.
         let sign = self.constant(SIGN);
         let flipped = self.add(MachineOp::Binary(i::VXORPD, true, node, sign));
         let limit = self.constant((u64::from(len) - 1) ^ SIGN);
