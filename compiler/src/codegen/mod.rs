@@ -5,7 +5,7 @@
 //! same bits as [`ir::interpret`](crate::ir::interpret); the tests in `agreement` check that. Only `emit`,
 //! `emit_outlined`, `emit_f64x2`, `target`, `jit` and `executable_memory` know Cranelift.
 //!
-//! The passes in the order in which they run:
+//! The passes in the order in which they run; `passes` lists those of the step with their conditions:
 //!
 //! ```text
 //! tiering             interprets a function first; calls jit once it has run often enough

@@ -1,16 +1,17 @@
-//! The passes from a program to machine code, in their order, with what each did: `fric build --emit passes`.
+//! The list of all passes from a program to machine code, in order, with their effects: `fric build --emit passes`.
 //!
-//! In: a program and a method. Out: a line for each pass. The passes before the back ends are listed in [`opt::PASSES`] and run
-//! from there. Those of the back end run inside emission, where control flow exists; [`LATE`] lists them in that order, with
-//! their conditions, and counts their effect on the step by the same functions that emission calls.
+//! In: a program and a method. Out: one report for each pass. The passes before code generation are listed in
+//! [`opt::PASSES`] and run from there. Those of code generation run during emission, because they need control flow;
+//! [`LATE`] lists them with their conditions. Their effects on the step are counted by the functions that emission
+//! calls.
 
-use crate::codegen::emit::{Facts, Watch};
+use crate::codegen::emit::{ExitCondition, Facts};
 use crate::codegen::hoist_params::Hoisted;
-use crate::codegen::outline::{Lengths, cut};
+use crate::codegen::outline::{Lengths, outline};
 use crate::codegen::select_to_branch::BranchRegions;
-use crate::codegen::sink::sunk;
-use crate::codegen::specialise_modes::{numbers, specialise};
-use crate::codegen::unswitch::unswitched;
+use crate::codegen::sink::sink;
+use crate::codegen::specialise_modes::{modes, specialise};
+use crate::codegen::unswitch::unswitchable;
 use crate::codegen::{loop_distribution, tiering};
 use crate::ir::program::Program;
 use crate::ir::{Func, Value};
@@ -20,16 +21,16 @@ use crate::{math, numerics};
 use abi::Layout;
 use abi::plan::Method;
 
-/// A pass of the back end.
+/// A pass of code generation.
 pub struct Late {
     /// The name of its module.
     pub name: &'static str,
-    /// What it does and when it runs.
+    /// What the pass does and when it runs.
     pub does: &'static str,
     effect: fn(&Func, &Layout) -> Option<String>,
 }
 
-/// The passes of the back end, in their order.
+/// The passes of code generation, in order.
 pub static LATE: [Late; 7] = [
     Late {
         name: "hoist_params",
@@ -42,14 +43,14 @@ pub static LATE: [Late; 7] = [
     Late {
         name: "unswitch",
         does: "copies the step for each answer to a comparison that three automata or more test",
-        effect: |func, _| unswitched(func).map(|_| "a copy for each answer".into()),
+        effect: |func, _| unswitchable(func).map(|_| "a copy for each answer".into()),
     },
     Late {
         name: "specialise_modes",
         does: "makes a residual step for each mode of an automaton, and a switch between them",
         effect: |func, _| {
-            let (watch, late) = Watch::of(func);
-            let automata = specialise(func, &numbers(func), &late, watch.asked().0).automata;
+            let (exit_condition, cold) = ExitCondition::of(func);
+            let automata = specialise(func, &modes(func), &cold, exit_condition.values().0).automata;
             let modes: usize = automata.iter().map(|automaton| automaton.cases.len()).sum();
             (modes > 0).then(|| format!("{modes} modes of {} automata", automata.len()))
         },
@@ -59,7 +60,7 @@ pub static LATE: [Late; 7] = [
         does: "moves cheap operations on loads down to their first use, for lower register pressure",
         effect: |func, _| {
             let before = operations(func);
-            let moved = before.iter().zip(sunk(&func.ops, &before)).filter(|(a, b)| *a != b).count();
+            let moved = before.iter().zip(sink(&func.ops, &before)).filter(|(a, b)| *a != b).count();
             (moved > 0).then(|| format!("{moved} places in the order changed"))
         },
     },
@@ -68,7 +69,7 @@ pub static LATE: [Late; 7] = [
         does: "turns selections with an expensive arm into branches that compute one arm",
         effect: |func, _| {
             let results: Vec<Value> = func.results().collect();
-            let count = BranchRegions::of(&func.ops, &operations(func), &results).of_choice.len();
+            let count = BranchRegions::of(&func.ops, &operations(func), &results).arms.len();
             (count > 0).then(|| format!("{count} branches"))
         },
     },
@@ -77,8 +78,11 @@ pub static LATE: [Late; 7] = [
         does: "cuts functions of more than 2,000 operations into pieces; repeated parts become loops (reroll)",
         effect: |func, _| {
             let lengths = Lengths::USUAL;
-            let outlined =
-                if func.ops.len() > lengths.whole { cut(func, &Facts::of(func), lengths)? } else { return None };
+            let outlined = if func.ops.len() > lengths.max_function {
+                outline(func, &Facts::of(func), lengths)?
+            } else {
+                return None;
+            };
             Some(format!(
                 "{} pieces, {} rows of repeated operations",
                 outlined.pieces.len(),
@@ -90,31 +94,31 @@ pub static LATE: [Late; 7] = [
         name: "loop_distribution",
         does: "computes what depends on time alone in a leading vectorised loop; for many steps in one call",
         effect: |func, layout| {
-            let ahead = loop_distribution::split(func, layout.size())?;
-            Some(format!("{} operations in the leading loop", ahead.instants.ops.len()))
+            let distribution = loop_distribution::split(func, layout.size())?;
+            Some(format!("{} operations in the leading loop", distribution.leading.ops.len()))
         },
     },
 ];
 
-/// All operations that a function needs, in order.
+/// All live operations of a function, in order.
 fn operations(func: &Func) -> Vec<Value> {
     let live = func.live();
     (0..func.ops.len()).filter(|i| live[*i]).map(|i| Value(i as u32)).collect()
 }
 
-/// What a pass did with the step of a program.
+/// The report of one pass over the step of a program.
 pub struct Ran {
-    /// Its name.
+    /// The name of the pass.
     pub name: &'static str,
-    /// What it does.
+    /// A description of the pass.
     pub does: &'static str,
-    /// Operations before and after; of the back end's passes both are the step's.
+    /// Operations before and after the pass; for passes of code generation, both are those of the step.
     pub ops: [usize; 2],
-    /// What it did, in words, where the numbers do not say it.
+    /// The effect in words, where the numbers do not show it.
     pub effect: Option<String>,
 }
 
-/// Runs the passes on the step of a method; `ran` is called after each.
+/// Runs the passes on the step of a method and calls `ran` after each.
 pub fn each(program: &Program, method: Method, ran: &mut dyn FnMut(Ran)) {
     let plain = |name, does, before, after| Ran { name, does, ops: [before, after], effect: None };
     let func = match method {
