@@ -1,6 +1,10 @@
-//! Syntax tree to machine code: resolve, flatten, check, lower, and the back ends.
+//! Compiler: from syntax trees to machine code.
 //!
-//! Text in, values out: no files, no clock.
+//! In: texts with their syntax trees ([`Loaded`]), and [`Sources`] for imports. Out: runnable instances, plans,
+//! programs, and diagnostics. Opens no file and reads no clock.
+//!
+//! Order of the stages: resolve, flatten, unit check, causality check, analyses, lowering, numerics, optimisation, code
+//! generation.
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
@@ -34,10 +38,10 @@ use grammar::span::FileId;
 use pipeline::{Depth, analyse};
 use std::sync::Arc;
 
-/// How to compile.
+/// Options of a compilation.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Changes to the experiment.
+    /// Changes to the experiment from outside, such as those of the command line.
     pub changes: Changes,
     /// Run the reference interpreter instead of machine code.
     pub interpret: bool,
@@ -51,15 +55,14 @@ pub struct Case {
     pub instance: Instance,
     /// What to run.
     pub experiment: abi::plan::Experiment,
-    /// What the user should know: a processor without what machine code needs.
+    /// Notes for the user, such as: this processor lacks instructions that machine code needs.
     pub notes: Vec<String>,
 }
 
-/// Compiles an experiment of a loaded text: one case for each combination of its sweeps. `on_stage` is called with the
-/// name of each stage when it begins.
+/// Compiles an experiment of a loaded text. Returns one case for each combination of its sweeps. Calls `on_stage` with
+/// the name of each stage when the stage begins.
 ///
-/// # Errors
-/// Everything that is wrong with the experiment and the models it runs.
+/// # Errors All errors of the experiment and of the models it runs.
 pub fn compile(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -75,11 +78,10 @@ pub fn compile(
     Ok(cases)
 }
 
-/// Compiles an experiment once for many runs under other values of the parameters in `options.changes.vary`: one for
-/// each combination of its own sweeps.
+/// Compiles an experiment once for many runs that differ in the values of the parameters in `options.changes.vary`.
+/// Returns one entry for each combination of the experiment's own sweeps.
 ///
-/// # Errors
-/// Everything that is wrong with the experiment and the models it runs.
+/// # Errors All errors of the experiment and of the models it runs.
 pub fn varying(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -95,7 +97,7 @@ pub fn varying(
     }
     let one = |variant: experiment::Variant| {
         let paths = &varied(&variant);
-        // What is described keeps its ranges; the code of a fixed step loses those that change.
+        // The description keeps its ranges. The code of a fixed step drops the guards of those that the runs change.
         let mut coded = variant.program.clone();
         coded.description.guards = experiment::vary::in_code(&variant, paths);
         let functions = functions(&coded, variant.experiment.solver.method);
@@ -116,19 +118,18 @@ pub fn varying(
     Ok(variants.into_iter().map(one).collect())
 }
 
-/// A model or an experiment as one program, for what is made of it beside a run.
+/// A model or an experiment as one program, for uses other than a run (C, images, listings).
 pub struct Built {
     /// The program.
     pub program: ir::program::Program,
-    /// How an experiment is stepped; none for a model on its own.
+    /// How an experiment is stepped; `None` for a model on its own.
     pub solver: Option<abi::plan::Solver>,
 }
 
-/// Compiles a model on its own, its inputs open, or the first combination of an experiment's sweeps. A model that delays
-/// something can be stepped with `changes.step` only: how much of the past is kept depends on it.
+/// Compiles a model on its own with its inputs open, or the first combination of an experiment's sweeps. A model with
+/// delays can be stepped only with `changes.step`, because the length of the kept history depends on the step.
 ///
-/// # Errors
-/// Everything that is wrong with it.
+/// # Errors All errors of the model or experiment.
 pub fn build(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -157,11 +158,10 @@ pub fn build(
     Ok(Built { program, solver: None })
 }
 
-/// Makes a model or an experiment ready to be linearised; `name` is the name of either. The first combination of an
-/// experiment's sweeps counts.
+/// Prepares a model or an experiment for linearisation; `name` is the name of either. Takes the first combination of an
+/// experiment's sweeps.
 ///
-/// # Errors
-/// Everything that is wrong with it.
+/// # Errors All errors of the model or experiment.
 pub fn linear(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -210,30 +210,29 @@ pub fn linear(
 
 /// A rig, ready to run.
 pub struct Ready {
-    /// Its plan.
+    /// The plan of the rig.
     pub rig: abi::rig::Rig,
-    /// The control program: parameters set, not started.
+    /// The control program, with its parameters set but not started.
     pub control: Instance,
-    /// The crossed-out part: its own `Step`, by `expo`.
+    /// The partition (the part of the model that hardware replaces), with its own `Step` by `expo`.
     pub plant: Instance,
-    /// The control program before it was compiled: for derivatives of its step.
+    /// The control program before compilation, from which derivatives of its step are made.
     pub program: ir::program::Program,
-    /// The plant program before it was compiled.
+    /// The plant program before compilation.
     pub plant_program: ir::program::Program,
-    /// Which parameters may change while it runs, and what must hold of them.
+    /// Which parameters may change during the run, and the conditions on them.
     pub live: abi::live::Live,
-    /// What computes the numbers of that from a block of parameters.
+    /// Evaluates the numbers of those conditions from a block of parameters.
     pub judge: Instance,
-    /// The same before it was compiled.
+    /// The program of `judge` before compilation.
     pub judge_program: ir::program::Program,
-    /// What the user should know: a processor without what machine code needs.
+    /// Notes for the user, such as: this processor lacks instructions that machine code needs.
     pub notes: Vec<String>,
 }
 
-/// Compiles a rig of a loaded text. Of the changes in `options` only `set` counts.
+/// Compiles a rig of a loaded text. Only `set` of the changes in `options` has an effect.
 ///
-/// # Errors
-/// Everything that is wrong with the rig and the models it runs.
+/// # Errors All errors of the rig and of the models it runs.
 pub fn rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -263,12 +262,12 @@ pub fn rig(
     })
 }
 
-/// The one function of a judge.
+/// The only function of a judge: its `Outputs`.
 pub fn judging(judge: &ir::program::Program) -> Vec<(Function, ir::Func)> {
     vec![(Function::Outputs, math::expand(&judge.outputs))]
 }
 
-/// A rig up to its programs.
+/// Compiles a rig as far as its lowered programs.
 fn lowered_rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -284,7 +283,7 @@ fn lowered_rig(
     let prepared = rig::prepare(loaded, sources, item);
     let changes = overrides.iter().map(|change| change.override_in(root)).collect();
     let cut = rig::read(loaded, sources, &prepared, changes, Vec::new(), Vec::new(), &mut diagnostics);
-    // What rests on a declaration that could not be read has been reported with that.
+    // Errors that follow from an unreadable declaration have been reported with the declaration.
     let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
     let Some(cut) = cut.filter(|_| !lost && !diagnostics.iter().any(Diagnostic::is_error)) else {
         return Err(once(diagnostics));
@@ -299,18 +298,18 @@ fn lowered_rig(
     Ok(lowered)
 }
 
-/// Code of the last case, and what it was made from.
+/// Code of the previous case, and the program that it was made from.
 struct Made {
     program: ir::program::Program,
     method: Method,
     code: Code,
-    /// Code of the same for adaptive runs, if that is another one.
+    /// Code for adaptive runs, if it differs from `code`.
     adaptive: Option<Code>,
     notes: Vec<String>,
 }
 
 impl Made {
-    /// Whether the code of a program is the same: it differs in the values of parameters at most.
+    /// Whether a program has the same code: it may differ only in the values of its parameters.
     fn fits(&self, program: &ir::program::Program, method: Method) -> bool {
         let ir::program::Program {
             description,
@@ -331,7 +330,8 @@ impl Made {
     }
 }
 
-/// Cases of a sweep over parameters differ in numbers of the block only: they share the code of the one before.
+/// Makes a case runnable. Cases of a sweep over parameters differ only in numbers of the block, so each reuses the code
+/// of the previous one.
 fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) -> Case {
     let experiment::Variant { label, mut program, adaptive, mut experiment, mut rig, .. } = variant;
     let stepped = rig.as_mut().map_or(&mut program, |(_, plant)| plant);
@@ -355,14 +355,14 @@ fn case(variant: experiment::Variant, interpret: bool, made: &mut Option<Made>) 
     Case { label, instance, experiment, notes: notes.clone() }
 }
 
-/// The surroundings of a dry run.
+/// The simulated surroundings of a rig for software in the loop.
 fn bench(rig: abi::rig::Rig, plant: &ir::program::Program, method: Method, interpret: bool) -> abi::rig::Bench {
     let (code, _) = codegen::tiering::late(plant, method, interpret);
     abi::rig::Bench { rig, plant: Instance::new(Arc::new(plant.description.clone()), code, &plant.params) }
 }
 
-/// Whether a friction model dissipates, with the parameters that the arguments of an instance give it. None for what
-/// does not fit `Friction`, or has a part or input that stays open.
+/// Decides whether a friction model dissipates, with the parameter values of an instance's arguments. Returns `None` if
+/// the model does not match the interface `Friction`, or has an open part or input.
 pub fn dissipation(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -394,10 +394,9 @@ pub fn dissipation(
     analysis::dissipation::dissipation(&system, &types)
 }
 
-/// Explains a model of a loaded text, on its own.
+/// Explains a model of the root file on its own.
 ///
-/// # Errors
-/// Everything that is wrong with it.
+/// # Errors All errors of the model.
 pub fn explain(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -410,10 +409,9 @@ pub fn explain(
     }
 }
 
-/// Explains a model of any file of a loaded text, on its own.
+/// Explains a model of any loaded file on its own.
 ///
-/// # Errors
-/// Everything that is wrong with it, or that there is none.
+/// # Errors All errors of the model, or that there is no such model.
 pub fn explain_in(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -432,10 +430,9 @@ pub fn explain_in(
     }
 }
 
-/// A model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
+/// Compiles a model of the text on its own, ready for fixed steps of `step` s, at its start with its inputs at 0.
 ///
-/// # Errors
-/// Everything that is wrong with it, and why there is no machine code.
+/// # Errors All errors of the model, or the reason why there is no machine code.
 pub fn stepping(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -461,10 +458,9 @@ pub fn stepping(
     Ok(instance)
 }
 
-/// Every quantity of what an experiment runs, with these changes.
+/// Lists every quantity of an experiment's system, with these changes.
 ///
-/// # Errors
-/// Everything that is wrong with it.
+/// # Errors All errors of the experiment.
 pub fn quantities(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -475,10 +471,9 @@ pub fn quantities(
     Ok(analysis::explain::quantities(&variant.system, &variant.types, &loaded.files))
 }
 
-/// Explains what an experiment runs, with these changes.
+/// Explains an experiment's system, with these changes.
 ///
-/// # Errors
-/// Everything that is wrong with it.
+/// # Errors All errors of the experiment.
 pub fn explain_run(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -489,7 +484,7 @@ pub fn explain_run(
     Ok(analysis::explain::explain(&variant.system, &variant.types, &loaded.files))
 }
 
-/// The first combination of an experiment's sweeps.
+/// Reads an experiment and returns the first combination of its sweeps.
 fn first(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -501,7 +496,8 @@ fn first(
     Ok(variants.into_iter().next().expect("there is at least one combination"))
 }
 
-/// The model that this name stands for in the first text, and its file: an imported one too, if no experiment has the name.
+/// The model called `name` in the root file, and its file. Finds an imported model too, unless an experiment has the
+/// name.
 fn model_of(loaded: &Loaded, name: &str) -> Option<(grammar::ast::Model, FileId)> {
     if loaded.experiments().iter().any(|experiment| experiment.name == name) {
         return loaded.models().into_iter().find(|model| model.name.text == name).map(|m| (m.clone(), loaded.root()));
@@ -509,7 +505,7 @@ fn model_of(loaded: &Loaded, name: &str) -> Option<(grammar::ast::Model, FileId)
     loaded.model_named(name)
 }
 
-/// A model of the text on its own, changed by `open` before its units are checked, if nothing is wrong with it.
+/// A model of the text on its own, changed by `open` before the unit check. Fails if it has errors.
 fn sound<T>(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -528,7 +524,7 @@ fn sound<T>(
     Ok((system, types, opened))
 }
 
-/// A model on its own, flat and typed, its circles reported.
+/// A model on its own, flattened and typed, with its algebraic loops reported.
 fn alone(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -540,7 +536,7 @@ fn alone(
     (system, types, diagnostics)
 }
 
-/// As [`alone`], changed by `open` before its units are checked.
+/// As [`alone`], but changed by `open` before the unit check.
 fn opened<T>(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -563,7 +559,8 @@ fn opened<T>(
     (system, types, diagnostics, opened)
 }
 
-/// Checks everything in a loaded text: each model on its own, each experiment.
+/// Checks every item of a loaded text: each model on its own, each experiment, rig, interface, function, constant and
+/// table.
 pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let mut all = loaded.diagnostics.clone();
     let root = loaded.root();
@@ -581,7 +578,8 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                         all.extend(steps(loaded, experiment, &variants));
                     }
                     Err(errors) => {
-                        // What a statement that could not be read would have declared is missing in what is run, too.
+                        // Declarations of an unreadable statement are missing in the experiment too; their absence is
+                        // not reported again.
                         let missing = |d: &Diagnostic| {
                             matches!(d.code, "E0106" | "E0203" | "E0204" | "E0205" | "E0206" | "E0303" | "E0501")
                         };
@@ -589,7 +587,7 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
                     }
                 }
             }
-            // What calls a function that grows beyond all bounds does so too, each time anew.
+            // Callers of a function that grows without bound grow without bound too, and would each repeat the error.
             Item::Function(_) if all.iter().any(|d| d.recurring == Some(Recurring::Operations)) => {}
             Item::Function(_) | Item::Const(_) | Item::Table(_) => {
                 let flat = frontend::flatten::flatten_item(loaded, sources, root, item);
@@ -612,17 +610,17 @@ pub fn check(loaded: &mut Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
             Item::Import(_) | Item::Device(_) => {}
         }
     }
-    // What cannot be read elsewhere is missing here: say the cause.
+    // Names from an unreadable file are missing here; the report names only the cause.
     if loaded.diagnostics.iter().any(|d| d.is_error() && d.span().file != root) {
         all.retain(|d| d.span().file != root || !matches!(d.code, "E0201" | "E0203" | "E0204" | "E0205" | "E0206"));
     }
     once(all)
 }
 
-/// Most combinations of an experiment whose steps are looked at.
+/// Limit on the combinations of one experiment whose steps are checked.
 const MOST_STEPPED: usize = 4;
 
-/// What is to be said of the steps and ticks of an experiment, once for all combinations of its sweeps.
+/// Warnings and errors about the steps and ticks of an experiment, each code once for all combinations of its sweeps.
 fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[experiment::Variant]) -> Vec<Diagnostic> {
     use grammar::ast::ExperimentStatement as Statement;
     let run = experiment.body.iter().find_map(|statement| match statement {
@@ -671,17 +669,17 @@ fn steps(loaded: &Loaded, experiment: &grammar::ast::Experiment, variants: &[exp
     said
 }
 
-/// Checks the models of a loaded text, each on its own, but for the physics of friction: what a run should know, in no
-/// time.
+/// Checks the models of a loaded text, each on its own, without the physics of friction. Fast enough to precede each
+/// run.
 pub fn check_models(loaded: &Loaded, sources: &dyn Sources) -> Vec<Diagnostic> {
     let models = loaded.models();
     once(models.into_iter().flat_map(|model| check_model(loaded, sources, model, false)).collect())
 }
 
-/// Checks a model of the text on its own.
+/// Checks a model of the text on its own; `physics` includes the physics of friction.
 fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model, physics: bool) -> Vec<Diagnostic> {
     let file = loaded.root();
-    // What is proven of a text with gaps would rest on them.
+    // Proofs about a text with missing declarations would not hold.
     let whole = !loaded.has_errors();
     let depth = if whole { Depth::Domains } else { Depth::Values };
     let (system, types, mut diagnostics) = alone(loaded, sources, (model, file), Vec::new(), depth);
@@ -690,14 +688,14 @@ fn check_model(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Mod
     }
     diagnostics.extend(with_defaults(loaded, sources, model));
     if loaded.misread(model.span) {
-        // What could not be read is missing elsewhere: say the cause.
+        // Unreadable declarations are missing elsewhere; the report names only the cause.
         diagnostics.retain(|d| !matches!(d.code, "E0106" | "E0203" | "E0204" | "E0303" | "E0305" | "E0310" | "E0501"));
     }
     analysis::lints::silence(&system, &mut diagnostics);
     diagnostics
 }
 
-/// What is wrong with the defaults of a model's inputs: on its own they come from outside.
+/// Checks the defaults of a model's inputs, which the check of the model on its own leaves open. Returns errors only.
 fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::Model) -> Vec<Diagnostic> {
     use grammar::ast::{DeclarationKind, Statement};
     let given = model.body.iter().any(|statement| match statement {
@@ -725,7 +723,7 @@ fn with_defaults(loaded: &Loaded, sources: &dyn Sources, model: &grammar::ast::M
 fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::ast::Interface) -> Vec<Diagnostic> {
     use grammar::ast::{DeclarationKind, Model, Statement};
     let grammar::ast::Interface { name, ports, doc, span } = interface.clone();
-    // An output has no equation here: it is checked as an input is, if it states its unit.
+    // An output has no equation here, so it is checked as an input, provided that it states its unit.
     let port = |port: grammar::ast::Declaration| {
         let stated = port.kind == DeclarationKind::Input || port.unit.is_some();
         stated.then_some(Statement::Declaration(grammar::ast::Declaration { kind: DeclarationKind::Input, ..port }))
@@ -737,15 +735,15 @@ fn check_interface(loaded: &Loaded, sources: &dyn Sources, interface: &grammar::
     diagnostics
 }
 
-/// One mistake, one message: in the order of the files, each code at each place once, warnings only without errors.
+/// Removes repetitions: keeps each code once per position, sorts by position, and drops warnings if there are errors.
 pub fn once(mut diagnostics: Vec<Diagnostic>) -> Vec<Diagnostic> {
     let errors = diagnostics.iter().any(Diagnostic::is_error);
     diagnostics.retain(|diagnostic| !errors || diagnostic.is_error());
     let mut seen = std::collections::HashSet::new();
     let mut circles = std::collections::HashSet::new();
     diagnostics.retain(|diagnostic| {
-        // A circle is met from each of its members; the first is where it was entered. What grows without end does so
-        // wherever it is used.
+        // A cycle is found from each of its members; only the first is reported. The same holds for a program that
+        // grows without bound, which is reported at each use.
         let again = diagnostic.recurring.is_some_and(|recurring| !circles.insert(recurring));
         seen.insert((diagnostic.code, diagnostic.span())) && !again
     });

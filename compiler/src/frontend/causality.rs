@@ -1,7 +1,8 @@
-//! Which quantity needs the present value of which, and the circles in it.
+//! Causality: the dependency graph of present values, and its cycles (algebraic loops).
 //!
-//! In: a flat [`System`]. Out: diagnostics only; `lower` follows the same graph on demand. The graph is over single
-//! quantities, one for each phase; states, held outputs and `next` break circles.
+//! In: a flat [`System`]. Out: diagnostics only; `lower` follows the same graph on demand. There is one graph over
+//! single quantities for each phase. States, held outputs and `next` break cycles. Cycles are strongly connected
+//! components (Tarjan, *Depth-first search and linear graph algorithms*, 1972).
 
 use crate::frontend::delays;
 use crate::frontend::source::Files;
@@ -11,18 +12,18 @@ use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 use std::collections::{HashMap, VecDeque};
 
-/// When something is evaluated.
+/// When an expression is evaluated.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Phase {
-    /// Once, at t = 0: initial values and the blocks due then.
+    /// Once, at t = 0: initial values and the `on` blocks due then.
     Start,
     /// At any instant.
     Now,
-    /// At a tick: as `Now`, with held quantities renewed.
+    /// At a tick: as `Now`, but held quantities are recomputed.
     Tick,
 }
 
-/// The expression that gives a quantity its present value in a phase; none where the value is stored.
+/// The expression that defines a quantity's present value in a phase; `None` where the value is stored.
 pub fn value_of(var: &Var, phase: Phase) -> Option<ExprId> {
     match (&var.definition, phase) {
         (Definition::Value(value, _), _) => Some(*value),
@@ -32,7 +33,7 @@ pub fn value_of(var: &Var, phase: Phase) -> Option<ExprId> {
     }
 }
 
-/// What `dz/dt` and `dx/ds` stand for.
+/// The definition of `dz/dt` or `dx/ds`.
 pub fn rate_of(system: &System, node: &Node) -> Option<ExprId> {
     let (Node::Rate(var) | Node::PathRate(var)) = node else { return None };
     match (node, &system.var(*var).definition) {
@@ -42,7 +43,7 @@ pub fn rate_of(system: &System, node: &Node) -> Option<ExprId> {
     }
 }
 
-/// Reports every circle once, by its shortest walk.
+/// Reports every cycle once, by its shortest path.
 pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     for phase in [Phase::Now, Phase::Tick, Phase::Start] {
         let graph = graph(system, phase);
@@ -57,15 +58,16 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
     }
 }
 
-/// For each quantity, and behind them for the rate of each: what it needs, and where it is mentioned.
+/// For each quantity, followed by the rate of each quantity: the nodes that it needs, each with the expression that
+/// mentions it.
 type Graph = Vec<Vec<(VarId, ExprId)>>;
 
-/// The number of a rate in the graph.
+/// The index of a quantity's rate in the graph.
 fn rate_number(system: &System, var: VarId) -> VarId {
     VarId(system.vars.len() as u32 + var.0)
 }
 
-/// The quantity behind a number of the graph, and whether its rate is meant.
+/// The quantity of a graph index, and whether the index stands for its rate.
 fn behind(system: &System, id: VarId) -> (VarId, bool) {
     match id.0.checked_sub(system.vars.len() as u32) {
         Some(var) => (VarId(var), true),
@@ -92,7 +94,7 @@ fn graph(system: &System, phase: Phase) -> Graph {
                 Node::Rate(needed) => out.push((rate_number(system, *needed), id)),
                 node => {
                     let mut operands: Vec<ExprId> = match phase {
-                        // The value before is known.
+                        // A delayed value is known from the past.
                         Phase::Now | Phase::Tick if delays::breaks(system, node) => Vec::new(),
                         _ => node.operands().collect(),
                     };
@@ -109,7 +111,7 @@ fn graph(system: &System, phase: Phase) -> Graph {
     (0..2 * n).map(edges).collect()
 }
 
-/// Strongly connected components with a circle in them, each sorted.
+/// Strongly connected components that contain a cycle, each sorted.
 fn circles(graph: &Graph) -> Vec<Vec<VarId>> {
     let edge = |v: usize, k: usize| graph[v].get(k).map(|(w, _): &(VarId, ExprId)| w.0 as usize);
     let circle = |component: &Vec<usize>| {
@@ -122,11 +124,12 @@ fn circles(graph: &Graph) -> Vec<Vec<VarId>> {
     out
 }
 
-/// The shortest circle inside a component: (quantity, where it mentions the next one). A chain of parts is walked
-/// from an output of a part, if there is one.
+/// The shortest cycle within a component, as pairs (quantity, expression in which it mentions the next one). Starts at
+/// an output of a part, if there is one.
 fn shortest(graph: &Graph, component: &[VarId]) -> Vec<(VarId, ExprId)> {
     let mut best: Option<Vec<(VarId, ExprId)>> = None;
-    // Every quantity of a small component is tried; of a large one the first few, which bounds the work.
+    // Breadth-first search from every quantity of a small component, but only from the first 64 of a large one, which
+    // bounds the work.
     for &start in component.iter().take(64) {
         let mut from: HashMap<VarId, (VarId, ExprId)> = HashMap::new();
         let mut queue = VecDeque::from([start]);
@@ -160,7 +163,7 @@ fn shortest(graph: &Graph, component: &[VarId]) -> Vec<(VarId, ExprId)> {
 }
 
 fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)]) -> Diagnostic {
-    // Begin with the output of a part: what the user thinks of as the thing that depends on itself.
+    // Begins with the output of a part, which users see as the quantity that depends on itself.
     let is_output = |id: VarId| {
         let (id, rate) = behind(system, id);
         let var = system.var(id);
@@ -178,7 +181,7 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
         Phase::Tick => ("E0402", format!("{called} depends on itself within one tick")),
         Phase::Start => ("E0309", format!("the initial value of {called} depends on itself")),
     };
-    // A port that is bound to a plain name is no step of its own: `fr.F needs F_ext, which is u`.
+    // A port bound to a plain name is no step of its own: `fr.F needs F_ext, which is u`.
     let mut steps: Vec<(Span, String)> = Vec::new();
     let mut k = 0;
     while k < walk.len() {
@@ -213,7 +216,7 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
         (span, text)
     };
     let mut labels: Vec<(Span, String)> = steps.into_iter().enumerate().map(numbered).collect();
-    // The change is to be made where the circle closes.
+    // The primary label is where the cycle closes, since that is where the user should change it.
     labels.rotate_right(1);
     let mut error = Diagnostic::error(code, message);
     for (span, text) in &labels {
@@ -222,7 +225,7 @@ fn message(system: &System, files: &Files, phase: Phase, walk: &[(VarId, ExprId)
     error.help(help(system, files, phase, &walk))
 }
 
-/// `the friction force`, if it is the output F of a model with an input v.
+/// `the friction force`, if the quantity is the output F of a model with an input v.
 fn friction_force(system: &System, id: VarId) -> Option<String> {
     let (id, rate) = behind(system, id);
     if rate {

@@ -1,32 +1,32 @@
-//! Columns of numbers from the text of a file: recordings and tables.
+//! Reads columns of numbers from the text of a file, for recordings and tables.
 //!
-//! In: text, and which of its columns are wanted. Out: their numbers and the units that the heading states; or what does
-//! not fit, with its line and column. Nothing is guessed: each line has as many cells as the first one, and a comma that
-//! could part cells or decimals is an error.
+//! In: text, and which of its columns are wanted. Out: their numbers and the units that the heading states, or the
+//! first error with its line and column. Nothing is guessed: every line must have as many cells as the first one, and a
+//! comma that could separate either cells or decimals is an error.
 //!
-//! Cells are parted by semicolons, tabs, commas or blanks: by the first of these that the first line has outside quotes.
-//! A decimal comma is read where commas do not part cells, or in quotes; a file has one kind of decimals. A first line
-//! without a number is a heading; `name [unit]` and `name (unit)` state units. Lines that begin with `#` are comments.
+//! Cells are separated by semicolons, tabs, commas or blanks: by the first of these that occurs in the first line
+//! outside quotes. A decimal comma is accepted where commas do not separate cells, or in quotes; a file must use one
+//! decimal mark throughout. A first line without a number is a heading; `name [unit]` and `name (unit)` state units.
+//! Lines that begin with `#` are comments.
 
 use abi::unit::Unit;
 
 /// Columns of a file.
 #[derive(Debug, PartialEq)]
 pub struct Columns {
-    /// Numbers as written, a list for each wanted column; of those that are not wanted, nothing.
+    /// Numbers as written, one list for each wanted column; the lists of other columns are empty.
     pub numbers: Vec<Vec<f64>>,
     /// The unit of each column, if the heading states one.
     pub units: Vec<Option<Unit>>,
 }
 
-/// Reads as many columns as `wanted` has entries; those not wanted may hold anything.
+/// Reads as many columns as `wanted` has entries. Cells of columns that are not wanted may hold anything.
 ///
-/// # Errors
-/// What does not fit, in words that begin with the line.
+/// # Errors The first error, in words that begin with the line.
 pub fn read(text: &str, wanted: &[bool]) -> Result<Columns, String> {
     let mut out = Columns { numbers: vec![Vec::new(); wanted.len()], units: vec![None; wanted.len()] };
     let mut separator = None;
-    // The number of cells, and whether a heading names them.
+    // The number of cells, and whether there is a heading that names them.
     let mut cells: Option<(usize, bool)> = None;
     let mut decimals = None;
     for (row, line) in text.lines().enumerate() {
@@ -69,7 +69,7 @@ pub fn read(text: &str, wanted: &[bool]) -> Result<Columns, String> {
     Ok(out)
 }
 
-/// A cell, and whether it stood in quotes.
+/// A cell, and whether it was quoted.
 struct Cell {
     text: String,
     quoted: bool,
@@ -87,7 +87,7 @@ fn separator_of(line: &str) -> Option<char> {
     [';', '\t', ','].into_iter().find(|separator| plain.contains(*separator))
 }
 
-/// The cells of a line; an empty one behind the last separator is none.
+/// The cells of a line. An empty cell after the last separator is ignored.
 fn split(line: &str, separator: Option<char>) -> Vec<Cell> {
     let mut cells = vec![Cell { text: String::new(), quoted: false }];
     let mut inside = false;
@@ -116,7 +116,7 @@ fn split(line: &str, separator: Option<char>) -> Vec<Cell> {
     cells
 }
 
-/// A finite number, and whether it has decimals behind a comma.
+/// A finite number, and whether it has a decimal comma.
 fn number(cell: &Cell, separator: Option<char>) -> Option<(f64, bool)> {
     let commas = cell.text.matches(',').count();
     let comma = commas == 1 && !cell.text.contains('.') && (separator != Some(',') || cell.quoted);
@@ -155,7 +155,7 @@ fn push(
     Ok(())
 }
 
-/// The unit that a cell of the heading states: `x [mm]`, or `x (mm)` if that is one.
+/// The unit that a cell of the heading states: `x [mm]`, or `x (mm)` if `mm` is a unit.
 fn stated(cell: &str, at: usize, k: usize) -> Result<Option<Unit>, String> {
     let inside = |open: char, close: char| {
         let text = cell.strip_suffix(close)?;
@@ -170,7 +170,7 @@ fn stated(cell: &str, at: usize, k: usize) -> Result<Option<Unit>, String> {
     Ok(inside('(', ')').and_then(|text| Unit::parse(&text).ok()))
 }
 
-/// A cell as a message shows it.
+/// A cell as shown in messages: control characters replaced, at most 40 characters.
 fn shown(text: &str) -> String {
     let short: String = text.chars().take(40).map(|c| if c.is_control() { '?' } else { c }).collect();
     if short.len() < text.len() { format!("{short}…") } else { short }
@@ -218,7 +218,7 @@ mod tests {
         assert_eq!(units("t [s],x [kp]\n0,1\n"), Err("line 1, column 2: unknown unit `kp` in the heading".into()));
     }
 
-    /// What is written in any of the usual ways is read again to the bit, or refused; never read as something else.
+    /// Numbers written in any of the usual formats are read back to the bit or refused, never read as other numbers.
     #[test]
     fn what_is_written_is_read() {
         let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(16);

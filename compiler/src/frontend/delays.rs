@@ -1,6 +1,7 @@
-//! What `delay(x, T)` can ask for: between which bounds T lies, and so how much must be kept.
+//! Bounds of the time T in `delay(x, T)`, and the length of history that they require.
 //!
-//! In: a flat [`System`]. Out: bounds, diagnostics. A T that is never 0 breaks circles: x at this instant is not needed.
+//! In: a flat [`System`]. Out: bounds and diagnostics, and ring buffers sized for a step. A T that is never 0 breaks
+//! cycles, because the present x is not needed.
 
 use crate::frontend::system::*;
 use crate::frontend::units::three_digits;
@@ -11,10 +12,10 @@ use abi::description::{Layout, Segment};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
-/// Samples that the delays of a model keep at most, all together: 32 MiB.
+/// Limit on the samples that all delays of a model keep together: 32 MiB.
 pub const MOST_SAMPLES: f64 = 4_194_304.0;
 
-/// The arguments of a delay.
+/// The arguments of a delay: (x, T).
 pub fn of(system: &System, node: ExprId) -> (ExprId, ExprId) {
     match system.node(node) {
         Node::Call(Builtin::Delay, args) => (args[0], args[1]),
@@ -22,7 +23,7 @@ pub fn of(system: &System, node: ExprId) -> (ExprId, ExprId) {
     }
 }
 
-/// Least and greatest T in s, if they are known; the least is 0 if nothing else is said.
+/// Least and greatest T in s, if known; the least is 0 by default.
 pub fn range(system: &System, time: ExprId) -> Option<(f64, f64)> {
     if let Some(time) = system.literal(time) {
         return (time >= 0.0 && time.is_finite()).then_some((time, time));
@@ -39,7 +40,7 @@ pub fn range(system: &System, time: ExprId) -> Option<(f64, f64)> {
     }
 }
 
-/// Whether the present value is not needed: no step will be longer than the least T.
+/// Whether the present value is not needed. Holds if the least T is positive, since no step may be longer than it.
 pub fn breaks(system: &System, node: &Node) -> bool {
     match node {
         Node::Call(Builtin::Delay, args) => range(system, args[1]).is_some_and(|(least, _)| least > 0.0),
@@ -47,7 +48,7 @@ pub fn breaks(system: &System, node: &Node) -> bool {
     }
 }
 
-/// E0503: T is a time or a param between bounds that are numbers.
+/// E0503: T must be a number or a parameter with constant bounds.
 pub fn check(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     for delay in &system.delays {
         let (_, time) = of(system, *delay);
@@ -71,7 +72,7 @@ pub fn check(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     }
 }
 
-/// E0503: no step is longer than the least T that breaks a circle, and not too much is kept.
+/// E0503: no step may exceed the least T that breaks a cycle, and the history must fit into [`MOST_SAMPLES`].
 pub fn fits(system: &System, step: f64, at: Option<Span>, diagnostics: &mut Vec<Diagnostic>) {
     let mut samples = 0.0;
     for delay in &system.delays {
@@ -99,7 +100,7 @@ pub fn fits(system: &System, step: f64, at: Option<Span>, diagnostics: &mut Vec<
     }
 }
 
-/// E0905: what a delay does to small motions is no matrix.
+/// E0905: a delay has no finite state matrix.
 pub fn linear(system: &System) -> Option<Diagnostic> {
     let delay = system.delays.first()?;
     let error = Diagnostic::error("E0905", "a model with a `delay` cannot be linearised yet")
@@ -107,7 +108,7 @@ pub fn linear(system: &System) -> Option<Diagnostic> {
     Some(error.help("a first-order lag comes close for slow motions: `dy/dt = (x - y) / T`"))
 }
 
-/// A time in words.
+/// A time for a message.
 fn shown(seconds: f64) -> String {
     match seconds < 1.0 {
         true => format!("{} ms", three_digits(seconds * 1e3)),
@@ -115,7 +116,7 @@ fn shown(seconds: f64) -> String {
     }
 }
 
-/// Slots of a ring that reaches so far back in steps of so many s: a power of two.
+/// Slots of a ring buffer that reaches `most` s back in steps of `step` s: a power of two.
 fn slots(most: f64, step: f64) -> f64 {
     let needed = (most / step).ceil() + 2.0;
     let mut slots = 2.0;
@@ -126,15 +127,15 @@ fn slots(most: f64, step: f64) -> f64 {
 }
 
 impl crate::ir::program::Program {
-    /// Makes room for fixed steps of so many s, and for those of companion runs that are up to four times as short, where
-    /// that is not too much.
+    /// Sizes the ring buffers for fixed steps of `step` s, and for those of companion runs, which may be four times
+    /// shorter, unless that exceeds [`MOST_SAMPLES`].
     pub fn size_rings_for_companions(&mut self, step: f64) {
         let samples: f64 = self.description.delays.iter().map(|delay| slots(delay.range.1, 0.25 * step)).sum();
         self.size_rings(if samples <= MOST_SAMPLES { 0.25 * step } else { step });
     }
 
-    /// Makes room for what is delayed in fixed steps of so many s, and takes back that for adaptive ones: before code is
-    /// made for them.
+    /// Sizes the ring buffers for fixed steps of `step` s and removes those for adaptive runs. Call it before code is
+    /// generated.
     pub fn size_rings(&mut self, step: f64) {
         let mut len = 0;
         let mut layout = self.description.layout.clone();
@@ -152,7 +153,7 @@ impl crate::ir::program::Program {
             let [time, past] = [delay.time, delay.past].map(|slot| stored(slot).expect("the start stores it"));
             let steps = build.div(time, h);
             let [back, weight] = [build.sub(steps, one), build.sub(one, steps)].map(|steps| build.max(zero, steps));
-            // The value at the start is the first sample, and what was before it.
+            // The start value is the first sample, and also the value of all time before the start.
             let ends = [0, delay.ring.len as usize - 1].map(|k| (delay.ring.slot(k), past));
             let places = [(delay.back, back)].into_iter().chain(delay.weight.map(|slot| (slot, weight)));
             stores.retain(|(slot, _)| *slot != delay.back && Some(*slot) != delay.weight);

@@ -1,7 +1,7 @@
-//! From texts to one flat system of equations, checked for units and causality.
+//! Front end: from texts to one flat system of equations, checked for units and causality.
 //!
-//! In: syntax trees and what reads files. Out: a [`System`](system::System) with the dimension of every expression, an order of
-//! evaluation, and diagnostics. Knows nothing of programs but constants and delays.
+//! In: syntax trees and [`Sources`](source::Sources). Out: a [`System`](system::System) with the dimension of every
+//! expression, and diagnostics. Knows nothing of programs, except for constants and the buffers of delays.
 
 pub mod names;
 pub mod source;

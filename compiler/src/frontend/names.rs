@@ -1,10 +1,12 @@
-//! Which name was meant: candidates by edit distance.
+//! Suggestions for misspelt names, by edit distance.
+//!
+//! In: a word and candidates. Out: the nearest candidate, if any is near enough. Knows nothing of scopes.
 
-/// The candidate nearest to `word`, if it is near enough to be meant; case alone counts nothing, and ties go to the one
-/// listed first.
+/// The candidate nearest to `word` within a limit that grows with the length of `word`. Differences of case alone cost
+/// nothing; of equally near candidates the first wins.
 pub fn nearest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let limit = match word.chars().count() {
-        // Every other letter would be near.
+        // With a limit of 1, every other single letter would match.
         0..=1 => 0,
         2 => 1,
         3..=5 => 2,

@@ -1,6 +1,6 @@
-//! Reads a text with all that it imports, and says what each name at the top of a file means.
+//! Name resolution at file level: reads a text with all its imports and resolves the top-level names of each file.
 //!
-//! In: a text and [`Sources`]. Out: [`Loaded`], always, with what is wrong. Knows nothing inside items.
+//! In: a text and [`Sources`]. Out: always a [`Loaded`], with its diagnostics. Does not look inside items.
 
 use crate::frontend::names::nearest;
 use crate::frontend::source::{Files, SourceFile, Sources};
@@ -11,24 +11,24 @@ use std::cell::RefCell;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-/// Texts that belong together, with their names resolved.
+/// The texts of a compilation, with their top-level names resolved.
 #[derive(Clone, Debug, Default)]
 pub struct Loaded {
-    /// The texts; the first is the one that was asked for.
+    /// The texts; the first is the root file, which the caller named.
     pub files: Files,
-    /// What is wrong with syntax, imports and names at the top of files.
+    /// Errors of syntax, imports and top-level names.
     pub diagnostics: Vec<Diagnostic>,
     scopes: Vec<Scope>,
 }
 
-/// Names at the top of one file.
+/// Top-level names visible in one file.
 #[derive(Clone, Debug, Default)]
 struct Scope {
     own: HashMap<(Space, String), ItemRef>,
     imported: HashMap<(Space, String), Vec<ItemRef>>,
 }
 
-/// Name spaces at the top of a file.
+/// Namespaces at file level.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Space {
     /// Models, interfaces, devices.
@@ -43,7 +43,7 @@ pub enum Space {
     Rig,
 }
 
-/// An item of a file.
+/// Reference to an item of a file.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct ItemRef {
     /// The file.
@@ -52,34 +52,34 @@ pub struct ItemRef {
     pub index: u32,
 }
 
-/// Result of looking a name up.
+/// Result of a name lookup.
 pub enum Lookup<'a> {
-    /// The item.
+    /// The only item of that name.
     Found(ItemRef, &'a Item),
     /// Defined by two imports.
     Ambiguous(ItemRef, ItemRef),
-    /// Not there.
+    /// Not defined.
     Missing,
 }
 
-/// An experiment of the asked-for file.
+/// An experiment of the root file.
 #[derive(Clone, PartialEq, Debug)]
 pub struct ExperimentInfo {
     /// Its name.
     pub name: String,
-    /// Where the name stands.
+    /// Span of the name.
     pub span: Span,
-    /// Whether it expects anything.
+    /// Whether it has an `expect` with a condition.
     pub has_expect: bool,
 }
 
 impl Loaded {
-    /// The item.
+    /// The item of a reference.
     pub fn item(&self, item: ItemRef) -> &Item {
         &self.files.get(item.file).ast.items[item.index as usize]
     }
 
-    /// What `name` means in `file`: its own item first, else what exactly one import gives.
+    /// Resolves `name` in `file`. The file's own items take precedence over imported ones.
     pub fn find(&self, file: FileId, space: Space, name: &str) -> Lookup<'_> {
         let scope = &self.scopes[file.0 as usize];
         let key = (space, name.to_string());
@@ -93,7 +93,7 @@ impl Loaded {
         }
     }
 
-    /// All names of a name space visible in `file`, sorted.
+    /// All names of a namespace visible in `file`, sorted.
     pub fn visible(&self, file: FileId, space: Space) -> Vec<&str> {
         let scope = &self.scopes[file.0 as usize];
         let mut names: Vec<&str> = scope
@@ -108,7 +108,7 @@ impl Loaded {
         names
     }
 
-    /// Adds a text from outside, such as a value of the command line: it has places, but no names of its own.
+    /// Adds a text from outside, such as a value of the command line. It has spans, but no names of its own.
     pub fn add_text(&mut self, name: &str, text: &str) -> FileId {
         let id = FileId(self.files.0.len() as u32);
         let file = SourceFile { name: name.into(), text: text.into(), ast: Arc::default(), library: false };
@@ -117,19 +117,19 @@ impl Loaded {
         id
     }
 
-    /// The file that was asked for.
+    /// The file that the caller named.
     pub fn root(&self) -> FileId {
         FileId(0)
     }
 
-    /// Whether something in this place could not be read.
+    /// Whether an error lies within this span.
     pub fn misread(&self, place: Span) -> bool {
         self.diagnostics.iter().any(|d| {
             d.is_error() && place.file == d.span().file && place.start <= d.span().start && d.span().end <= place.end
         })
     }
 
-    /// Experiments of the asked-for file, in order.
+    /// Experiments of the root file, in order.
     pub fn experiments(&self) -> Vec<ExperimentInfo> {
         let experiment = |item: &Item| match item {
             Item::Experiment(e) => Some(ExperimentInfo {
@@ -145,7 +145,7 @@ impl Loaded {
         self.files.get(self.root()).ast.items.iter().filter_map(experiment).collect()
     }
 
-    /// Rigs of the asked-for file, in order.
+    /// Rigs of the root file, in order.
     pub fn rigs(&self) -> Vec<&ast::Rig> {
         let items = self.files.get(self.root()).ast.items.iter();
         items
@@ -156,7 +156,7 @@ impl Loaded {
             .collect()
     }
 
-    /// The model that a name stands for in the first text, its own or an imported one; and the file that it is in.
+    /// The model called `name` in the root file, its own or an imported one, and the model's file.
     pub fn model_named(&self, name: &str) -> Option<(ast::Model, FileId)> {
         match self.find(self.root(), Space::Type, name) {
             Lookup::Found(item, Item::Model(model)) => Some((model.clone(), item.file)),
@@ -164,7 +164,7 @@ impl Loaded {
         }
     }
 
-    /// Models of the asked-for file, in order.
+    /// Models of the root file, in order.
     pub fn models(&self) -> Vec<&ast::Model> {
         self.files
             .get(self.root())
@@ -178,13 +178,13 @@ impl Loaded {
             .collect()
     }
 
-    /// Whether anything forbids compiling.
+    /// Whether there are errors, which prevent compilation.
     pub fn has_errors(&self) -> bool {
         self.diagnostics.iter().any(Diagnostic::is_error)
     }
 }
 
-/// The name space and name of an item; imports have none.
+/// The namespace and name of an item; `None` for imports.
 fn named(item: &Item) -> Option<(Space, &Name)> {
     Some(match item {
         Item::Import(_) => return None,
@@ -219,7 +219,7 @@ struct Loader<'a> {
     loaded: Loaded,
     sources: &'a dyn Sources,
     by_name: HashMap<String, FileId>,
-    /// Files whose imports are being read: to find circles.
+    /// Files whose imports are being read, to detect import cycles.
     open: Vec<FileId>,
 }
 
@@ -267,7 +267,7 @@ impl Loader<'_> {
         }
     }
 
-    /// The files that an import stands for.
+    /// The files that an import refers to.
     fn import(&mut self, from: FileId, import: &ast::Import) -> Vec<FileId> {
         match &import.source {
             ast::ImportSource::Library(module) => {
@@ -350,13 +350,13 @@ impl Loader<'_> {
     }
 }
 
-/// Trees of library texts that are kept for the next text that imports them.
+/// Capacity of the cache of library trees.
 const MOST_KEPT: usize = 1000;
 
 type Tree = (Arc<str>, Arc<ast::File>);
 
 thread_local! {
-    /// By their place among the texts of a compilation, which the tree mentions, and their name.
+    /// Key: the file id, which the spans of the tree contain, and the name.
     static KEPT: RefCell<HashMap<(FileId, String), Tree>> = RefCell::default();
 }
 
@@ -366,7 +366,7 @@ fn tree(id: FileId, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
     (text.into(), Arc::new(parsed.file))
 }
 
-/// As [`tree`], of a text that many others import: read once, as long as it is the same.
+/// As [`tree`], with a cache for library texts, which many texts import. An entry is valid while the text is the same.
 fn library_tree(id: FileId, name: &str, text: &str, diagnostics: &mut Vec<Diagnostic>) -> Tree {
     let key = (id, name.to_string());
     let known = KEPT.with_borrow(|kept| kept.get(&key).filter(|(known, _)| **known == *text).cloned());
@@ -386,7 +386,7 @@ fn library_tree(id: FileId, name: &str, text: &str, diagnostics: &mut Vec<Diagno
     new
 }
 
-/// E0210
+/// E0210: a declaration of a reserved name.
 pub fn reserved(name: &Name) -> Diagnostic {
     Diagnostic::error("E0210", format!("`{}` has a fixed meaning and cannot be declared", name.text))
         .label(name.span, "declared here")
@@ -396,7 +396,7 @@ pub fn reserved(name: &Name) -> Diagnostic {
         })
 }
 
-/// E0202 for two declarations in one scope.
+/// E0202: two declarations of one name in one scope.
 pub fn declared_twice(name: &Name, first: Span) -> Diagnostic {
     Diagnostic::error("E0202", format!("`{}` is declared twice", name.text))
         .label(name.span, "again here")

@@ -1,42 +1,43 @@
-//! One whole instance as a flat set of quantities and equations.
+//! The flat system: one instance with all its parts as quantities and equations.
 //!
-//! Expressions form one arena in which operands stand before their users, so most passes are one walk over it.
-//! A function call is expanded in place: its arguments are shared nodes, so nothing is computed twice.
+//! Result of `flatten`, input of unit check, causality, analyses and `lower`. Expressions form one arena in which
+//! operands precede their users, so most passes are a single walk over it. Function calls are expanded in place with
+//! shared nodes for their arguments, so nothing is computed twice. Knows nothing of text or of programs.
 
 use abi::unit::{Angle, Dimension, Unit};
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
 
-/// A node of the arena.
+/// Index of a node in the arena.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct ExprId(pub u32);
 
-/// A quantity.
+/// Index of a quantity.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug)]
 pub struct VarId(pub u32);
 
-/// An instance of a model: the whole, or a part.
+/// Index of an instance of a model: the root instance or a part.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct InstanceId(pub u32);
 
-/// An automaton; a model with regimes has one per instance.
+/// Index of an automaton; each instance of a model with regimes has one.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct AutomatonId(pub u32);
 
-/// A block of sampled code.
+/// Index of an `every` block.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct BlockId(pub u32);
 
-/// Everything about one instance.
+/// One instance with all its parts.
 #[derive(Clone, Debug, Default)]
 pub struct System {
-    /// Arena; `spans` runs along with it.
+    /// Arena of expressions, parallel to `spans`.
     pub nodes: Vec<Node>,
-    /// Where each node was written.
+    /// Span of each node.
     pub spans: Vec<Span>,
-    /// Quantities in the order of the text, a part's behind its owner's.
+    /// Quantities in the order of the text; those of a part follow those of its owner.
     pub vars: Vec<Var>,
-    /// Instances; the first is the whole.
+    /// Instances; the first is the root.
     pub instances: Vec<InstanceInfo>,
     /// Automata.
     pub automata: Vec<Automaton>,
@@ -44,42 +45,43 @@ pub struct System {
     pub events: Vec<Event>,
     /// `every` blocks.
     pub blocks: Vec<Block>,
-    /// `crosses`, `rises`, `falls`: each has memory of its own.
+    /// `crosses`, `rises` and `falls`; each has memory of its own.
     pub crossings: Vec<Crossing>,
     /// `require` statements.
     pub requires: Vec<Require>,
     /// `storage` statements.
     pub storages: Vec<(InstanceId, ExprId)>,
-    /// Bounds of repetitions: how many parts there are.
+    /// Bounds of repetitions, which determine the number of parts.
     pub counts: Vec<ExprId>,
     /// Tables and recordings.
     pub tables: Vec<Table>,
-    /// Instants at which a signal has a corner.
+    /// Instants at which a signal is not smooth.
     pub corners: Vec<ExprId>,
-    /// Calls of `delay`: each has memory of its own.
+    /// Calls of `delay`; each has memory of its own.
     pub delays: Vec<ExprId>,
-    /// Where the state of a reset is named, by the value it is given.
+    /// For the value of each reset, the span of the state's name.
     pub reset_places: Vec<(ExprId, Span)>,
-    /// States whose start value is given from outside of their model, and by whom.
+    /// States whose start value is given from outside their model, and the origin of the value.
     pub starts: Vec<(VarId, Origin)>,
-    /// Instances that cannot be made rotary or do not fit their slot: reported, and their units fit everything.
+    /// Instances that have no rotary twin or do not match their slot. They have been reported, and their units match
+    /// every unit.
     pub strangers: Vec<InstanceId>,
-    /// Paths of parameters that were read while parts were made: how many there are follows from them.
+    /// Paths of parameters read while parts were instantiated: the number of parts depends on them.
     pub structural: Vec<String>,
 }
 
 /// An instance of a model.
 #[derive(Clone, Debug)]
 pub struct InstanceInfo {
-    /// Dotted path; empty for the whole.
+    /// Dotted path; empty for the root.
     pub path: String,
     /// Name of the model.
     pub model: String,
-    /// The rotary twin.
+    /// Whether it is the rotary twin.
     pub rotary: bool,
-    /// Where it is made: the model's name in `part fr = LuGre(…)`.
+    /// Span of the model's name in `part fr = LuGre(…)`.
     pub span: Span,
-    /// Names of its own lints that are silenced.
+    /// Names of the lints that the model itself silences.
     pub allows: Vec<String>,
 }
 
@@ -88,31 +90,31 @@ pub struct InstanceInfo {
 pub struct Var {
     /// Dotted path: `fr.z`.
     pub path: String,
-    /// Its own name: `z`.
+    /// Name without path: `z`.
     pub name: String,
-    /// Where the name is declared.
+    /// Span of the declared name.
     pub span: Span,
-    /// Owner.
+    /// Owning instance.
     pub instance: InstanceId,
-    /// What it was declared as.
+    /// Kind of its declaration.
     pub kind: VarKind,
-    /// Declared unit and its place.
+    /// Declared unit and its span.
     pub unit: Option<(Unit, Span)>,
-    /// Whether a unit is declared that could not be read: it fits everything.
+    /// Whether the declared unit could not be read; it then matches every unit.
     pub unreadable: bool,
-    /// Unit of the number it is given where it is declared: for display, if no unit is declared.
+    /// Unit of the number in its declaration, for display if no unit is declared.
     pub shown: Option<Unit>,
     /// Declared range.
     pub range: VarRange,
-    /// Where the range stands.
+    /// Span of the range.
     pub range_span: Option<Span>,
-    /// How its value is found.
+    /// How its value is determined.
     pub definition: Definition,
     /// Doc comment.
     pub doc: Option<String>,
 }
 
-/// What a quantity was declared as.
+/// Kind of a declaration.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum VarKind {
@@ -121,12 +123,12 @@ pub enum VarKind {
     Output,
     State,
     Let,
-    /// Asked for by an experiment.
+    /// Observed by an experiment.
     Observed,
 }
 
 impl VarKind {
-    /// In messages.
+    /// The kind as a word for messages.
     pub fn word(self) -> &'static str {
         match self {
             VarKind::Param => "param",
@@ -139,7 +141,7 @@ impl VarKind {
     }
 }
 
-/// Bounds of a range; strict ones are not reached.
+/// Bounds of a range; a strict bound itself is excluded.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct VarRange {
     /// Lower bound and whether it is strict.
@@ -148,54 +150,54 @@ pub struct VarRange {
     pub high: Option<(ExprId, bool)>,
 }
 
-/// How the value of a quantity is found.
+/// How the value of a quantity is determined.
 #[derive(Clone, Debug)]
 pub enum Definition {
-    /// It is not; reported.
+    /// Missing or refused; has been reported.
     Missing,
-    /// Comes from outside.
+    /// Given from outside.
     Free,
     /// An expression of other quantities at the same instant.
     Value(ExprId, Origin),
     /// A continuous state.
     Continuous {
-        /// At the start.
+        /// Value at the start.
         initial: ExprId,
-        /// dx/dt; of a path equation already the product with ds/dt.
+        /// dx/dt; for a path equation already multiplied by ds/dt.
         rate: ExprId,
-        /// The equation as written along a path: dx/ds, and s.
+        /// The path equation as written: dx/ds, and s.
         path: Option<(ExprId, VarId)>,
-        /// Where the left side stands.
+        /// Span of the left side.
         span: Span,
     },
     /// A sampled state.
     Sampled {
-        /// At the start.
+        /// Value at the start.
         initial: ExprId,
-        /// After a tick.
+        /// Value after a tick.
         next: ExprId,
-        /// Its block.
+        /// Its `every` block.
         block: BlockId,
     },
     /// Assigned at ticks and held between them.
     Held {
-        /// At a tick.
+        /// Value at a tick.
         value: ExprId,
-        /// Its block.
+        /// Its `every` block.
         block: BlockId,
-        /// Where the left side stands.
+        /// Span of the left side.
         origin: Origin,
     },
 }
 
-/// Who wrote a definition: for messages.
+/// Origin of a definition, for messages.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Origin {
-    /// `F = …`, in the model or in its declaration; the place of the name.
+    /// `F = …`, in the model or in its declaration; with the span of the name.
     Equation(Span),
     /// A default.
     Default,
-    /// `Model(v = …)`: the place of the model's name, and of the whole argument.
+    /// `Model(v = …)`: with the spans of the model's name and of the whole argument.
     Argument {
         /// `LuGre`
         model: Span,
@@ -209,13 +211,13 @@ pub enum Origin {
 /// One operation of the arena.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Node {
-    /// A number in SI. Without a dimension it fits any: 0 and inf.
+    /// A number in SI units.
     Number {
-        /// In SI.
+        /// Value in SI units.
         value: f64,
-        /// None: fits any.
+        /// Dimension; `None` matches every dimension (0 and inf).
         dimension: Option<Dimension>,
-        /// As written.
+        /// Angle annotation of the unit as written.
         angle: Angle,
     },
     /// `true`, `false`
@@ -232,45 +234,45 @@ pub enum Node {
     Negate(ExprId),
     /// `not a`
     Not(ExprId),
-    /// `a + b`, …; not the crossings.
+    /// `a + b`, …; crossings have a node of their own.
     Binary(BinaryOp, ExprId, ExprId),
     /// `if c then a else b`
     If(ExprId, ExprId, ExprId),
     /// A built-in function.
     Call(Builtin, Box<[ExprId]>),
-    /// A table at an argument.
+    /// Value of a table at an argument.
     Table(u32, ExprId),
     /// Whether this regime is active.
     InRegime(AutomatonId, u32),
-    /// A crossing of this number.
+    /// A crossing, by its index.
     Crossing(u32),
     /// A value that must have this dimension: an argument or result of a function.
     Fits {
-        /// The value, handed on.
+        /// The value, which the node returns unchanged.
         value: ExprId,
-        /// What it must have.
+        /// Required dimension.
         dimension: Dimension,
-        /// Why.
+        /// Reason for the requirement.
         role: Role,
     },
-    /// A measure over the course of a value; only in expectations.
+    /// A measure over a run; occurs only in expectations.
     Measure(MeasureName, ExprId, Option<ExprId>, Window),
     /// `?`
     Hole,
-    /// Reported already.
+    /// An error, which has been reported.
     Error,
 }
 
-/// Over which part of a run a measure is taken: from a time or from the first instant of a condition, and so on.
+/// The part of a run over which a measure is taken; bounded by times, or by the first instants of conditions.
 #[derive(Clone, Copy, PartialEq, Default, Debug)]
 pub struct Window {
-    /// Its begin.
+    /// Its start.
     pub after: Option<ExprId>,
     /// Its end.
     pub before: Option<ExprId>,
 }
 
-/// Why a value must have a dimension.
+/// Reason why a value must have a dimension.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Role {
     /// Argument `name` of `function`.
@@ -324,7 +326,7 @@ pub enum Builtin {
     Delay,
 }
 
-/// Name, function, least and greatest number of arguments.
+/// Name, function, number of arguments.
 const BUILTINS: &[(&str, Builtin, usize)] = &[
     ("abs", Builtin::Abs, 1),
     ("sign", Builtin::Sign, 1),
@@ -365,7 +367,7 @@ impl Builtin {
         BUILTINS.iter().find(|(known, ..)| *known == name).map(|(_, builtin, args)| (*builtin, *args))
     }
 
-    /// Its name.
+    /// The name of the function.
     pub fn name(self) -> &'static str {
         BUILTINS.iter().find(|(_, builtin, _)| *builtin == self).expect("every built-in is listed").0
     }
@@ -376,7 +378,7 @@ impl Builtin {
     }
 }
 
-/// Measures of an expectation.
+/// Measures in expectations.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum MeasureName {
@@ -430,68 +432,68 @@ const MEASURES: &[(&str, MeasureName, usize)] = &[
 ];
 
 impl MeasureName {
-    /// The measure of this name with so many arguments; `min(a, b)` is a function, not a measure.
+    /// The measure of this name and its number of arguments. The caller compares the number: `min(a, b)` is a function.
     pub fn named(name: &str) -> Option<(MeasureName, usize)> {
         MEASURES.iter().find(|(known, ..)| *known == name).map(|(_, measure, args)| (*measure, *args))
     }
 }
 
-/// One automaton.
+/// The automaton of one instance.
 #[derive(Clone, Debug)]
 pub struct Automaton {
-    /// Owner.
+    /// Owning instance.
     pub instance: InstanceId,
     /// Regimes in the order of the text.
     pub regimes: Vec<Regime>,
-    /// Number of the one it starts in.
+    /// Index of the initial regime.
     pub initial: u32,
 }
 
 /// One regime.
 #[derive(Clone, Debug)]
 pub struct Regime {
-    /// Its name.
+    /// Name of the regime.
     pub name: String,
     /// `mode NAME`
     pub span: Span,
-    /// Transitions in the order in which they are tried.
+    /// Transitions in the order of evaluation.
     pub transitions: Vec<Transition>,
 }
 
 /// `go OTHER when COND { … }`
 #[derive(Clone, Debug)]
 pub struct Transition {
-    /// Number of the regime it leads to.
+    /// Index of the target regime.
     pub target: u32,
-    /// When.
+    /// Condition.
     pub condition: ExprId,
-    /// What is reset.
+    /// States that are reset, and their new values.
     pub resets: Vec<(VarId, ExprId)>,
-    /// The statement.
+    /// Span of the statement.
     pub span: Span,
 }
 
 /// `when COND { … }`
 #[derive(Clone, Debug)]
 pub struct Event {
-    /// Owner.
+    /// Owning instance.
     pub instance: InstanceId,
-    /// Acts when this becomes true.
+    /// Condition; the event fires when it becomes true.
     pub condition: ExprId,
-    /// What is reset.
+    /// States that are reset, and their new values.
     pub resets: Vec<(VarId, ExprId)>,
-    /// The statement.
+    /// Span of the statement.
     pub span: Span,
 }
 
 /// `every PERIOD { … }`
 #[derive(Clone, Debug)]
 pub struct Block {
-    /// Owner.
+    /// Owning instance.
     pub instance: InstanceId,
-    /// In s.
+    /// Period in s.
     pub period: ExprId,
-    /// The statement.
+    /// Span of the statement.
     pub span: Span,
 }
 
@@ -500,24 +502,24 @@ pub struct Block {
 pub struct Crossing {
     /// `Crosses`, `Rises` or `Falls`.
     pub kind: BinaryOp,
-    /// a − b
+    /// The difference a − b, whose sign is observed.
     pub difference: ExprId,
 }
 
 /// `require COND, "message"`
 #[derive(Clone, Debug)]
 pub struct Require {
-    /// Owner.
+    /// Owning instance.
     pub instance: InstanceId,
-    /// What must hold.
+    /// Condition that must hold.
     pub condition: ExprId,
-    /// In the user's words.
+    /// Message of the model's author.
     pub message: Option<String>,
-    /// The condition.
+    /// Span of the condition.
     pub span: Span,
 }
 
-/// A table: strictly increasing arguments and their values, SI.
+/// A table: strictly increasing arguments and their values, in SI units.
 #[derive(Clone, Debug)]
 pub struct Table {
     /// Name as written.
@@ -526,11 +528,11 @@ pub struct Table {
     pub x_dimension: Dimension,
     /// Dimension of the value.
     pub y_dimension: Dimension,
-    /// Monotone cubics rather than straight lines.
+    /// Whether it interpolates by monotone cubics rather than linearly.
     pub smooth: bool,
-    /// Arguments.
+    /// Arguments, in SI units.
     pub x: Vec<f64>,
-    /// Values.
+    /// Values, in SI units.
     pub y: Vec<f64>,
 }
 
@@ -555,7 +557,7 @@ pub const LINTS: &[(&str, &str)] = &[
 ];
 
 impl System {
-    /// The quantity that an expression is, and nothing more.
+    /// The quantity that an expression merely names, if it is no more than that.
     pub fn alias(&self, id: ExprId) -> Option<VarId> {
         match self.node(id) {
             Node::Var(var) => Some(*var),
@@ -564,7 +566,7 @@ impl System {
         }
     }
 
-    /// The value of a number as written, with its sign, or of a sum, product or quotient of such numbers.
+    /// The value of a literal with its sign, or of a sum, product or quotient of literals.
     pub fn literal(&self, id: ExprId) -> Option<f64> {
         match self.node(id) {
             Node::Number { value, .. } => Some(*value),
@@ -584,44 +586,44 @@ impl System {
         }
     }
 
-    /// Who wrote the start value of a state: its own declaration, or the user of the model.
+    /// Origin of a state's start value: its own declaration, or the user of the model.
     pub fn start_origin(&self, state: VarId) -> Origin {
         self.starts.iter().find(|(of, _)| *of == state).map_or(Origin::Default, |(_, origin)| *origin)
     }
 
-    /// Puts a node into the arena.
+    /// Appends a node to the arena.
     pub fn push(&mut self, node: Node, span: Span) -> ExprId {
         self.nodes.push(node);
         self.spans.push(span);
         ExprId(self.nodes.len() as u32 - 1)
     }
 
-    /// The node.
+    /// The node with this index.
     pub fn node(&self, id: ExprId) -> &Node {
         &self.nodes[id.0 as usize]
     }
 
-    /// Where it was written.
+    /// The span of a node.
     pub fn span(&self, id: ExprId) -> Span {
         self.spans[id.0 as usize]
     }
 
-    /// Where the state that a reset gives this value is named.
+    /// The span of the state's name in the reset with this value.
     pub fn reset_place(&self, value: ExprId) -> Span {
         self.reset_places.iter().find(|(of, _)| *of == value).map_or(self.span(value), |(_, place)| *place)
     }
 
-    /// The quantity.
+    /// The quantity with this index.
     pub fn var(&self, id: VarId) -> &Var {
         &self.vars[id.0 as usize]
     }
 
-    /// All quantities with their numbers.
+    /// The indices of all quantities.
     pub fn var_ids(&self) -> impl Iterator<Item = VarId> + use<> {
         (0..self.vars.len() as u32).map(VarId)
     }
 
-    /// The instance.
+    /// The instance with this index.
     pub fn instance(&self, id: InstanceId) -> &InstanceInfo {
         &self.instances[id.0 as usize]
     }

@@ -1,4 +1,6 @@
 //! Reads tables: listed points, or two columns of a file.
+//!
+//! In: a table's syntax tree and [`Sources`]. Out: points in SI units, or diagnostics. Knows nothing of interpolation.
 
 use crate::frontend::columns;
 use crate::frontend::resolve::Loaded;
@@ -9,7 +11,7 @@ use grammar::ast::{self, Expr, ExprKind, TablePoints, TableShape, UnaryOp};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 
-/// The table of an item; nothing if something is wrong with it, which is reported.
+/// Reads the table of an item. Returns `None` after it has reported an error.
 pub fn read(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -64,8 +66,8 @@ pub fn read(
     })
 }
 
-/// The first columns of a file of numbers, one for each of `units`: in SI, and each with the unit of its numbers. That of
-/// the heading counts where it states one; it must fit. None is not wanted.
+/// The first columns of a file of numbers, one for each of `units`, converted to SI. A unit in the heading overrides
+/// the entry of `units` and must have its dimension. A column whose entry is `None` is not wanted.
 pub fn columns(
     loaded: &Loaded,
     sources: &dyn Sources,
@@ -130,7 +132,7 @@ fn check_order(x: &[f64], span: Span, diagnostics: &mut Vec<Diagnostic>) -> Opti
     }
 }
 
-/// A literal of this dimension, SI.
+/// A literal of this dimension, in SI.
 fn number(expr: &Expr, dimension: Dimension, diagnostics: &mut Vec<Diagnostic>) -> Option<f64> {
     match &expr.kind {
         ExprKind::Unary(UnaryOp::Negate, a) => Some(-number(a, dimension, diagnostics)?),

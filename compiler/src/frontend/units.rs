@@ -1,7 +1,8 @@
-//! Gives every expression its dimension, and says where dimensions do not fit.
+//! Dimension inference: assigns a dimension to every expression and reports dimensions that do not match.
 //!
-//! In: a flat [`System`]. Out: [`Types`]. Quantities without a declared unit get one by unification: dimensions form a
-//! vector space over the rationals, so an equation between them is linear and one unknown of it can be eliminated.
+//! In: a flat [`System`]. Out: [`Types`] and diagnostics. Quantities without a declared unit are inferred by
+//! unification: dimensions form a vector space over the rationals, so an equation between them is linear, and one of
+//! its unknowns can be eliminated (Kennedy, *Types for units-of-measure*, 2010).
 
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
@@ -14,13 +15,13 @@ use grammar::span::Span;
 /// Dimensions and truth values of a system.
 #[derive(Clone, Debug, Default)]
 pub struct Types {
-    /// Per node; none where unknown.
+    /// Dimension of each node; `None` where unknown.
     pub nodes: Vec<Option<Dimension>>,
-    /// Per node: true or false rather than a quantity.
+    /// Whether each node is a truth value rather than a quantity.
     pub boolean: Vec<bool>,
-    /// Per quantity: the unit it is shown in.
+    /// Unit in which each quantity is displayed.
     pub units: Vec<Unit>,
-    /// Per quantity: true or false rather than a quantity.
+    /// Whether each variable is a truth value rather than a quantity.
     pub boolean_vars: Vec<bool>,
 }
 
@@ -36,7 +37,7 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
         diagnostics.extend(found);
         return types;
     }
-    // A straight model in a rotary place gets and gives wrong units everywhere: say the cause, not what follows.
+    // A straight model in a rotary slot has mismatched units everywhere. The second pass reports only the cause.
     strangers.extend(&system.strangers);
     let mut again = Vec::new();
     let (types, _) = walk(system, files, &strangers, &mut again);
@@ -45,7 +46,8 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
     types
 }
 
-/// One pass; the quantities of `strangers` fit everything. Returns the instances found to be of the other kind of motion.
+/// One pass, in which the quantities of `strangers` match every dimension. Returns the instances found to be of the
+/// other kind of motion.
 fn walk(
     system: &System,
     files: &Files,
@@ -74,13 +76,13 @@ fn walk(
     (checker.finish(), found)
 }
 
-/// E0105 for exponents that cannot be told from others.
+/// E0105: an exponent too large to be represented.
 fn too_large(message: &str, span: Span) -> Diagnostic {
     let error = Diagnostic::error("E0105", message).label(span, "a quantity to this power");
     error.help("make the base a pure number first: divide it by a quantity of its kind")
 }
 
-/// A dimension with unknowns in it: `base · Π unknown^exponent`.
+/// A dimension with unknowns: `base · Π unknown^exponent`.
 #[derive(Clone, PartialEq, Debug)]
 struct Term {
     base: Dimension,
@@ -111,26 +113,26 @@ impl Term {
 enum Kind {
     Boolean,
     Real(Term),
-    /// Reported already; fits everything.
+    /// Has been reported; matches every type.
     Unknown,
 }
 
 struct Checker<'a> {
     system: &'a System,
     files: &'a Files,
-    /// Instances whose quantities fit everything.
+    /// Instances whose quantities match every dimension.
     strangers: &'a [InstanceId],
-    /// Instances found to be straight in a rotary place, or the reverse.
+    /// Instances found to be straight in a rotary slot, or rotary in a straight one.
     found: Vec<InstanceId>,
     diagnostics: &'a mut Vec<Diagnostic>,
-    /// What each unknown was found to be.
+    /// The substitution: the term of each unknown solved so far.
     unknowns: Vec<Option<Term>>,
     types: Vec<Kind>,
     vars: Vec<Kind>,
 }
 
 impl Checker<'_> {
-    /// E0105 for an exponent that grew too large to be told from others.
+    /// E0105: an exponent of an inferred dimension too large to be represented.
     fn within_reason(&mut self, id: ExprId, found: Kind) -> Kind {
         let beyond = |term: &Term| term.base.is_beyond() || term.unknowns.iter().any(|(_, e)| e.is_beyond());
         if !matches!(&found, Kind::Real(term) if beyond(term)) {
@@ -157,7 +159,7 @@ impl Checker<'_> {
         term
     }
 
-    /// Makes two terms equal; false if they cannot be.
+    /// Unifies two terms; returns false if that is impossible.
     fn unify(&mut self, a: &Term, b: &Term) -> bool {
         if a.unknowns.is_empty() && b.unknowns.is_empty() {
             return a.base == b.base;
@@ -206,7 +208,8 @@ impl Checker<'_> {
         self.files.slice(self.system.span(id))
     }
 
-    /// `0.006 1/N·m`, which is (1/N)·m, where 1/(N·m) is needed: how it is read, and the number with the unit that fits.
+    /// For a unit such as `0.006 1/N·m`, which reads as (1/N)·m where 1/(N·m) is needed: how it is read, and the number
+    /// with the unit that fits.
     fn left_to_right(&self, value: ExprId, wanted: &Term) -> Option<String> {
         let (number, unit) = self.text(value).trim().split_once(' ')?;
         let (above, below) = unit.trim().split_once('/')?;
@@ -322,7 +325,7 @@ impl Checker<'_> {
                 }
                 Kind::Real(result)
             }
-            // Its difference is a node before this one and has been checked as a subtraction.
+            // The difference is an earlier node and has been checked as a subtraction.
             Node::Crossing(_) => Kind::Boolean,
             Node::Fits { value, dimension, role } => self.fits(value, dimension, &role),
             Node::Measure(measure, value, second, window) => {
@@ -383,7 +386,7 @@ impl Checker<'_> {
         }
     }
 
-    /// Two operands that should have one unit.
+    /// Reports two operands whose units differ but must agree.
     fn differ(&mut self, code: &'static str, message: String, a: ExprId, x: &Term, b: ExprId, y: &Term) {
         // A bare number beside a quantity lacks a unit.
         for (number, other, term) in [(a, b, y), (b, a, x)] {
@@ -417,7 +420,7 @@ impl Checker<'_> {
         }
     }
 
-    /// What a sum of two different quantities may have meant: a coefficient that has the quotient as its unit.
+    /// Suggestion for a sum of two different quantities: a coefficient whose unit is the quotient of theirs.
     fn help(&self, a: ExprId, x: &Term, b: ExprId, y: &Term) -> Option<String> {
         let (x, y) = (self.resolved(x), self.resolved(y));
         if !x.unknowns.is_empty() || !y.unknowns.is_empty() {
@@ -434,7 +437,7 @@ impl Checker<'_> {
             .vars
             .iter()
             .find(|var| var.instance == owner && var.kind == VarKind::Param && self.unit_of(var) == Some(wanted))?;
-        // `Fc + vs * sign(v)`: a velocity parameter stands where its coefficient belongs.
+        // `Fc + vs * sign(v)`: a velocity parameter in the place of its coefficient.
         if let Node::Binary(BinaryOp::Multiply, p, s) = self.system.node(b)
             && let (Node::Var(p), Node::Call(Builtin::Sign, args)) = (self.system.node(*p), self.system.node(*s))
             && self.system.var(*p).kind == VarKind::Param
@@ -453,7 +456,7 @@ impl Checker<'_> {
         Some(format!("a coefficient in {unit} is missing; `{0}` is one: `{0} * {1}`", fitting.name, self.text(b)))
     }
 
-    /// What a side of an equation may lack: the unit of a number in it, or a param that has the quotient as its unit.
+    /// Suggestion for a side of an equation: the unit of a number in it, or a parameter whose unit is the quotient.
     fn factor(&self, value: ExprId, found: &Term, wanted: &Term, owner: InstanceId) -> Option<String> {
         let (found, wanted) = (self.resolved(found), self.resolved(wanted));
         if !found.unknowns.is_empty() || !wanted.unknowns.is_empty() {
@@ -491,7 +494,7 @@ impl Checker<'_> {
         Some(format!("divide by something in {unit}; `{name}` is one: `{text} / {name}`"))
     }
 
-    /// The instance that some quantity of the expression belongs to.
+    /// The instance that owns the first quantity of the expression.
     fn owner(&self, id: ExprId) -> Option<InstanceId> {
         match self.system.node(id) {
             Node::Var(var) | Node::Rate(var) => Some(self.system.var(*var).instance),
@@ -641,7 +644,7 @@ impl Checker<'_> {
             Builtin::Abs => Kind::Real(terms[0].clone()),
             Builtin::Floor => {
                 if !self.unify(&terms[0], &none) {
-                    // Rounding a quantity needs a unit to round to; SI would be a guess.
+                    // Rounding a quantity requires a unit to round to; the SI unit would be a guess.
                     let (unit, text) = (self.shown(&terms[0]), self.text(args[0]));
                     let message = format!("`floor` needs a pure number, not {}", self.described(&terms[0]));
                     let error = Diagnostic::error("E0104", message)
@@ -1056,7 +1059,7 @@ impl Checker<'_> {
             };
             units.push(unit);
         }
-        // What follows from the first is no mistake of its own.
+        // Only the first is reported; the others may follow from it.
         if let Some(id) = beyond {
             self.diagnostics.push(too_large("the exponents of its unit are beyond reason", self.system.var(id).span));
         }
@@ -1089,7 +1092,7 @@ impl Checker<'_> {
             });
         }
         if quiet {
-            // A copy of a quantity without a unit has none for the same reason.
+            // A copy of a quantity without a unit lacks one for the same reason.
             let copy = |id: &VarId| match self.system.var(*id).definition {
                 Definition::Value(value, _) => matches!(self.system.node(value), Node::Var(_)),
                 _ => false,
@@ -1111,7 +1114,7 @@ impl Checker<'_> {
     }
 }
 
-/// Which quantities are true or false: those defined by a condition.
+/// For each quantity, whether it is a truth value: whether a condition defines it.
 fn boolean_vars(system: &System) -> Vec<bool> {
     #[derive(Clone, Copy, PartialEq)]
     enum Mark {
@@ -1121,7 +1124,7 @@ fn boolean_vars(system: &System) -> Vec<bool> {
     }
     let mut marks = vec![Mark::Unseen; system.vars.len()];
     for start in 0..system.vars.len() {
-        // Follow a chain of plain copies to what decides it.
+        // Follows a chain of plain copies to the definition that decides.
         let mut chain = Vec::new();
         let mut at = start;
         let answer = loop {
@@ -1167,7 +1170,7 @@ fn boolean_vars(system: &System) -> Vec<bool> {
     marks.into_iter().map(|mark| mark == Mark::Is(true)).collect()
 }
 
-/// A unit spelled out where it is a single word.
+/// The unit's name in full if the unit is a single symbol.
 fn spelled(unit: &Unit) -> String {
     let name = match unit.text.as_str() {
         "N" => "newton",
@@ -1184,7 +1187,7 @@ fn spelled(unit: &Unit) -> String {
     name.to_string()
 }
 
-/// A rotary kind of quantity, named as such.
+/// A description of a dimension that names rotary quantities as such.
 fn angular(dimension: Dimension) -> String {
     match angular_unit(dimension).as_str() {
         "rad" => "an angle".into(),

@@ -1,7 +1,7 @@
-//! Turns a checked system into straight-line functions over one block.
+//! Lowering: turns a checked system into straight-line functions over one block.
 //!
-//! In: a [`System`] without circles, its [`Types`], and what is to be observed. Out: a [`Program`]. After this there
-//! are no units, and names serve only printing.
+//! In: a [`System`] without algebraic loops, its [`Types`], and the expressions to observe. Out: a [`Program`]. Later
+//! stages know no units, and use names for printing only.
 
 mod lookup;
 
@@ -21,34 +21,34 @@ use grammar::ast::BinaryOp;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
-/// Where the value of a quantity lies while a model runs.
+/// Location of a quantity's value at run time.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Place {
     /// Computed on demand.
     Computed,
-    /// In this slot.
+    /// Stored in this slot.
     Slot(Slot),
 }
 
-/// An expression that is wanted as a quantity.
+/// An expression to observe as a quantity.
 pub struct Wanted {
     /// The expression.
     pub expr: ExprId,
-    /// As written.
+    /// The expression as written.
     pub text: String,
-    /// The unit it is shown in; none: its own.
+    /// Unit for display; `None` for the expression's own unit.
     pub unit: Option<Unit>,
 }
 
-/// A program and the slots of what was wanted, in the same order.
+/// A lowered program.
 pub struct Lowered {
     /// The program.
     pub program: Program,
-    /// Slot of each wanted expression.
+    /// Slot of each observed expression, in the order of the request.
     pub observed: Vec<Slot>,
 }
 
-/// Lowers a system.
+/// Lowers a system; `wanted` are the expressions to observe.
 pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     let mut pool = [&crate::math::POOL, crate::numerics::rosenbrock::constants()].concat();
     let tables = Lookup::place_all(&system.tables, &mut pool);
@@ -79,14 +79,14 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
             description.coupling = coupling.into();
         }
     }
-    // The segments behind the roots move up by their number.
+    // The segments after the roots move up by the number of roots.
     let lens = {
         let l = &description.layout;
         [l.params, l.inputs, l.states, l.memory, l.regimes, l.outputs, l.derivatives, l.roots, l.jacobian, l.due]
             .map(|segment| segment.len)
     };
     let mut moved = Layout::new(lens);
-    // What is delayed is looked up outside, before each evaluation.
+    // Delayed values are looked up by the caller before each evaluation, so a model with delays has no fused step.
     if (1..=MOST_FUSED).contains(&moved.states.len) && description.delays.is_empty() {
         moved = moved.with_trial(description.guards.len() as u32);
     }
@@ -106,7 +106,7 @@ pub fn lower(system: &System, types: &Types, wanted: &[Wanted]) -> Lowered {
     Lowered { program, observed }
 }
 
-/// The function with its loads moved.
+/// The function with its loads relocated.
 fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
     for op in &mut func.ops {
         if let crate::ir::Op::Load(at) = op {
@@ -116,8 +116,8 @@ fn renamed(mut func: Func, slot: &impl Fn(Slot) -> Slot) -> Func {
     func
 }
 
-/// Values of expressions that depend on parameters only, each parameter at its default. What depends on anything else
-/// is NaN.
+/// Values of expressions that depend on parameters only, with each parameter at its default. An expression that depends
+/// on anything else is NaN.
 pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
@@ -126,8 +126,8 @@ pub fn evaluate(system: &System, types: &Types, exprs: &[ExprId]) -> Vec<f64> {
     evaluate_in(&plan, exprs)
 }
 
-/// The function that computes expressions from the parameters in a block, as at the start; and the size of the block, in
-/// whose last slots their values are.
+/// Compiles expressions of parameters to a function that reads the parameters in a block and runs as at the start. Also
+/// returns the size of the block; its last slots receive the values.
 pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usize) {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
@@ -143,22 +143,22 @@ pub fn formulas(system: &System, types: &Types, exprs: &[ExprId]) -> (Func, usiz
     (crate::math::expand(&emit.build.finish()), from + exprs.len())
 }
 
-/// Number of parameters that depend on no other: those that have a slot.
+/// Number of parameters that depend on no other quantity. Only these have slots.
 pub fn independent(system: &System) -> u32 {
     independent_params(system).iter().map(|free| u32::from(*free)).sum()
 }
 
-/// What [`of_params`] computes.
+/// A value that [`of_params`] computes.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Sought {
-    /// The value of a quantity: of a parameter that depends on no other what its slot holds.
+    /// The value of a quantity. For an independent parameter this is the content of its slot.
     Var(VarId),
     /// An expression.
     Expr(ExprId),
 }
 
-/// A program that computes these values from parameters alone, each into an output slot in their order, and the slot of
-/// each parameter that depends on no other. What is not constant while a model runs is NaN, as in [`evaluate`].
+/// A program that computes these values from parameters alone, each into the output slot of its index, and the slot of
+/// each independent parameter. Values that are not constant during a run are NaN, as in [`evaluate`].
 pub fn of_params(system: &System, types: &Types, sought: &[Sought]) -> (Program, Vec<(VarId, Slot)>) {
     let mut pool = crate::math::POOL.to_vec();
     let tables = Lookup::place_all(&system.tables, &mut pool);
@@ -210,7 +210,7 @@ fn evaluate_in(plan: &Plan, exprs: &[ExprId]) -> Vec<f64> {
     block.split_off(Slot::FIXED as usize)
 }
 
-/// What lies where.
+/// The layout: which quantity is stored where.
 struct Plan<'a> {
     system: &'a System,
     types: &'a Types,
@@ -223,12 +223,12 @@ struct Plan<'a> {
     periods: Vec<Slot>,
     crossings: Vec<Slot>,
     events: Vec<Slot>,
-    /// The number of each call of `delay`.
+    /// Index of each call of `delay`.
     delayed: HashMap<ExprId, usize>,
-    /// Quantity or expression of each output slot.
+    /// The quantity or expression of each output slot.
     outputs: Vec<Output>,
     observed: Vec<Slot>,
-    /// Expressions that are looked at while the model runs.
+    /// Expressions that are observed during the run.
     wanted: Vec<ExprId>,
     tables: Vec<Lookup>,
 }
@@ -239,22 +239,22 @@ enum Output {
     Expr(ExprId),
 }
 
-/// Where something to be looked at is found.
+/// Location of an observed value.
 enum Found {
-    /// In the slot of a quantity.
+    /// In the slot of this quantity.
     Var(VarId),
-    /// In an output slot.
+    /// In the output slot of this index.
     Output(usize),
 }
 
-/// Adds an output and returns its number.
+/// Appends an output and returns its index.
 fn added(outputs: &mut Vec<Output>, output: Output) -> usize {
     outputs.push(output);
     outputs.len() - 1
 }
 
 impl<'a> Plan<'a> {
-    /// `watched`: computed quantities whose declared ranges are watched, beside outputs.
+    /// `watched`: computed quantities whose declared ranges are guarded, in addition to outputs.
     fn new(
         system: &'a System,
         types: &'a Types,
@@ -281,7 +281,7 @@ impl<'a> Plan<'a> {
         .map(Output::Var)
         .collect();
         outputs.extend(watched.iter().copied().map(Output::Var));
-        // Plain names that have a slot already need no other.
+        // A plain name of a quantity with a slot needs no output slot.
         let stored =
             |id: VarId| !matches!(system.var(id).definition, Definition::Value(..)) || independent[id.0 as usize];
         let named = |id: VarId, outputs: &mut Vec<Output>| match stored(id) {
@@ -361,7 +361,7 @@ impl<'a> Plan<'a> {
             let [at, back, past, weight, slope] = take(5).try_into().expect("five slots");
             Delay {
                 time: at,
-                // Checked before; a text with mistakes is never run.
+                // Has been checked; texts with errors are never run.
                 range: delays::range(system, time).unwrap_or((0.0, 0.0)),
                 back,
                 source: slot_of(source),
@@ -436,7 +436,7 @@ impl<'a> Plan<'a> {
             };
             let kind = match (var.kind, &var.definition) {
                 (VarKind::Param, _) => Kind::Param,
-                // Nothing can be put in where an argument says what it is.
+                // An input bound by an argument cannot be set from outside.
                 (VarKind::Input, _) if watched.contains(&id) => Kind::Let,
                 (VarKind::Input, _) => Kind::Input,
                 (VarKind::State, Definition::Sampled { .. }) => Kind::SampledState,
@@ -494,7 +494,7 @@ impl<'a> Plan<'a> {
         self.description.quantities = quantities;
     }
 
-    /// Declared ranges of what is stored, and the guards that watch them.
+    /// Evaluates the declared ranges of stored quantities and adds the guards for them.
     fn ranges(&mut self, quantities: &mut [Quantity]) {
         let mut bounds: Vec<ExprId> = Vec::new();
         let mut of: Vec<(usize, bool, bool)> = Vec::new();
@@ -512,7 +512,7 @@ impl<'a> Plan<'a> {
         drop(index);
         let values = evaluate_in(self, &bounds);
         for ((k, high, strict), value) in of.into_iter().zip(values) {
-            // A bound that is not constant is not watched: the check of ranges reports it.
+            // A bound that is not constant has no guard; the check of ranges reports it.
             if !value.is_nan() {
                 let range = &mut quantities[k].range;
                 if high {
@@ -528,7 +528,7 @@ impl<'a> Plan<'a> {
             let mut range = q.range;
             match q.kind {
                 Kind::State | Kind::SampledState | Kind::Output | Kind::Observed => {}
-                // What is proven of other quantities rests on these ranges, and nothing else would notice.
+                // Proofs about other quantities rely on these ranges, and no other check covers them.
                 Kind::Input | Kind::Let if range != (f64::NEG_INFINITY, f64::INFINITY) => {
                     range.0 = if strict.0 { TINY } else { range.0 };
                     range.1 = if strict.1 { -TINY } else { range.1 };
@@ -546,7 +546,7 @@ impl<'a> Plan<'a> {
             emit.build.store(self.slot(*id).expect("it is stored"), value);
         }
         for id in &self.sampled {
-            // The blocks due at 0 have run: the state is what they say is next.
+            // The blocks due at 0 have run, so the state takes its next value.
             let Definition::Sampled { next, .. } = self.system.var(*id).definition else {
                 unreachable!("it is sampled")
             };
@@ -624,9 +624,9 @@ impl<'a> Plan<'a> {
         emit.build.finish()
     }
 
-    /// `balanced` becomes whether a contact stops what it acts on.
+    /// Sets `balanced` to whether a contact stops the mass on which it acts.
     fn transitions(&self, mut emit: Emit, balanced: &mut bool) -> Func {
-        // For each state: what is reset when, in the order of the text.
+        // For each state: its resets with their conditions, in the order of the text.
         let mut resets: HashMap<VarId, Vec<(Value, Value)>> = HashMap::new();
         let mut order: Vec<VarId> = Vec::new();
         let mut note = |emit: &mut Emit, fires: Value, list: &[(VarId, ExprId)]| {
@@ -669,7 +669,7 @@ impl<'a> Plan<'a> {
         }
         let (inputs, states): (Vec<VarId>, Vec<VarId>) =
             order.into_iter().partition(|var| self.system.var(*var).kind == VarKind::Input);
-        // What an impulse needs, in slots of its own behind each other: whether it acts, the value, the force.
+        // Each impulse needs three slots, allocated downwards: whether it acts, the target value, the force.
         let mut impulses: Vec<(Func, [Slot; 3])> = Vec::new();
         for var in inputs {
             let Some((func, force)) = self.impulse(var) else { continue };
@@ -678,7 +678,7 @@ impl<'a> Plan<'a> {
                 acts = emit.build.or(acts, *fires);
                 target = emit.build.select(*fires, *value, target);
             }
-            // What bounces is not held.
+            // A contact that bounces has no holding force.
             let holds = resets[&var].iter().all(|(_, value)| emit.build.constant(*value) == Some(0.0));
             let force = if holds { emit.var(force) } else { emit.build.real(0.0) };
             let values = [emit.number(acts), target, force];
@@ -689,7 +689,7 @@ impl<'a> Plan<'a> {
         for var in states {
             let slot = self.slot(var).expect("a state is stored");
             let mut value = emit.build.load(slot);
-            // The first in the text wins: it is applied last.
+            // The first reset of the text takes precedence, so it is applied last.
             for (fires, reset) in resets[&var].iter().rev() {
                 value = emit.build.select(*fires, *reset, value);
             }
@@ -707,15 +707,16 @@ impl<'a> Plan<'a> {
             all.inline(func, &mut env);
         }
         *balanced = !impulses.is_empty();
-        // What the next instant is compared with is what this one holds after its resets.
+        // The memory holds values after the resets, with which the next instant is compared.
         all.inline(&memory, &mut env);
         let size = self.description.layout.size() as u32;
         all.store_env(&env, |slot| slot.0 < size);
         all.finish()
     }
 
-    /// How an input is set: by an impulse of the first output of its part that moves a state on which the input depends;
-    /// and that output. None for what no output moves, as a measured speed.
+    /// The function that sets an input by an impulse of a force, and that force: the first output of the input's part
+    /// that moves a state on which the input depends. `None` for an input that no output moves, such as a measured
+    /// speed.
     fn impulse(&self, input: VarId) -> Option<(Func, VarId)> {
         let mut emit = Emit::new(self, "speed", Phase::Now);
         let value = emit.var(input);
@@ -740,8 +741,8 @@ impl<'a> Plan<'a> {
         })
     }
 
-    /// Remembers the sides of crossings and whether events hold. A crossing is an instant: it holds no longer afterwards,
-    /// so that an event happens at every crossing, even at one in each step.
+    /// Stores the signs of crossings and the truth of event conditions. A crossing is true for a single instant and
+    /// false in the memory, so that an event fires at every crossing, even at one in each step.
     fn memory(&self) -> Func {
         let mut emit = Emit::new(self, "memory", Phase::Now);
         emit.between = true;
@@ -757,8 +758,8 @@ impl<'a> Plan<'a> {
         emit.build.finish()
     }
 
-    /// Surfaces on which a branch of what moves the states or of what is looked at changes, or a transition or event
-    /// happens.
+    /// Switching surfaces: functions of the state that change their sign where a branch in the rates or in the observed
+    /// expressions changes, or where a transition or event occurs.
     fn roots(&self, mut emit: Emit) -> (Func, Vec<Root>) {
         // Conditions first: a surface that a branch shares with a condition counts as the condition's.
         let mut from: Vec<ExprId> = Vec::new();
@@ -775,11 +776,11 @@ impl<'a> Plan<'a> {
         let mut seen = vec![false; self.system.nodes.len()];
         let mut stack = from;
         stack.reverse();
-        // With whether derivatives at most bend there.
+        // The flag says that derivatives are continuous there and only have a kink.
         let mut surfaces: Vec<(Value, ExprId, bool)> = Vec::new();
         let mut known: HashMap<Value, usize> = HashMap::new();
         let mut moving: HashMap<Value, bool> = HashMap::new();
-        // Observed quantities come last: a surface of theirs must not change the course of a run.
+        // Observed quantities come last, because their surfaces must not affect the course of a run.
         let mut own = None;
         loop {
             let Some(id) = stack.pop() else {
@@ -809,7 +810,7 @@ impl<'a> Plan<'a> {
                 }
                 let place = *known.entry(value).or_insert(surfaces.len());
                 match surfaces.get_mut(place) {
-                    // How an observed quantity changes says nothing of derivatives.
+                    // A branch in an observed quantity does not affect the derivatives.
                     Some(surface) => surface.2 &= bends || own.is_some_and(|own| place < own),
                     None => surfaces.push((value, id, bends)),
                 }
@@ -846,7 +847,7 @@ impl<'a> Plan<'a> {
                     }
                 }
                 Node::Call(Builtin::Square, args) => {
-                    // The sign changes where the sine of its phase does.
+                    // The sign changes with that of the sine of its phase.
                     let frequency = emit.value(args[1]);
                     let (time, turn) = (emit.build.load(Slot::TIME), emit.build.real(2.0 * std::f64::consts::PI));
                     let phase = emit.build.mul(turn, frequency);
@@ -877,7 +878,7 @@ impl<'a> Plan<'a> {
         (emit.build.finish(), roots)
     }
 
-    /// The comparisons and crossings that conditions are joined of.
+    /// The comparisons and crossings of which conditions consist.
     fn comparisons(&self, conditions: &[ExprId]) -> HashSet<ExprId> {
         let mut out = HashSet::new();
         let mut stack = conditions.to_vec();
@@ -893,30 +894,30 @@ impl<'a> Plan<'a> {
         out
     }
 
-    /// A short name of a surface; the caller knows the text.
+    /// A short name of a surface, from which the caller can find the text.
     fn root_text(&self, id: ExprId) -> String {
         let span = self.system.span(id);
         format!("{}:{}..{}", span.file.0, span.start, span.end)
     }
 }
 
-/// Largest number of states with a dense Jacobian in the block.
+/// Limit on the number of states for a dense Jacobian in the block.
 pub const MOST_JACOBIAN: usize = 200;
 
-/// Least and largest number of states of which it is known which depend on which, and how many others each may depend on,
-/// in the mean, to be worth it.
+/// Sparsity is computed for systems with at least `LEAST_COUPLED` and at most `MOST_COUPLED` states, and used if a
+/// state depends on at most `MOST_ENTRIES` others on average; otherwise it does not pay.
 const LEAST_COUPLED: usize = 40;
 const MOST_COUPLED: usize = 20_000;
 const MOST_ENTRIES: usize = 40;
 
-/// Largest number of states of an adaptive run of which each may depend on all others, or on nobody knows which: its matrices
-/// take some hundred megabytes.
+/// Limit on the number of states of an adaptive run with a dense or unknown sparsity. Its matrices take some hundred
+/// megabytes.
 pub const MOST_DENSE: usize = 2000;
 
-/// Largest number of states whose adaptive step is one function.
+/// Limit on the number of states for an adaptive step that is a single function.
 const MOST_FUSED: u32 = 8;
 
-/// Inputs and `let`s that are computed, and of which nothing but their declared range says that they lie in it.
+/// Computed inputs and `let`s whose declared range cannot be proven and is therefore assumed.
 fn believed(system: &System) -> Vec<VarId> {
     let mut reach: Option<Reach> = None;
     let ids = system.var_ids().filter(|id| {
@@ -931,7 +932,7 @@ fn believed(system: &System) -> Vec<VarId> {
         }
         let reach = reach.get_or_insert_with(|| Reach::new(system));
         let (value, bounds) = (reach.unbound(*id), reach.bounds(*id));
-        // Above 0 is above 0, however little.
+        // A value proven to be positive satisfies `> 0`, even below [`TINY`].
         let low = value.low >= bounds.low || bounds.low == TINY && value.low > 0.0;
         let high = value.high <= bounds.high || bounds.high == -TINY && value.high < 0.0;
         !(low && high)
@@ -939,7 +940,7 @@ fn believed(system: &System) -> Vec<VarId> {
     ids.collect()
 }
 
-/// Which quantities are parameters whose value needs no other quantity.
+/// Whether each quantity is a parameter whose value depends on no other quantity.
 fn independent_params(system: &System) -> Vec<bool> {
     let mut out = vec![false; system.vars.len()];
     for (k, var) in system.vars.iter().enumerate() {
@@ -965,19 +966,19 @@ fn independent_params(system: &System) -> Vec<bool> {
     out
 }
 
-/// One function being emitted: each node and quantity at most once.
+/// Emits one function; each node and quantity at most once.
 struct Emit<'a> {
     plan: &'a Plan<'a>,
     phase: Phase,
     build: Build,
     nodes: Vec<Option<Value>>,
-    /// Parameters count as their values, and what a run decides as NaN.
+    /// Parameters are replaced by their values, and quantities unknown before a run by NaN.
     inline_params: bool,
-    /// But parameters that depend on no other are read from their slots.
+    /// With `inline_params`: independent parameters are read from their slots nevertheless.
     loads_params: bool,
-    /// Whether nothing crosses anything: between two instants.
+    /// Whether the function is evaluated between two instants, where every crossing is false.
     between: bool,
-    /// A quantity that is read from [`impulse::FORCE`] instead of computed.
+    /// A quantity that is read from [`impulse::FORCE`] instead of being computed.
     replaced: Option<VarId>,
 }
 
@@ -989,7 +990,7 @@ impl<'a> Emit<'a> {
         Emit { plan, phase, build, nodes, inline_params, loads_params, between, replaced: None }
     }
 
-    /// The expression that a node hands on to, if it does not compute its value from its operands.
+    /// The expression that a node forwards to, if it does not compute its value from its operands.
     fn behind(&self, node: &Node) -> Option<ExprId> {
         let system = self.plan.system;
         match node {
@@ -1011,7 +1012,7 @@ impl<'a> Emit<'a> {
         }
     }
 
-    /// The value of an expression; shared with every other use of it.
+    /// The value of an expression, shared with all its other uses.
     fn value(&mut self, id: ExprId) -> Value {
         let system = self.plan.system;
         let mut stack = vec![id];
@@ -1046,7 +1047,7 @@ impl<'a> Emit<'a> {
         self.nodes[id.0 as usize].expect("just computed")
     }
 
-    /// The operands that must be known: of a delay that breaks circles only the time, but at the start.
+    /// The operands that must be computed. A delay that breaks cycles needs only its time, except at the start.
     fn operands<'n>(&self, node: &'n Node) -> impl Iterator<Item = ExprId> + use<'n> {
         let known = self.phase != Phase::Start && delays::breaks(self.plan.system, node);
         node.operands().skip(usize::from(known))
@@ -1060,8 +1061,8 @@ impl<'a> Emit<'a> {
         (self.build.type_of(self.got(a)), self.build.type_of(self.got(b)))
     }
 
-    /// An operand as a condition. Where a text has mistakes, constants are evaluated all the same: what is wrong there
-    /// is neither true nor a number.
+    /// An operand as a condition. Constants are evaluated even in texts with errors, where an operand may have the
+    /// wrong type.
     fn condition(&mut self, id: ExprId) -> Value {
         let value = self.got(id);
         if self.build.type_of(value) == Type::Bool { value } else { self.truth(value) }
@@ -1073,7 +1074,7 @@ impl<'a> Emit<'a> {
         if self.build.type_of(value) == Type::Bool { self.number(value) } else { value }
     }
 
-    /// The value of a quantity that is computed: at a tick, a held one is renewed only if its block is due.
+    /// The value of a computed quantity. At a tick, a held quantity is updated only if its block is due.
     fn handed_on(&mut self, node: &Node, behind: ExprId) -> Value {
         let value = self.got(behind);
         let (Node::Var(id), Phase::Tick) = (node, self.phase) else { return value };
@@ -1105,7 +1106,7 @@ impl<'a> Emit<'a> {
         }
     }
 
-    /// As [`var`](Self::var), as it is stored: a number.
+    /// As [`var`](Self::var), in its stored form: a number.
     fn stored(&mut self, id: VarId) -> Value {
         let value = self.var(id);
         self.as_number(value, self.plan.types.boolean_vars[id.0 as usize])
@@ -1120,7 +1121,7 @@ impl<'a> Emit<'a> {
                 let value = self.build.load(slot);
                 if self.plan.types.boolean_vars[id.0 as usize] { self.truth(value) } else { value }
             }
-            // Not known: an input, or a quantity without a definition.
+            // Unknown: an input, or a quantity without a definition.
             _ => {
                 let unknown = self.build.real(f64::NAN);
                 if self.plan.types.boolean_vars[id.0 as usize] { self.truth(unknown) } else { unknown }
@@ -1132,13 +1133,13 @@ impl<'a> Emit<'a> {
         self.plan.description.layout.params.contains(slot)
     }
 
-    /// A stored Boolean: not 0.
+    /// A stored truth value as a condition: true if it is not 0.
     fn truth(&mut self, value: Value) -> Value {
         let half = self.build.real(0.5);
         self.build.less(half, value)
     }
 
-    /// 1 or 0.
+    /// A condition as 1 or 0.
     fn number(&mut self, condition: Value) -> Value {
         let (one, zero) = (self.build.real(1.0), self.build.real(0.0));
         self.build.select(condition, one, zero)
@@ -1148,7 +1149,7 @@ impl<'a> Emit<'a> {
         if boolean { self.number(value) } else { value }
     }
 
-    /// Whether a value changes while a model runs.
+    /// Whether a value varies during a run.
     fn moves(&self, value: Value, known: &mut HashMap<Value, bool>) -> bool {
         let params = self.plan.description.layout.params;
         let mut stack = vec![value];
@@ -1243,7 +1244,7 @@ impl<'a> Emit<'a> {
         }
     }
 
-    /// What was before, or between that and what is now; at the start what is then.
+    /// The delayed value, or an interpolation between it and the present one. At the start it is the present value.
     fn delay(&mut self, id: ExprId) -> Value {
         let (value, _) = delays::of(self.plan.system, id);
         if self.inline_params {
@@ -1309,7 +1310,7 @@ impl<'a> Emit<'a> {
         }
     }
 
-    /// A whole constant exponent is multiplication, by squaring; ½ is the root; all else `pow`.
+    /// A constant whole exponent becomes repeated squaring, ½ the square root, and any other exponent `pow`.
     fn power(&mut self, a: Value, b: Value, exponent: Option<f64>) -> Value {
         match exponent {
             Some(n) if n.fract() == 0.0 && n.abs() <= 64.0 => {
@@ -1440,13 +1441,13 @@ impl<'a> Emit<'a> {
         }
     }
 
-    /// f · t
+    /// f · t, a phase in turns.
     fn turns(&mut self, frequency: Value) -> Value {
         let time = self.time();
         self.build.mul(frequency, time)
     }
 
-    /// Turns as radians, whole turns taken off first.
+    /// A phase in turns as an angle in radians, after whole turns are removed.
     fn angle(&mut self, turns: Value) -> Value {
         let whole = self.build.nearest(turns);
         let part = self.build.sub(turns, whole);

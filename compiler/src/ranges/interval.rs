@@ -1,17 +1,20 @@
-//! Intervals of doubles: what a quantity can be, rounding included.
+//! Interval arithmetic over doubles, with outward rounding (Moore, Kearfott, Cloud, *Introduction to Interval
+//! Analysis*, 2009).
 //!
-//! An interval is a closed set of doubles between two ends, without those nearer to 0 than `away`. A strict bound `x > a`
-//! is the closed bound at the next double, so nothing here is lost to an end that is "left out". Ends of results are
-//! rounded outwards (Moore, Interval Analysis), so that they hold for every order in which code may compute a result:
-//! with products fused into sums, and quotients as products with a reciprocal. −0 and 0 are one number.
+//! In: intervals of operands. Out: an interval that contains every possible result. Knows nothing of expressions.
 //!
-//! A result too small for a double is 0, and the interval of such a result contains 0. One that is too large ends at
-//! infinity; infinite operands are not promised anything.
+//! An interval is a closed set of doubles between two ends, without those nearer to 0 than `away`. A strict bound `x >
+//! a` is the closed bound at the next double, so open ends are not needed. Ends of results are rounded outwards, so
+//! that they hold for every order in which code may compute a result: with products fused into sums, and with quotients
+//! computed as products with a reciprocal. −0 and 0 are the same number.
+//!
+//! A result too small for a double is 0, and the interval of such a result contains 0. A result too large ends at
+//! infinity; nothing is guaranteed for infinite operands.
 
 /// The smallest positive double.
 const LEAST: f64 = f64::from_bits(1);
 
-/// Relative error that an elementary function may have; the accuracy of `math` is within one unit in the last place.
+/// Bound on the relative error of an elementary function; those of `math` are accurate to one unit in the last place.
 const ELEMENTARY: f64 = 4.0 * f64::EPSILON;
 
 /// All doubles x with `low` ≤ x ≤ `high` and |x| ≥ `away`.
@@ -19,68 +22,68 @@ const ELEMENTARY: f64 = 4.0 * f64::EPSILON;
 pub struct Interval {
     /// Least value.
     pub low: f64,
-    /// Greatest value; below `low` if there is no value.
+    /// Greatest value; below `low` if the interval is empty.
     pub high: f64,
-    /// Least magnitude. Above 0, it keeps 0 out of an interval with both signs.
+    /// Least magnitude. If it is positive, it excludes 0 from an interval with both signs.
     pub away: f64,
 }
 
 impl Interval {
-    /// Everything.
+    /// All doubles.
     pub const ALL: Interval = Interval { low: f64::NEG_INFINITY, high: f64::INFINITY, away: 0.0 };
 
-    /// Nothing: what is computed where contradicting conditions hold.
+    /// The empty set: the value of an expression under contradictory conditions.
     pub const EMPTY: Interval = Interval { low: f64::INFINITY, high: f64::NEG_INFINITY, away: f64::INFINITY };
 
-    /// Everything but 0.
+    /// All doubles but 0.
     pub const NOT_ZERO: Interval = Interval { away: LEAST, ..Interval::ALL };
 
-    /// One number; everything, if it is NaN.
+    /// A single number; [`Interval::ALL`] for NaN.
     pub fn point(x: f64) -> Interval {
         if x.is_nan() { Interval::ALL } else { Interval::closed(x, x) }
     }
 
-    /// Both ends included; an end that is NaN is open.
+    /// The interval with both ends included; an end that is NaN is unbounded.
     pub fn closed(low: f64, high: f64) -> Interval {
         Interval { low, high, away: 0.0 }.normal()
     }
 
-    /// Everything from `low` on.
+    /// All numbers ≥ `low`.
     pub fn from(low: f64) -> Interval {
         Interval::closed(low, f64::INFINITY)
     }
 
-    /// Everything up to `high`.
+    /// All numbers ≤ `high`.
     pub fn to(high: f64) -> Interval {
         Interval::closed(f64::NEG_INFINITY, high)
     }
 
-    /// All numbers of at least this magnitude.
+    /// All numbers of magnitude ≥ `away`.
     pub fn beyond(away: f64) -> Interval {
         Interval { away: away.max(0.0), ..Interval::ALL }
     }
 
-    /// Whether there is no value.
+    /// Whether the interval is empty.
     pub fn is_empty(self) -> bool {
         self.low > self.high
     }
 
-    /// Whether it is one number.
+    /// Whether it holds a single number.
     pub fn is_point(self) -> bool {
         self.low == self.high
     }
 
-    /// Whether 0 can be reached.
+    /// Whether it contains 0.
     pub fn has_zero(self) -> bool {
         self.low <= 0.0 && self.high >= 0.0 && self.away == 0.0
     }
 
-    /// Whether every number in it is at least 0.
+    /// Whether all its numbers are ≥ 0.
     pub fn is_not_negative(self) -> bool {
         self.low >= 0.0 || self.is_empty()
     }
 
-    /// Whether every number in it is above 0.
+    /// Whether all its numbers are > 0.
     pub fn is_positive(self) -> bool {
         self.low > 0.0 || self.is_empty()
     }
@@ -90,7 +93,7 @@ impl Interval {
         if self.is_empty() { 0.0 } else { self.high.max(-self.low) }
     }
 
-    /// The same set with ends and magnitude as narrow as they say together.
+    /// The same set in normal form: each of the three bounds as tight as the other two allow.
     fn normal(self) -> Interval {
         let mut low = if self.low.is_nan() { f64::NEG_INFINITY } else { self.low + 0.0 };
         let mut high = if self.high.is_nan() { f64::INFINITY } else { self.high + 0.0 };
@@ -110,13 +113,13 @@ impl Interval {
         Interval { low, high, away }
     }
 
-    /// What lies in both.
+    /// Intersection.
     pub fn and(self, other: Interval) -> Interval {
         let (low, high) = (self.low.max(other.low), self.high.min(other.high));
         Interval { low, high, away: self.away.max(other.away) }.normal()
     }
 
-    /// The smallest interval around both.
+    /// Convex hull: the smallest interval that contains both.
     pub fn hull(self, other: Interval) -> Interval {
         let (low, high) = (self.low.min(other.low), self.high.max(other.high));
         Interval { low, high, away: self.away.min(other.away) }.normal()
@@ -187,13 +190,13 @@ impl Interval {
         if self.is_empty() { self } else { Interval { low: self.away, high: self.size(), away: self.away }.normal() }
     }
 
-    /// a multiplied with itself.
+    /// a · a
     pub fn square(self) -> Interval {
         let size = self.abs();
         size.multiply(size)
     }
 
-    /// a^n by repeated multiplication.
+    /// a^n by repeated multiplication
     pub fn power(self, n: u32) -> Interval {
         let mut out = if n % 2 == 1 { self } else { Interval::point(1.0) };
         let square = self.square();
@@ -203,12 +206,12 @@ impl Interval {
         out
     }
 
-    /// The smaller of both.
+    /// min(a, b)
     pub fn min(self, other: Interval) -> Interval {
         self.negate().max(other.negate()).negate()
     }
 
-    /// The larger of both.
+    /// max(a, b)
     pub fn max(self, other: Interval) -> Interval {
         if self.is_empty() || other.is_empty() {
             return Interval::EMPTY;
@@ -217,7 +220,7 @@ impl Interval {
         Interval { low, high, away: self.away.min(other.away) }.normal()
     }
 
-    /// The root, of what is not negative.
+    /// √a of the non-negative part of a.
     pub fn sqrt(self) -> Interval {
         let inside = self.and(Interval::from(0.0));
         if inside.is_empty() {
@@ -229,20 +232,20 @@ impl Interval {
         Interval::closed(low, if exact(high, inside.high) { high } else { high.next_up() })
     }
 
-    /// The image under an elementary function that rises everywhere and whose values lie within `limits`.
+    /// The image under an increasing elementary function with values within `limits`.
     pub fn rising(self, f: impl Fn(f64) -> f64, limits: (f64, f64)) -> Interval {
         if self.is_empty() {
             return self;
         }
         let (low, high) = (f(self.low), f(self.high));
-        // Of a value too small to be a normal number the relative error is larger.
+        // The relative error of a subnormal value is larger.
         let low = if low.abs() < f64::MIN_POSITIVE && low > 0.0 { 0.0 } else { low - ELEMENTARY * low.abs() };
         let high = if high.abs() < f64::MIN_POSITIVE && high < 0.0 { 0.0 } else { high + ELEMENTARY * high.abs() };
-        // f(x) keeps the sign that it has at the ends: a value of 0 there is exact or too small.
+        // f(x) keeps the sign that it has at the ends: a value of 0 there is exact or has underflowed.
         Interval::closed(low.max(limits.0), high.min(limits.1))
     }
 
-    /// The same with each end further outwards, by a part of its own magnitude.
+    /// Moves each end outwards by the rounding error relative to that end.
     pub fn loosened(self) -> Interval {
         if self.is_empty() {
             return self;
@@ -253,14 +256,14 @@ impl Interval {
         Interval { low, high, away: if self.away.is_finite() { self.away * (1.0 - ELEMENTARY) } else { 0.0 } }.normal()
     }
 
-    /// The same with both ends further outwards, by a part of the greatest magnitude: for what is interpolated.
+    /// Moves both ends outwards by the rounding error relative to the greatest magnitude, for interpolated values.
     pub fn rounded(self) -> Interval {
         let slack = ELEMENTARY * self.size();
         if self.is_empty() { self } else { Interval::closed(self.low - slack, self.high + slack) }
     }
 }
 
-/// a + b rounded down and up. Knuth's two-sum gives the error of the rounded sum exactly.
+/// a + b, rounded down and rounded up. Knuth's two-sum yields the exact error of the rounded sum.
 fn sum(a: f64, b: f64) -> (f64, f64) {
     let s = a + b;
     if planted::is("ends do not round") && s.is_finite() {
@@ -268,7 +271,7 @@ fn sum(a: f64, b: f64) -> (f64, f64) {
     }
     if !s.is_finite() {
         return match a.is_finite() && b.is_finite() {
-            // Too large: it may be the greatest double or infinite.
+            // Overflow: the result may be the greatest double or infinite.
             true if s > 0.0 => (f64::MAX, s),
             true => (s, f64::MIN),
             false if s.is_nan() => (f64::NEG_INFINITY, f64::INFINITY),
@@ -280,7 +283,7 @@ fn sum(a: f64, b: f64) -> (f64, f64) {
     (if error < 0.0 { s.next_down() } else { s }, if error > 0.0 { s.next_up() } else { s })
 }
 
-/// a · b rounded down and up; 0 · ∞ is 0, since the infinite end stands for large numbers.
+/// a · b, rounded down and rounded up. 0 · ∞ is 0, since an infinite end stands for arbitrarily large numbers.
 fn product(a: f64, b: f64) -> (f64, f64) {
     if a == 0.0 || b == 0.0 {
         return (0.0, 0.0);
@@ -298,7 +301,7 @@ fn product(a: f64, b: f64) -> (f64, f64) {
             let p = p.abs().max(LEAST) * a.signum() * b.signum();
             return (p, p);
         }
-        // The error of the product may itself be too small to see. A product keeps the sign of its factors, and is 0 at worst.
+        // The error of the product may itself underflow. A product keeps the sign given by its factors, or is 0.
         let below = p.next_down();
         let above = p.next_up();
         return if (a > 0.0) == (b > 0.0) { (below.max(0.0), above) } else { (below, above.min(0.0)) };
@@ -307,7 +310,7 @@ fn product(a: f64, b: f64) -> (f64, f64) {
     (if error < 0.0 { p.next_down() } else { p }, if error > 0.0 { p.next_up() } else { p })
 }
 
-/// a / b of numbers that are not negative, rounded down and up.
+/// a / b for a, b ≥ 0, rounded down and rounded up.
 fn quotient(a: f64, b: f64) -> (f64, f64) {
     let q = a / b;
     if !q.is_finite() || b.is_infinite() {
@@ -317,12 +320,12 @@ fn quotient(a: f64, b: f64) -> (f64, f64) {
     if exact { (q, q) } else { (q.next_down(), q.next_up()) }
 }
 
-/// Mistakes that tests plant in the rules of proofs, by name: each must be found.
+/// Fault injection: deliberate mistakes in the rules of proofs, by name. Tests check that each of them is detected.
 #[cfg(test)]
 pub(crate) mod planted {
     use std::cell::Cell;
 
-    /// All names.
+    /// Names of all faults.
     pub const ALL: &[&str] = &[
         "products are never too small",
         "exponentials are never zero",
@@ -341,23 +344,23 @@ pub(crate) mod planted {
 
     thread_local! { static PLANTED: Cell<&'static str> = const { Cell::new("") } }
 
-    /// Plants a mistake in this thread; none: "".
+    /// Activates a fault in this thread; "" deactivates it.
     pub fn plant(name: &'static str) {
         assert!(name.is_empty() || ALL.contains(&name), "{name}");
         PLANTED.set(name);
     }
 
-    /// Whether this mistake is planted.
+    /// Whether this fault is active.
     pub fn is(name: &str) -> bool {
         debug_assert!(ALL.contains(&name), "{name}");
         PLANTED.get() == name
     }
 }
 
-/// Mistakes are planted in tests only.
+/// Fault injection is compiled into tests only.
 #[cfg(not(test))]
 pub(crate) mod planted {
-    /// Never.
+    /// No fault is ever active.
     pub const fn is(_: &str) -> bool {
         false
     }
@@ -410,7 +413,8 @@ mod tests {
         assert_eq!(a.min(b), Interval::closed(-5.0, 3.0));
     }
 
-    /// What operations give for numbers of two intervals lies in their interval, for numbers of all sizes.
+    /// Results of operations on numbers of two intervals lie in the interval of the result, for numbers of all
+    /// magnitudes.
     #[test]
     fn numbers_stay_inside() {
         inside();
@@ -437,7 +441,7 @@ mod tests {
                 let (a, b) = (number(), number());
                 let inside = if number() < 0.0 { a } else { b };
                 let whole = Interval::closed(a.min(b), a.max(b));
-                // Sometimes without its middle.
+                // Sometimes with a gap around 0.
                 let whole = if number() > 1.0 { whole.and(Interval::beyond(a.abs().min(b.abs()))) } else { whole };
                 (whole, inside)
             };

@@ -1,7 +1,8 @@
-//! What quantities can be: interval arithmetic over doubles, and the intervals of a system's quantities.
+//! Abstract interpretation of a system by intervals: interval arithmetic over doubles, and the intervals of a system's
+//! expressions.
 //!
-//! In: a flat system with declared ranges. Out: for each expression an interval that holds whatever parameters, inputs and states
-//! are within their ranges.
+//! In: a flat system with declared ranges. Out: an interval for each expression, which holds for all parameters, inputs
+//! and states within their ranges. Knows nothing of code.
 
 pub mod interval;
 pub mod reach;

@@ -1,12 +1,12 @@
-//! What quantities can be: intervals of expressions, whatever parameters, inputs and states are within their declared
+//! Interval analysis of expressions: bounds that hold for all parameters, inputs and states within their declared
 //! ranges.
 //!
-//! In: a flat system. Out: an [`Interval`] for each expression that is asked for, rounding included. `require` statements
-//! and the conditions of branches are facts. Beyond plain interval arithmetic there are two forms that carry friction:
-//! `exp(−x²)` lies in [0, 1], and `a + (b − a)·k` with k in [0, 1] lies between a and b.
+//! In: a flat system. Out: an [`Interval`] for each requested expression, rounding included. `require` statements and
+//! the conditions of branches serve as facts. Two forms go beyond plain interval arithmetic, because friction models
+//! need them: `exp(−x²)` lies in [0, 1], and `a + (b − a)·k` with k in [0, 1] lies between a and b.
 //!
-//! What is believed: a declared range, because it is checked at the start or watched while a model runs; and that what
-//! comes from outside is of a size that occurs, see [`TINY`] and [`HUGE`].
+//! Assumptions: declared ranges hold, because they are checked at the start or guarded while a model runs; and
+//! magnitudes of values from outside are physical, see [`TINY`] and [`HUGE`].
 
 use crate::frontend::causality::rate_of;
 use crate::frontend::system::*;
@@ -16,13 +16,14 @@ pub use abi::live::{greatest, least};
 use grammar::ast::BinaryOp;
 use std::collections::HashMap;
 
-/// Parameters, inputs, states and time are at most this large, in SI: quotients of such numbers are no zero of a double.
+/// Upper bound in SI units on the magnitude of parameters, inputs, states and time. Quotients of such numbers do not
+/// underflow to 0.
 pub const HUGE: f64 = 1e40;
 
-/// A condition that holds, or does not hold, where an expression is evaluated.
+/// A condition, and whether it holds where an expression is evaluated.
 type Fact = (ExprId, bool);
 
-/// a ≥ b, or a > b.
+/// `large` ≥ `small`, or `large` > `small` if strict.
 #[derive(Clone, Copy)]
 struct Order {
     large: ExprId,
@@ -30,28 +31,28 @@ struct Order {
     strict: bool,
 }
 
-/// Finds what expressions can be.
+/// Computes intervals of expressions, with a memo for each set of facts.
 pub struct Reach<'a> {
     system: &'a System,
     requires: Vec<Fact>,
     required: Vec<Order>,
     facts: Vec<Fact>,
-    /// What each of the facts says of the order of two expressions.
+    /// The order relations that each of the facts implies.
     orders: Vec<Vec<Order>>,
-    /// Whether nothing counts but ranges. The other side of a `require` is looked at so, and that of a branch's condition
-    /// without branches: no fact rests on itself.
+    /// Whether only declared ranges are used. The other side of a `require` is evaluated in this way, and the other
+    /// side of a branch's condition without the facts of branches, so that no fact depends on itself.
     ranges_only: bool,
-    /// What is known by ranges; with `require`; and with each of the facts.
+    /// Memos: by ranges only; with `require`; and one more for each fact.
     known: Vec<HashMap<ExprId, Interval>>,
     open: Vec<VarId>,
-    /// Quantities whose declared range is being read: a range that leads back to its own quantity says nothing.
+    /// Quantities whose declared range is being evaluated. A range that depends on its own quantity yields no bound.
     bounding: Vec<VarId>,
-    /// Parameters whose range is taken without its ends: what if it were declared so?
+    /// Parameters whose ranges are taken without their ends, to try whether a strict range would suffice.
     strict: Vec<VarId>,
 }
 
 impl<'a> Reach<'a> {
-    /// Takes the `require` statements as facts.
+    /// Starts with the `require` statements as facts.
     pub fn new(system: &'a System) -> Reach<'a> {
         let requires: Vec<Fact> = system.requires.iter().map(|require| (require.condition, true)).collect();
         let mut reach = Reach {
@@ -71,12 +72,12 @@ impl<'a> Reach<'a> {
         reach
     }
 
-    /// The system it looks at.
+    /// The analysed system.
     pub fn system(&self) -> &'a System {
         self.system
     }
 
-    /// What an expression can be.
+    /// The interval of an expression under the present facts.
     pub fn interval(&mut self, id: ExprId) -> Interval {
         let depth = self.depth();
         if let Some(known) = self.known[depth].get(&id) {
@@ -87,7 +88,7 @@ impl<'a> Reach<'a> {
             for k in 0..self.requires.len() {
                 let said = self.by_ranges(|reach| reach.told(reach.requires[k], id));
                 let both = interval.and(said);
-                // What contradicts itself is reported at the start.
+                // Contradictory requirements are reported by the check of start values.
                 interval = if both.is_empty() { interval } else { both };
             }
             for k in 0..self.facts.len() {
@@ -99,17 +100,17 @@ impl<'a> Reach<'a> {
         interval
     }
 
-    /// Whether nothing is assumed but what always holds.
+    /// Whether no branch conditions are assumed.
     pub fn is_plain(&self) -> bool {
         self.facts.is_empty()
     }
 
-    /// Number of conditions that are assumed.
+    /// Number of branch conditions assumed.
     pub fn assumed(&self) -> usize {
         self.facts.len()
     }
 
-    /// Does something where a condition holds, or does not hold.
+    /// Runs `then` under the assumption that a condition holds, or that it does not.
     pub fn assuming<T>(&mut self, condition: ExprId, holds: bool, then: impl FnOnce(&mut Self) -> T) -> T {
         self.facts.push((condition, holds));
         let orders = self.order((condition, holds));
@@ -122,7 +123,7 @@ impl<'a> Reach<'a> {
         out
     }
 
-    /// Whether a condition is the same for all values; none if it depends.
+    /// The value of a condition if it is the same for all values of its operands.
     pub fn decide(&mut self, condition: ExprId) -> Option<bool> {
         match *self.system.node(condition) {
             Node::Bool(truth) => Some(truth),
@@ -161,14 +162,15 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// What an expression could be if a parameter were declared without the ends of its range, and no branch were taken.
+    /// The interval of an expression if the range of a parameter were declared without its ends, and without branch
+    /// facts.
     pub fn if_strict(&mut self, param: VarId, id: ExprId) -> Interval {
         let mut other = Reach::new(self.system);
         other.strict.push(param);
         other.interval(id)
     }
 
-    /// What the value of a quantity can be, whatever its own declared range says.
+    /// The interval of a quantity's value without regard to its own declared range.
     pub fn unbound(&mut self, id: VarId) -> Interval {
         match self.system.var(id).definition {
             Definition::Value(value, _) | Definition::Held { value, .. } => self.interval(value),
@@ -176,7 +178,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// What a declared range allows.
+    /// The interval of a declared range.
     pub fn bounds(&mut self, id: VarId) -> Interval {
         let range = self.system.var(id).range;
         let strict = self.strict.contains(&id);
@@ -192,7 +194,7 @@ impl<'a> Reach<'a> {
 
     // ---- facts
 
-    /// The number of what is known at the present level.
+    /// Index of the memo for the present facts.
     fn depth(&self) -> usize {
         if self.ranges_only { 0 } else { 1 + self.facts.len() }
     }
@@ -204,7 +206,7 @@ impl<'a> Reach<'a> {
         out
     }
 
-    /// Without the facts of branches.
+    /// Runs `then` without the facts of branches.
     fn elsewhere<T>(&mut self, then: impl FnOnce(&mut Self) -> T) -> T {
         let (facts, orders) = (std::mem::take(&mut self.facts), std::mem::take(&mut self.orders));
         let known = self.known.split_off(2);
@@ -214,12 +216,13 @@ impl<'a> Reach<'a> {
         out
     }
 
-    /// As [`interval`](Self::interval), without the facts of branches: of another instant, or of the bound of a range.
+    /// As [`interval`](Self::interval), without the facts of branches: for values at another instant and for bounds of
+    /// ranges.
     fn plain(&mut self, id: ExprId) -> Interval {
         self.elsewhere(|reach| reach.interval(id))
     }
 
-    /// The expression that a name stands for at the same instant, if it has not a value for each run.
+    /// The expression that a name stands for at the same instant, unless it is a default, which a run may change.
     fn meaning(&self, id: VarId) -> Option<ExprId> {
         match self.system.var(id).definition {
             Definition::Value(value, origin) if origin != Origin::Default => Some(value),
@@ -227,7 +230,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// What a fact says of an expression.
+    /// The interval of an expression that a fact implies.
     fn told(&mut self, (condition, holds): Fact, id: ExprId) -> Interval {
         match *self.system.node(condition) {
             Node::Not(a) if planted::is("not is forgotten") => self.told((a, holds), id),
@@ -267,7 +270,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// What `id` can be, where `expr` is known to lie in `inside`: functions are gone back through.
+    /// The interval of `id` if `expr` lies in `inside`, found by inverting the operations between them.
     fn constrain(&mut self, expr: ExprId, inside: Interval, id: ExprId, deep: u32) -> Interval {
         if self.same(expr, id) {
             return inside;
@@ -340,7 +343,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// What a fact says of the order of two expressions.
+    /// The order relations that a fact implies.
     fn order(&self, (condition, holds): Fact) -> Vec<Order> {
         let one = |large, small, strict| vec![Order { large, small, strict }];
         match *self.system.node(condition) {
@@ -360,7 +363,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// All that is known of the order of two expressions.
+    /// All known order relations.
     fn all_orders(&self) -> Vec<Order> {
         if self.ranges_only {
             Vec::new()
@@ -369,9 +372,9 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// Whether `large ≥ small` is known; then whether it is strict.
+    /// Whether `large ≥ small` is known, and if so whether the order is strict.
     fn ordered(&self, large: ExprId, small: ExprId) -> Option<bool> {
-        // A product is rounded where it is compared, while in a difference it may be fused.
+        // A comparison rounds a product, while a difference may fuse it.
         if self.is_rounded(large) || self.is_rounded(small) {
             return None;
         }
@@ -393,7 +396,7 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// An expression as a factor times another.
+    /// An expression as a constant factor times another expression.
     fn scaled(&self, id: ExprId) -> (f64, ExprId) {
         match *self.system.node(id) {
             Node::Fits { value, .. } => self.scaled(value),
@@ -449,7 +452,8 @@ impl<'a> Reach<'a> {
 
     // ---- expressions
 
-    /// A source (parameter, input, state): anything in its declared range between [`TINY`] and [`HUGE`] in size.
+    /// A source (parameter, input, state): any value of its declared range with a magnitude between [`TINY`] and
+    /// [`HUGE`].
     fn outside(&mut self, id: VarId) -> Interval {
         let sizes = Interval::closed(-HUGE, HUGE);
         let bounds = self.bounds(id);
@@ -459,7 +463,7 @@ impl<'a> Reach<'a> {
 
     fn var(&mut self, id: VarId) -> Interval {
         let var = self.system.var(id);
-        // The default of a parameter is only one of its values; an argument is all of them.
+        // A parameter's default is only one of its possible values; an argument fixes the value.
         let (value, held) = match var.definition {
             Definition::Value(_, Origin::Default) => return self.outside(id),
             Definition::Value(value, _) => (value, false),
@@ -470,14 +474,14 @@ impl<'a> Reach<'a> {
             return self.bounds(id);
         }
         self.open.push(id);
-        // What is held is of an earlier instant.
+        // A held value was computed at an earlier instant.
         let found = if held { self.plain(value) } else { self.interval(value) };
         self.open.pop();
         if var.range.low.is_none() && var.range.high.is_none() {
             return found;
         }
         let mut bounds = self.bounds(id);
-        // What is above 0 for another reason may be nearer to it.
+        // A value that is positive for another reason may be nearer to 0 than [`TINY`].
         if bounds.low == TINY && found.low > 0.0 {
             bounds.low = found.low;
         }
@@ -485,7 +489,7 @@ impl<'a> Reach<'a> {
             bounds.high = found.high;
         }
         let both = found.and(bounds);
-        // A value outside its range is reported as that, before a run or at its begin.
+        // A value outside its range is reported by another check, before or at the start of a run.
         if both.is_empty() { bounds } else { both }
     }
 
@@ -520,7 +524,7 @@ impl<'a> Reach<'a> {
                 let y = &system.tables[*table as usize].y;
                 let low = y.iter().copied().fold(f64::INFINITY, f64::min);
                 let high = y.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-                // At the points it is exact; between them there is rounding.
+                // Exact at the points; interpolation rounds between them.
                 if low == high { Interval::point(low) } else { Interval::closed(low, high).rounded() }
             }
             _ => Interval::ALL,
@@ -572,7 +576,8 @@ impl<'a> Reach<'a> {
         }
     }
 
-    /// a − b. Without rounding it has the sign that a comparison of both finds: gradual underflow keeps a ≠ b apart.
+    /// a − b. A comparison of a and b agrees with the sign of the unfused difference: gradual underflow keeps a ≠ b
+    /// apart.
     fn difference(&mut self, a: ExprId, b: ExprId) -> Interval {
         if self.same(a, b) {
             return Interval::point(0.0);
@@ -586,7 +591,7 @@ impl<'a> Reach<'a> {
         if let Some(strict) = self.ordered(b, a) {
             out = out.and(above(strict).negate());
         }
-        // p t ≥ q u and a = c t, b = d u: a − b ≥ (c q/p − d) u.
+        // p t ≥ q u with a = c t and b = d u implies a − b ≥ (c q/p − d) u.
         let ((c, t), (d, u)) = (self.scaled(a), self.scaled(b));
         for order in self.all_orders() {
             let ((p, large), (q, small)) = (self.scaled(order.large), self.scaled(order.small));
@@ -601,7 +606,7 @@ impl<'a> Reach<'a> {
         out
     }
 
-    /// (f − d) u, if the factors differ by more than they are rounded by.
+    /// (f − d) u, provided that the factors differ by more than their rounding errors.
     fn share(&mut self, f: f64, d: f64, u: ExprId) -> Interval {
         let rest = f - d;
         match rest.abs() > 1e-9 * f.abs().max(d.abs()) {
@@ -628,11 +633,11 @@ impl<'a> Reach<'a> {
             let (from, to) = (self.interval(a), self.interval(b));
             let ends = from.hull(to);
             let mut between = if planted::is("mixtures need no order") { ends } else { ends.rounded() };
-            // a ≥ 0, b ≥ 0: b − a ≥ −a, rounded or not, so the sum is not negative.
+            // a ≥ 0 and b ≥ 0 imply b − a ≥ −a, rounded or not, so the sum is not negative.
             if ends.is_not_negative() {
                 between = between.and(Interval::from(0.0));
             }
-            // b ≥ a: what is added to a is not negative.
+            // b ≥ a: the addend of a is not negative.
             if from.high <= to.low || self.ordered(b, a).is_some() {
                 between = between.and(Interval::from(from.low));
             } else if to.high <= from.low || self.ordered(a, b).is_some() {
@@ -645,7 +650,7 @@ impl<'a> Reach<'a> {
 
     fn call(&mut self, builtin: Builtin, args: &[ExprId]) -> Interval {
         let values: Vec<Interval> = match builtin {
-            // What is delayed is of another instant.
+            // A delayed value was computed at an earlier instant.
             Builtin::Delay => args.iter().map(|arg| self.plain(*arg)).collect(),
             _ => args.iter().map(|arg| self.interval(*arg)).collect(),
         };
@@ -668,7 +673,7 @@ impl<'a> Reach<'a> {
             Builtin::Floor => Interval::closed(values[0].low.floor(), values[0].high.floor()),
             Builtin::Sqrt => values[0].sqrt(),
             Builtin::Exp => {
-                // Of what is not positive it is at most 1, and at least 1 of what is not negative.
+                // exp(x) is at most 1 for x ≤ 0, and at least 1 for x ≥ 0.
                 let most = if values[0].high <= 0.0 { 1.0 } else { f64::INFINITY };
                 let least = if values[0].low >= 0.0 { 1.0 } else { 0.0 };
                 let least = if planted::is("exponentials are never zero") { f64::from_bits(1) } else { least };
@@ -704,15 +709,15 @@ impl<'a> Reach<'a> {
     }
 }
 
-/// How many functions are gone back through.
+/// Limit on the number of operations inverted in sequence.
 const DEEPEST: u32 = 8;
 
-/// More than squares and roots are rounded by.
+/// Upper bound on the rounding errors of squares and roots.
 const SLACK: f64 = 1e-14;
 
 const LINE: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
-/// The least whole exponent that is computed by logarithms.
+/// The largest whole exponent whose power is computed by multiplication.
 const MOST_MULTIPLIED: f64 = 64.0;
 
 /// Whether a power with this exponent is computed by multiplication.
@@ -720,7 +725,7 @@ pub fn whole(n: f64) -> bool {
     n.fract() == 0.0 && n.abs() <= MOST_MULTIPLIED
 }
 
-/// An odd function that rises through 0 has the sign of its argument.
+/// An odd increasing function has the sign of its argument.
 fn keeping_sign(x: Interval, image: Interval) -> Interval {
     match (x.low >= 0.0, x.high <= 0.0) {
         (true, _) => image.and(Interval::from(0.0)),
@@ -729,13 +734,13 @@ fn keeping_sign(x: Interval, image: Interval) -> Interval {
     }
 }
 
-/// What x can be where x^n, n even, lies in an interval.
+/// The interval of x, given an interval of x^n with n even.
 fn roots_of(inside: Interval, n: u32) -> Interval {
     if inside.high < 0.0 {
         return Interval::EMPTY;
     }
     let root = |x: f64| if n == 2 { x.sqrt() } else { bounds::pow(x, 1.0 / f64::from(n)) };
-    // A product too small for a normal number has a relative error of up to a half, or all of it.
+    // A subnormal product has a relative error of up to a half, or underflows to 0.
     let away = match inside.low {
         low if low >= f64::MIN_POSITIVE => root(low) * (1.0 - SLACK),
         low if low > 0.0 && n == 2 => 0.5 * root(low),
@@ -746,7 +751,7 @@ fn roots_of(inside: Interval, n: u32) -> Interval {
     Interval::closed(-most, most).and(Interval::beyond(away))
 }
 
-/// x^n of what is not negative, n any: it is monotonic in each, so its corners bound it.
+/// x^n for x ≥ 0 and any n. It is monotonic in each argument, so its values at the corners bound it.
 fn general_power(x: Interval, n: Interval) -> Interval {
     if x.is_empty() || n.is_empty() {
         return Interval::EMPTY;
@@ -762,15 +767,16 @@ fn general_power(x: Interval, n: Interval) -> Interval {
     }
     let low = corners.iter().copied().fold(f64::INFINITY, f64::min);
     let high = corners.iter().copied().fold(0.0, f64::max);
-    // The logarithm's error grows with the exponent; the smallest results are rounded off.
+    // The error of the logarithm grows with the exponent. The smallest results are rounded to 0.
     let low = if low < 1e-300 { 0.0 } else { low * (1.0 - 1e-12) };
     let high = high * (1.0 + 1e-12);
-    // At 1 it is exact: no power of what is at most 1, with an exponent that is not negative, lies above it.
+    // 1 is exact: powers of x ≤ 1 with n ≥ 0 do not exceed it.
     let high = if x.high <= 1.0 && n.low >= 0.0 { high.min(1.0) } else { high };
     Interval::closed(low, high)
 }
 
-/// Elementary functions at the ends of intervals: no value of a run comes from here, so the platform's will do.
+/// Elementary functions at the ends of intervals. No value of a run depends on them, so the platform's functions
+/// suffice.
 mod bounds {
     #![expect(clippy::disallowed_methods, reason = "bounds of intervals, not values of a run")]
 

@@ -1,4 +1,7 @@
-//! The equations: each quantity is defined exactly once, in every regime, by an expression, a rate, or at ticks.
+//! Equations: reads all definitions of an instance and checks that each quantity is defined exactly once in every
+//! regime, by an expression, by a rate, or at ticks.
+//!
+//! In: declared instances. Out: definitions in the [`System`]. Knows nothing of units.
 
 use super::*;
 
@@ -8,7 +11,7 @@ impl<'a> Flattener<'a> {
         let model = self.tree(id).model;
         let env = self.env(id);
         let equations = Env { equation: true, ..env.clone() };
-        // Where each quantity is defined: to find two.
+        // Where each quantity is defined, to report second definitions.
         let mut defined: HashMap<VarId, Span> = HashMap::new();
         for declaration in declarations(model) {
             self.define_declaration(id, declaration, &env, &mut defined);
@@ -46,7 +49,7 @@ impl<'a> Flattener<'a> {
         self.undefined(id, &defined);
     }
 
-    /// E0204 for a lint that is none.
+    /// E0204: an unknown lint.
     pub(super) fn lint(&mut self, lint: &Name) {
         if LINTS.iter().any(|(name, _)| *name == lint.text) {
             return;
@@ -137,9 +140,9 @@ impl<'a> Flattener<'a> {
                 }
             }
             (None, None) => match declaration.kind {
-                // The argument that was meant is reported where it is misspelt.
+                // The misspelt argument has been reported.
                 DeclarationKind::Param | DeclarationKind::Input if self.misspelt(id, &name.text) => Definition::Missing,
-                // A model that does not fit its slot has been reported with the slot.
+                // A model that does not match its slot has been reported there.
                 DeclarationKind::Param | DeclarationKind::Input if self.system.strangers.contains(&id) => {
                     Definition::Missing
                 }
@@ -224,7 +227,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// The quantity that an equation defines, and how.
+    /// The quantity that an equation defines, and the kind of definition.
     pub(super) fn target(&mut self, id: InstanceId, target: &'a Target) -> Option<(VarId, Wanted)> {
         let name = target.name();
         let var = match self.tree(id).names.get(name.text.as_str()) {
@@ -314,7 +317,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// Notes a definition; reports a second one.
+    /// Records a definition. Reports a second one and returns false.
     pub(super) fn once(&mut self, var: VarId, span: Span, defined: &mut HashMap<VarId, Span>) -> bool {
         match defined.insert(var, span) {
             None => true,
@@ -560,9 +563,9 @@ impl<'a> Flattener<'a> {
         out
     }
 
-    /// Turns rates into definitions of states; those along a path are multiplied by the speed of the path.
+    /// Turns rates into definitions of states. Rates along a path are multiplied by the rate of the path variable.
     pub(super) fn rates(&mut self, rates: Vec<(VarId, Rate)>) {
-        // Those along time first, then those whose path is done.
+        // First the rates along time, then repeatedly those whose path variable has its rate.
         let mut waiting: Vec<(VarId, Rate)> = Vec::new();
         for (var, rate) in rates {
             match rate.along {
@@ -609,12 +612,12 @@ impl<'a> Flattener<'a> {
     pub(super) fn set_rate(&mut self, var: VarId, value: ExprId, path: Option<(ExprId, VarId)>, span: Span) {
         let definition = &mut self.system.vars[var.0 as usize].definition;
         if let Definition::Continuous { initial, .. } = *definition {
-            // A state that stays where it starts has its initial value as its rate no longer.
+            // Replaces the provisional definition, in which a state's initial value serves as its rate.
             *definition = Definition::Continuous { initial, rate: value, path, span };
         }
     }
 
-    /// `value · speed`, with `sign(v)` taken in where the speed is `abs(v)`, so that nothing jumps in time.
+    /// `value · speed`. Merges `sign(v)` with a speed of `abs(v)`, so that the product has no jump in time.
     pub(super) fn times_speed(&mut self, value: ExprId, speed: ExprId, span: Span) -> ExprId {
         let inner = match self.system.node(speed) {
             Node::Call(Builtin::Abs, args) => args[0],
@@ -650,7 +653,7 @@ impl<'a> Flattener<'a> {
         self.system.push(node, span)
     }
 
-    /// Whether `sign(inner)` stands in the expression as a factor that can be reached.
+    /// Whether `sign(inner)` occurs in the expression as a factor that can be merged.
     pub(super) fn has_sign(&self, value: ExprId, inner: ExprId) -> bool {
         match self.system.node(value) {
             Node::Call(Builtin::Sign, args) => self.same(args[0], inner),
@@ -670,7 +673,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// Whether two expressions are written alike.
+    /// Whether two expressions have the same structure.
     pub(super) fn same(&self, a: ExprId, b: ExprId) -> bool {
         if a == b {
             return true;
@@ -685,7 +688,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// Reports quantities that nothing defines.
+    /// Reports quantities without a definition.
     pub(super) fn undefined(&mut self, id: InstanceId, defined: &HashMap<VarId, Span>) {
         let model = self.tree(id).model;
         for declaration in declarations(model) {

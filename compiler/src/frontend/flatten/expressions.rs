@@ -1,4 +1,6 @@
-//! Expressions: names become quantities, functions are expanded in place, numbers become SI.
+//! Expressions: resolves names to quantities, expands functions in place, and converts numbers to SI units.
+//!
+//! In: syntax trees of expressions and an [`Env`]. Out: nodes of the arena. Knows nothing of units beyond literals.
 
 use super::*;
 
@@ -8,11 +10,11 @@ fn kind_with_article(kind: DeclarationKind) -> String {
     format!("{} {word}", if word.starts_with(['i', 'o']) { "an" } else { "a" })
 }
 
-/// Quantities of a model that a message lists at most.
+/// Limit on the quantities of a model that a message lists.
 const MOST_LISTED: usize = 12;
 
 impl<'a> Flattener<'a> {
-    /// E0204
+    /// E0204: an unknown name.
     pub(super) fn unknown(&mut self, id: InstanceId, name: &Name) {
         let tree = self.tree(id);
         let model = tree.model;
@@ -40,7 +42,7 @@ impl<'a> Flattener<'a> {
                 None => error.help(format!("did you mean `{near}`?")),
             },
             None if name.text == "time" => error.help("time is `t`"),
-            // In a model of another file nothing can be declared from here.
+            // The user cannot add declarations to a model of another file from here, so its own names are listed.
             None if name.span.file != file || self.loaded.files.get(file).library => {
                 let mut known: Vec<&str> = declarations(model).map(|d| d.name.text.as_str()).collect();
                 let more = known.len().saturating_sub(MOST_LISTED);
@@ -57,14 +59,15 @@ impl<'a> Flattener<'a> {
         self.report(error);
     }
 
-    /// Whether it has been said why this name is not known: its declaration could not be used, or it is the lower half
-    /// of what was read as a derivative.
+    /// Whether an error already explains the unknown name: its declaration could not be used, or it is the denominator
+    /// of a derivative that has been reported.
     pub(super) fn explained(&self, name: &Name, file: FileId) -> bool {
         let lost = &self.loaded.files.get(file).ast.lost;
         lost.contains(&name.text) || self.derivatives_read.contains(&name.span)
     }
 
-    /// `fr.dz/dt`, where `z` is a quantity of the part: outside a division, and meant as a derivative.
+    /// Reports `fr.dz/dt`, where `z` is a quantity of a part: the parser reads it as a division, but a derivative is
+    /// meant.
     fn derivative_of_part(&mut self, part: InstanceId, path: &ast::Path, name: &Name, env: &Env) -> bool {
         let state = name.text.strip_prefix('d').filter(|state| self.tree(part).names.contains_key(*state));
         let (Some(state), Some((along, place))) = (state, self.below(name)) else { return false };
@@ -85,7 +88,7 @@ impl<'a> Flattener<'a> {
         true
     }
 
-    /// What stands below in `dv/dt`, if that is what begins with this name, and where.
+    /// The denominator of a derivative such as `dv/dt` that begins with this name, and its span.
     fn below(&self, name: &Name) -> Option<(&'a str, Span)> {
         let loaded: &'a Loaded = self.loaded;
         let text = &loaded.files.get(name.span.file).text;
@@ -95,7 +98,7 @@ impl<'a> Flattener<'a> {
         Some((&below[..length], Span::new(name.span.file, start, start + length)))
     }
 
-    /// `dv/dt`, where `v` is declared, but as no state.
+    /// Reports `dv/dt` for a declared `v` that is no state.
     fn derivative_of_no_state(&mut self, id: InstanceId, name: &Name) -> bool {
         let Some(of) = name.text.strip_prefix('d') else { return false };
         let Some(kind) = declarations(self.tree(id).model).find(|d| d.name.text == of).map(|d| d.kind) else {
@@ -115,7 +118,7 @@ impl<'a> Flattener<'a> {
         true
     }
 
-    /// `9.81 m / s^2`: what follows the blanks is read as a name.
+    /// Reports `9.81 m / s^2`: after the blanks the parser reads a name instead of a unit.
     fn spaced_unit(&mut self, name: &Name) -> bool {
         let text = &self.loaded.files.get(name.span.file).text;
         let (before, behind) = (&text[..name.span.start as usize], &text[name.span.end as usize..]);
@@ -160,9 +163,9 @@ impl<'a> Flattener<'a> {
         self.system.push(Node::Error, span)
     }
 
-    /// Reads an expression.
+    /// Reads an expression; returns its node.
     pub(super) fn expr(&mut self, expr: &'a Expr, env: &Env) -> ExprId {
-        // Long sums and products lean to the left: walk down without recursion.
+        // Long sums and products nest to the left: descends without recursion.
         let mut spine: Vec<(&'a Expr, BinaryOp, Span, &'a Expr)> = Vec::new();
         let mut first = expr;
         while let ExprKind::Binary(op, op_span, left, right) = &first.kind {
@@ -318,7 +321,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// Follows a path from a name of an instance down its parts.
+    /// Follows a path from a name of an instance through its parts.
     pub(super) fn through(&mut self, id: InstanceId, binding: Binding, path: &'a ast::Path, env: &Env) -> ExprId {
         let (mut id, mut binding) = (id, binding);
         for k in 0..path.segments.len() {
@@ -455,7 +458,7 @@ impl<'a> Flattener<'a> {
         self.system.push(node, span)
     }
 
-    /// A measure. `first(a rises b)` is when `a >= b` turns true, having been false.
+    /// Reads a measure. `first(a rises b)` is the first instant at which `a >= b` becomes true after it was false.
     fn measure(
         &mut self,
         mut measure: MeasureName,
@@ -503,7 +506,7 @@ impl<'a> Flattener<'a> {
         {
             return folded;
         }
-        // Names that came later give way to a function of the text.
+        // Names of measures that were added later yield to the user's own functions.
         let late = ["count", "duration", "peaks", "peak", "slope"].contains(&function.text.as_str());
         let own = late && matches!(self.loaded.find(env.file, Space::Function, &function.text), Lookup::Found(..));
         if env.outside
@@ -625,7 +628,7 @@ impl<'a> Flattener<'a> {
         self.report(error);
     }
 
-    /// `sum(el.f)`: folds an array of parts in the order of the index. Nothing if the path has no array.
+    /// `sum(el.f)`: folds an array of parts in index order. Returns `None` if the path contains no array.
     pub(super) fn fold(&mut self, function: &'a Name, path: &'a ast::Path, span: Span, env: &Env) -> Option<ExprId> {
         let id = env.instance?;
         let mut binding = self.tree(id).names.get(path.segments[0].name.text.as_str())?.clone();
@@ -678,7 +681,7 @@ impl<'a> Flattener<'a> {
         Some(result)
     }
 
-    /// A function of the text, expanded in place.
+    /// Expands a call of a user's function in place.
     pub(super) fn expand(
         &mut self,
         item: ItemRef,
@@ -734,7 +737,7 @@ impl<'a> Flattener<'a> {
         result
     }
 
-    /// The value, held to a dimension if there is one.
+    /// The value with a check of its dimension, if there is one.
     fn fitting(&mut self, value: ExprId, dimension: Option<Dimension>, role: Role, span: Span) -> ExprId {
         match dimension {
             Some(dimension) => self.system.push(Node::Fits { value, dimension, role }, span),
@@ -762,7 +765,7 @@ impl<'a> Flattener<'a> {
                 crate::frontend::tables::read(self.loaded, self.sources, item.file, table, &mut self.diagnostics);
             let number = made.map(|mut table| {
                 if env.rotary {
-                    // The twin has the same numbers over the mapped dimensions.
+                    // The rotary twin has the same numbers with mapped dimensions.
                     table.x_dimension = table.x_dimension.rotary();
                     table.y_dimension = table.y_dimension.rotary();
                 }

@@ -1,63 +1,65 @@
-//! A rig around the instance it runs: drives and devices with their signals, parts that only the rig needs, and
-//! expressions over all of them.
+//! The frame of a rig around its instance: drives and devices with their signals, parts that belong to the rig alone,
+//! and expressions over all of these.
+//!
+//! In: a [`Frame`]. Out: [`Framed`], which locates its contents in the system. Knows nothing of buses.
 
 use super::*;
 
-/// What a rig adds to the instance it runs.
+/// Everything that a rig adds to the instance it runs.
 pub struct Frame<'a> {
-    /// The rig as a model, for its name and for suggestions; what stands in it is not read.
+    /// The rig as an empty model, for its name and for suggestions; its body is not read.
     pub model: &'a ast::Model,
-    /// Where the rig stands.
+    /// File of the rig.
     pub file: FileId,
     /// Drives and devices.
     pub nodes: Vec<Node<'a>>,
-    /// Drives and devices whose description is wrong: reported.
+    /// Drives and devices with invalid descriptions, which have been reported.
     pub broken: Vec<&'a Name>,
     /// Observers and filters of the rig.
     pub parts: Vec<&'a ast::Part>,
-    /// The part that is crossed out.
+    /// The part that hardware replaces.
     pub hardware: Option<&'a Name>,
-    /// Expressions of the rig.
+    /// Expressions of the rig, with their scopes.
     pub expressions: Vec<(Scope, &'a Expr)>,
 }
 
-/// A drive or device: its inputs are the signals read from the bus.
+/// A drive or device. Its inputs are the signals read from the bus.
 pub struct Node<'a> {
-    /// As the rig calls it.
+    /// Its name in the rig.
     pub name: &'a Name,
-    /// Its description.
+    /// Its description as a model.
     pub model: &'a ast::Model,
-    /// Where that stands.
+    /// File of the description.
     pub file: FileId,
-    /// What the rig says of it.
+    /// Its declaration in the rig.
     pub instance: &'a ast::Instance,
 }
 
-/// Whose names an expression of a rig may use, and what it wants to be.
+/// Scope of an expression in a rig.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Scope {
-    /// Drives, devices and parts of the rig, then those of the instance it runs.
+    /// Drives, devices and parts of the rig, then names of the instance it runs.
     Rig,
-    /// As `Rig`, in a condition in which crossings may stand.
+    /// As `Rig`, for a condition, which may contain crossings.
     Condition,
-    /// Those of the crossed-out part, then as `Rig`.
+    /// Names of the part that hardware replaces, then as `Rig`.
     Part,
 }
 
-/// Where a frame came to lie in the system.
+/// Location of a frame in the system.
 pub struct Framed {
     /// The rig itself.
     pub rig: InstanceId,
-    /// Its drives and devices.
+    /// Its drives and devices, in order.
     pub nodes: Vec<InstanceId>,
-    /// The crossed-out part; none if there is no such part, which is reported.
+    /// The part that hardware replaces; `None` if there is no such part, which has been reported.
     pub hardware: Option<InstanceId>,
-    /// One node for each expression.
+    /// The node of each expression.
     pub expressions: Vec<ExprId>,
 }
 
 impl<'a> Flattener<'a> {
-    /// Makes the instances of a frame around the first instance.
+    /// Instantiates a frame around the first instance.
     pub(super) fn surround(&mut self, frame: &Frame<'a>, overrides: &[Change<'a>]) -> Framed {
         let top = InstanceId(0);
         let names = self.tree(top).names.clone();
@@ -100,7 +102,7 @@ impl<'a> Flattener<'a> {
         Framed { rig, nodes, hardware, expressions: Vec::new() }
     }
 
-    /// An instance without quantities of its own, whose names are these.
+    /// An instance without quantities of its own, which only provides these names.
     fn scope(&mut self, model: &'a ast::Model, file: FileId, names: HashMap<&'a str, Binding>) -> InstanceId {
         let id = InstanceId(self.system.instances.len() as u32);
         let info = InstanceInfo {

@@ -1,9 +1,11 @@
-//! The tree of instances: models made of models, arguments, slots, and what every name means.
+//! The instance tree: instantiates models and their parts, binds arguments and slots, and declares every name.
+//!
+//! In: models of a [`Loaded`]. Out: instances and declared quantities. Knows nothing of equations.
 
 use super::*;
 
 impl<'a> Flattener<'a> {
-    /// An instance as written, at the top.
+    /// Instantiates the root as written in the text.
     pub(super) fn written(
         &mut self,
         instance: &'a ast::Instance,
@@ -21,7 +23,7 @@ impl<'a> Flattener<'a> {
         Some(self.instantiate(model, item.file, made, false))
     }
 
-    /// The model of this name, or a report.
+    /// Finds the model of this name, or reports why not.
     pub(super) fn model(&mut self, file: FileId, name: &Name) -> Option<(ItemRef, &'a ast::Model)> {
         let loaded = self.loaded;
         match loaded.find(file, Space::Type, &name.text) {
@@ -193,7 +195,7 @@ impl<'a> Flattener<'a> {
         self.system.automata.push(Automaton { instance: id, regimes, initial });
     }
 
-    /// Whether the name may be declared here.
+    /// Whether the name may be declared in this scope; reports it otherwise.
     pub(super) fn new_name(&mut self, name: &'a Name, first: &mut HashMap<&'a str, Span>) -> bool {
         if RESERVED.contains(&name.text.as_str()) {
             self.report(reserved(name));
@@ -265,7 +267,7 @@ impl<'a> Flattener<'a> {
         VarId(self.system.vars.len() as u32 - 1)
     }
 
-    /// Whether the parser complained inside of a place.
+    /// Whether a syntax error lies within this span.
     pub(super) fn misread(&self, place: Span) -> bool {
         self.loaded.diagnostics.iter().any(|d| {
             let span = d.span();
@@ -273,7 +275,7 @@ impl<'a> Flattener<'a> {
         })
     }
 
-    /// The span of a declared unit with its brackets.
+    /// The span of a declared unit including its brackets.
     pub(super) fn bracketed(&self, span: Span) -> Span {
         let text = self.loaded.files.get(span.file).text.as_bytes();
         let (before, behind) = ((span.start as usize).wrapping_sub(1), span.end as usize);
@@ -283,14 +285,14 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// The span of a bound with its operator: `>= 0`.
+    /// The span of a bound including its operator: `>= 0`.
     pub(super) fn with_operator(&self, span: Span) -> Span {
         let before = &self.loaded.files.get(span.file).text[..span.start as usize];
         let operator = before.trim_end().trim_end_matches(['<', '>', '=']);
         Span::new(span.file, operator.len(), span.end as usize)
     }
 
-    /// A unit as written, mapped for a rotary instance; or a report.
+    /// Reads a unit and maps it for a rotary instance. Reports an error if there is none.
     pub(super) fn unit(&mut self, unit: &ast::UnitText, rotary: bool, owner: Option<InstanceId>) -> Option<Unit> {
         match Unit::parse(&unit.text) {
             Ok(parsed) => {
@@ -324,7 +326,7 @@ impl<'a> Flattener<'a> {
         self.report(error);
     }
 
-    /// Makes the parts of an instance.
+    /// Instantiates the parts of an instance.
     pub(super) fn parts(&mut self, id: InstanceId, changes: Vec<Change<'a>>) {
         let model = self.tree(id).model;
         let env = self.env(id);
@@ -375,7 +377,7 @@ impl<'a> Flattener<'a> {
         env: &Env,
         changes: Vec<Change<'a>>,
     ) {
-        // Read as expressions too, so that what they mention counts as read.
+        // Also read as expressions, so that their parameters count as used.
         let counts = [self.expr(&repeat.first, env), self.expr(&repeat.last, env)];
         self.system.counts.extend(counts);
         let bounds = (self.whole(&repeat.first, env), self.whole(&repeat.last, env));
@@ -409,7 +411,7 @@ impl<'a> Flattener<'a> {
         self.bind(id, &part.name.text, Binding::Parts(Rc::new(made), first));
     }
 
-    /// Makes one part, with another model in a slot if a change or an argument says so.
+    /// Instantiates one part; a change or an argument may put another model into its slot.
     pub(super) fn part(
         &mut self,
         id: InstanceId,
@@ -491,7 +493,7 @@ impl<'a> Flattener<'a> {
                 let given: Vec<&str> = args.iter().map(|arg| arg.name).collect();
                 args.extend(wiring.into_iter().filter(|arg| port(arg.name) && !given.contains(&arg.name)));
             }
-            // A slot drops its wiring for a model that lacks an optional port.
+            // Arguments for optional ports that this model lacks are dropped.
             let (kept, dropped) = args.into_iter().partition(|arg| !port(arg.name) || has(arg.name));
             args = kept;
             self.dropped.extend::<Vec<_>>(dropped);
@@ -501,7 +503,7 @@ impl<'a> Flattener<'a> {
         let made = self.instantiate(model, item.file, made, false);
         self.models.pop();
         if !fits {
-            // What it lacks, and what its units do not fit, has been said.
+            // Missing ports and mismatched units have been reported.
             self.system.strangers.push(made);
         }
         Some(made)
@@ -530,7 +532,7 @@ impl<'a> Flattener<'a> {
         None
     }
 
-    /// Whether a model has the ports of an interface; or a report.
+    /// Whether a model has the ports of an interface; reports the differences.
     #[allow(clippy::too_many_arguments)]
     pub(super) fn check_fit(
         &mut self,
@@ -592,7 +594,7 @@ impl<'a> Flattener<'a> {
         true
     }
 
-    /// Every argument must name a port, parameter, slot, or a state for its start value.
+    /// Checks that every argument names a port, a parameter, a slot, or a state (for its start value).
     pub(super) fn check_arguments(&mut self, id: InstanceId) {
         let tree = self.tree(id);
         let model = tree.model;
@@ -654,7 +656,7 @@ impl<'a> Flattener<'a> {
         self.diagnostics.extend(errors);
     }
 
-    /// Whether an argument that the model does not have comes closest to this name.
+    /// Whether an unknown argument is a likely misspelling of this name.
     pub(super) fn misspelt(&self, id: InstanceId, name: &str) -> bool {
         let tree = self.tree(id);
         let taken = || declarations(tree.model).filter(|d| takes(d.kind)).map(|d| d.name.text.as_str());
@@ -675,7 +677,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// A whole number known before anything is compiled: a bound of a repetition.
+    /// A whole number known at compile time: a bound of a repetition.
     pub(super) fn whole(&mut self, expr: &'a Expr, env: &Env) -> Option<i64> {
         match self.early(expr, env, 0) {
             Some(value) if value.fract() == 0.0 && value.abs() < 1e9 => Some(value as i64),
@@ -689,7 +691,7 @@ impl<'a> Flattener<'a> {
         }
     }
 
-    /// Value of simple arithmetic over numbers, constants and parameters.
+    /// Evaluates simple arithmetic over numbers, constants and parameters at compile time.
     pub(super) fn early(&mut self, expr: &'a Expr, env: &Env, depth: usize) -> Option<f64> {
         if depth > DEEPEST {
             return None;
@@ -719,7 +721,7 @@ impl<'a> Flattener<'a> {
                 if let Some(id) = env.instance {
                     let tree = self.tree(id);
                     if let Some(declaration) = declarations(tree.model).find(|d| d.name.text == name) {
-                        // A state does not keep the value that it starts with.
+                        // A state does not keep its start value.
                         let keeps = declaration.kind != DeclarationKind::State;
                         let arg = tree.args.iter().find(|arg| keeps && arg.name == name);
                         let arg = arg.map(|arg| (arg.value, arg.env.clone()));
@@ -742,7 +744,7 @@ impl<'a> Flattener<'a> {
     }
 }
 
-/// Whether an argument may name it: a state is given its start value.
+/// Whether an argument may name it. The argument of a state is its start value.
 fn takes(kind: DeclarationKind) -> bool {
     match kind {
         DeclarationKind::Param | DeclarationKind::Input | DeclarationKind::State => true,

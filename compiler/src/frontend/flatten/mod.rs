@@ -1,7 +1,8 @@
-//! Makes one flat [`System`] of an instance with all its parts.
+//! Flattening: turns an instance with all its parts into one [`System`].
 //!
-//! First every name of the whole tree is declared, then every expression is read, so that order never matters.
-//! Checks what concerns names: unknown ones, arguments, slots, and that each quantity is defined exactly once.
+//! In: a [`Request`] and the resolved texts. Out: a [`Flat`]. Declares every name of the whole tree before it reads any
+//! expression, so the order of the text is irrelevant. Checks names: unknown ones, arguments, slots, and that each
+//! quantity is defined exactly once. Knows nothing of units or of evaluation order.
 
 mod equations;
 mod expressions;
@@ -22,28 +23,28 @@ use std::rc::Rc;
 
 pub use frame::{Frame, Framed, Node as BusNode, Scope};
 
-/// Most quantities of one instance with all its parts.
+/// Limit on the quantities of one instance with all its parts.
 pub const MOST_VARS: usize = 200_000;
-/// Most operations of one instance with all its parts.
+/// Limit on the operations of one instance with all its parts.
 pub const MOST_NODES: usize = 2_000_000;
-/// Most operations of a function on its own.
+/// Limit on the operations of a function on its own.
 const MOST_NODES_OF_ITEM: usize = 100_000;
-/// For so many unknown names a suggestion is looked for; the rest is hardly read.
+/// Number of unknown names for which suggestions are computed; users hardly read more.
 const MOST_SUGGESTIONS: usize = 50;
-/// With so many mistakes nothing more is made.
+/// Number of errors after which flattening stops.
 const MOST_MISTAKES: usize = 1000;
-/// Deepest nesting of parts in parts, and of functions in functions.
+/// Limit on the nesting of parts and of function calls.
 const DEEPEST: usize = 64;
 
-/// What is made from: a model with arguments, as an experiment or a check asks for it.
+/// Input of flattening: a model with arguments, as an experiment or a check requires it.
 pub struct Request<'a> {
-    /// The model, or nothing for a model on its own with its inputs free.
+    /// The model and how its inputs are supplied.
     pub instance: Instance<'a>,
-    /// Changes from outside, by path: they win over what the text says.
+    /// Changes from outside, by path. They override the text.
     pub overrides: Vec<Override<'a>>,
-    /// Expressions over the names of the instance that are wanted as quantities: plots and expectations.
+    /// Expressions over the names of the instance that become quantities: plots and expectations.
     pub observed: Vec<&'a Expr>,
-    /// Recordings that may be read as `data.NAME`: the number of the table.
+    /// Recordings readable as `data.NAME`.
     pub data: Vec<(String, Table, Unit)>,
     /// The rig around the instance.
     pub frame: Option<Frame<'a>>,
@@ -51,43 +52,43 @@ pub struct Request<'a> {
 
 /// The instance of a [`Request`].
 pub enum Instance<'a> {
-    /// As written in a `run`; arguments are read in the scope of the file.
+    /// As in a `run`; arguments are read in the scope of the file.
     Written(&'a ast::Instance, FileId),
-    /// A model on its own: inputs come from outside, parameters without a default stay open.
+    /// A model on its own: inputs are given from outside, parameters without a default stay open.
     Alone(&'a ast::Model, FileId),
-    /// A model on its own, whose inputs have their defaults.
+    /// A model on its own, whose inputs take their defaults.
     WithDefaults(&'a ast::Model, FileId),
 }
 
 /// A change from outside: `fr.Fs = 2 N`, `fr = LuGre()`.
 #[derive(Clone)]
 pub struct Override<'a> {
-    /// The path.
+    /// Path of what is changed.
     pub path: &'a ast::Path,
-    /// The value, read in the scope of the file.
+    /// New value, read in the scope of the file.
     pub value: OverrideValue<'a>,
-    /// The file.
+    /// File in whose scope the value is read.
     pub file: FileId,
 }
 
 /// The value of an [`Override`].
 #[derive(Clone, Copy)]
 pub enum OverrideValue<'a> {
-    /// A value.
+    /// An expression.
     Expr(&'a Expr),
     /// A model for a slot.
     Instance(&'a ast::Instance),
 }
 
-/// The flat system, the observed expressions in it, and what is wrong.
+/// Result of flattening.
 pub struct Flat {
     /// The system; complete only if there are no errors.
     pub system: System,
     /// One node for each observed expression.
     pub observed: Vec<ExprId>,
-    /// Where the rig came to lie.
+    /// Location of the rig's frame.
     pub framed: Option<Framed>,
-    /// What is wrong.
+    /// Errors and warnings.
     pub diagnostics: Vec<Diagnostic>,
 }
 
@@ -104,7 +105,7 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         .iter()
         .map(|o| Change { path: &o.path.segments, span: o.path.span, value: o.value, env: Env::file(o.file) })
         .collect();
-    // A change of a drive or of a part of the rig is none of the instance.
+    // Changes of a drive or of a part of the rig do not concern the instance.
     let of_frame = |change: &Change| {
         let head = &change.path[0].name.text;
         request.frame.as_ref().is_some_and(|frame| {
@@ -156,13 +157,13 @@ pub fn flatten(loaded: &Loaded, sources: &dyn Sources, request: &Request) -> Fla
         None => Vec::new(),
     };
     if f.too_large {
-        // Nobody looks at what is refused.
+        // The system of a refused program is not used.
         f.system = System::default();
     }
     Flat { system: f.system, observed, framed, diagnostics: f.diagnostics }
 }
 
-/// Reads a function, constant or table on its own: a function's arguments come from outside.
+/// Flattens a function, constant or table on its own; a function's arguments are given from outside.
 pub fn flatten_item(loaded: &Loaded, sources: &dyn Sources, file: FileId, item: &Item) -> Flat {
     let mut f = Flattener { most_nodes: MOST_NODES_OF_ITEM, ..Flattener::new(loaded, sources) };
     let env = Env::file(file);
@@ -212,75 +213,75 @@ struct Flattener<'a> {
     sources: &'a dyn Sources,
     system: System,
     diagnostics: Vec<Diagnostic>,
-    /// Runs along with `system.instances`.
+    /// Parallel to `system.instances`.
     instances: Vec<Tree<'a>>,
-    /// Expansions by function, arguments and place, so that the same call of the same values is made once.
+    /// Expanded calls by function and arguments, so that equal calls share nodes.
     expansions: HashMap<(ItemRef, Vec<ExprId>, bool, bool), ExprId>,
-    /// Functions being expanded: to find circles.
+    /// Functions being expanded, to detect recursion.
     functions: Vec<ItemRef>,
-    /// By item and whether it is the rotary twin.
+    /// Tables by item and whether it is the rotary twin.
     tables: HashMap<(ItemRef, bool), Option<u32>>,
     consts: HashMap<(ItemRef, bool), ExprId>,
     open_consts: Vec<ItemRef>,
-    /// Models being instantiated: to find circles.
+    /// Models being instantiated, to detect recursion.
     models: Vec<ItemRef>,
-    /// Unknown names reported so far: suggestions are made for the first of them only.
+    /// Number of unknown names reported so far; only the first have suggestions.
     unknowns: usize,
-    /// The lower halves of what was read as a derivative that there is not, which has been reported.
+    /// Spans of the denominators of nonexistent derivatives, which have been reported.
     derivatives_read: Vec<Span>,
-    /// Wiring of slots that the present model has no port for: another model may read it.
+    /// Arguments of slots for ports that the present model lacks; another model may read them.
     dropped: Vec<Arg<'a>>,
-    /// Most operations, and whether it has been reported that there are more.
+    /// Limit on operations. `too_large`: whether exceeding it has been reported.
     most_nodes: usize,
     too_large: bool,
-    /// Parts whose name is taken, and reported.
+    /// Parts with names already in use, which have been reported.
     refused_parts: Vec<Span>,
-    /// Quantities whose definition was refused, and reported.
+    /// Quantities with refused definitions, which have been reported.
     refused: Vec<VarId>,
     data: HashMap<String, (u32, Unit)>,
 }
 
-/// What is known of an instance besides [`InstanceInfo`].
+/// Properties of an instance in addition to [`InstanceInfo`].
 struct Tree<'a> {
     model: &'a ast::Model,
     file: FileId,
     names: HashMap<&'a str, Binding>,
     args: Vec<Arg<'a>>,
     alone: bool,
-    /// Alone, but inputs with a default have it.
+    /// As `alone`, but inputs take their defaults.
     defaults: bool,
-    /// A drive or device: inputs come from the bus.
+    /// A drive or device, whose inputs come from the bus.
     on_bus: bool,
-    /// A rig, which only lends its names.
+    /// A rig, which only provides names.
     scope: bool,
     locals: Locals,
 }
 
-/// What a name of an instance means.
+/// Meaning of a name in an instance.
 #[derive(Clone)]
 enum Binding {
     Var(VarId),
     Part(InstanceId),
     Parts(Rc<Vec<InstanceId>>, i64),
     Regime(AutomatonId, u32),
-    /// Declared, but not usable: reported.
+    /// Declared but not usable; has been reported.
     Broken,
 }
 
 type Locals = Rc<Vec<(String, ExprId)>>;
 
-/// Where an expression is read.
+/// Context in which an expression is read.
 #[derive(Clone)]
 struct Env {
     file: FileId,
     instance: Option<InstanceId>,
     rotary: bool,
     locals: Locals,
-    /// Read from outside the model, by an experiment: lets are visible, measures are allowed.
+    /// Read by an experiment from outside the model: `let`s are visible and measures are allowed.
     outside: bool,
-    /// In an equation rather than a declaration: E0109 looks there.
+    /// Within an equation rather than a declaration, where E0109 applies.
     equation: bool,
-    /// In the condition of a transition or event: crossings may stand there.
+    /// Within the condition of a transition or event, where crossings are allowed.
     instants: bool,
 }
 
@@ -314,7 +315,7 @@ enum ArgValue<'a> {
     Instance(&'a ast::Instance),
 }
 
-/// A change from outside on its way down the tree.
+/// A change from outside, passed down the instance tree.
 #[derive(Clone)]
 struct Change<'a> {
     path: &'a [ast::Segment],
@@ -323,7 +324,7 @@ struct Change<'a> {
     env: Env,
 }
 
-/// How an instance is made.
+/// Parameters of an instantiation.
 struct Making<'a> {
     path: String,
     rotary: bool,
@@ -361,7 +362,7 @@ impl<'a> Flattener<'a> {
         self.diagnostics.push(diagnostic);
     }
 
-    /// Whether the program has grown too large to go on: reported once, at a place where it grows.
+    /// Whether the program exceeds a limit. Reports that once, at the place where it grows.
     fn full(&mut self, span: Span) -> bool {
         if self.diagnostics.len() >= MOST_MISTAKES {
             return true; // Thousands of parts with the same mistake say no more than some.
@@ -383,7 +384,7 @@ impl<'a> Flattener<'a> {
     }
 }
 
-/// The beginning of an equation: enough to know it by, `F = clamp` of `F = clamp(F_ext, -Fs, Fs)`.
+/// The beginning of an equation, long enough to identify it: `F = clamp` of `F = clamp(F_ext, -Fs, Fs)`.
 fn head(equation: &ast::Equation) -> Span {
     let mut first = &equation.value;
     while let ExprKind::Binary(_, _, left, _) = &first.kind {
@@ -396,14 +397,14 @@ fn head(equation: &ast::Equation) -> Span {
     equation.target.span().to(end)
 }
 
-/// How an equation gives its quantity a value.
+/// Kind of definition that an equation gives its quantity.
 enum Wanted {
     Value,
     Rate { along: Along },
     Next,
 }
 
-/// What a derivative is taken along: time, or a state named at a place.
+/// Variable of differentiation: time, or a state with the span of its name.
 type Along = Option<(VarId, Span)>;
 
 /// The right side of a derivative equation.
@@ -432,7 +433,7 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
     ];
     let error =
         Diagnostic::error("E0102", format!("unknown unit `{part}`")).label(unit.span, "not a unit that fric knows");
-    // Units that people have and SI has not: what one of them is.
+    // Common units outside SI, and their values.
     const OTHERS: [(&[&str], &str); 13] = [
         (&["degC", "°C", "celsius", "Celsius", "C"], "temperatures are in K: 20 degC is `293.15 K`"),
         (&["bar"], "1 bar is `1e5 Pa`"),
@@ -451,7 +452,7 @@ fn unknown_unit(unit: &ast::UnitText, part: &str) -> Diagnostic {
     if let Some((_, what)) = OTHERS.iter().find(|(names, _)| names.contains(&part)) {
         return error.help(*what);
     }
-    // Of so short words only the nearest is near.
+    // For short words only a difference of case counts as near.
     let near = |known: &&str| known.eq_ignore_ascii_case(part) || part.len() > 2 && known.len() > 1;
     match nearest(part, known.into_iter().filter(near)).filter(|near| near.len() + 1 >= part.len()) {
         Some(near) => error.help(format!("did you mean `{near}`?")),
@@ -474,7 +475,7 @@ fn args_of<'a>(args: &'a [ast::Bind], env: &Env) -> Vec<Arg<'a>> {
     args.iter().map(arg).collect()
 }
 
-/// All declarations of a model, those inside `every` included.
+/// All declarations of a model, including those inside `every`.
 fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
     model.body.iter().flat_map(|statement| {
         let (one, many): (Option<&ast::Declaration>, &[ast::EveryStatement]) = match statement {

@@ -1,33 +1,34 @@
-//! `slope(x)`: the derivative of an expression in time, as an expression, for experiments.
+//! `slope(x)`: symbolic differentiation of an expression with respect to time, for experiments.
 //!
-//! In: an expression over the quantities of a flat system whose equations have been read. Out: its derivative by the rules
-//! of calculus, down to the rates of states; or what has none that is known. It is that between events: where a quantity
-//! jumps it has no derivative, so `sign`, `floor`, ticks and noise are refused rather than said to be 0.
+//! In: an expression over the quantities of a flat system whose equations have been read. Out: its derivative by the
+//! rules of calculus, down to the rates of states, or the subexpression without a known derivative. The derivative
+//! holds between events. Where a quantity jumps it has none, so `sign`, `floor`, ticks and noise are refused rather
+//! than differentiated to 0.
 
 use super::*;
 
-/// Deepest chain of quantities and operations.
+/// Limit on the depth of the chain of quantities and operations.
 const DEEPEST_CHAIN: usize = 400;
 
-/// The derivative; none if it is 0.
+/// A derivative; `None` if it is 0.
 type Slope = Option<ExprId>;
 
-/// What has no known derivative, and why.
+/// A subexpression without a known derivative, and the reason.
 type Unknown = (Span, String);
 
-/// Derivatives found so far.
+/// Memo of derivatives.
 #[derive(Default)]
 struct Known {
     exprs: HashMap<ExprId, Slope>,
-    /// Operations and quantities that the present one is part of.
+    /// Current depth of recursion.
     depth: usize,
 }
 
 impl<'a> Flattener<'a> {
-    /// The derivative of an expression, as an expression; or a report.
+    /// The derivative of an expression as an expression; reports an error if it is unknown.
     pub(super) fn slope(&mut self, of: ExprId, span: Span) -> ExprId {
         let slope = self.rate(of, &mut Known::default()).map(|slope| match slope {
-            // Copied, so that it has the place of the call.
+            // Copied, so that its span is that of the call.
             Some(slope) => self.system.push(self.system.node(slope).clone(), span),
             None => self.system.push(zero(), span),
         });
@@ -166,7 +167,7 @@ impl<'a> Flattener<'a> {
         known: &mut Known,
     ) -> Result<Slope, Unknown> {
         let unknown = |why: &str| Err((span, why.to_string()));
-        // Signals move by themselves.
+        // Signals that depend on time even if their arguments are constant.
         match builtin {
             Builtin::Step | Builtin::Pulse | Builtin::Square => return unknown("this signal jumps"),
             Builtin::Noise | Builtin::Random => return unknown("chance has no derivative"),
@@ -210,7 +211,7 @@ impl<'a> Flattener<'a> {
             f.system.push(Node::If(condition, a, b), span)
         };
         let x = args[0];
-        // Of functions of one argument: its slope, to be multiplied by that of the argument.
+        // Functions of one argument, by the chain rule: `factor` is the outer derivative.
         let factor = match builtin {
             Builtin::Min => return Ok(Some(choice(self, args[0], args[1], slopes[0], slopes[1]))),
             Builtin::Max => return Ok(Some(choice(self, args[0], args[1], slopes[1], slopes[0]))),
