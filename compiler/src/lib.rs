@@ -214,7 +214,7 @@ pub struct Ready {
     pub rig: abi::rig::Rig,
     /// The control program, with its parameters set but not started.
     pub control: Instance,
-    /// The partition (the part of the model that hardware replaces), with its own `Step` by `expo`.
+    /// The plant: the part of the model that hardware replaces, with its own `Step` by `expo`.
     pub plant: Instance,
     /// The control program before compilation, from which derivatives of its step are made.
     pub program: ir::program::Program,

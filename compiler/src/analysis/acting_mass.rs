@@ -1,9 +1,9 @@
-//! Whether a sampled contact knows the mass on which it acts.
+//! Checks that a sampled contact is given the mass on which it acts.
 //!
-//! In: a system with its program. Out: W0705 where a contact that gives its force at ticks and takes a mass `m` (KFMClip)
-//! takes one that is far from the mass that its force moves. In each tick it sets its speed to 0 by F = m v/h, so that
-//! 1 − m/M of it remains on a mass M: with m > 2 M the contact chatters, with m much less it stops after many ticks. The mass
-//! M is 1/|a|, a the change of the speed's rate by the force.
+//! In: a system with its program. Out: W0705 for a contact that computes its force at ticks from a mass `m` (such as
+//! KFMClip), if `m` is far from the mass that the force accelerates. At each tick the contact stops the mass by F = m
+//! v/h, after which 1 − m/M of the speed remains on a mass M. With m > 2 M the contact chatters; with m ≪ M it takes
+//! many ticks to stop. M is 1/|a|, where a is the change of the speed's rate per unit of force.
 
 use crate::frontend::system::*;
 use crate::frontend::units::{Types, three_digits};
@@ -20,10 +20,10 @@ use std::sync::Arc;
 
 const MASS: Dimension = Dimension::of([1, 0, 0, 0, 0]);
 const INERTIA: Dimension = Dimension::of([1, 2, 0, 0, 0]);
-/// Parts of the mass that a contact may take for the whole: within these it stops in a few ticks.
+/// Ratios m/M that are accepted: within these the contact stops in a few ticks.
 const FITS: std::ops::RangeInclusive<f64> = 0.5..=1.5;
 
-/// A sampled contact: the quantities that matter.
+/// The quantities of a sampled contact.
 struct Contact {
     speed: VarId,
     force: VarId,
@@ -50,8 +50,8 @@ fn contacts(system: &System, types: &Types) -> Vec<Contact> {
         .collect()
 }
 
-/// What is to be said of the contacts of a system. `elsewhere`: the mass that they move where the system does not hold it,
-/// in SI, as in the control program of a rig. `place`: what is run.
+/// Checks the contacts of a system. `elsewhere`: the accelerated mass in SI units, for systems that do not contain it,
+/// such as the control program of a rig. `place`: span of the run.
 pub fn check(
     system: &System,
     types: &Types,
@@ -83,7 +83,7 @@ fn said(
     let force = slot(contact.force)?;
     let Definition::Value(mass, _) = system.var(contact.mass).definition else { return None };
     let told = crate::lower::evaluate(system, types, &[mass])[0];
-    // How far a force of 1 moves each rate, and so the speed.
+    // The rates with a force of 0 and of 1, whose difference is the gain.
     let layout = &at.description().layout;
     let rates = |force_is: f64| {
         let mut moved = at.clone();
@@ -116,7 +116,7 @@ fn said(
     )
 }
 
-/// The states of which a quantity is a sum, with their signs; nothing where it is anything else.
+/// The states whose signed sum a quantity is, with their signs; empty for any other form.
 fn parts_of(system: &System, id: VarId) -> Vec<(VarId, f64)> {
     let (mut found, mut open) = (Vec::new(), vec![(Node::Var(id), 1.0)]);
     while let Some((node, sign)) = open.pop() {
@@ -140,7 +140,7 @@ fn parts_of(system: &System, id: VarId) -> Vec<(VarId, f64)> {
     found
 }
 
-/// Three digits in a unit.
+/// A value with three digits in a unit.
 fn shown(value: f64, unit: &Unit) -> String {
     format!("{} {unit}", three_digits(unit.from_si(value)))
 }

@@ -1,8 +1,9 @@
-//! The physics of a model that fits `Friction`: does it jump at rest, does it hold, does it dissipate?
+//! Dissipation analysis of friction models (Willems, *Dissipative dynamical systems*, 1972): does the force jump at
+//! rest, does the contact hold a load, does it dissipate energy?
 //!
-//! In: a model on its own. Out: warnings, and a [`Verdict`] for those who ask. The model's own functions are evaluated
-//! by the reference interpreter on a fixed grid; where that finds nothing wrong with the dissipation, a proof by intervals
-//! is tried. The work is bounded and the answer the same everywhere.
+//! In: a model on its own that matches the interface `Friction`. Out: warnings, and a [`Verdict`] on request. The
+//! reference interpreter evaluates the model's own functions on a fixed grid. If the grid contains no violation of
+//! dissipation, a proof by intervals is tried. The work is bounded, and the result does not depend on the machine.
 
 use crate::analysis::interval_proof::{Claim, Range, prove};
 use crate::analysis::memo::Memo;
@@ -19,41 +20,41 @@ use abi::unit::{Dimension, Unit};
 use grammar::diagnostic::Diagnostic;
 use std::rc::Rc;
 
-/// What is known of the dissipation of a model.
+/// Result of the dissipation analysis of a model.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Verdict {
-    /// Proven for all velocities from 1e-6 m/s to 10 m/s or to the ends of their range, all states within theirs, and all
-    /// external forces within theirs or up to 1e6 N.
+    /// Proven for all velocities from 1e-6 m/s to 10 m/s or to the ends of their range, for all states within their
+    /// ranges, and for all external forces within their range or up to 1e6 N.
     Proved,
-    /// No counterexample among so many points.
+    /// No counterexample at this number of points.
     Holds(usize),
-    /// Power is given out at this point.
+    /// The model supplies power at this point.
     Fails(Counterexample),
-    /// A model with states needs a `storage` to say.
+    /// Not decidable: a model with states needs a `storage` function.
     NotChecked,
 }
 
-/// Where a model gives out power.
+/// A point at which a model supplies power.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Counterexample {
-    /// Velocity, SI.
+    /// Velocity, SI units.
     pub v: f64,
-    /// Continuous states, SI, in the order of the layout.
+    /// Continuous states, SI units, in the order of the layout.
     pub states: Vec<f64>,
-    /// Friction force, SI.
+    /// Friction force, SI units.
     pub force: f64,
 }
 
 const VELOCITY: Dimension = Dimension::of([0, 1, -1, 0, 0]);
 const FORCE: Dimension = Dimension::of([1, 1, -2, 0, 0]);
-/// Operations that may be interpreted for one verdict: less than a second.
+/// Limit on interpreted operations for one verdict: less than a second.
 const WORK: usize = 100_000_000;
-/// Steps that a proof may take: as long again.
+/// Limit on the steps of a proof, which takes about as long again.
 const PROOF: usize = 8_000_000;
-/// Velocities, m/s, and external forces, N, of a model that declares no narrower range.
+/// Velocities in m/s and external forces in N for a model without a narrower declared range.
 const SPEEDS: (f64, f64) = (1e-6, 10.0);
 const LARGEST_LOAD: f64 = 1e6;
-/// A velocity at which every regularised sign is still next to nothing, m/s.
+/// A velocity in m/s at which every regularised sign function is still close to 0.
 const CRAWL: f64 = 1e-15;
 
 /// The ports of a friction model on its own.
@@ -77,7 +78,7 @@ fn contact(system: &System, types: &Types) -> Option<Contact> {
     Some(Contact { v, force, external: port("F_ext", VarKind::Input, FORCE) })
 }
 
-/// A model that can be evaluated at points.
+/// Evaluates a model at points.
 struct Bench {
     program: Program,
     outputs: Rc<Func>,
@@ -85,11 +86,11 @@ struct Bench {
     v: Slot,
     external: Option<Slot>,
     force: Slot,
-    /// Writes dV/dt into the first slot of the jacobian, if there is a `storage` and a state.
+    /// Writes dV/dt into the first slot of the Jacobian. `None` without a `storage` or without states.
     flow: Option<Rc<Func>>,
-    /// Where the stored energy is.
+    /// Slot of the stored energy V.
     energy: Option<Slot>,
-    /// For each regime, whether it would be left: slots that are 1 where a level of a transition holds.
+    /// For each regime the slots of its exit conditions. A slot is 1 if the regime would be left.
     exits: Vec<Vec<Slot>>,
     /// For each continuous state, whether force or storage depend on it.
     matters: Vec<bool>,
@@ -98,7 +99,7 @@ struct Bench {
 
 impl Bench {
     fn new(system: &System, types: &Types, contact: &Contact) -> Option<Bench> {
-        // Every open parameter must have a value, every other input too.
+        // All open parameters and all other inputs must have values.
         let open = system.var_ids().any(|id| {
             let var = system.var(id);
             matches!(var.definition, Definition::Free | Definition::Missing)
@@ -146,7 +147,7 @@ impl Bench {
         crate::ir::interpret::run_once(func, &mut self.block, &self.program.description.pool);
     }
 
-    /// The force at this velocity, from the states it starts in.
+    /// The force at this velocity, with the states at their start values.
     fn force_at(&mut self, v: f64, external: f64) -> f64 {
         self.block[self.v.index()] = v;
         if let Some(slot) = self.external {
@@ -159,14 +160,14 @@ impl Bench {
     }
 }
 
-/// Warnings of a friction model; nothing for other models.
+/// Warnings for a friction model; none for other models.
 pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
     let Some(contact) = contact(system, types) else { return };
     let Some(mut bench) = Bench::new(system, types, &contact) else { return };
     let force = system.var(contact.force);
     let memory = !system.automata.is_empty()
         || system.vars.iter().any(|var| !matches!(var.definition, Definition::Value(..) | Definition::Free));
-    // Whatever pushes from outside, a force that is 0 at rest carries nothing.
+    // A force that is 0 at rest under every external force has no stiction.
     let loads: &[f64] = if contact.external.is_some() { &[1.0, -1.0] } else { &[] };
     let scale = bench.force_at(1.0, 0.0).abs().max(f64::MIN_POSITIVE);
     let answers = loads.iter().any(|load| bench.force_at(0.0, *load).abs() > 1e-3 * scale);
@@ -187,7 +188,7 @@ pub fn check(system: &System, types: &Types, found: &mut Vec<Diagnostic>) {
     }
 }
 
-/// The load that a contact without stiction gives way to, and how fast.
+/// Reports a contact without stiction: the load that moves it, and the resulting speed.
 fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagnostic>) {
     let coulomb = system
         .var_ids()
@@ -200,7 +201,7 @@ fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagno
         return; // No friction at all: nothing that could hold.
     }
     let load = 0.5 * coulomb.unwrap_or(largest);
-    // The least speed at which the force reaches the load: bracketed by a grid, then halved.
+    // The least speed at which the force reaches the load: bracketed by a grid, then bisected.
     let Some(k) = (-90..=20).find(|k| bench.force_at(decade(*k, 10), 0.0) >= load) else { return };
     let (mut low, mut high) = (decade(k - 1, 10), decade(k, 10));
     for _ in 0..60 {
@@ -213,11 +214,11 @@ fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagno
     found.push(warning);
 }
 
-/// 10^(k/n), from a table of exact powers and roots so that it is the same everywhere.
+/// 10^(k/n), computed without platform functions so that it is the same on every machine.
 fn decade(k: i32, n: i32) -> f64 {
     let whole = k.div_euclid(n);
     let part = f64::from(k.rem_euclid(n)) / f64::from(n);
-    // exp(part · ln 10) by its series: exact enough for a grid, and the same on every machine.
+    // exp(part · ln 10) by its series, which is accurate enough for a grid.
     let x = part * std::f64::consts::LN_10;
     let (mut term, mut sum) = (1.0, 1.0);
     for i in 1..40 {
@@ -227,7 +228,7 @@ fn decade(k: i32, n: i32) -> f64 {
     (0..whole.abs()).fold(sum, |value, _| if whole > 0 { value * 10.0 } else { value / 10.0 })
 }
 
-/// A speed with a handy prefix.
+/// A speed with a suitable prefix.
 fn speed(v: f64) -> String {
     let (scale, unit) = match v.abs() {
         x if x < 1e-6 => (1e-9, "nm/s"),
@@ -256,19 +257,19 @@ fn dissipation_of(system: &System, contact: &Contact, bench: &mut Bench) -> Verd
     })
 }
 
-/// Whether intervals prove what samples did not refute: in every regime and for both directions.
+/// Tries to prove by intervals, in every regime and for both directions, what the samples did not refute.
 fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
     let energy = system.storages.iter().any(|(owner, _)| *owner == InstanceId(0));
     let layout = bench.program.description.layout.clone();
     let description = bench.program.description.clone();
     let range = |slot: Slot| description.quantities.iter().find(|q| q.slot == slot).map(|q| q.range);
     let (low, high) = range(bench.v).unwrap_or((f64::NEG_INFINITY, f64::INFINITY));
-    // Everything but velocity, load and the states that matter stays where it starts.
+    // Everything but velocity, load and the relevant states keeps its start value.
     bench.force_at(SPEEDS.0, 0.0);
     let mut work = PROOF;
     for regime in 0..bench.exits.len().max(1) {
         for sign in [1.0, -1.0] {
-            // |v| in its range of this sign; the function reads it in the slot of v.
+            // v| within the range of this sign; the function reads it from the slot of v.
             let (least, most) = if sign > 0.0 { (low, high) } else { (-high, -low) };
             let (least, most) = (least.max(SPEEDS.0), most.min(SPEEDS.1));
             if least >= most {
@@ -330,7 +331,7 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
                 let power = build.mul(force, v);
                 build.sub(power, flow)
             };
-            // F v ≥ min(0, F_ext v): one of both.
+            // F v ≥ min(0, F_ext v) holds if one of two inequalities holds.
             let mut any = vec![lost(&mut build, force)];
             if let Some(slot) = bench.external {
                 let external = build.read(slot, &env);
@@ -344,7 +345,7 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
                 let left = build.less(half, value);
                 any.push(build.select(left, one, zero));
             }
-            // Stored, so that all of it counts as used.
+            // Stored, so that all operations count as live.
             for (k, value) in any.iter().enumerate() {
                 build.store(Slot((layout.size() + k) as u32), *value);
             }
@@ -360,7 +361,8 @@ fn proved(system: &System, contact: &Contact, bench: &mut Bench) -> bool {
             for value in (claims..any.len()).map(stored) {
                 match func.ops[value.index()] {
                     Op::Select(condition, ..) => unless.push(condition),
-                    // A regime that would be left at once is no regime; one that never is has nothing to leave out.
+                    // An exit condition that is constantly true excludes the regime; one that is constantly false
+                    // excludes nothing.
                     Op::Real(bits) => left |= f64::from_bits(bits) > 0.5,
                     _ => return false,
                 }
@@ -381,13 +383,14 @@ fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
     let layout = bench.program.description.layout.clone();
     let n = layout.states.len as usize;
     let storage = system.storages.iter().find(|(owner, _)| *owner == InstanceId(0)).map(|(_, energy)| *energy);
-    // What the force does not depend on stores nothing.
+    // A state on which the force does not depend stores no energy.
     let memory = bench.matters.contains(&true);
     if memory && storage.is_none() || !system.blocks.is_empty() || !system.delays.is_empty() {
         return Verdict::NotChecked;
     }
     let flow = bench.flow.clone();
-    // States at the ends of their ranges, at rest and half-way; those without a range where they start.
+    // Values of each state: the ends of its range, 0 and half-way points. A state without a range keeps its start
+    // value.
     let mut choices: Vec<Vec<f64>> = Vec::new();
     for k in 0..n {
         let slot = layout.states.slot(k);
@@ -414,7 +417,7 @@ fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
     let speeds = (-6..=1).map(|k| decade(k, 1)).chain((-60..=10).map(|k| decade(k, 10)));
     for v in speeds.flat_map(|v| [v, -v]) {
         for &external in externals {
-            // A model without regimes is in its only one.
+            // A model without regimes counts as having one.
             for at in 0..corners * bench.exits.len().max(1) {
                 looked += 1;
                 if looked > most {
@@ -423,7 +426,7 @@ fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
                 bench.force_at(v, external);
                 let mut rest = at % corners;
                 for (choice, state) in choices.iter().zip(&mut bench.block[layout.states.range()]) {
-                    // A state without choices stays where it starts.
+                    // A state without choices keeps its start value.
                     if !choice.is_empty() {
                         *state = choice[rest % choice.len()];
                         rest /= choice.len();
@@ -435,7 +438,7 @@ fn sampled(system: &System, contact: &Contact, bench: &mut Bench) -> Verdict {
                 }
                 let outputs = bench.outputs.clone();
                 bench.run(&outputs);
-                // Where a regime would be left at once it is not.
+                // The model is never in a regime whose exit condition holds.
                 let left = bench.exits.get(at / corners);
                 if left.is_some_and(|exits| exits.iter().any(|slot| bench.block[slot.index()] > 0.5)) {
                     continue;
@@ -473,7 +476,7 @@ fn depends(program: &Program, outputs: impl Iterator<Item = Slot>) -> Vec<bool> 
     found
 }
 
-/// dV/dt = Σ ∂V/∂x · dx/dt, where V is the output in slot `energy`; none without states.
+/// dV/dt = Σ ∂V/∂x · dx/dt, where V is the output in slot `energy`; `None` without states.
 fn energy_flow(program: &Program, energy: Slot) -> Option<Func> {
     let layout = &program.description.layout;
     let n = layout.states.len as usize;
@@ -527,7 +530,7 @@ fn pushes(system: &System, types: &Types, force: &Var, bench: &Bench, point: &Co
     }
 }
 
-/// A unit in letters that a text can hold.
+/// The unit in characters allowed in a model's text.
 fn plain(unit: &Unit) -> String {
     unit.to_string().replace('µ', "u")
 }

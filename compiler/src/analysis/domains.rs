@@ -1,7 +1,7 @@
-//! Proves that nothing divides by zero or leaves the domain of a function, whatever the parameters, inputs and states
-//! are within their declared ranges.
+//! Domain check: proves that no division by zero occurs and no function is evaluated outside its domain, for all
+//! parameters, inputs and states within their declared ranges.
 //!
-//! In: a model on its own, flat and typed. Out: diagnostics. What a divisor or an argument can be says [`Reach`].
+//! In: a model on its own, flat and typed. Out: diagnostics. The bounds of divisors and arguments come from [`Reach`].
 
 use crate::frontend::source::Files;
 use crate::frontend::system::*;
@@ -13,7 +13,7 @@ use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 use std::collections::HashSet;
 
-/// Reports what cannot be proven safe, and comparisons that practically never hold.
+/// Reports what cannot be proven safe, and equality comparisons that hardly ever hold.
 pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     equalities(system, types, files, diagnostics);
     let mut reach = Reach::new(system);
@@ -23,8 +23,8 @@ pub fn check(system: &System, types: &Types, files: &Files, diagnostics: &mut Ve
     }
 }
 
-/// Reports what an experiment gives to the model it runs and what is certainly undefined: `u = chirp(…, 0 s)`. Only
-/// constants are judged: what depends on time need not reach during the run what it could reach later.
+/// Reports arguments that an experiment passes to its model and that are certainly undefined: `u = chirp(…, 0 s)`.
+/// Checks only constants, since a value that depends on time may stay within its domain during the run.
 pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, diagnostics: &mut Vec<Diagnostic>) {
     let mut reach = Reach::new(system);
     let mut visit = Visit { seen: vec![HashSet::new()], constants: true };
@@ -46,7 +46,7 @@ pub fn check_given(system: &System, types: &Types, files: &Files, run: Span, dia
     }
 }
 
-/// Every expression that is evaluated before or while a model runs.
+/// Every expression that is evaluated before or during a run.
 fn roots(system: &System) -> Vec<ExprId> {
     let mut out = Vec::new();
     for var in &system.vars {
@@ -122,9 +122,10 @@ fn computed(system: &System, id: ExprId) -> bool {
 // ---- divisions and domains
 
 struct Visit {
-    /// Whether only divisors and arguments that are constants are judged.
+    /// Whether only constant divisors and arguments are checked.
     constants: bool,
-    /// Nodes visited without facts, and under each of those that hold: their operands need no second look.
+    /// Nodes visited without facts, and nodes visited under each of the present facts. Their operands are not visited
+    /// again.
     seen: Vec<HashSet<ExprId>>,
 }
 
@@ -140,7 +141,7 @@ impl Visit {
                 self.walk(reach, *c, types, files, found);
                 let decided = reach.decide(*c);
                 for (holds, value) in [(true, *a), (false, *b)] {
-                    // A branch that no argument takes is not evaluated.
+                    // A branch that is never taken is not checked.
                     if decided != Some(!holds) {
                         self.seen.push(HashSet::new());
                         reach.assuming(*c, holds, |reach| self.walk(reach, value, types, files, found));
@@ -181,7 +182,7 @@ impl Visit {
                     found.push(domain(reach, files, args[0], "`log1p`", "-1 or less", "> -1", "max"));
                 }
             }
-            // The time in which a chirp sweeps, and for which noise keeps a value.
+            // The sweep time of a chirp, and the time for which noise keeps a value.
             Node::Call(Builtin::Chirp, args) if !reach.interval(args[3]).is_positive() => {
                 found.push(domain(reach, files, args[3], "`chirp`", "zero or negative", "> 0", "max"));
             }
@@ -199,7 +200,7 @@ impl Visit {
         }
     }
 
-    /// A power with a negative exponent divides; one whose exponent is not whole has no negative base.
+    /// A power with a negative exponent divides; one with a fractional exponent requires a non-negative base.
     fn power(
         &mut self,
         reach: &mut Reach,
@@ -246,14 +247,14 @@ fn domain(reach: &Reach, files: &Files, id: ExprId, what: &str, can_be: &str, ra
         "max" => format!("max({text}, …)"),
         other => format!("{other}({text})"),
     };
-    // A power of a negative number is one only if its exponent is whole.
+    // A power of a negative number is real only if the exponent is whole.
     let (what, range) = if range == "0" { ("a power with this exponent", ">= 0") } else { (what, range) };
     Diagnostic::error("E0602", format!("`{text}` can be {can_be}, where {what} is not defined"))
         .label(reach.system().span(id), format!("not proven to be {}", range.replace("-1 .. 1", "within -1 .. 1")))
         .help(format!("declare a range of what it is made of, so that it is `in {range}`, or guard it: `{shown}`"))
 }
 
-/// `param Fc [N] = 1 N`: the declaration of a quantity as written, without what stands behind its value.
+/// `param Fc [N] = 1 N`: a declaration as written, without the text after its value.
 fn declaration(system: &System, files: &Files, var: &Var) -> String {
     let behind = &files.get(var.span.file).text[var.span.end as usize..];
     let unit = behind.trim_start_matches(' ').strip_prefix('[').and_then(|rest| rest.split_once(']'));
@@ -265,7 +266,7 @@ fn declaration(system: &System, files: &Files, var: &Var) -> String {
     format!("{} {}{unit}{value}", var.kind.word(), var.name)
 }
 
-/// E0601: names the parameter whose range would mend it, if one does.
+/// E0601: names the parameter whose range would resolve the error, if there is one.
 fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) -> Diagnostic {
     let system = reach.system();
     let text = files.slice(system.span(divisor));
@@ -309,7 +310,7 @@ fn division(reach: &mut Reach, types: &Types, files: &Files, divisor: ExprId) ->
     }
 }
 
-/// The span with the `/` before it.
+/// The span extended to the `/` before it.
 fn with_slash(files: &Files, span: Span) -> Span {
     let before = &files.get(span.file).text[..span.start as usize];
     let trimmed = before.trim_end_matches(|c: char| c.is_whitespace() || c == '(');
@@ -319,7 +320,7 @@ fn with_slash(files: &Files, span: Span) -> Span {
     }
 }
 
-/// Parameters an expression depends on, and the named quantities on the way.
+/// The parameters and inputs on which an expression depends, and the named quantities on the path to them.
 fn sources(system: &System, id: ExprId) -> (Vec<VarId>, Vec<VarId>) {
     let (mut params, mut path) = (Vec::new(), Vec::new());
     let mut stack = vec![id];
@@ -340,7 +341,7 @@ fn sources(system: &System, id: ExprId) -> (Vec<VarId>, Vec<VarId>) {
     (params, path)
 }
 
-/// The input that makes an exponential in a quantity vanish.
+/// The input in the argument of an exponential, which may make the quantity vanish.
 fn vanishing(system: &System, id: VarId) -> Option<String> {
     let Definition::Value(value, _) = system.var(id).definition else { return None };
     let mut stack = vec![(value, false)];

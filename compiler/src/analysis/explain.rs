@@ -1,7 +1,7 @@
-//! What the compiler knows of a model on its own: its quantities, its equations in order, how each state is stepped and
-//! why, and what that costs.
+//! Explanation of a model: its quantities, its equations in order of evaluation, how each state is integrated and why,
+//! and the cost of a step.
 //!
-//! In: a flat and typed system. Out: plain data for whoever shows it.
+//! In: a flat and typed system. Out: plain data; knows nothing of its presentation.
 
 use crate::analysis::dissipation::{self, Verdict};
 use crate::analysis::step_stability::Bench;
@@ -22,89 +22,91 @@ use abi::plan::Method;
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
 
-/// Everything about a model.
+/// Explanation of a model.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Explanation {
     /// Name of the model.
     pub model: String,
     /// Its quantities and those of its parts, in the order of the text.
     pub quantities: Vec<Listed>,
-    /// Equations in the order in which they are computed: left side, right side as written.
+    /// Equations in order of evaluation: left side, right side as written.
     pub equations: Vec<(String, String)>,
-    /// For each quantity that is computed, those its equation names: paths.
+    /// For each computed quantity, the paths that its equation mentions.
     pub needs: Vec<(String, Vec<String>)>,
-    /// How each continuous state is stepped.
+    /// How each continuous state is integrated.
     pub states: Vec<Stepped>,
-    /// What the fixed steps cost.
+    /// Cost of a step by each fixed-step method.
     pub steps: Vec<StepCost>,
-    /// Bytes of the block of one instance.
+    /// Size in bytes of the block of one instance.
     pub bytes: usize,
-    /// What is stored, as written: for models that say it.
+    /// Stored energy as written, for models with a `storage`.
     pub storage: Vec<String>,
-    /// Whether the friction depends on the path only; none for other models.
+    /// Whether the friction is rate-independent (depends on the path only); `None` for other models.
     pub rate_independent: Option<bool>,
-    /// Whether the friction dissipates; none for other models.
+    /// Whether the friction dissipates; `None` for other models.
     pub dissipation: Option<Verdict>,
 }
 
-/// What one fixed step of a method costs, with its outputs.
+/// Cost of one fixed step by a method, including the outputs.
 #[derive(Clone, PartialEq, Debug)]
 pub struct StepCost {
-    /// The method.
+    /// The method of integration.
     pub method: Method,
     /// Operations before elementary functions are expanded.
     pub plain: usize,
-    /// Operations of arithmetic.
+    /// Arithmetic operations after expansion.
     pub operations: usize,
-    /// Divisions and roots among them.
+    /// Divisions and square roots among them.
     pub divisions: usize,
-    /// Instructions of the machine code for this processor, and its bytes; none where there is none.
+    /// Instructions and bytes of the machine code for this processor; `None` if there is none.
     pub code: Option<(usize, usize)>,
-    /// The largest stable step in s over the ranges, open ones up to [`OPEN`](crate::analysis::step_stability::OPEN); [`LONGEST`](crate::analysis::step_stability::LONGEST) for any, 0 for none.
-    /// None without continuous states, and with too many of them.
+    /// The largest stable step in s over the declared ranges, with open ranges up to
+    /// [`OPEN`](crate::analysis::step_stability::OPEN). It is [`LONGEST`](crate::analysis::step_stability::LONGEST) if
+    /// every step is stable, and 0 if none is. `None` without continuous states, or with too many.
     pub stable: Option<f64>,
 }
 
-/// One quantity.
+/// A quantity in an explanation.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Listed {
     /// `param`, `input`, …
     pub kind: &'static str,
     /// Dotted path.
     pub path: String,
-    /// The unit it is shown in.
+    /// Unit for display.
     pub unit: String,
-    /// The range as written.
+    /// Range as written.
     pub range: Option<String>,
     /// The doc comment.
     pub doc: Option<String>,
 }
 
-/// How a state is stepped.
+/// How a state is integrated.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Stepped {
     /// Dotted path.
     pub path: String,
-    /// How its own dynamics enters its rate.
+    /// How its rate depends on the state itself.
     pub own: Own,
-    /// The fastest own rate found, 1/s, and the velocity in m/s at which it was, for models with an input `v`.
+    /// The greatest magnitude of its own rate found, in 1/s, and the velocity there in m/s for models with an input
+    /// `v`.
     pub fastest: Option<(f64, Option<f64>)>,
 }
 
 /// How the rate of a state depends on the state itself.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Own {
-    /// Not at all: it is integrated.
+    /// Not at all: a pure integrator.
     Not,
-    /// f = a·x + b with a and b free of x, in each branch: `expo` steps it exactly.
+    /// f = a·x + b with a and b independent of x, in each branch: `expo` is exact.
     Affine,
-    /// Otherwise: `expo` linearises it in each step.
+    /// Nonlinear: `expo` linearises it in each step.
     Nonlinear,
     /// Sampled: it changes at ticks.
     Sampled,
 }
 
-/// A step in s, where what is told depends on one: the room that delays take.
+/// A step in s for sizing the delay buffers, on which the size of the block depends.
 const EXAMPLE_STEP: f64 = 1e-3;
 
 /// Explains a model on its own.
@@ -139,7 +141,7 @@ pub fn explain(system: &System, types: &Types, files: &Files) -> Explanation {
     }
 }
 
-/// Every quantity, parts after their owner, in the order of the text.
+/// Every quantity in the order of the text; those of a part follow their owner.
 pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> {
     let listed = |id: VarId| {
         let var = system.var(id);
@@ -155,10 +157,10 @@ pub fn quantities(system: &System, types: &Types, files: &Files) -> Vec<Listed> 
     system.var_ids().map(listed).collect()
 }
 
-/// Instructions and bytes of the machine code of a function; none on a processor without.
+/// Instructions and bytes of the machine code of a function; `None` on a processor without a back end.
 fn code_size(func: &Func) -> Option<(usize, usize)> {
     let mut coder = FunctionCompiler::new(here().ok()?);
-    // One instruction a line; labels stand at the margin.
+    // One indented instruction per line; labels are not indented.
     let instructions = coder.assembly(func).ok()?.lines().filter(|line| line.starts_with(' ')).count();
     Some((instructions, coder.function(func).ok()?.code.len()))
 }
@@ -167,7 +169,7 @@ fn one_line(files: &Files, span: Span) -> String {
     files.slice(span).split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Equations in the order of need.
+/// Equations in order of evaluation.
 fn equations(system: &System, files: &Files) -> Vec<(String, String)> {
     let one_line = |id: ExprId| one_line(files, system.span(id));
     let mut done = vec![false; system.vars.len()];
@@ -218,7 +220,7 @@ fn equations(system: &System, files: &Files) -> Vec<(String, String)> {
     out
 }
 
-/// What the equation of each quantity names.
+/// The quantities that each equation mentions.
 fn needs(system: &System) -> Vec<(String, Vec<String>)> {
     let of = |id: VarId| {
         let var = system.var(id);
@@ -240,7 +242,7 @@ fn needs(system: &System) -> Vec<(String, Vec<String>)> {
     system.var_ids().filter_map(of).collect()
 }
 
-/// The right side of an equation; one put together from regimes has no text of its own.
+/// The right side of an equation as written. One combined from regimes has no text of its own.
 fn right_side(system: &System, files: &Files, left: grammar::span::Span, value: ExprId) -> String {
     let span = system.span(value);
     match system.node(value) {
@@ -270,7 +272,7 @@ fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     out
 }
 
-/// How each state is stepped.
+/// How each state is integrated.
 pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     let layout = &program.description.layout;
     let n = layout.states.len as usize;
@@ -291,7 +293,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     }
     let rates = crate::math::expand(&build.finish());
     let start = crate::math::expand(&program.start);
-    // The fastest own rate over velocities within the input's range, states where they start.
+    // The greatest own rate over velocities within the range of the input, with the states at their start values.
     let v = program.description.quantities.iter().find(|q| q.path == "v" && q.kind == abi::description::Kind::Input);
     let points: Vec<Option<f64>> = match v {
         Some(v) => {
@@ -333,7 +335,7 @@ pub fn states(system: &System, program: &Program) -> Vec<Stepped> {
     out
 }
 
-/// Whether a value is computed from what a slot holds, other than by the choice of a branch.
+/// Whether a value depends on the content of a slot other than through the condition of a branch.
 fn depends(build: &Build, value: Value, slot: Slot) -> bool {
     let mut seen = std::collections::HashSet::new();
     let mut stack = vec![value];
@@ -343,7 +345,7 @@ fn depends(build: &Build, value: Value, slot: Slot) -> bool {
         }
         match build.get(value) {
             Op::Load(at) if at == slot => return true,
-            // Which branch is taken may depend on the state; within it the rate is affine.
+            // The condition may depend on the state; within each branch the rate is affine.
             Op::Select(_, a, b) => stack.extend([a, b]),
             op => op.each_operand(|operand| stack.push(operand)),
         }
@@ -351,7 +353,7 @@ fn depends(build: &Build, value: Value, slot: Slot) -> bool {
     false
 }
 
-/// Whether every derivative is along a path whose speed is |v|, and v enters otherwise only through sign(v).
+/// Whether every derivative is along a path with speed |v|, and v occurs otherwise only in sign(v).
 fn rate_independent(system: &System) -> Option<bool> {
     let own = |name: &str, kind: VarKind| {
         system.var_ids().find(|id| {
@@ -406,7 +408,7 @@ fn is_zero(system: &System, id: ExprId) -> bool {
 }
 
 impl Stepped {
-    /// In words: how, and why.
+    /// Describes in words how the state is integrated, and why.
     pub fn words(&self) -> String {
         let name = self.path.rsplit('.').next().unwrap_or(&self.path);
         let mut text = match self.own {
@@ -428,7 +430,7 @@ impl Stepped {
     }
 }
 
-/// A time with a handy prefix.
+/// A time with a suitable prefix.
 fn time(t: f64) -> String {
     let (scale, unit) = match t {
         t if t < 1e-6 => (1e-9, "ns"),

@@ -1,18 +1,21 @@
-//! Proves that a value of a function is nowhere negative, whatever its inputs are within a box.
+//! Interval branch and bound: proves that a value of a function is non-negative for all inputs within a box (Moore,
+//! Kearfott, Cloud, *Introduction to Interval Analysis*, 2009).
 //!
-//! In: a function before its elementary functions are expanded, what it reads as intervals, and the work it may cost. Out:
-//! whether there is a proof. Boxes are halved until each is proven: a value is written as a sum of products of what is
-//! opaque (inputs, functions, quotients, branches that are not decided), so that what cancels on paper cancels here, and
-//! then bounded by intervals. Comparisons that are the same all over a box are decided; one of an input with a number
-//! halves the box just there. Bounds are rounded outwards; a sum that is negative by no more than 1e-12 of its
-//! terms counts as zero, for coefficients of the same product may differ in their last digit.
+//! In: a function before its elementary functions are expanded, the intervals of its inputs, and a limit on the work.
+//! Out: whether there is a proof.
+//!
+//! Boxes are bisected until each is proven. A value is expanded into a sum of products of opaque terms (inputs,
+//! functions, quotients, undecided branches), so that terms cancel symbolically, and is then bounded by intervals.
+//! Comparisons with the same result throughout a box are decided; a comparison of an input with a number bisects the
+//! box at that number. Bounds are rounded outwards. A sum counts as zero if it is negative by no more than 1e-12 of its
+//! terms, because coefficients of equal products may differ in their last digits.
 
 use crate::ir::{Binary, Func, Op, Unary, Value};
 use abi::Slot;
 use std::collections::{BTreeMap, HashMap};
 use std::rc::Rc;
 
-/// Closed, never empty.
+/// A closed, non-empty interval.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Range {
     /// Least value; may be infinite.
@@ -21,25 +24,25 @@ pub struct Range {
     pub high: f64,
 }
 
-/// One thing to prove, of a function: that one of these values is nowhere negative where none of these conditions holds.
+/// A claim about a function: one of the values `any` is non-negative wherever none of the conditions `unless` holds.
 pub struct Claim<'a> {
     /// The function.
     pub func: &'a Func,
-    /// Any one of them suffices, in each box another one.
+    /// Alternatives: in each box one of them suffices, not necessarily the same.
     pub any: &'a [Value],
-    /// Where one of these holds, nothing is claimed.
+    /// Exceptions: where one of these holds, nothing is claimed.
     pub unless: &'a [Value],
 }
 
-/// Most terms of a sum of products; one with more is opaque.
+/// Limit on the terms of an expanded sum; a longer sum is opaque.
 const MOST_TERMS: usize = 48;
-/// Parts of a sum that count as nothing.
+/// Relative magnitude below which a part of a sum counts as zero.
 const NOTHING: f64 = 1e-12;
-/// Most halvings one inside the other.
+/// Limit on the depth of bisection.
 const DEEPEST: u32 = 60;
 
-/// Proves a claim for all inputs in `inputs`; false where there is no proof within `work` steps, of which each is some
-/// operations. What is left of the work stays in it.
+/// Proves a claim for all inputs in `inputs`. Returns false if there is no proof within `work` steps of a few
+/// operations each. Subtracts the steps taken from `work`.
 pub fn prove(claim: &Claim, inputs: &[(Slot, Range)], pool: &[f64], work: &mut usize) -> bool {
     let live = claim.func.live();
     let mut stack = vec![Cell { inputs: inputs.to_vec(), facts: Vec::new(), depth: 0 }];
@@ -63,7 +66,7 @@ pub fn prove(claim: &Claim, inputs: &[(Slot, Range)], pool: &[f64], work: &mut u
     true
 }
 
-/// A box, with comparisons that are known in it.
+/// A box, with the known results of comparisons in it.
 #[derive(Clone)]
 struct Cell {
     inputs: Vec<(Slot, Range)>,
@@ -71,10 +74,10 @@ struct Cell {
     depth: u32,
 }
 
-/// What is opaque, by its value, and its power.
+/// A product of powers of opaque terms: (index of the value, exponent).
 type Product = Vec<(u32, i32)>;
 
-/// A sum of products with their coefficients; each with the sum of magnitudes that it was added from.
+/// A sum of products. Each has its coefficient, and the sum of the magnitudes from which the coefficient was added up.
 #[derive(Clone, Default)]
 struct Sum(BTreeMap<Product, (f64, f64)>);
 
@@ -115,7 +118,7 @@ impl Sum {
         out
     }
 
-    /// The one product that it is, with its coefficient.
+    /// The only product of the sum and its coefficient, if there is exactly one.
     fn single(&self) -> Option<(&Product, f64)> {
         match self.0.len() {
             1 => self.0.iter().next().map(|(product, (x, _))| (product, *x)),
@@ -124,14 +127,14 @@ impl Sum {
     }
 }
 
-/// What is known of the values of a function in a box.
+/// Bounds of the values of a function in a box.
 struct Bounds<'a> {
     func: &'a Func,
     cell: &'a Cell,
     ranges: Vec<Range>,
     truths: Vec<Option<bool>>,
     sums: Vec<Option<Rc<Sum>>>,
-    /// Opaque values that stand for the inverse of a sum, by its value.
+    /// Opaque terms that stand for the reciprocal of a sum, by the index of the sum.
     inverse: HashMap<u32, Range>,
     work: &'a mut usize,
 }
@@ -139,7 +142,7 @@ struct Bounds<'a> {
 const ALL: Range = Range { low: f64::NEG_INFINITY, high: f64::INFINITY };
 
 impl Range {
-    /// From the least to the greatest of these, rounded outwards; everything if one is no number.
+    /// The hull of these values, rounded outwards; [`ALL`] if one of them is NaN.
     fn around(values: &[f64]) -> Range {
         if values.iter().any(|x| x.is_nan()) {
             return ALL;
@@ -161,7 +164,7 @@ impl Range {
     }
 
     fn multiply(self, other: Range) -> Range {
-        // 0 · inf is 0: an infinite end is never reached.
+        // 0 · inf is 0, since an infinite end is never attained.
         let product = |a: f64, b: f64| if a == 0.0 || b == 0.0 { 0.0 } else { a * b };
         let ends = [
             product(self.low, other.low),
@@ -170,7 +173,7 @@ impl Range {
             product(self.high, other.high),
         ];
         let mut out = Range::around(&ends);
-        // What is exact stays so: a zero is the most common end.
+        // Keeps exact zeros, which are the most common ends.
         for (end, exact) in [(&mut out.low, f64::min as fn(f64, f64) -> f64), (&mut out.high, f64::max)] {
             let bound = ends.into_iter().reduce(exact).expect("there are four");
             if bound == 0.0 {
@@ -196,7 +199,7 @@ impl Range {
         Range { low: if base.low <= 0.0 && base.high >= 0.0 { 0.0 } else { out.low.max(0.0) }, high: out.high }
     }
 
-    /// An end that was exactly zero is zero.
+    /// Restores ends that were exactly zero.
     fn keep_zero(self, base: Range) -> Range {
         Range {
             low: if base.low == 0.0 { 0.0 } else { self.low },
@@ -212,7 +215,7 @@ impl Range {
         self.low.abs().max(self.high.abs())
     }
 
-    /// Under a function that rises, whose values are right to some last digits, within `limits`.
+    /// The image under an increasing function within `limits` whose values are accurate to a few last digits.
     fn rising(self, f: impl Fn(f64) -> f64, limits: (f64, f64)) -> Range {
         let off = |x: f64| 8.0 * f64::EPSILON * x.abs();
         let (low, high) = (f(self.low), f(self.high));
@@ -369,7 +372,7 @@ impl<'a> Bounds<'a> {
         self.truths[condition.index()]
     }
 
-    /// The value as a sum of products.
+    /// The value as a sum of products, memoised.
     fn sum(&mut self, value: Value) -> Rc<Sum> {
         if let Some(known) = &self.sums[value.index()] {
             return known.clone();
@@ -401,7 +404,8 @@ impl<'a> Bounds<'a> {
                         Sum([(turned, (1.0 / x, (1.0 / x).abs()))].into())
                     }
                     _ => {
-                        // The divisor is opaque as a whole: under its own number, with the sign bit of none other.
+                        // The divisor as a whole becomes opaque: its index with the top bit set, which no other opaque
+                        // term has.
                         let key = b.0 | 1 << 31;
                         self.inverse.insert(key, if safe { range.inverse() } else { ALL });
                         Sum([(vec![(key, 1)], (1.0, 1.0))].into())
@@ -431,7 +435,7 @@ impl<'a> Bounds<'a> {
         self.inverse.get(&key).copied().unwrap_or_else(|| self.ranges[key as usize])
     }
 
-    /// Whether the value is nowhere negative in the box.
+    /// Whether the value is non-negative throughout the box.
     fn not_negative(&mut self, value: Value) -> bool {
         if self.ranges[value.index()].low >= 0.0 {
             return true;
@@ -441,7 +445,7 @@ impl<'a> Bounds<'a> {
         if sum.0.is_empty() {
             return true;
         }
-        // What all products have in common and is positive says nothing of the sign.
+        // A common positive factor does not affect the sign.
         let mut common: BTreeMap<u32, i32> = sum.0.keys().next().expect("there is one").iter().copied().collect();
         for product in sum.0.keys() {
             common.retain(|opaque, power| match product.iter().find(|(other, _)| other == opaque) {
@@ -469,8 +473,8 @@ impl<'a> Bounds<'a> {
         total.low >= -NOTHING * size && size.is_finite() || total.low >= 0.0
     }
 
-    /// The box in two: at the number with which a comparison that is open compares an input, else where an input that
-    /// matters is widest, by ratio where it has one sign.
+    /// Bisects the box: at the number with which an undecided comparison compares an input; otherwise the widest
+    /// relevant input, at its geometric mean if it has one sign.
     fn halves(&self, claim: &Claim) -> Option<[Cell; 2]> {
         let mut matters = vec![false; self.func.ops.len()];
         claim.any.iter().chain(claim.unless).for_each(|value| matters[value.index()] = true);
@@ -522,7 +526,7 @@ impl<'a> Bounds<'a> {
         let width = |range: &Range| match (range.low, range.high) {
             (low, high) if low > 0.0 => (high / low).min(1e300) - 1.0,
             (low, high) if high < 0.0 => (low / high).min(1e300) - 1.0,
-            // Across zero a ratio says nothing.
+            // The ratio of the ends is meaningless across zero.
             (low, high) => {
                 if low == high {
                     0.0
@@ -557,7 +561,7 @@ impl<'a> Bounds<'a> {
     }
 }
 
-/// `if a < b then a else b` is at most both, and `if b < a then a else b` at least both.
+/// `if a < b then a else b` is at most both of them; `if b < a then a else b` is at least both.
 fn smaller_or_larger(func: &Func, condition: Value, a: Value, b: Value, x: Range, y: Range) -> Option<Range> {
     match func.ops[condition.index()] {
         Op::Less(p, q) | Op::LessEqual(p, q) if (p, q) == (a, b) => {
@@ -578,7 +582,7 @@ mod tests {
     const X: Slot = Slot(0);
     const Y: Slot = Slot(1);
 
-    /// Whether it is proven that what `f` makes of x in −1..1 and y in 0.001..10 is nowhere negative.
+    /// Whether `f(x, y)` is proven non-negative for x in −1..1 and y in 0.001..10.
     fn proven(f: impl Fn(&mut Build, Value, Value) -> Value) -> bool {
         let mut build = Build::new("claim");
         let (x, y) = (build.load(X), build.load(Y));
@@ -603,7 +607,7 @@ mod tests {
             let rest = b.sub(square, xx);
             b.sub(rest, two)
         }));
-        // x y − x (y − y x / 2) = y x²/2: a bristle gives out no more than it took.
+        // x y − x (y − y x / 2) = y x²/2: a bristle returns no more energy than it has stored.
         assert!(proven(|b, x, y| {
             let half = b.real(0.5);
             let part = b.mul(y, x);
@@ -616,7 +620,7 @@ mod tests {
 
     #[test]
     fn boxes_are_halved_where_it_is_needed() {
-        // x² − x + 0.3 has its least value, 0.05, at 0.5; with 0.2 it is negative there.
+        // x² − x + 0.3 has its minimum, 0.05, at 0.5; with 0.2 it is negative there.
         let parabola = |c: f64| {
             move |b: &mut Build, x: Value, _: Value| {
                 let (square, c) = (b.mul(x, x), b.real(c));

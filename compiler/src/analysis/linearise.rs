@@ -1,9 +1,9 @@
-//! Linearisation: what small changes of states and inputs do to rates and outputs.
+//! Linearisation: state-space matrices of a model at a point.
 //!
-//! In: a model or an experiment, the names of inputs and outputs. Out: a [`Linear`], which gives A, B, C and D at any
-//! point of its block, by the derivative pass. An input that gets its value inside the model is moved by a small amount
-//! that is added to it. Sampled states, regimes and branches are held. Where parameters are named, P and Q say what small
-//! changes of these do.
+//! In: a model or an experiment, and the names of inputs and outputs. Out: a [`Linear`], which computes A, B, C and D
+//! at any point of its block by automatic differentiation. An input that has a value inside the model is perturbed by
+//! an added quantity. Sampled states, regimes and branches are held fixed. If parameters are named, P and Q are the
+//! derivatives with respect to them.
 
 use crate::frontend::names::nearest;
 use crate::frontend::system::*;
@@ -22,14 +22,14 @@ use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::sync::Arc;
 
-/// Inputs and outputs of a linearisation, by path. Where none are named, those of the whole.
+/// Inputs and outputs of a linearisation, by path. Empty lists stand for those of the root instance.
 #[derive(Clone, Debug, Default)]
 pub struct Ports {
     /// Inputs.
     pub inputs: Vec<String>,
-    /// Outputs, or any other quantity.
+    /// Outputs, or any other quantities.
     pub outputs: Vec<String>,
-    /// Parameters, for P and Q; none unless named.
+    /// Parameters for P and Q; none by default.
     pub params: Vec<String>,
 }
 
@@ -39,13 +39,13 @@ pub type PortSlots = (Vec<(String, Slot)>, Vec<(String, Slot)>);
 /// Inputs and outputs found in a system.
 #[derive(Default)]
 pub struct Opened {
-    /// The path of each input, and of the quantity that moves it: itself, or what is added to it.
+    /// Path of each input, and of the quantity that perturbs it: the input itself, or a quantity added to it.
     pub inputs: Vec<(String, String)>,
-    /// The path of each output, and its value.
+    /// Path of each output, and its value.
     pub outputs: Vec<(String, ExprId)>,
 }
 
-/// Finds inputs and outputs, and makes what has a value of its own movable.
+/// Finds inputs and outputs. Adds a perturbation to each input that has a value of its own.
 pub fn open(system: &mut System, ports: &Ports, diagnostics: &mut Vec<Diagnostic>) -> Opened {
     let mut opened = Opened::default();
     for id in chosen(system, &ports.inputs, &[VarKind::Input], "input", diagnostics) {
@@ -85,7 +85,8 @@ pub fn open(system: &mut System, ports: &Ports, diagnostics: &mut Vec<Diagnostic
     opened
 }
 
-/// The quantities of these names; those of the whole if there are no names. `kinds`: which are allowed; empty for any.
+/// The quantities of these names; those of the root instance if there are no names. `kinds`: allowed kinds, empty for
+/// any.
 fn chosen(
     system: &System,
     names: &[String],
@@ -125,22 +126,22 @@ fn chosen(
 
 /// A model that can be linearised.
 pub struct Linear {
-    /// To be put to the point of interest: parameters, inputs, then started, then states.
+    /// Set it to the operating point: parameters, inputs, then start it, then states.
     pub instance: Instance,
-    /// What was to be run, if an experiment was asked for.
+    /// The experiment, if one was linearised.
     pub experiment: Option<Experiment>,
     /// States x, in order.
     pub states: Vec<Quantity>,
-    /// Inputs u: path, and the quantity that moves it.
+    /// Inputs u: path, and the quantity that perturbs it.
     pub inputs: Vec<(String, Quantity)>,
     /// Outputs y: path and quantity.
     pub outputs: Vec<(String, Quantity)>,
-    /// Parameters p that were named and are there.
+    /// Parameters p: those of the requested that exist.
     pub params: Vec<Quantity>,
     func: Func,
 }
 
-/// dx/dt = A x + B u + P p, y = C x + D u + Q p, around a point; SI. Row by row.
+/// dx/dt = A x + B u + P p and y = C x + D u + Q p around a point, in SI units; row-major.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Matrices {
@@ -150,12 +151,12 @@ pub struct Matrices {
     pub d: Vec<f64>,
     pub p: Vec<f64>,
     pub q: Vec<f64>,
-    /// dx/dt at the point itself: 0 at rest.
+    /// dx/dt at the point itself; 0 at an equilibrium.
     pub rates: Vec<f64>,
 }
 
 impl Linear {
-    /// Of a program and its ports; `params`: paths of parameters, those that are none being left out.
+    /// From a program and its ports. `params`: paths of parameters; unknown ones are ignored.
     pub fn new(
         program: &Program,
         instance: Instance,
@@ -182,7 +183,7 @@ impl Linear {
         let mut next = layout.size();
         let rows = (0..states.len()).map(|i| layout.derivatives.slot(i));
         for row in rows.chain(outputs.iter().map(|(_, quantity)| quantity.slot)) {
-            // An output that is a state is read where the state lies.
+            // The derivative of an output that is a state is a row of the identity.
             let itself = directions.iter().position(|direction| *direction == row);
             let gradient = of_rates.get(&row).or_else(|| of_outputs.get(&row));
             for k in 0..directions.len() {
@@ -196,7 +197,7 @@ impl Linear {
         Linear { instance, experiment, states, inputs, outputs, params, func }
     }
 
-    /// The matrices where the instance is.
+    /// The matrices at the present point of the instance.
     pub fn at(&mut self) -> Matrices {
         let (n, m, p) = (self.states.len(), self.inputs.len(), self.outputs.len());
         let width = n + m + self.params.len();
@@ -224,7 +225,7 @@ impl Linear {
         }
     }
 
-    /// What can be given a value at the point: states, free inputs, parameters.
+    /// Quantities that can be set at the operating point: states, free inputs, parameters.
     pub fn movable(&self) -> impl Iterator<Item = &Quantity> {
         let kinds = [Kind::State, Kind::SampledState, Kind::Input, Kind::Param];
         let description = self.instance.description();

@@ -1,5 +1,6 @@
-//! What deserves a look in a model that compiles: names that nothing reads, regimes that nothing reaches, and the
-//! physics of friction. Each has a name and can be silenced by `allow NAME "reason"`.
+//! Lints: warnings for models that compile, about unused names, unreachable regimes, and the physics of friction.
+//!
+//! In: a flat and typed system. Out: warnings. Each lint has a name and can be silenced by `allow NAME "reason"`.
 
 use crate::analysis::dissipation;
 use crate::frontend::source::Files;
@@ -8,7 +9,7 @@ use crate::frontend::units::Types;
 use crate::ranges::reach::Reach;
 use grammar::diagnostic::Diagnostic;
 
-/// All warnings of a model on its own; `physics`: those of friction too, which take longer.
+/// All warnings of a model on its own. `physics` includes the dissipation analysis, which takes longer.
 pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Vec<Diagnostic> {
     let mut found = Vec::new();
     unused(system, &mut found);
@@ -19,10 +20,10 @@ pub fn check(system: &System, types: &Types, files: &Files, physics: bool) -> Ve
     found
 }
 
-/// Takes out warnings that the model allows.
+/// Removes the warnings that the model allows.
 pub fn silence(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     let Some(top) = system.instances.first() else { return };
-    // What a part allows of its physics, with a reason, the whole need not allow again.
+    // A part that allows a lint of its physics, with a reason, allows it for the whole model.
     let by_parts = |name: &str| system.instances.iter().any(|part| part.allows.iter().any(|allow| allow == name));
     let allowed: Vec<&str> = LINTS
         .iter()

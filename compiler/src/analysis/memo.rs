@@ -1,7 +1,8 @@
-//! Answers about a program that take a while, kept for as long as this process runs: a text that is checked again after
-//! an edit asks again only about what has changed.
+//! Memoisation of expensive results about programs, for the lifetime of the process: after an edit, a check recomputes
+//! only results for programs that changed.
 //!
-//! In: a program and whatever else the answer depends on. Out: the answer, computed or remembered; the same either way.
+//! In: a program and the other values on which the result depends. Out: the result, computed or cached; the same either
+//! way.
 
 use crate::ir::program::Program;
 use std::collections::HashMap;
@@ -9,23 +10,23 @@ use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 use std::sync::Mutex;
 
-/// Answers that are kept; when there are more, all are forgotten.
+/// Capacity; when it is exceeded, the memo is cleared.
 const MOST: usize = 1024;
 
-/// Answers to one question about programs.
+/// Memo of one kind of result about programs.
 pub struct Memo<T>(Mutex<Option<HashMap<u64, T>>>);
 
 impl<T: Clone> Memo<T> {
-    /// None yet.
+    /// An empty memo.
     pub const fn new() -> Memo<T> {
         Memo(Mutex::new(None))
     }
 
-    /// The answer about a program, from before if it was asked. `also`: what else it depends on.
+    /// The result for a program, from the memo if it is known. `also`: other values on which it depends.
     pub fn answer(&self, program: &Program, also: &[u64], compute: impl FnOnce() -> T) -> T {
         let key = key(program, also);
         let known = |answers: &Option<HashMap<u64, T>>| answers.as_ref()?.get(&key).cloned();
-        // Whoever panicked while holding it left it as it was.
+        // A panic in another thread leaves the map consistent, so a poisoned lock can be used.
         let lock = || self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         if let Some(known) = known(&lock()) {
             return known;
@@ -47,7 +48,7 @@ impl<T: Clone> Default for Memo<T> {
     }
 }
 
-/// A hash of all that a program computes: its functions as printed, its numbers by their bits, its ranges.
+/// A hash of everything that a program computes: its functions as printed, its numbers by their bits, its ranges.
 fn key(program: &Program, also: &[u64]) -> u64 {
     let mut hasher = DefaultHasher::new();
     for func in [Some(&program.start), Some(&program.outputs), Some(&program.derivatives)]

@@ -1,7 +1,7 @@
-//! What is found out about a checked system or its program, and told to people.
+//! Analyses of a checked system or its program, and their reports.
 //!
-//! In: a flat system, its program, a step. Out: diagnostics, verdicts with their reasons, linear models, explanations. Changes
-//! nothing of what it looks at.
+//! In: a flat system, its program, a step. Out: diagnostics, verdicts with their reasons, linear models, explanations.
+//! Changes none of its inputs.
 
 pub mod parameter_checks;
 pub mod domains;

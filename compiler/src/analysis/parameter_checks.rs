@@ -1,4 +1,7 @@
-//! Values known before anything runs: ranges and `require`, at the argument that breaks them.
+//! Checks of values known before a run: ranges, `require` statements, periods and delays.
+//!
+//! In: a flat and typed system. Out: diagnostics at the argument that violates a condition. Knows nothing of states
+//! beyond their start values.
 
 use crate::frontend::delays;
 use crate::frontend::source::Files;
@@ -20,7 +23,7 @@ pub fn values(system: &System, types: &Types, files: &Files, diagnostics: &mut V
     requires(system, types, files, diagnostics);
 }
 
-/// Params and `require` are over params and constants.
+/// Parameters and `require` statements may depend only on parameters and constants.
 fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     for var in system.vars.iter().filter(|var| var.kind == VarKind::Param) {
         let Definition::Value(value, origin) = &var.definition else { continue };
@@ -45,7 +48,7 @@ fn constants(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     }
 }
 
-/// What in an expression changes while a model runs, if anything does.
+/// The part of an expression that changes during a run, if there is one.
 pub fn moving(system: &System, id: ExprId) -> Option<ExprId> {
     match system.node(id) {
         Node::Var(var) => (system.var(*var).kind != VarKind::Param).then_some(id),
@@ -57,7 +60,7 @@ pub fn moving(system: &System, id: ExprId) -> Option<ExprId> {
 fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<Diagnostic>) {
     let mut exprs = Vec::new();
     let mut checked = Vec::new();
-    // What has no value yet still has a range that must hold something.
+    // A quantity without a value still needs a non-empty range.
     let open = ExprId(u32::MAX);
     for id in system.var_ids() {
         let var = system.var(id);
@@ -126,7 +129,7 @@ fn ranges(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec<D
     }
 }
 
-/// Periods are positive and known before a run.
+/// Periods must be positive and known before a run.
 fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
     let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
     for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
@@ -144,7 +147,7 @@ fn periods(system: &System, types: &Types, diagnostics: &mut Vec<Diagnostic>) {
     }
 }
 
-/// E0701: with fixed steps every period is a whole number of them.
+/// E0701: every period must be a whole multiple of the fixed step.
 pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>, diagnostics: &mut Vec<Diagnostic>) {
     let exprs: Vec<ExprId> = system.blocks.iter().map(|block| block.period).collect();
     for (expr, value) in exprs.iter().zip(evaluate(system, types, &exprs)) {
@@ -153,7 +156,7 @@ pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>
         }
         let error = Diagnostic::error("E0701", live::no_multiple(value, step));
         let ticks = (system.span(*expr), format!("{} steps", three_digits(value / step)));
-        // The first label is where the change is to be made: not in a library.
+        // The primary label is where the user should make the change, which is not in a library.
         let labels = match at.map(|at| (at, "the step".to_string())) {
             Some(step) if step.0.file != ticks.0.file => vec![step, ticks],
             step => std::iter::once(ticks).chain(step).collect(),
@@ -163,7 +166,7 @@ pub fn whole_periods(system: &System, types: &Types, step: f64, at: Option<Span>
     }
 }
 
-/// `reset` sets a continuous state, each once.
+/// A `reset` must set a continuous state, and no state twice.
 fn resets(system: &System, diagnostics: &mut Vec<Diagnostic>) {
     let transitions = system.automata.iter().flat_map(|automaton| &automaton.regimes).flat_map(|r| &r.transitions);
     let all: Vec<&Vec<(VarId, ExprId)>> =
@@ -252,7 +255,7 @@ fn requires(system: &System, types: &Types, files: &Files, diagnostics: &mut Vec
     }
 }
 
-/// What is said of a `require` that does not hold.
+/// The message of a `require` that does not hold.
 pub fn unmet(system: &System, files: &Files, require: &Require) -> String {
     match (&require.message, system.node(require.condition)) {
         (Some(message), _) => message.clone(),
@@ -263,7 +266,7 @@ pub fn unmet(system: &System, files: &Files, require: &Require) -> String {
     }
 }
 
-/// What the opposite of a comparison is called.
+/// The negation of a comparison, in words.
 fn broken(op: BinaryOp) -> &'static str {
     match op {
         BinaryOp::GreaterEqual => "is smaller than",
@@ -274,7 +277,7 @@ fn broken(op: BinaryOp) -> &'static str {
     }
 }
 
-/// The instance as written from the model's name to the closing bracket.
+/// The text of an instance from the model's name to the closing parenthesis.
 fn instance_text(files: &Files, name: Span) -> Option<String> {
     let text = &files.get(name.file).text[name.start as usize..];
     let mut depth = 0;

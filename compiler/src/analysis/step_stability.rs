@@ -1,10 +1,14 @@
-//! Does a fixed step make motion out of nothing? Looks for a point of the declared ranges at which a step of a method
-//! lets small deviations grow although the model itself does not.
+//! Numerical stability of a fixed step: searches the declared ranges for a point at which a step of a method amplifies
+//! small deviations although the model itself does not.
 //!
-//! In: a program, a method, a step. Out: where it is unstable and up to where it is not, or the state that chatters. The
-//! step is differentiated as it is compiled, with the exponentials of `expo` and the pivots of `implicit`. A point counts
-//! only if a run from there leaves what much shorter steps do, so that kinks, transients and coincidences raise no alarm.
-//! The work has a fixed limit, so the answer is the same everywhere. Knows no text.
+//! In: a program, a method, a step. Out: where the step is unstable and up to which value it is stable, or a state that
+//! chatters. Knows no text.
+//!
+//! The compiled step is differentiated, including the exponentials of `expo` and the pivots of `implicit`; the
+//! criterion is the spectral radius of its derivative (Hairer, Wanner, *Solving ODEs II*, IV.2). A point counts only if
+//! a run from there also leaves the solution that much shorter steps find, so that kinks, transients and coincidences
+//! cause no false alarms. The work is bounded by operations rather than time, so the result does not depend on the
+//! machine.
 
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
@@ -18,40 +22,40 @@ use abi::Slot;
 use abi::description::{Kind, Quantity};
 use abi::plan::Method;
 
-/// Most continuous states of a program that is looked at.
+/// Limit on the number of continuous states of an analysed program.
 pub const MOST_STATES: usize = 48;
-/// Operations that may be interpreted for one answer: some tenths of a second.
+/// Limit on interpreted operations for one result: some tenths of a second.
 const WORK: usize = 30_000_000;
-/// By how much a deviation may grow in one step: what lies below is an error of the method, no instability.
+/// Growth of a deviation in one step that is tolerated: below it is an error of the method rather than an instability.
 const MARGIN: f64 = 1e-3;
-/// Steps of a run that has to confirm an instability.
+/// Number of steps of the run that confirms an instability.
 const RUN: usize = 200;
-/// Steps of the run it is compared with, to each of those.
+/// Steps of the reference run for each step of the confirming run.
 const FINER: usize = 16;
-/// How many times farther than that it must go.
+/// Factor by which the confirming run must go farther than the reference run.
 const FARTHER: f64 = 10.0;
-/// Steps of a run that has to confirm a chatter, and how many of the last half of them must turn back.
+/// Number of steps of the run that confirms chattering, and the number of reversals required in its second half.
 const CHATTER: (usize, usize) = (256, 8);
-/// Steps, and their length in s, in which what is fast comes to where the rest lets it be.
+/// Number of steps, and their length in s, in which fast states relax to their quasi-steady values.
 const RELAXING: (usize, f64) = (8, 2e-5);
-/// Greatest value in SI of a quantity whose range is open.
+/// Greatest value in SI units for a quantity with an open range.
 pub const OPEN: f64 = 10.0;
-/// 10^(k/8) for k from 0 to 7: the points between two powers of ten.
+/// 10^(k/8) for k from 0 to 7: subdivision of a decade.
 const EIGHTHS: [f64; 8] = [1.0, 1.3335, 1.7783, 2.3714, 3.1623, 4.2170, 5.6234, 7.4989];
-/// The power of ten up to which an end of the run is looked for.
+/// Exponent of ten up to which the search looks for a condition that ends the run.
 const FAR: i32 = 4;
-/// The longest step in s that is looked for.
+/// The longest step in s that is tried.
 pub const LONGEST: f64 = 1.0;
 
-/// A step that makes motion out of nothing.
+/// Result: a step that is numerically unstable.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Unstable {
-    /// The state that takes the largest part in it: its number.
+    /// Index of the state with the largest share in the unstable mode.
     pub state: usize,
-    /// Its own rate there, −∂f/∂x in 1/s.
+    /// Its own rate there, −∂f/∂x, in 1/s.
     pub rate: f64,
-    /// The state or input on whose size it depends, and up to which size in SI it is stable; none if it is unstable
-    /// where it starts.
+    /// The state or input on whose magnitude the instability depends; `None` if the step is unstable at the start
+    /// point.
     pub along: Option<Along>,
     /// The largest stable step at the worst point, in s.
     pub stable: f64,
@@ -60,60 +64,61 @@ pub struct Unstable {
 /// A quantity along which a step becomes unstable.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Along {
-    /// Its slot.
+    /// Slot of the quantity.
     pub slot: Slot,
-    /// Stable up to this size, SI.
+    /// The step is stable up to this magnitude, SI units.
     pub limit: f64,
-    /// The farthest point that was looked at, SI.
+    /// The farthest point that was examined, SI units.
     pub farthest: f64,
-    /// Whether it is the other way round: stable from `limit` on, unstable from there down to `farthest`, which is next to
-    /// nothing. So it is where friction is steepest at rest and the run starts in motion.
+    /// Whether the direction is reversed: stable from `limit` upwards and unstable below it, down to `farthest`, which
+    /// is close to 0. This happens where friction is steepest at rest and the run starts in motion.
     pub inward: bool,
-    /// Whether the declared ranges, or what ends a run, go no farther.
+    /// Whether the declared ranges, or conditions that end the run, bound the quantity there.
     pub closed: bool,
 }
 
-/// A state that jumps to and fro.
+/// Result: a state that chatters.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Chatter {
-    /// Its number.
+    /// Index of the state.
     pub state: usize,
-    /// How far in one step, SI.
+    /// Its change in one step, SI units.
     pub amplitude: f64,
 }
 
-/// Where the model itself grows so fast that the linear equations of a step by `implicit` are nearly singular.
+/// Result: a point at which the model itself grows so fast that the linear equations of a step by `implicit` are nearly
+/// singular.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Singular {
-    /// Slot of the quantity that was moved, and its value there, SI.
+    /// Slot of the varied quantity, and its value there in SI units.
     pub at: (Slot, f64),
-    /// The rate at which deviations grow there, in 1/s.
+    /// The growth rate of deviations there, in 1/s.
     pub rate: f64,
 }
 
-/// A program at points of its ranges.
+/// Evaluates a program at points of its ranges.
 pub struct Bench<'a> {
     program: &'a Program,
     start: Func,
     outputs: Func,
     derivatives: Func,
-    /// ∂f/∂x, row by row behind the block.
+    /// ∂f/∂x, row-major, stored after the block.
     jacobian: Func,
-    /// A step of `expo`, states only.
+    /// A step of `expo` for the states only.
     relaxing: Func,
-    /// Slots that are not 0 where a run has ended.
+    /// Slots that are not 0 where the run would have ended.
     ends: Vec<Slot>,
     n: usize,
-    /// Where it starts.
+    /// The block at the start point.
     base: Vec<f64>,
 }
 
-/// A fixed step of a method and what it does to small deviations.
+/// The derivative of a method's fixed step with respect to the states.
 struct Stepper {
     derivative: Func,
 }
 
-/// What is varied: a slot, its values by size, and whether there are no others.
+/// A quantity to vary: its slot, its values by magnitude, and whether its range is bounded.
 struct Scan {
     slot: Slot,
     values: Vec<f64>,
@@ -121,8 +126,8 @@ struct Scan {
 }
 
 impl<'a> Bench<'a> {
-    /// Of a program whose rings have their sizes; `ends`: outputs that are not 0 where a run ends. None for one without
-    /// continuous states, and for one with more than [`MOST_STATES`].
+    /// From a program whose ring buffers are sized; `ends`: outputs that are not 0 where a run ends. `None` for a
+    /// program without continuous states or with more than [`MOST_STATES`].
     pub fn new(program: &'a Program, ends: &[Slot]) -> Option<Bench<'a>> {
         let layout = &program.description.layout;
         let n = layout.states.len as usize;
@@ -157,7 +162,7 @@ impl<'a> Bench<'a> {
         Stepper { derivative: derivative(self.program, &fixed_step::advance(self.program, method), &rows) }
     }
 
-    /// What can move it to another point: its inputs and states, by powers of ten and to the ends of their ranges.
+    /// The quantities to vary: inputs and states, by powers of ten and to the ends of their ranges.
     fn scans(&self) -> Vec<Scan> {
         let kinds = [Kind::State, Kind::Input];
         let moved = self.program.description.quantities.iter().filter(|q| kinds.contains(&q.kind) && !q.boolean);
@@ -168,7 +173,7 @@ impl<'a> Bench<'a> {
                 let size = ten_to(power);
                 values.extend([size, -size].into_iter().filter(|x| (low..=high).contains(x)));
             }
-            // Beyond what is usual only where a run ends on the way.
+            // Values above `OPEN` only for quantities for which some value ends the run.
             let ends = values.iter().any(|x| self.ended(&self.at(&self.base, quantity.slot, *x)));
             values.retain(|x| ends || x.abs() <= OPEN);
             values.extend([low, high].into_iter().filter(|x| x.is_finite() && *x != 0.0));
@@ -179,7 +184,7 @@ impl<'a> Bench<'a> {
         moved.map(scan).collect()
     }
 
-    /// Blocks to begin with: where it starts; and there with every state that has a range at its upper or lower end.
+    /// Start blocks: the start point, and the start point with every bounded state at its upper or at its lower end.
     fn settings(&self) -> Vec<Vec<f64>> {
         let mut out = vec![self.base.clone()];
         for upper in [true, false] {
@@ -197,7 +202,7 @@ impl<'a> Bench<'a> {
         out
     }
 
-    /// Whether a run has ended where the block is.
+    /// Whether a run would have ended at this block.
     fn ended(&self, block: &[f64]) -> bool {
         if self.ends.is_empty() {
             return false;
@@ -207,7 +212,7 @@ impl<'a> Bench<'a> {
         self.ends.iter().any(|slot| block[slot.index()] != 0.0)
     }
 
-    /// The matrix that a function writes behind the block.
+    /// The matrix that a function writes after the block.
     fn matrix(&self, func: &Func, block: &[f64], h: f64) -> Vec<f64> {
         let mut block = block.to_vec();
         block[Slot::STEP.index()] = h;
@@ -215,27 +220,27 @@ impl<'a> Bench<'a> {
         block.split_off(self.program.description.layout.size())
     }
 
-    /// By how much deviations grow in one step here, where they grow more than the model lets them; and the state that
-    /// takes the largest part.
+    /// The growth of deviations in one step at this point, if it exceeds that of the model, and the state with the
+    /// largest share.
     fn grows(&self, stepper: &Stepper, block: &[f64], h: f64) -> Option<(f64, usize)> {
         let n = self.n;
         let step = self.matrix(&stepper.derivative, block, h);
         let (growth, power) = radius(&step, n, 1.0 + 2.0 * MARGIN)?;
-        // What is unstable itself may grow, but not at more than twice its own rate: a Stribeck curve that falls hides no
-        // bristle that is thrown off.
+        // An unstable model may grow, but the step by no more than twice the model's own rate; otherwise the falling
+        // branch of a Stribeck curve would mask the instability of a bristle.
         let model = self.matrix(&self.jacobian, block, h);
         if let Some((own, _)) = radius(&exponential(&model, n, h), n, 1.0 + MARGIN)
             && (own.is_nan() || growth - 1.0 <= 2.0 * (own - 1.0) + 2.0 * MARGIN)
         {
             return None;
         }
-        // Of a rank-one matrix v·wᵀ the diagonal says how much each state takes part, in whatever units.
+        // The diagonal of the rank-one matrix v·wᵀ measures the share of each state independently of units.
         let part = |k: &usize| power[k * n + k].abs();
         let state = (0..n).filter(|k| !part(k).is_nan()).max_by(|a, b| part(a).total_cmp(&part(b))).unwrap_or(0);
         Some((growth, state))
     }
 
-    /// The first point at which a step of this length is unstable, confirmed.
+    /// The first point found at which a step of this length is unstable, confirmed by a run.
     pub fn unstable(&self, method: Method, h: f64) -> Option<Unstable> {
         let stepper = self.stepper(method);
         let settings = self.settings();
@@ -249,7 +254,7 @@ impl<'a> Bench<'a> {
         }
         let mut work = WORK / self.cost(&stepper);
         for scan in self.scans() {
-            // Unstable points, each with its setting, its value and how much it grows.
+            // Unstable points: (index of the start block, value, growth, state).
             let mut found: Vec<(usize, f64, f64, usize)> = Vec::new();
             let (mut closed, mut farthest) = (scan.closed, 0.0_f64);
             for (at, setting) in settings.iter().enumerate() {
@@ -267,7 +272,7 @@ impl<'a> Bench<'a> {
                     }
                 }
             }
-            // The farthest of the worst: there a run shows it soonest.
+            // The farthest of the worst points, where a run diverges soonest.
             let worst =
                 found.iter().max_by(|a, b| a.2.min(1e9).total_cmp(&b.2.min(1e9)).then(a.1.abs().total_cmp(&b.1.abs())));
             let Some(&(at, value, _, state)) = worst else { continue };
@@ -276,7 +281,8 @@ impl<'a> Bench<'a> {
             if !self.diverges(method, &point(value), h) {
                 continue;
             }
-            // Up to where, along the same setting and sign: between the last stable and the first unstable value.
+            // Bisects for the limit with the same start block and sign, between the last stable and the first unstable
+            // value.
             let same = |x: &f64| x.signum() == value.signum();
             let first = found
                 .iter()
@@ -295,7 +301,7 @@ impl<'a> Bench<'a> {
                     None => low = middle,
                 }
             }
-            // What ends a run may lie between two powers of ten.
+            // The condition that ends the run may change between two powers of ten.
             let edge = match inward {
                 true => least,
                 false => self.edge(setting, scan.slot, farthest.copysign(value), &scan),
@@ -308,12 +314,13 @@ impl<'a> Bench<'a> {
         None
     }
 
-    /// The point at which the model itself grows fastest, where that is so fast that a step by `implicit` loses its way: its
-    /// equations (I − γhJ) k = f are singular where an eigenvalue of J is 1/(γh), and from three quarters of that on a step
-    /// makes of a deviation some three times what the model makes of it. It grows once, while the point is passed, so no run
-    /// from there goes ever farther, and [`Bench::unstable`] says nothing of it.
+    /// The point at which the model itself grows fastest, if that is too fast for a step by `implicit`. Its equations
+    /// (I − γhJ) k = f are singular where an eigenvalue of J is 1/(γh). From three quarters of that value, a step
+    /// amplifies a deviation about three times as much as the model does. The growth happens once, while the point is
+    /// passed, so a run from there does not diverge, and [`Bench::unstable`] does not find it.
     ///
-    /// Sought along each input and state by [`EIGHTHS`], for such a place is narrow: of a Stribeck curve, the speeds at which it falls.
+    /// Searches each input and state at the subdivision [`EIGHTHS`], because such a region is narrow: on a Stribeck
+    /// curve, the speeds at which it falls.
     pub fn singular(&self, h: f64) -> Option<Singular> {
         let (limit, n) = (0.75 / (fixed_step::GAMMA * h), self.n);
         let cost =
@@ -343,7 +350,7 @@ impl<'a> Bench<'a> {
         worst
     }
 
-    /// The farthest value up to which a run has not ended.
+    /// The farthest value up to which the run has not ended, by bisection.
     fn edge(&self, setting: &[f64], slot: Slot, reached: f64, scan: &Scan) -> f64 {
         let beyond = scan.values.iter().copied().filter(|x| x.signum() == reached.signum() && x.abs() > reached.abs());
         let Some(mut high) = beyond.min_by(|a, b| a.abs().total_cmp(&b.abs())) else { return reached };
@@ -361,8 +368,8 @@ impl<'a> Bench<'a> {
         block
     }
 
-    /// A point near by in which what is fast has come to rest: how a step answers a state that is thrown far off for a
-    /// moment says nothing of where it goes.
+    /// A nearby point at which the fast states have relaxed. The response of a step to a state that is momentarily far
+    /// off does not show where a run goes.
     fn relaxed(&self, mut block: Vec<f64>) -> Vec<f64> {
         let begin = block.clone();
         block[Slot::STEP.index()] = RELAXING.1;
@@ -373,7 +380,8 @@ impl<'a> Bench<'a> {
         if block[states].iter().all(|x| x.is_finite()) { block } else { begin }
     }
 
-    /// The same while one quantity keeps its value: else a mass slows down and leaves the speed that is asked of.
+    /// As [`relaxed`](Self::relaxed), with one quantity held: otherwise a mass would slow down and leave the examined
+    /// speed.
     fn relaxed_around(&self, mut block: Vec<f64>, held: Slot) -> Vec<f64> {
         let (begin, value) = (block.clone(), block[held.index()]);
         block[Slot::STEP.index()] = RELAXING.1;
@@ -398,7 +406,7 @@ impl<'a> Bench<'a> {
             + 40 * self.n.pow(3)
     }
 
-    /// The largest step below h that is stable at a point.
+    /// The largest step below h that is stable at a point, by bisection.
     fn largest(&self, stepper: &Stepper, block: &[f64], h: f64) -> f64 {
         let stable = |h: f64| self.grows(stepper, block, h).is_none();
         let mut low = h;
@@ -416,10 +424,10 @@ impl<'a> Bench<'a> {
         low
     }
 
-    /// Whether deviations grow a little with any step, as swings do that nothing damps: a quarter of the step, and they
-    /// still grow although the model does not let them.
+    /// Whether deviations grow slightly at any step, as undamped oscillations do with some methods. Called with a
+    /// quarter of the step: whether they still grow although the model does not let them.
     fn always_grows(&self, stepper: &Stepper, points: &[Vec<f64>], h: f64) -> bool {
-        // Repeated squaring tells a radius from 1 to some 1e-4, but errs alike for both.
+        // Repeated squaring resolves a radius near 1 to about 1e-4, but its error is the same for both matrices.
         const LEAST: f64 = 4e-5;
         let growth = |matrix: &[f64]| radius(matrix, self.n, 0.0).map_or(0.0, |(growth, _)| growth);
         points.iter().any(|block| {
@@ -429,13 +437,13 @@ impl<'a> Bench<'a> {
         })
     }
 
-    /// The largest step of a method that is stable at all points, in s, up to [`LONGEST`]; 0 where none is.
+    /// The largest step of a method in s that is stable at all points, up to [`LONGEST`]; 0 if there is none.
     pub fn largest_stable(&self, method: Method) -> f64 {
         let stepper = self.stepper(method);
         let settings = self.settings();
         let mut points = settings.clone();
-        // Powers of ten from 1e-3 on, and the ends of the range: of all quantities the farthest first, for of a large
-        // model only so many can be looked at.
+        // Powers of ten from 1e-3, and the ends of the ranges; the farthest of each quantity first, because only a
+        // limited number of points of a large model can be examined.
         let scans = self.scans();
         let far = |scan: &Scan, k: usize| scan.values.iter().rev().copied().filter(|x| x.abs() >= 0.9e-3).nth(k);
         let most = scans.iter().map(|scan| scan.values.len()).max().unwrap_or(0);
@@ -448,7 +456,7 @@ impl<'a> Bench<'a> {
         points.truncate((WORK / 40 / self.cost(&stepper)).max(4 + 6 * scans.len()));
         let points: Vec<Vec<f64>> = points.into_iter().map(|block| self.relaxed(block)).collect();
         let stable = |h: f64| points.iter().all(|block| self.grows(&stepper, block, h).is_none());
-        // From below: a step beyond the first unstable one is of no use.
+        // Searches upwards: a step beyond the first unstable one is of no use.
         let mut low = 1e-8;
         while low < LONGEST && stable(2.0 * low) {
             low *= 2.0;
@@ -464,7 +472,7 @@ impl<'a> Bench<'a> {
         if self.always_grows(&stepper, &points, 0.25 * low) { 0.0 } else { low }
     }
 
-    /// Whether a run from near a point goes where one with much shorter steps does not.
+    /// Whether a run from near a point leaves the region in which a run with much shorter steps stays.
     fn diverges(&self, method: Method, block: &[f64], h: f64) -> bool {
         let states = self.program.description.layout.states.range();
         let mut block = block.to_vec();
@@ -472,13 +480,13 @@ impl<'a> Bench<'a> {
         for slot in states.clone() {
             let (low, high) = self.quantity(Slot(slot as u32)).map_or((0.0, f64::INFINITY), |q| q.range);
             let width = if (high - low).is_finite() { high - low } else { f64::INFINITY };
-            // A little off, so that rest shows what it is worth; inwards.
+            // A small perturbation, so that an unstable equilibrium is left; towards the inside of the range.
             let off = if width.is_finite() { 1e-3 * width } else { 1e-6 };
             block[slot] += if block[slot] + off > high { -off } else { off };
             widths.push(width);
         }
         let test = self.excursions(method, &block, h, RUN);
-        // A method that takes no instability from stiffness.
+        // The reference method, which is stable for stiff models.
         let other = Method::Implicit;
         let reference = self.excursions(other, &block, h / FINER as f64, RUN * FINER);
         test.iter().zip(&reference).zip(&widths).any(|((test, reference), width)| {
@@ -487,7 +495,8 @@ impl<'a> Bench<'a> {
         })
     }
 
-    /// How far each state goes from where it is, in so many steps; infinite where it is lost.
+    /// The greatest distance of each state from its initial value within `steps` steps; infinite if it ceases to be
+    /// finite.
     fn excursions(&self, method: Method, block: &[f64], h: f64, steps: usize) -> Vec<f64> {
         let mut farthest = vec![0.0_f64; self.n];
         self.run(method, block, h, steps, |first, now| {
@@ -499,7 +508,8 @@ impl<'a> Bench<'a> {
         farthest
     }
 
-    /// Runs it with all its ticks and transitions; shows the states at the start and after each step, until they are lost.
+    /// Runs with all ticks and transitions. Calls `look` with the initial and the present states after each step, until
+    /// they cease to be finite.
     fn run(&self, method: Method, block: &[f64], h: f64, steps: usize, mut look: impl FnMut(&[f64], &[f64])) {
         let mut program = self.program.clone();
         program.size_rings(h);
@@ -514,7 +524,7 @@ impl<'a> Bench<'a> {
         at[layout.states.range()].copy_from_slice(&block[self.program.description.layout.states.range()]);
         let first = at[layout.states.range()].to_vec();
         let step = expand(&fixed_step::step(&program, method));
-        // What a run may cost.
+        // Limit on the cost of a run.
         let most = WORK / (2 * step.ops.len());
         for _ in 0..steps.min(most.max(RUN)) {
             run_once(&step, &mut at, &program.description.pool);
@@ -526,8 +536,8 @@ impl<'a> Bench<'a> {
         }
     }
 
-    /// A state whose rate jumps where it changes its sign, against it on both sides, so that a fixed step of this length
-    /// throws it to and fro.
+    /// A state whose rate jumps at a change of its sign and opposes it on both sides, so that fixed steps of this
+    /// length make it chatter around 0.
     pub fn chatters(&self, method: Method, h: f64) -> Option<Chatter> {
         let layout = &self.program.description.layout;
         (0..self.n).find_map(|k| {
@@ -560,7 +570,8 @@ impl<'a> Bench<'a> {
     }
 }
 
-/// The derivative of what a function stores in `rows` along the continuous states, row by row behind the block.
+/// The derivative of the values that a function stores in `rows` with respect to the continuous states, row-major after
+/// the block.
 fn derivative(program: &Program, func: &Func, rows: &[Slot]) -> Func {
     let layout = &program.description.layout;
     let states: Vec<Slot> = layout.states.range().map(|slot| Slot(slot as u32)).collect();
@@ -579,14 +590,14 @@ fn derivative(program: &Program, func: &Func, rows: &[Slot]) -> Func {
     expand(&build.finish())
 }
 
-/// The spectral radius of an n × n matrix by repeated squaring, and the power that it was read from, scaled to a largest
-/// entry of 1; NaN of a matrix that is not finite. None as soon as it is known to be at most `bound`.
+/// The spectral radius of an n × n matrix by repeated squaring, and the last power, scaled to a largest entry of 1. NaN
+/// for a matrix that is not finite. `None` as soon as the radius is known to be at most `bound`.
 fn radius(matrix: &[f64], n: usize, bound: f64) -> Option<(f64, Vec<f64>)> {
     let mut power = matrix.to_vec();
     if power.iter().any(|x| !x.is_finite()) {
         return Some((f64::NAN, power));
     }
-    // The matrix to the power 2^k is `power` times e^(log).
+    // The matrix to the power 2^k is `power` · e^(log).
     let mut log = 0.0;
     let mut growth = 0.0;
     for k in 0..=SQUARINGS {
@@ -596,7 +607,7 @@ fn radius(matrix: &[f64], n: usize, bound: f64) -> Option<(f64, Vec<f64>)> {
         }
         power.iter_mut().for_each(|x| *x /= largest);
         log += ln(largest);
-        // ρ ≤ ‖A^m‖^(1/m) ≤ (n · largest entry)^(1/m)
+        // Bound: ρ ≤ ‖A^m‖^(1/m) ≤ (n · largest entry)^(1/m).
         let m = f64::from(1_u32 << k);
         growth = exp((log + ln(n as f64)) / m);
         if growth <= bound {
@@ -610,7 +621,7 @@ fn radius(matrix: &[f64], n: usize, bound: f64) -> Option<(f64, Vec<f64>)> {
     Some((growth, power))
 }
 
-/// A^(2^16): what is not normal in A is then felt by less than MARGIN.
+/// Computes A^(2^16), for which the non-normality of A affects the result by less than MARGIN.
 const SQUARINGS: u32 = 16;
 
 /// 10^power, exactly rounded.
@@ -633,7 +644,7 @@ fn exponential(a: &[f64], n: usize, h: f64) -> Vec<f64> {
     let scaled: Vec<f64> = a.iter().map(|x| h * x * half_to(squarings)).collect();
     let identity = |i: usize| f64::from(i / n == i % n);
     let mut sum: Vec<f64> = (0..n * n).map(identity).collect();
-    // The series by Horner: twelve terms leave less than 1e-17.
+    // Taylor series by Horner's scheme: the remainder after twelve terms is less than 1e-17.
     for k in (1..=12).rev() {
         sum = product(&scaled, &sum, n).into_iter().map(|x| x / f64::from(k)).collect();
         (0..n).for_each(|i| sum[i * n + i] += 1.0);

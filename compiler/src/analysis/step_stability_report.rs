@@ -1,8 +1,8 @@
-//! Says that a fixed step is unstable, or that it chatters, in the words of the text.
+//! Diagnostics about the stability of fixed steps, in terms of the user's text.
 //!
-//! In: a system with its program, its method and its step. Out: E0702 where it happens inside of the ranges, W0704 where
-//! ranges are open or the model itself grows too fast for `implicit`, W0705. What is found, and how, is told in
-//! [`stability`](crate::analysis::step_stability).
+//! In: a system with its program, method and step. Out: E0702 for an instability within declared ranges; W0704 if
+//! ranges are open or the model itself grows too fast for `implicit`; W0705 for chattering. The analysis itself is in
+//! [`step_stability`](crate::analysis::step_stability).
 
 use crate::analysis::explain::{Own, states};
 use crate::analysis::memo::Memo;
@@ -19,39 +19,39 @@ use grammar::ast::BinaryOp;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
-/// A system in fixed steps, and the places of the text that say so.
+/// A system in fixed steps, and the related spans of the text.
 pub struct Fixed<'a> {
-    /// What is stepped.
+    /// The flat system.
     pub system: &'a System,
     /// Its types.
     pub types: &'a Types,
-    /// Its program, rings sized for the step.
+    /// The program, with ring buffers sized for the step.
     pub program: &'a Program,
-    /// How.
+    /// The method.
     pub method: Method,
     /// Length of a step in s.
     pub step: f64,
-    /// Where the method is named, or else the step.
+    /// Span of the method's name, or else of the step.
     pub place: Span,
-    /// What is run: `Servo(…)`.
+    /// Span of the run's instance: `Servo(…)`.
     pub run: Span,
-    /// Conditions that end a run, and the outputs that say so.
+    /// Conditions that end a run, and the outputs that hold their values.
     pub ends: &'a [(ExprId, Slot)],
-    /// Whether a step of another length is a matter of `step`, or of `rate`.
+    /// Whether this is a rig, where `rate` rather than `step` determines the step.
     pub rig: bool,
 }
 
-/// What is to be said of it, at most one thing of each kind.
+/// Checks the step; returns at most one diagnostic of each kind.
 pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
     let ends: Vec<Slot> = fixed.ends.iter().map(|(_, slot)| *slot).collect();
     let Some(bench) = Bench::new(fixed.program, &ends) else { return Vec::new() };
     let stable = |method: Method| bench.unstable(method, fixed.step).is_none();
-    // What jumps to and fro is also thrown off: the jump is the cause.
+    // A chattering state is also unstable; the jump is the cause.
     let look = || match bench.chatters(fixed.method, fixed.step) {
         Some(chatter) => Finding::Chatters(chatter),
         None => {
             let unstable = bench.unstable(fixed.method, fixed.step);
-            // What is unstable inside of ranges is an error, which a warning does not replace.
+            // An instability within declared ranges is an error, which the warning must not replace.
             let open = unstable.as_ref().is_none_or(|found| found.along.as_ref().is_some_and(|along| !along.closed));
             let look = open && fixed.method == Method::Implicit;
             match (look.then(|| bench.singular(fixed.step)).flatten(), unstable) {
@@ -76,7 +76,7 @@ pub fn check(fixed: &Fixed, files: &Files) -> Vec<Diagnostic> {
 
 #[derive(Clone)]
 enum Finding {
-    /// And whether `implicit` is stable with this step.
+    /// An instability, and whether `implicit` is stable with this step.
     Unstable(Unstable, bool),
     Singular(Singular),
     Chatters(Chatter),
@@ -84,7 +84,7 @@ enum Finding {
 }
 
 impl Fixed<'_> {
-    /// The continuous state of this number.
+    /// The continuous state of this index.
     fn state(&self, number: usize) -> VarId {
         let continuous = |id: &VarId| matches!(self.system.var(*id).definition, Definition::Continuous { .. });
         self.system.var_ids().filter(continuous).nth(number).expect("the program has a slot for each state")
@@ -99,7 +99,7 @@ impl Fixed<'_> {
         let stiff = unstable.rate * self.step > 1.0;
         let place = match system.instance(var.instance).path.is_empty() {
             true => self.run,
-            // A part of a library is not to be changed: what is run is.
+            // A part inside a library cannot be changed by the user; the label is on the run.
             false if system.instance(var.instance).span.file != self.place.file => self.run,
             false => whole_instance(files, system.instance(var.instance).span),
         };
@@ -172,7 +172,7 @@ impl Fixed<'_> {
         let unit = unit.map_or(&moved.unit, |id| &self.types.units[id.0 as usize]);
         let (at, step) = (amount(value, unit), time(self.step));
         let rate = two_digits(singular.rate);
-        // With γhλ at most a half, the equations of a step are far from singular.
+        // With γhλ ≤ ½ the equations of a step are far from singular.
         let shorter = below(0.5 / (fixed_step::GAMMA * singular.rate));
         let shorter = if self.rig {
             format!("divide the period: `solver implicit step {shorter}`")
@@ -208,12 +208,12 @@ impl Fixed<'_> {
             )
     }
 
-    /// What the owner of a state calls the quantity that was moved, and its unit.
+    /// The name that the owner of a state has for the varied quantity, and its unit.
     fn name_of(&self, along: &Along, owner: InstanceId) -> Option<(String, Unit)> {
         let system = self.system;
         let moved = self.program.description.quantities.iter().find(|quantity| quantity.slot == along.slot)?;
         let moved = system.var_ids().find(|id| system.var(*id).path == moved.path)?;
-        // An input that is handed on under other names is the same.
+        // An input that is passed on under other names counts as the same.
         let source = |id: VarId| {
             let mut id = id;
             for _ in 0..system.vars.len() {
@@ -232,7 +232,7 @@ impl Fixed<'_> {
         Some((name.clone(), self.types.units[id.0 as usize].clone()))
     }
 
-    /// Where the text says that it goes no farther: the number in the condition that ends a run, or a range.
+    /// The span of the bound: the number in the condition that ends a run, or a range.
     fn end(&self, along: &Along) -> Option<Span> {
         let system = self.system;
         let near = |id: ExprId| {
@@ -255,7 +255,7 @@ impl Fixed<'_> {
         system.vars.iter().find(|var| var.path == moved.path)?.range_span
     }
 
-    /// `dz/dt = ... - sigma0*|v|/g * z`: of an equation the term that holds its own state, if there is one.
+    /// `dz/dt = ... - sigma0*|v|/g * z`: the term of an equation that contains its own state, if there is one.
     fn slope(&self, id: VarId) -> Option<String> {
         let system = self.system;
         let var = system.var(id);
@@ -287,7 +287,7 @@ impl Fixed<'_> {
         (coefficient.len() <= 40).then(|| format!("d{0}/dt = {sign}{coefficient} * {0}", var.name))
     }
 
-    /// A product of names and numbers without blanks, |x| for its size; none for anything else.
+    /// A product of names and numbers without blanks, with |x| for `abs(x)`; `None` for any other expression.
     fn tight(&self, id: ExprId, depth: u32) -> Option<String> {
         let system = self.system;
         if depth > 8 {
@@ -309,7 +309,7 @@ impl Fixed<'_> {
     }
 }
 
-/// `rotary LuGre(…)` from the name in it.
+/// The span of `rotary LuGre(…)`, from the span of the name in it.
 fn whole_instance(files: &Files, name: Span) -> Span {
     let text = &files.get(name.file).text;
     let before = text[..name.start as usize].trim_end();
@@ -347,7 +347,7 @@ fn two_digits(x: f64) -> String {
     }
 }
 
-/// A value in the unit of a quantity, with a handy prefix where that is a plain one.
+/// A value in the unit of a quantity, with a suitable prefix if the unit allows one.
 fn amount(value: f64, unit: &Unit) -> String {
     let prefixed = [(1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n")];
     let plain = unit.scale == 1.0 && unit.text.starts_with(['m', 'r', 'N']) && !unit.text.contains('^');
@@ -371,7 +371,7 @@ pub fn two_digits_time(t: f64) -> String {
     format!("{} {unit}", two_digits(t / scale))
 }
 
-/// The round time below: 1, 2 or 5 of a power of ten.
+/// The greatest round time (1, 2 or 5 times a power of ten) that is not above t.
 fn below(t: f64) -> String {
     let round = (-9..=0).rev().flat_map(|power| [5.0, 2.0, 1.0].map(|digit| digit * ten_to(power)));
     let mut round = round;

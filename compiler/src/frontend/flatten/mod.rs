@@ -215,7 +215,7 @@ struct Flattener<'a> {
     diagnostics: Vec<Diagnostic>,
     /// Parallel to `system.instances`.
     instances: Vec<Tree<'a>>,
-    /// Expanded calls by function and arguments, so that equal calls share nodes.
+    /// Expanded calls by function, arguments, rotary twin, and whether within an equation; equal calls share nodes.
     expansions: HashMap<(ItemRef, Vec<ExprId>, bool, bool), ExprId>,
     /// Functions being expanded, to detect recursion.
     functions: Vec<ItemRef>,
