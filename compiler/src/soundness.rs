@@ -1,9 +1,11 @@
-//! Whatever `check` accepts divides by no zero and leaves no domain, for numbers of the declared ranges; on random texts.
+//! Soundness test on random texts: a text that `check` accepts neither divides by 0 nor leaves the domain of a
+//! function, for numbers within the declared ranges.
 //!
-//! A text is made of quantities with ranges, `require` statements, `let`s, a part with an argument, branches, and an
-//! output. If it is accepted, it is evaluated twice at the edges of the ranges and at random numbers between: by the
-//! interpreter, whose output must be finite, and by an evaluator of its own, which sees each divisor. Not judged: results
-//! too large for a double, and instants at which a range that is watched is left. `FRIC_SEED`, `FRIC_RUNS` (default 600).
+//! A text consists of quantities with ranges, `require` statements, `let`s, a part with an argument, branches, and an
+//! output. An accepted text is evaluated at the ends of the ranges and at random numbers between them, in two ways: by
+//! the interpreter, whose output must be finite, and by an independent evaluator, which sees each divisor. Exempt are
+//! results too large for a double, and instants at which a guarded range is left. `FRIC_SEED` sets the seed,
+//! `FRIC_RUNS` the number of texts (default 600).
 
 use crate::ir::random::Random;
 use crate::ranges::interval::planted;
@@ -43,17 +45,18 @@ enum C {
     Either(Rc<C>, Rc<C>),
 }
 
-/// Bounds, each with whether it is left out.
+/// Lower and upper bound, each with whether it is strict.
 type Bounds = (Option<(f64, bool)>, Option<(f64, bool)>);
 
 #[derive(Clone, Debug)]
 struct Text {
-    /// Params and inputs: whether it is a param, its default, its range.
+    /// Parameters and inputs: whether it is a parameter, its default, its range.
     quantities: Vec<(bool, f64, Bounds)>,
     /// `large >= small`
     requires: Vec<(&'static str, Node, Node)>,
     lets: Vec<Node>,
-    /// The argument of the part's input, the range of that, and the part's output, in which `Quantity(0)` is that input.
+    /// The argument of the part's input, the range of that input, and the part's output, in which `Quantity(0)` is the
+    /// input.
     part: Option<(Node, Bounds, Node)>,
     output: Node,
 }
@@ -251,16 +254,16 @@ impl Maker {
 
 // ---- values
 
-/// What an evaluation meets.
+/// Observations of an evaluation.
 #[derive(Default)]
 struct Met {
     /// A divisor of 0, or an argument outside its domain.
     bad: Option<String>,
     /// A result too large for a double.
     large: bool,
-    /// A watched range that is left, beyond its slack.
+    /// A guarded range was left by more than its tolerance.
     watched: bool,
-    /// A watched range that is left.
+    /// A guarded range was left.
     near: bool,
 }
 
@@ -291,11 +294,11 @@ impl Values<'_> {
             E::Part => {
                 let (argument, bounds, body) = self.text.part.clone().expect("there is a part");
                 let a = self.value(&argument, self.numbers);
-                // What is proven to be above 0 may be nearer to it than what is declared so.
+                // A value proven to be positive may be nearer to 0 than the least value of a range declared as `> 0`.
                 let within = |(bound, strict): (f64, bool)| if strict { bound.next_up() } else { bound };
                 let least = bounds.0.map_or(f64::NEG_INFINITY, within);
                 let most = bounds.1.map_or(f64::INFINITY, |(high, strict)| -within((-high, strict)));
-                // A range is watched with a slack of a millionth.
+                // Guards have a tolerance of a millionth.
                 let slack = 1e-6 * if (most - least).is_finite() { most - least } else { a.abs() };
                 self.met.watched |= a < least - slack || a > most + slack;
                 self.met.near |= a < least || a > most;
@@ -346,7 +349,7 @@ impl Values<'_> {
                     "floor" => (x.floor(), false),
                     "exp" => (x.exp(), false),
                     "expm1" => (x.exp_m1(), false),
-                    // Beyond 1e12 the compiler's sine is 0.
+                    // The compiler's sine is 0 beyond 1e12.
                     "sin" => (if x.abs() > 1e12 { 0.0 } else { x.sin() }, false),
                     "tanh" => (x.tanh(), false),
                     "atan" => (x.atan(), false),
@@ -370,7 +373,7 @@ impl Values<'_> {
         match c {
             C::Compare(op, a, b) => compare(op, self.value(a, numbers), self.value(b, numbers)),
             C::Not(a) => !self.holds(a, numbers),
-            // Both sides are evaluated: a condition has no branches.
+            // Both sides are evaluated: a condition does not short-circuit.
             C::Both(a, b) => self.holds(a, numbers) & self.holds(b, numbers),
             C::Either(a, b) => self.holds(a, numbers) | self.holds(b, numbers),
         }
@@ -386,7 +389,7 @@ fn compare(op: &str, a: f64, b: f64) -> bool {
     }
 }
 
-/// A number of a range: often an edge.
+/// A number of a range, often one of its ends.
 fn sample(random: &mut Random, (low, high): Bounds) -> f64 {
     let least = low.map_or(-HUGE, |(low, strict)| crate::ranges::reach::least(low, strict));
     let most = high.map_or(HUGE, |(high, strict)| crate::ranges::reach::greatest(high, strict));
@@ -437,7 +440,7 @@ fn sample(random: &mut Random, (low, high): Bounds) -> f64 {
 
 // ---- the property
 
-/// What is wrong with a text that is accepted, if something is; and whether it is accepted.
+/// The violation by an accepted text, if there is one, and whether the text is accepted.
 fn wrong(text: &Text, seed: u64) -> (Option<String>, bool) {
     let shown = text.show();
     let mut loaded = crate::load("a.fric", &shown, &crate::NoSources);
@@ -465,7 +468,7 @@ fn wrong(text: &Text, seed: u64) -> (Option<String>, bool) {
         }
         values.met = Met::default();
         let expected = values.value(&text.output, &numbers);
-        // What is computed whether or not the output needs it.
+        // Values that are computed whether or not the output depends on them.
         for value in &text.lets {
             values.value(value, &numbers);
         }
@@ -501,7 +504,7 @@ fn wrong(text: &Text, seed: u64) -> (Option<String>, bool) {
     (None, true)
 }
 
-/// Smaller expressions that could stand for one.
+/// Smaller expressions that can replace an expression, for shrinking.
 fn smaller(e: &Node) -> Vec<Node> {
     let mut out: Vec<Node> = vec![];
     let mut with = |parts: Vec<&Node>, build: &dyn Fn(Vec<Node>) -> E| {
@@ -532,7 +535,7 @@ fn smaller(e: &Node) -> Vec<Node> {
     out
 }
 
-/// The smallest text that is wrong too.
+/// Shrinks a text to a smaller one with a violation.
 fn shrunk(mut text: Text, seed: u64) -> (Text, String) {
     let mut message = wrong(&text, seed).0.expect("it is wrong");
     'again: loop {
@@ -572,7 +575,7 @@ fn from_environment(name: &str, otherwise: u64) -> u64 {
     std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise)
 }
 
-/// The first of so many texts that is accepted and wrong, with its number; and how many are accepted.
+/// The first of `runs` texts that is accepted and has a violation, with its index, and the number of accepted texts.
 fn search(seed: u64, runs: u64) -> (Option<(u64, Text, String)>, u64) {
     let mut accepted = 0;
     for run in 0..runs {
@@ -615,7 +618,7 @@ fn planted_mistakes_are_found() {
     assert!(missed.is_empty(), "seed {seed}: not found: {missed:?}");
 }
 
-/// The compiler's elementary functions keep the limits that proofs rest on, to the last bit.
+/// The compiler's elementary functions stay within the limits that proofs rely on, to the last bit.
 #[test]
 fn elementary_functions_keep_their_limits() {
     use crate::ir::build::Build;

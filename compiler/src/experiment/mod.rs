@@ -1,7 +1,7 @@
-//! Reads an experiment: what to run, how, what to show and what must hold.
+//! Reads experiments: what to run and how, what to plot, and what must hold.
 //!
-//! In: an experiment's tree and changes from outside. Out: for each combination of its sweeps a flat system with a plan
-//! that holds slots only.
+//! In: an experiment's syntax tree and changes from outside. Out: one [`Variant`] for each combination of its sweeps: a
+//! flat system, its program, and a plan that refers to slots only. Knows nothing of integration.
 
 pub mod start_values;
 pub mod vary;
@@ -27,35 +27,34 @@ use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 use std::sync::Arc;
 
-/// Changes from outside to an experiment.
+/// Changes to an experiment from outside.
 #[derive(Clone, Debug, Default)]
 pub struct Changes {
     /// `fr.Fs = 2 N`, as text.
     pub set: Vec<String>,
-    /// Another method.
+    /// Method that replaces that of the experiment.
     pub method: Option<Method>,
-    /// Another fixed step, in s.
+    /// Fixed step in s that replaces that of the experiment.
     pub step: Option<f64>,
-    /// Another tolerance.
+    /// Tolerance that replaces that of the experiment.
     pub tol: Option<f64>,
-    /// Another duration, in s.
+    /// Duration in s that replaces that of the experiment.
     pub duration: Option<f64>,
-    /// Paths of parameters, and of states for their start values, that will change from run to run without compiling
-    /// again.
+    /// Paths of parameters, and of states for their start values, that vary from run to run without recompilation.
     pub vary: Vec<String>,
-    /// What is needed besides to linearise.
+    /// Inputs and outputs of a linearisation.
     pub ports: Option<Ports>,
-    /// Statements that the experiment gets besides its own, as text: `expect max(x) < 1 mm`.
+    /// Additional statements of the experiment, as text: `expect max(x) < 1 mm`.
     pub also: Vec<String>,
-    /// Leaves the experiment's own expectations out: a question at the prompt judges nothing, and a window of one may lie
-    /// beyond the time for which it is compiled.
+    /// Omits the experiment's own expectations. A question at the prompt does not judge the run, and a window of an
+    /// expectation may lie beyond the compiled duration.
     pub unjudged: bool,
 }
 
-/// A number of a plan that was computed from an expression.
+/// A number of a plan that an expression determines.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Place {
-    /// Simulated time.
+    /// Duration of the run.
     Duration,
     /// Fixed step.
     Step,
@@ -69,7 +68,7 @@ pub enum Place {
     Second(usize, usize),
     /// Start of the window of this measure of this expectation.
     MeasureAfter(usize, usize),
-    /// End of it.
+    /// End of the window of this measure of this expectation.
     MeasureBefore(usize, usize),
 }
 
@@ -77,34 +76,34 @@ pub enum Place {
 pub struct Variant {
     /// `fr = LuGre()`; empty without a sweep.
     pub label: String,
-    /// The system.
+    /// The flat system.
     pub system: System,
     /// Its types.
     pub types: Types,
-    /// The program.
+    /// The lowered program.
     pub program: crate::ir::program::Program,
-    /// Of an experiment with fixed steps, the same for adaptive runs, where these are possible.
+    /// For an experiment with fixed steps: its program for adaptive runs, if it has one.
     pub adaptive: Option<crate::ir::program::Program>,
-    /// What to run.
+    /// The plan of the run.
     pub experiment: plan::Experiment,
-    /// Numbers of the plan that follow from expressions.
+    /// Numbers of the plan that depend on expressions.
     pub places: Vec<(Place, ExprId)>,
-    /// Inputs of a linearisation, each with the slot along which it moves; and its outputs.
+    /// Inputs of a linearisation, each with the slot that perturbs it, and its outputs.
     pub ports: PortSlots,
-    /// A dry run: the plan of the rig, and the crossed-out part.
+    /// For software in the loop: the plan of the rig, and the program of the part that hardware would replace.
     pub rig: Option<(abi::rig::Rig, crate::ir::program::Program)>,
 }
 
-/// The default of an adaptive run.
+/// Default tolerance of an adaptive run.
 pub const DEFAULT_TOL: f64 = 1e-6;
-/// The step of a fixed method that was chosen without one, in s.
+/// Default step of a fixed-step method, in s.
 pub const DEFAULT_STEP: f64 = 1e-5;
-/// Most fixed steps of a run.
+/// Limit on the number of fixed steps in a run.
 const MOST_STEPS: f64 = 1e12;
-/// Most combinations of the sweeps of one experiment.
+/// Limit on the number of combinations of an experiment's sweeps.
 pub const MOST_VARIANTS: usize = 100_000;
 
-/// The parts of an experiment's tree.
+/// The statements of an experiment, by kind.
 struct Parts<'a> {
     span: Span,
     run: &'a ast::Run,
@@ -117,7 +116,7 @@ struct Parts<'a> {
     stepped: bool,
 }
 
-/// Where the value of a sweep or a change comes from.
+/// A change by a sweep or from outside.
 #[derive(Clone, Copy)]
 struct Change<'a> {
     path: &'a ast::Path,
@@ -126,8 +125,7 @@ struct Change<'a> {
 
 /// Reads and lowers an experiment.
 ///
-/// # Errors
-/// Everything that is wrong, at least one error among it.
+/// # Errors All errors; at least one.
 pub fn read(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -160,11 +158,11 @@ pub fn read(
         experiment.to_mut().body.extend(also);
     }
     let experiment = &*experiment;
-    // A word that is reported once may be what its `run` lacks.
+    // The missing `run` may be a misspelt word, which has been reported.
     let Some(mut parts) = parts(experiment, misread || loaded.has_errors(), &mut diagnostics) else {
         return Err(diagnostics);
     };
-    // What is said from outside counts: a value that is given, or varied there, is not swept here.
+    // Changes from outside take precedence: a value that is set or varied there is not swept.
     let plain = |text: &str| text.split_whitespace().collect::<String>();
     let path = |path: &ast::Path| plain(loaded.files.slice(path.span));
     let said: Vec<String> =
@@ -226,7 +224,7 @@ pub fn read(
     Ok(variants)
 }
 
-/// Further statements of an experiment, each with its own text.
+/// Additional statements of an experiment, each from a text of its own.
 fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>) -> Vec<ExperimentStatement> {
     let mut out = Vec::new();
     for text in texts {
@@ -238,7 +236,7 @@ fn also(loaded: &mut Loaded, texts: &[String], diagnostics: &mut Vec<Diagnostic>
     out
 }
 
-/// Texts given on the command line, read.
+/// The changes of the command line, parsed.
 struct Given {
     set: Vec<Set>,
     method: Option<Method>,
@@ -256,27 +254,27 @@ struct Set {
     instance: Option<ast::Instance>,
 }
 
-/// Changes of values from outside, read.
+/// Changes of values from outside, parsed.
 pub struct Overrides(Vec<Set>);
 
 impl Overrides {
-    /// One by one.
+    /// The changes one by one.
     pub fn iter(&self) -> impl Iterator<Item = ChangeOf<'_>> {
         self.0.iter().map(|set| ChangeOf(Given::change(set)))
     }
 }
 
-/// One of them.
+/// One change of [`Overrides`].
 pub struct ChangeOf<'a>(Change<'a>);
 
 impl<'a> ChangeOf<'a> {
-    /// As flattening takes it; its value is read in the scope of this file.
+    /// The change as input of flattening; its value is read in the scope of this file.
     pub fn override_in(&self, file: FileId) -> Override<'a> {
         Override { path: self.0.path, value: self.0.value, file }
     }
 }
 
-/// Reads changes of values from outside.
+/// Parses changes of values from outside.
 pub fn overrides(loaded: &mut Loaded, changes: &Changes, diagnostics: &mut Vec<Diagnostic>) -> Overrides {
     Overrides(Given::read(loaded, changes, diagnostics).set)
 }
@@ -288,7 +286,7 @@ impl Given {
             let id = loaded.add_text("--set", text);
             match text.split_once('=') {
                 Some((path, value)) if looks_like_instance(value) => {
-                    // Read with blanks in place of the path, so that places stay true.
+                    // Parsed with blanks in place of the path, so that spans remain correct.
                     let (found, errors) = grammar::parse::parse_path(id, path);
                     diagnostics.extend(errors);
                     let blanks = " ".repeat(path.len() + 1);
@@ -427,7 +425,7 @@ fn recording(
     Some(out)
 }
 
-/// Values of `first .. last by step` as expressions, one list for each sweep.
+/// The values of each sweep `first .. last by step` as literals.
 fn grids(loaded: &Loaded, parts: &Parts, diagnostics: &mut Vec<Diagnostic>) -> Vec<Vec<Expr>> {
     let mut out = Vec::new();
     for sweep in &parts.sweeps {
@@ -457,12 +455,12 @@ fn grids(loaded: &Loaded, parts: &Parts, diagnostics: &mut Vec<Diagnostic>) -> V
     out
 }
 
-/// A number without the noise of `a + k·h`: twelve digits.
+/// A number rounded to twelve digits, which removes the rounding errors of `a + k·h`.
 fn rounded(x: f64) -> f64 {
     format!("{x:.11e}").parse().unwrap_or(x)
 }
 
-/// A literal in SI with its unit.
+/// A literal in SI units, its unit and the unit as written.
 fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
     match &expr.kind {
         ast::ExprKind::Number { value, unit: None } => Some((*value, Unit::none(), None)),
@@ -475,7 +473,7 @@ fn quantity(expr: &Expr) -> Option<(f64, Unit, Option<ast::UnitText>)> {
     }
 }
 
-/// All combinations of the sweeps, the last one fastest; each with the text of its value.
+/// All combinations of the sweeps, the last sweep varying fastest, each with the text of its value.
 fn combinations<'a>(parts: &Parts<'a>, grids: &'a [Vec<Expr>]) -> Vec<Vec<(Change<'a>, Option<String>)>> {
     let mut out: Vec<Vec<(Change<'a>, Option<String>)>> = vec![Vec::new()];
     for (sweep, grid) in parts.sweeps.iter().zip(grids) {
@@ -532,7 +530,7 @@ fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Positions of an expectation's expressions among the observed ones.
+/// Indices of an expectation's expressions among the observed ones.
 struct ExpectAt {
     value: usize,
     near: Option<(usize, usize)>,
@@ -555,7 +553,7 @@ fn variant(
     on_stage: &mut dyn FnMut(&'static str),
 ) -> Result<Variant, Vec<Diagnostic>> {
     let root = loaded.root();
-    // Every expression of the experiment is read as one of the instance; then each is picked out again.
+    // All expressions of the experiment are flattened together with the instance, then picked out by index.
     let mut observed: Vec<&Expr> = Vec::new();
     let mut add = |expr| {
         observed.push(expr);
@@ -591,7 +589,7 @@ fn variant(
             let Some(mut cut) = cut else { return Err(diagnostics) };
             let system = std::mem::take(&mut cut.control);
             let types = std::mem::take(&mut cut.control_types);
-            // What deserves a look is said of the rig, not of each of its experiments.
+            // Warnings concern the rig, and are not repeated for each of its experiments.
             diagnostics.retain(Diagnostic::is_error);
             (system, types, std::mem::take(&mut cut.observed), Opened::default(), Some(cut))
         }
@@ -610,13 +608,13 @@ fn variant(
             (system, types, flat.observed, ports.unwrap_or_default(), None)
         }
     };
-    // What rests on a declaration that could not be read has been reported with that.
+    // Errors that follow from an unreadable declaration have been reported with it.
     let lost = loaded.files.0.iter().any(|file| !file.ast.lost.is_empty());
     if lost && (cut.is_some() || nodes.is_empty() || system.nodes.iter().any(|node| matches!(node, Node::Error))) {
         diagnostics.retain(Diagnostic::is_error);
         return Err(diagnostics);
     }
-    // What is wrong with the experiment alone does not hide what else is wrong with it.
+    // Errors of units in the experiment alone do not stop the search for further errors.
     if diagnostics.iter().any(|d| d.is_error() && outside_of(parts.span, d))
         || diagnostics.iter().any(|d| d.is_error() && d.code != "E0101" && d.code != "E0103")
     {
@@ -772,7 +770,7 @@ fn variant(
     Ok(Variant { label, system, types, program, adaptive, experiment, places, ports, rig })
 }
 
-/// The rig that an experiment runs, with its descriptions; none if it runs a model.
+/// The rig that an experiment runs, with its descriptions; `None` if it runs a model.
 fn rig_of(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -813,13 +811,13 @@ fn rig_of(
     Ok(Some(rig::prepare(loaded, sources, item)))
 }
 
-/// Whether what is said concerns something outside of a place.
+/// Whether a diagnostic lies outside a span.
 fn outside_of(place: Span, diagnostic: &Diagnostic) -> bool {
     let span = diagnostic.span();
     span.file != place.file || span.start < place.start || span.end > place.end
 }
 
-/// The text of a surface from the place that stands for it.
+/// The text of a switching surface, from its encoded span.
 fn surface_text(loaded: &Loaded, place: &str) -> String {
     let parse = || {
         let (file, range) = place.split_once(':')?;
@@ -838,14 +836,14 @@ struct Reader<'a> {
     diagnostics: Vec<Diagnostic>,
     wanted: Vec<Wanted>,
     places: Vec<(Place, ExprId)>,
-    /// Parameters that will change.
+    /// Paths of parameters that vary from run to run.
     vary: &'a [String],
-    /// Number of the expectation that is read.
+    /// Index of the present expectation.
     expect: usize,
 }
 
 impl Reader<'_> {
-    /// Whether the value changes with a parameter that does.
+    /// Whether the value depends on a parameter that varies from run to run.
     fn varies(&self, expr: ExprId) -> bool {
         !self.vary.is_empty() && depends(self.system, expr, &|var| self.vary.contains(&var.path))
     }
@@ -858,7 +856,7 @@ impl Reader<'_> {
         self.types.nodes[expr.0 as usize].unwrap_or(Dimension::NONE)
     }
 
-    /// A positive time known before the run.
+    /// A positive time that is known before the run, in s.
     fn time(&mut self, expr: ExprId, what: &str) -> f64 {
         let value = self.constant(expr);
         let seconds = Dimension::of([0, 0, 1, 0, 0]);
@@ -918,7 +916,7 @@ impl Reader<'_> {
         }
     }
 
-    /// How the crossed-out part of a rig is stepped between ticks: by a fixed method whose step divides the period.
+    /// Method and step of the plant between ticks. The step must divide the period.
     fn between_ticks(&mut self, parts: &Parts, given: &Given, period: f64, solver: Solver) -> Solver {
         let usual = Solver { method: Method::Expo, step: period / f64::from(rig::PLANT_STEPS), ..solver };
         if given.method.is_none() && parts.solver.is_none() {
@@ -951,7 +949,7 @@ impl Reader<'_> {
         solver
     }
 
-    /// Wants an expression; returns its number.
+    /// Requests an expression as an observed quantity; returns its index.
     fn want(&mut self, expr: ExprId, unit: Option<Unit>) -> usize {
         let text = one_line(self.loaded.files.slice(self.system.span(expr)));
         let unit = unit.or_else(|| Some(self.own_unit(expr)));
@@ -959,7 +957,7 @@ impl Reader<'_> {
         self.wanted.len() - 1
     }
 
-    /// The unit in which an expression is shown if nobody says: that of a plain quantity, else SI.
+    /// Default display unit of an expression: that of a plain quantity, otherwise SI.
     fn own_unit(&self, expr: ExprId) -> Unit {
         match self.system.node(expr) {
             Node::Var(id) => self.types.units[id.0 as usize].clone(),
@@ -976,7 +974,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The unit that is written for what is shown, if it suits.
+    /// The display unit stated for an expression, if its dimension matches.
     fn unit_for(&mut self, expr: ExprId, text: &ast::UnitText) -> Option<Unit> {
         match Unit::parse(&text.text) {
             Ok(unit) if unit.dimension == self.dimension(expr) || self.types.boolean[expr.0 as usize] => Some(unit),
@@ -996,14 +994,14 @@ impl Reader<'_> {
         }
     }
 
-    /// The unit of a side of a comparison: that of the measure that it is made of, else SI.
+    /// Display unit of a side of a comparison: that of its measure, otherwise SI.
     fn side_unit(&self, id: ExprId) -> Unit {
         let boolean = self.types.boolean[id.0 as usize];
         let otherwise = || if boolean { Unit::none() } else { Unit::si(self.dimension(id)) };
         self.unit_of_measures(id).unwrap_or_else(otherwise)
     }
 
-    /// The unit of a measure, of its multiples, and of sums of measures in one unit.
+    /// The unit of a measure, of its multiples, and of sums of measures with the same unit.
     fn unit_of_measures(&self, id: ExprId) -> Option<Unit> {
         let number =
             |id: &ExprId| matches!(self.system.node(*id), Node::Number { .. }) && self.dimension(*id).is_none();
@@ -1105,7 +1103,8 @@ impl Reader<'_> {
         Some(plan::Expect { text, measures, condition, after, before })
     }
 
-    /// `expect max(x) after 5 s < 1 m`: the window comes before the comparison. The expectation as it should be.
+    /// Suggestion for `expect max(x) after 5 s < 1 m`, where the window precedes the comparison: the corrected
+    /// expectation.
     fn window_first(&mut self, expect: &ast::Expect) -> Option<String> {
         let compares =
             |op| matches!(op, BinaryOp::Less | BinaryOp::LessEqual | BinaryOp::Greater | BinaryOp::GreaterEqual);
@@ -1116,14 +1115,15 @@ impl Reader<'_> {
             (None, None) => return None,
         };
         let ast::ExprKind::Binary(op, _, time, limit) = &edge.kind else { return None };
-        // That a time is compared with something else is the same mistake.
+        // The error about the comparison of a time is a consequence of the same mistake.
         let edge = edge.span;
         self.diagnostics.retain(|d| d.span().start < edge.start || d.span().end > edge.end);
         let [value, time, limit] = [expect.value.span, time.span, limit.span].map(|span| self.loaded.files.slice(span));
         Some(format!("the window comes after the comparison: `expect {value} {} {limit} {word} {time}`", op.text()))
     }
 
-    /// Arithmetic over measures. The slot of a measure is the number of what it measures among the wanted ones.
+    /// Translates arithmetic over measures. The slot of a measure is the index of the measured expression among those
+    /// requested.
     fn formula(&mut self, id: ExprId, measures: &mut Vec<plan::Measure>) -> Option<Formula> {
         let node = self.system.node(id).clone();
         if !self.measured(id) {
@@ -1134,14 +1134,14 @@ impl Reader<'_> {
                     let (a, b) = (self.formula(a, measures)?, self.formula(b, measures)?);
                     return Some(compare(op, a, b));
                 }
-                // A condition without a measure is its value at the end.
+                // A condition without a measure means its value at the end.
                 return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
             }
             if let Some(value) = self.system.literal(id) {
                 return Some(Formula::Number(value));
             }
             if self.varies(id) {
-                // It is constant in a run, but not the same in each.
+                // Constant within a run, but not the same in all runs.
                 return Some(self.measure(id, id, MeasureKind::Final, plan::Window::default(), measures));
             }
             let value = self.constant(id);
@@ -1286,7 +1286,7 @@ impl Reader<'_> {
         let text = one_line(self.loaded.files.slice(self.system.span(whole)));
         let unit = match self.system.node(whole) {
             Node::Measure(name, ..) => self.measure_unit(*name, whole, value),
-            // A condition that is measured at the end.
+            // A condition, measured at the end.
             _ => self.own_unit(value),
         };
         let at = self.want(value, None);
@@ -1294,7 +1294,7 @@ impl Reader<'_> {
         Formula::Measure(measures.len() - 1)
     }
 
-    /// An instant that only the run shows, for `at(x, …)`.
+    /// An instant that is known only during the run, for `at(x, …)`.
     fn moment(&mut self, id: ExprId) -> Option<plan::Moment> {
         let node = self.system.node(id).clone();
         let inner = match node {
@@ -1334,7 +1334,7 @@ impl Reader<'_> {
         }
     }
 
-    /// Which peak is meant.
+    /// The index of a peak.
     fn number_of_peak(&mut self, id: ExprId) -> Option<f64> {
         let number = self.constant(id);
         if is_number_of_peak(number) {
@@ -1356,14 +1356,14 @@ impl Reader<'_> {
         None
     }
 
-    /// A comparison, to be shown in the unit of a quantity written on one of its sides, else in that of a measure that is a
-    /// whole side, else in SI.
+    /// A comparison with its display unit: that of a quantity written on one side, else that of a measure that forms a
+    /// whole side, else SI.
     fn shown_in(&self, left: ExprId, right: ExprId, comparison: Formula) -> Formula {
         let dimension = self.dimension(left);
         let written = |id: ExprId| {
             let text = self.loaded.files.slice(self.system.span(id));
             let unit = text.trim_start_matches(|c: char| c.is_ascii_digit() || "+-. ".contains(c));
-            // `5e-4 m`: what the exponent leaves is no unit, and the unit stands after the last blank.
+            // `5e-4 m`: the rest of the exponent is not a unit; the unit follows the last blank.
             let unit = if unit.starts_with(['e', 'E']) { unit.rsplit(' ').next().unwrap_or(unit) } else { unit };
             let number = matches!(self.system.node(id), Node::Number { .. } | Node::Negate(_));
             Unit::parse(unit.trim()).ok().filter(|unit| number && !unit.text.is_empty() && unit.dimension == dimension)
@@ -1375,10 +1375,10 @@ impl Reader<'_> {
         Formula::In(unit, Box::new(comparison))
     }
 
-    /// The unit in which a measure is shown.
+    /// The display unit of a measure.
     fn measure_unit(&self, name: MeasureName, whole: ExprId, value: ExprId) -> Unit {
         match name {
-            // An energy and no torque, which has the same dimension.
+            // An integral of power is an energy; a torque has the same dimension.
             MeasureName::Integral if Unit::si(self.dimension(value)).text == "W" => {
                 Unit::parse("J").expect("the joule is known")
             }
@@ -1412,12 +1412,12 @@ impl Reader<'_> {
     }
 }
 
-/// Whether a peak can have this number.
+/// Whether the number is a valid index of a peak: 1, 2, 3, …
 pub fn is_number_of_peak(number: f64) -> bool {
     number >= 1.0 && number.fract() == 0.0 && number < 1e9
 }
 
-/// Whether an expression depends on a quantity for which `of` is true.
+/// Whether an expression depends on a quantity that satisfies `of`.
 pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool {
     let mut seen = std::collections::HashSet::new();
     let mut stack = vec![expr];
@@ -1442,7 +1442,7 @@ pub fn depends(system: &System, expr: ExprId, of: &dyn Fn(&Var) -> bool) -> bool
     false
 }
 
-/// The elementary function of one number that a built-in one is, with its name.
+/// The elementary function of one argument that implements a built-in function, with its name.
 fn elementary(builtin: Builtin) -> Option<(&'static str, Unary)> {
     Some(match builtin {
         Builtin::Exp => ("exp", Unary::Exp),

@@ -1,17 +1,17 @@
-//! Start values of states that change from run to run without compiling again.
+//! Start values of states that vary from run to run without recompilation.
 //!
-//! In: a flat system and the paths that will change. Out: for each of them that is a state a parameter, from which the
-//! state starts: code and lanes then know of nothing but parameters.
+//! In: a flat system and the paths that vary. Out: for each state among them a parameter that holds its start value.
+//! Generated code and lanes then need to handle parameters only.
 
 use crate::frontend::system::*;
 use abi::unit::Angle;
 
-/// The path of the parameter from which a state starts. No declared parameter has such a name.
+/// The path of the parameter for a state's start value. No declared parameter can have such a name.
 pub fn path(state: &str) -> String {
     format!("{state}(0)")
 }
 
-/// Gives each state among `paths` a parameter for its start value, whose default is the start value as written.
+/// Adds a parameter for the start value of each state among `paths`. Its default is the start value as written.
 pub fn open(system: &mut System, paths: &[String]) {
     for state in system.var_ids() {
         let var = system.var(state);
@@ -27,7 +27,7 @@ pub fn open(system: &mut System, paths: &[String]) {
         let mut start = system.var(state).clone();
         (start.path, start.kind) = (path(&start.path), VarKind::Param);
         (start.range, start.range_span) = (VarRange::default(), None);
-        // A parameter follows from others at most; each run gives this one anyway.
+        // A parameter may depend only on other parameters. Other start values default to 0, since each run sets them.
         let value = match crate::analysis::parameter_checks::moving(system, initial) {
             None => initial,
             Some(_) => system.push(Node::Number { value: 0.0, dimension: None, angle: Angle::Silent }, place),
@@ -42,7 +42,7 @@ pub fn open(system: &mut System, paths: &[String]) {
     }
 }
 
-/// The paths of the parameters that change: of a state that of its start value.
+/// The paths of the varying parameters; for a state, that of its start value.
 pub fn params(system: &System, paths: &[String]) -> Vec<String> {
     let is_state = |path: &&String| system.vars.iter().any(|var| var.kind == VarKind::State && var.path == **path);
     paths.iter().map(|one| if is_state(&one) { path(one) } else { one.clone() }).collect()

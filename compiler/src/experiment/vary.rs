@@ -1,8 +1,8 @@
-//! Runs of one compiled experiment under other parameters.
+//! Runs of one compiled experiment with varying parameters.
 //!
-//! In: an experiment that was read with the paths of the parameters that will change. Out: for given values an instance
-//! and a plan, or what the values break. What of a plan follows from parameters is computed anew: duration, windows,
-//! corners, declared ranges and whatever `require` demands. Only code is made once.
+//! In: an experiment that was read with the paths of the varying parameters. Out: for given values an instance and a
+//! plan, or the condition that the values violate. Everything in a plan that depends on parameters is recomputed:
+//! duration, windows, corners, declared ranges and `require` conditions. Only code is compiled once.
 
 use crate::experiment::start_values;
 use crate::experiment::{Place, Variant, depends, is_number_of_peak};
@@ -22,15 +22,15 @@ use abi::{Description, Instance, Slot};
 use grammar::diagnostic::Diagnostic;
 use std::sync::Arc;
 
-/// A compiled experiment with parameters that change from run to run.
+/// A compiled experiment with parameters that vary from run to run.
 pub struct Varying {
-    /// What sets this combination of the experiment's own sweeps apart.
+    /// Label of this combination of the experiment's own sweeps.
     pub label: String,
-    /// The plan with the parameters as written.
+    /// The plan for the parameters as written.
     pub experiment: Experiment,
-    /// What the experiment shows.
+    /// The plots of the experiment.
     pub plots: Vec<Plot>,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
     description: Arc<Description>,
     params: Vec<f64>,
@@ -39,55 +39,55 @@ pub struct Varying {
     adaptive: Option<Arc<Instance>>,
     formulas: Func,
     size: usize,
-    /// What the values of the formulas are for, in their order.
+    /// Uses of the values of the formulas, in order.
     uses: Vec<Use>,
-    /// Expectations of the experiment; those behind them watch ranges.
+    /// Number of the experiment's expectations; those after them watch ranges.
     expects: usize,
 }
 
-/// What a value is for.
+/// Use of a computed value.
 enum Use {
     Plan(Place),
     Corner,
-    /// A bound of a quantity: its number in the description; upper or not.
+    /// A bound of a quantity: its index in the description, and whether it is the upper one.
     Bound(usize, bool),
-    /// A parameter with its bounds, which are the next values: path, unit, lower and upper, strict or not.
+    /// A parameter, whose bounds are the next values: path, unit, and for each bound whether it is strict.
     Range {
         path: String,
         unit: Unit,
         low: Option<bool>,
         high: Option<bool>,
     },
-    /// What a range consists of.
+    /// A bound of the preceding range.
     Limit,
-    /// What must not be 0, and what to say if it is.
+    /// A condition that must not be 0, and the message if it is.
     Require(String),
     /// A period in s.
     Period,
 }
 
-/// What was compiled of an experiment.
+/// Compiled code of an experiment.
 pub struct Runnable {
-    /// Its code.
+    /// Code for single runs.
     pub code: Code,
-    /// The same for many runs at once, if there is such.
+    /// Code for many runs at once in lanes, if available.
     pub lanes: Option<Lanes>,
-    /// Of fixed steps the same program for adaptive runs, if there is such.
+    /// The program for adaptive runs of an experiment with fixed steps, if available.
     pub adaptive: Option<Arc<Instance>>,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// What a run needs.
+/// Instance and plan for a run.
 pub struct Fitted {
-    /// With its parameters.
+    /// The instance with its parameters.
     pub instance: Instance,
-    /// Its plan.
+    /// The plan of the run.
     pub experiment: Experiment,
 }
 
 impl Varying {
-    /// From what was read, and its code.
+    /// From an experiment as read, and its code.
     pub fn new(variant: Variant, vary: &[String], files: &Files, runnable: Runnable) -> Varying {
         let Runnable { code, lanes, adaptive, notes } = runnable;
         let Variant { label, system, types, program, mut experiment, places, .. } = variant;
@@ -148,7 +148,7 @@ impl Varying {
         let expects = experiment.expects.len();
         let plots = std::mem::take(&mut experiment.plots);
         if experiment.solver.method != Method::Adaptive {
-            // The code of a fixed step holds ranges as they are written: `in_code` took out those that change.
+            // The code of a fixed step contains constant ranges; `in_code` has removed those that vary.
             let guarded = uses.iter().filter_map(|one| match one {
                 Use::Bound(k, _) => Some(&program.description.quantities[*k]),
                 _ => None,
@@ -174,28 +174,26 @@ impl Varying {
         }
     }
 
-    /// The code that makes steps of many runs at once, if there is such.
+    /// The code that steps many runs at once, if available.
     pub fn lanes(&self) -> Option<&Lanes> {
         self.lanes.as_ref()
     }
 
-    /// The parameter of this path, or that from which the state of this path starts, if a run can be given another value
-    /// for it.
+    /// The parameter of this path, or the one for the start value of the state of this path, if a run can set it.
     pub fn param(&self, path: &str) -> Option<&Quantity> {
         let start = self.description.quantity(&start_values::path(path));
         let found = start.or_else(|| self.description.quantity(path))?;
         (found.kind == Kind::Param && self.description.layout.params.contains(found.slot)).then_some(found)
     }
 
-    /// Number of expectations of the experiment; verdicts behind these are of ranges, see [`Varying::left`].
+    /// Number of the experiment's expectations. Later verdicts concern ranges; see [`Varying::left`].
     pub fn expects(&self) -> usize {
         self.expects
     }
 
-    /// An instance and a plan with these values in SI.
+    /// An instance and a plan for these values in SI units.
     ///
-    /// # Errors
-    /// What the values break, in words.
+    /// # Errors The violated condition, in words.
     pub fn fit(&self, values: &[(Slot, f64)]) -> Result<Fitted, String> {
         let mut instance = Instance::new(self.description.clone(), self.code.clone(), &self.params);
         if let Some(adaptive) = &self.adaptive {
@@ -237,7 +235,8 @@ impl Varying {
                     }
                 }
                 Use::Range { path, unit, low, high } => {
-                    // The formula of a parameter that has no other quantity in its value is the number as written.
+                    // The formula of an independent parameter is its number as written, so its value comes from the
+                    // slot.
                     let number = self.param(path).map_or(number, |param| instance.get(param.slot));
                     let shown = |x: f64| {
                         let shown = format!("{}", unit.from_si(x));
@@ -268,7 +267,7 @@ impl Varying {
             }
         }
         if experiment.duration != duration {
-            // What was open at the end stays open; no window goes beyond the run.
+            // Windows that extended to the end still do; no window exceeds the run.
             for expect in &mut experiment.expects {
                 let open = expect.before == duration;
                 expect.before = if open { experiment.duration } else { expect.before.min(experiment.duration) };
@@ -282,14 +281,14 @@ impl Varying {
         }
         if let Some(description) = description {
             let block = instance.block()[self.description.layout.params.range()].to_vec();
-            // The adaptive program would watch other ranges.
+            // The adaptive program would check other ranges, so it is dropped.
             instance = Instance::new(Arc::new(description), self.code.clone(), &block);
         }
         Ok(Fitted { instance, experiment })
     }
 
-    /// Of a run with fixed steps: the range that was left, from the readings of the expectations behind those of the
-    /// experiment, in words.
+    /// For a run with fixed steps: the violated range in words, from the readings of the expectations after those of
+    /// the experiment.
     pub fn left(&self, fitted: &Arc<Description>, readings: &[(f64, f64)]) -> Option<String> {
         let watched = &self.experiment.expects[self.expects..];
         watched.iter().zip(readings).find_map(|(expect, (least, most))| {
@@ -306,7 +305,7 @@ impl Varying {
     }
 }
 
-/// Why a parameter cannot change from run to run of one program: it decides what is compiled.
+/// An error if a parameter cannot vary between runs of one program, because it determines what is compiled.
 pub fn built_in(variant: &Variant, vary: &[String]) -> Option<Diagnostic> {
     let system = &variant.system;
     let varied = |expr: ExprId| vary.iter().find(|path| depends(system, expr, &|var| var.path == **path));
@@ -330,7 +329,7 @@ pub fn built_in(variant: &Variant, vary: &[String]) -> Option<Diagnostic> {
     )))
 }
 
-/// The guards as the code of a fixed step may know them: those whose range changes watch only that numbers are finite.
+/// The guards in the code of a fixed step. Those with varying ranges only check that values are finite.
 pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
     let system = &variant.system;
     let varies = |bound: Option<(ExprId, bool)>| {
@@ -345,7 +344,7 @@ pub fn in_code(variant: &Variant, vary: &[String]) -> Vec<Guard> {
     variant.program.description.guards.iter().map(known).collect()
 }
 
-/// An expectation that only reads the least and the greatest value.
+/// An expectation without a condition, which only reads the least and the greatest value.
 fn extremes(quantity: &Quantity, duration: f64) -> Expect {
     let measure = |kind| Measure {
         text: quantity.path.clone(),

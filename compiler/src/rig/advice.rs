@@ -1,8 +1,8 @@
-//! What deserves a look before a rig moves: contacts too stiff for the delay of the loop, and steps of encoder, speed and
+//! Warnings before a rig moves: contacts too stiff for the delay of the loop, and resolutions of encoder, speed and
 //! torque too coarse for the model.
 //!
-//! In: both programs and the plan. Out: warnings, and the inertia that the plan tells. The law of the delay is the one for
-//! the hand (docs/prediction.md); `fric predict` computes it from the compiled step.
+//! In: both programs and the plan. Out: warnings, and the inertia for the plan. Uses the approximate delay limit of
+//! docs/prediction.md; `fric predict` computes the limit from the compiled step.
 
 use super::Places;
 use crate::analysis::linearise::{Linear, Matrices, PortSlots};
@@ -18,18 +18,18 @@ use abi::{Instance, Slot};
 use grammar::diagnostic::Diagnostic;
 use std::sync::Arc;
 
-/// Fewest counts in the range of a state.
+/// Least number of encoder counts within the range of a state.
 const COUNTS: f64 = 20.0;
-/// Greatest share of the smallest speed that one step of the speed may be.
+/// Greatest resolution of the speed as a share of the smallest speed.
 const SPEED_SHARE: f64 = 0.2;
-/// Greatest share of the smallest force that one step of the torque may be.
+/// Greatest resolution of the torque as a share of the smallest force.
 const TORQUE_SHARE: f64 = 0.02;
 
 const SPEED: Dimension = Dimension::of([0, 0, -1, 0, 0]);
 const TORQUE: Dimension = Dimension::of([1, 2, -2, 0, 0]);
 
-/// The derivatives of a program at its start, between slots, and its number of states. None where a slot is not what is
-/// asked for.
+/// The linearisation of a program at its start, between slots, and its number of states. `None` if a slot is not an
+/// input or output of the expected kind.
 pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(Matrices, usize)> {
     let description = Arc::new(program.description.clone());
     let functions = crate::codegen::tiering::functions(program, Method::Adaptive);
@@ -44,8 +44,8 @@ pub fn linear(program: &Program, inputs: &[Slot], outputs: &[Slot]) -> Option<(M
     fits.then(|| (linear.at(), states))
 }
 
-/// The moment of inertia that a torque moves, kg·m²: from the derivatives of the plant at its start. None where no torque
-/// is applied, or it does not turn what is seen at once.
+/// The moment of inertia that a torque accelerates, in kg·m², from the linearisation of the plant at its start. `None`
+/// if no torque is applied, or if it does not directly accelerate the measured speed.
 pub fn inertia(rig: &Rig, plant: &Program) -> Option<f64> {
     let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| signal.what == What::Torque)?;
     let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
@@ -63,7 +63,8 @@ pub fn check(rig: &Rig, control: &Program, plant: &Program, places: &Places) -> 
     found
 }
 
-/// Drives of frames described by hand or by a file: nothing in those says that they stop when the computer dies.
+/// Warns about drives with frames described by hand or by a DBC file: such descriptions cannot show that the drive
+/// stops when the computer fails.
 fn unproven(rig: &Rig, places: &Places, found: &mut Vec<Diagnostic>) {
     for (k, node) in rig.nodes.iter().enumerate() {
         if node.moves && matches!(node.kind, Kind::Frames(_)) {
@@ -77,13 +78,13 @@ fn unproven(rig: &Rig, places: &Places, found: &mut Vec<Diagnostic>) {
     }
 }
 
-/// How a command answers a signal near rest: stiffness K in N·m/rad and damping B in N·m·s/rad, both resisting.
+/// Response of a command to a signal near rest: stiffness K in N·m/rad and damping B in N·m·s/rad, both resisting.
 struct Contact {
     stiffness: f64,
     damping: f64,
 }
 
-/// A contact that a program computes from the measured speed and a drive renders with a delay τ.
+/// A contact that a program computes from the measured speed and a drive applies with a delay τ.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Emulated {
     /// Natural frequency √(K/J), rad/s.
@@ -97,11 +98,11 @@ pub struct Emulated {
 }
 
 impl Emulated {
-    /// The total delay τ = T/2 + dead time + lag, s, from which on the contact is unstable.
+    /// The total delay τ = T/2 + dead time + lag, in s, above which the contact is unstable.
     ///
-    /// The program sums the speed over the coming period before it gives the force, so its spring is half a period ahead
-    /// of its damper. Source: the crossing of the imaginary axis of J s² (1 + s l) + (B s + K e^{s T/2}) e^{−s (τ − l)} for a
-    /// lag l; within 4 % of the limit of the sampled loop (`runtime::coupling::loop_stability`).
+    /// The program integrates the speed over the coming period before it outputs the force, so its spring leads its
+    /// damper by half a period. Source: the crossing of the imaginary axis of J s² (1 + s l) + (B s + K e^{s T/2})
+    /// e^{−s (τ − l)} for a lag l; within 4 % of the limit of the sampled loop (`runtime::coupling::loop_stability`).
     #[allow(
         clippy::disallowed_methods,
         reason = "a warning's limit: shown with three digits, decides nothing that runs"
@@ -109,9 +110,9 @@ impl Emulated {
     pub fn limit(self) -> f64 {
         let (zeta, lead, lag) =
             (self.damping_ratio.max(0.0), 0.5 * self.period * self.natural, self.lag * self.natural);
-        // The lead is held at a quarter turn: beyond it the period does not resolve the spring at all.
+        // The lead is limited to a quarter turn: beyond it the period does not resolve the spring at all.
         let turn = |w: f64| (w * lead).min(std::f64::consts::FRAC_PI_2);
-        // w in units of the natural frequency; |w² (1 + jwl)| = |2 ζ j w + e^{jw lead}|.
+        // Solves |w² (1 + jwl)| = |2 ζ j w + e^{jw lead}| by bisection, with w in units of the natural frequency.
         let (mut low, mut high) = (0.0, 2.0 + 2.0 * zeta);
         for _ in 0..60 {
             let w = 0.5 * (low + high);
@@ -122,7 +123,7 @@ impl Emulated {
         (phase - (low * lag).atan()) / (low * self.natural) + self.lag
     }
 
-    /// The greatest natural frequency that a delay allows, rad/s, and the damping ratio that it takes.
+    /// The greatest natural frequency that a delay permits, in rad/s, and the damping ratio at which it occurs.
     pub fn stiffest(period: f64, lag: f64, tau: f64) -> (f64, f64) {
         let stable = |natural: f64, damping_ratio: f64| Emulated { natural, damping_ratio, period, lag }.limit() > tau;
         let ratios = (5..=150).map(|k| f64::from(k) * 0.01);
@@ -180,21 +181,21 @@ fn emulation(rig: &Rig, control: &Program, plant: &Program, places: &Places, fou
     }
 }
 
-/// The answer of one command to speed and position at rest, as resistance of the shaft.
+/// The response of one command to speed and position at rest, as resistance of the shaft.
 fn contact(rig: &Rig, control: &Program, plant: &Program, command: Signal, slot: Slot, tau: f64) -> Option<Contact> {
-    // A contact answers the speed: what it keeps of it is a spring. What answers the position is a controller.
+    // A contact responds to the speed; its integral acts as a spring. A response to the position is a controller.
     let speeds: Vec<Slot> =
         rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
     let (m, n) = linear(control, &speeds, &[slot])?;
     let width = speeds.len();
     let (mut stiffness, mut damping) = (0.0, 0.0);
     for j in 0..width {
-        // What forgets the speed within the delay is no spring.
+        // A state that decays within the delay does not act as a spring.
         let held = |i: usize| m.a[i * n + i] > -0.1 / tau;
         stiffness -= (0..n).filter(|i| held(*i)).map(|i| m.c[i] * m.b[i * width + j]).sum::<f64>();
         damping -= m.d[j];
     }
-    // The sign with which this drive turns what is seen.
+    // The sign with which this drive turns the measured shaft.
     let (_, torque) = rig.plant.applied.iter().find(|(signal, _)| *signal == command)?;
     let (_, speed) = rig.plant.seen.iter().find(|(signal, _)| signal.what == What::Speed)?;
     let (p, states) = linear(plant, &[*torque], &[*speed])?;

@@ -1,7 +1,7 @@
-//! DBC files: messages and signals by name. The only place that knows the crate that reads them.
+//! DBC files: messages and signals by name. The only module that uses the `can_dbc` crate.
 //!
-//! In: a text. Out: its [`Message`]s, with the place of every name in that text. A signal's start bit is as the file counts
-//! it; its unit is what people write in such files, turned into ours where we know it.
+//! In: a text. Out: its [`Message`]s, with the span of every name. Start bits are counted as in the file. Units are
+//! converted from the notations common in such files, if they are known.
 
 use abi::rig::Format;
 use abi::unit::Unit;
@@ -13,19 +13,19 @@ use grammar::span::{FileId, Span};
 pub struct Message {
     /// Its name.
     pub name: String,
-    /// Where the name stands in the file.
+    /// Span of the name in the file.
     pub span: Span,
-    /// The identifier.
+    /// CAN identifier.
     pub id: u32,
-    /// 29-bit rather than 11-bit.
+    /// Whether the identifier has 29 bits rather than 11.
     pub extended: bool,
     /// Number of data bytes.
     pub length: u64,
-    /// `GenMsgCycleTime`, ns; 0 where the file names none.
+    /// `GenMsgCycleTime` in ns; 0 if the file has none.
     pub period_ns: u64,
-    /// What it carries.
+    /// Signals of the message.
     pub signals: Vec<Signal>,
-    /// Why we cannot tell which signals are in a frame, if we cannot: the signal, and words.
+    /// If the signals present in a frame cannot be determined: the index of the signal, and the reason.
     pub unclear: Option<(usize, String)>,
 }
 
@@ -34,37 +34,36 @@ pub struct Message {
 pub struct Signal {
     /// Its name.
     pub name: String,
-    /// Where the name stands in the file.
+    /// Span of the name in the file.
     pub span: Span,
-    /// As the file counts.
+    /// Start bit as counted in the file.
     pub start_bit: u64,
     /// Number of bits.
     pub bits: u64,
-    /// Most significant byte first.
+    /// Whether the most significant byte comes first.
     pub big_endian: bool,
-    /// How the bits are read.
+    /// Interpretation of the bits.
     pub format: Format,
-    /// Of the number in the file's unit: raw · factor + offset.
+    /// Factor of the value in the file's unit: raw · factor + offset.
     pub factor: f64,
     /// See `factor`.
     pub offset: f64,
-    /// The unit as the file writes it.
+    /// The unit as written in the file.
     pub unit_text: String,
-    /// The unit, if we know it.
+    /// The unit, if it is known.
     pub unit: Option<Unit>,
-    /// What is added to a number in `unit`: 273.15 for degrees Celsius, shown in K.
+    /// Added to a number in `unit`: 273.15 for degrees Celsius, which are displayed in K.
     pub unit_offset: f64,
-    /// Present only while the signal of this number, a switch, has this raw value.
+    /// For a multiplexed signal: the index of its switch, and the raw value of the switch at which it is present.
     pub present_at: Option<(usize, u64)>,
 }
 
-/// Reads a file whose text has this number.
+/// Reads the DBC file with this id.
 ///
-/// # Errors
-/// What is wrong, and where.
+/// # Errors The error and its span.
 pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
     let dbc = Dbc::try_from(text).map_err(|error| {
-        // The first line of the parser's words says what it wanted; the place is in `--> LINE:COLUMN`.
+        // The first line of the parser's message says what it expected; the position follows as `--> LINE:COLUMN`.
         let words = error.to_string();
         let place = words.split("--> ").nth(1).and_then(|rest| {
             let (line, rest) = rest.split_once(':')?;
@@ -142,10 +141,9 @@ pub fn read(file: FileId, text: &str) -> Result<Vec<Message>, (String, Span)> {
     Ok(messages)
 }
 
-/// Which signals of a message are present only while which other has which raw value.
+/// For each multiplexed signal, its switch and the raw value of the switch at which it is present.
 ///
-/// # Errors
-/// The signal of which the file does not say that, or more than we can do, and why.
+/// # Errors The signal whose switch is undetermined or unsupported, and the reason.
 #[allow(clippy::type_complexity, reason = "a signal, its switch and the value of that")]
 fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize, u64))>, (usize, String)> {
     let signals = &message.signals;
@@ -162,7 +160,7 @@ fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize,
             | MultiplexIndicator::MultiplexorAndMultiplexedSignal(value) => value,
         };
         let name = &signal.name;
-        // Where there are several switches, a line of its own names the one.
+        // With several switches, a separate line of the file names the switch.
         let extended = dbc.extended_multiplex.iter().find(|e| e.message_id == message.id && e.signal_name == *name);
         let (switch, value) = match extended {
             Some(extended) => {
@@ -184,7 +182,7 @@ fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize,
         };
         out.push((k, (switch, value)));
     }
-    // A switch may hang on another one, but none on itself.
+    // Switches may depend on each other, but not in a cycle.
     for &(k, _) in &out {
         let above = |at: usize| out.iter().find(|(signal, _)| *signal == at).map(|(_, (switch, _))| *switch);
         if std::iter::successors(Some(k), |at| above(*at)).take(signals.len() + 1).count() > signals.len() {
@@ -194,7 +192,7 @@ fn switched(dbc: &Dbc, message: &can_dbc::Message) -> Result<Vec<(usize, (usize,
     Ok(out)
 }
 
-/// What people write for units in such files: the unit, and what is added to a number in it.
+/// The unit for a common notation, and the offset to add to a number in it.
 fn known_unit(text: &str) -> (Option<Unit>, f64) {
     let text = text.trim();
     let ours = match text {
@@ -216,7 +214,7 @@ fn known_unit(text: &str) -> (Option<Unit>, f64) {
     (Unit::parse(ours).ok(), 0.0)
 }
 
-/// Where `BO_ id name` begins, and where the name stands.
+/// The offset of `BO_ id name`, and the span of the name.
 fn place_of_message(file: FileId, text: &str, raw: u32, name: &str) -> Option<(usize, Span)> {
     let mut start = 0;
     for line in text.split_inclusive('\n') {
@@ -230,7 +228,7 @@ fn place_of_message(file: FileId, text: &str, raw: u32, name: &str) -> Option<(u
     None
 }
 
-/// Where the name of a signal stands behind the begin of its message.
+/// The span of a signal's name after the start of its message.
 fn place_of_signal(file: FileId, text: &str, block: usize, name: &str) -> Span {
     let mut start = block;
     for line in text[block..].split_inclusive('\n') {

@@ -1,7 +1,9 @@
-//! What travels on the buses: messages of devices, identifiers, and how full a bus is.
+//! Frames on the buses: messages of devices, identifiers, and bus load.
 //!
-//! Source of the bits of a frame: ISO 11898-1; the worst case with stuffing is 55 + 10 n for n data bytes, with a 29-bit
-//! identifier 25 more.
+//! In: descriptions of nodes. Out: messages with their fields, and diagnostics. Knows nothing of timing within a cycle.
+//!
+//! Source of the bits of a frame: ISO 11898-1. The worst case with bit stuffing is 55 + 10 n for n data bytes, and 25
+//! more with a 29-bit identifier.
 
 use super::dbc;
 use super::nodes::{Description, Read, Speaks, format_of};
@@ -10,16 +12,16 @@ use abi::unit::Unit;
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 
-/// How often a drive says that it lives, s.
+/// Heartbeat period of a drive, s.
 const DRIVE_HEARTBEAT: f64 = 20e-3;
-/// How often a frame goes out that nothing makes change, s.
+/// Repetition period of a frame whose content does not change, s.
 const REPEATED: f64 = 100e-3;
-/// Share of a bus above which frames come late in bursts: a warning.
+/// Share of a bus above which frames arrive late in bursts: a warning.
 const BUSY: f64 = 0.80;
-/// Share of a bus that cannot be had.
+/// Share of a bus that cannot be reached.
 const FULL: f64 = 0.95;
 
-/// Messages of a node, and where each of its signals lies.
+/// Messages of a node, and the location of each of its signals.
 #[derive(Default)]
 pub struct Laid {
     /// Its messages.
@@ -28,7 +30,7 @@ pub struct Laid {
     pub fields: Vec<(usize, usize)>,
 }
 
-/// Lays out the messages of a device described by hand. `value`: of a hidden param by its name.
+/// Lays out the messages of a device described by hand. `value`: the value of a hidden parameter by name.
 pub fn by_hand(description: &Description, value: &dyn Fn(&str) -> f64, diagnostics: &mut Vec<Diagnostic>) -> Laid {
     let Speaks::Frames(signals) = &description.speaks else { return Laid::default() };
     let mut laid = Laid::default();
@@ -97,7 +99,7 @@ pub fn by_hand(description: &Description, value: &dyn Fn(&str) -> f64, diagnosti
     laid
 }
 
-/// Lays out the messages of a DBC file; those with a commanded signal are sent.
+/// Lays out the messages of a DBC file. Messages with a commanded signal are sent.
 pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnostics: &mut Vec<Diagnostic>) -> Laid {
     let mut laid = Laid::default();
     for (m, message) in messages.iter().enumerate() {
@@ -150,10 +152,9 @@ pub fn by_dbc(messages: &[dbc::Message], sent: &dyn Fn(usize) -> bool, diagnosti
     laid
 }
 
-/// The messages of a DBC file that can be read, for whoever wants to read frames by them.
+/// The messages of a DBC file that can be read, for callers that decode frames.
 ///
-/// # Errors
-/// What is wrong with the file, in words.
+/// # Errors The error in the file, in words.
 pub fn of_dbc(text: &str) -> Result<Vec<Message>, String> {
     let mut messages = dbc::read(FileId(0), text).map_err(|(why, span)| {
         let line = text[..span.start as usize].lines().count().max(1);
@@ -168,8 +169,8 @@ pub fn of_dbc(text: &str) -> Result<Vec<Message>, String> {
     }
 }
 
-/// Whether all bits of a signal lie in the frame. A big-endian signal starts at its most significant bit and goes down
-/// within a byte, then on to the top of the next.
+/// Whether all bits of a signal lie within the frame. A big-endian signal starts at its most significant bit, continues
+/// downwards within a byte, and then at the top of the next byte.
 fn inside(signal: &dbc::Signal, length: u64) -> bool {
     let (byte, bit) = (signal.start_bit / 8, signal.start_bit % 8);
     let last = match signal.big_endian {
@@ -179,7 +180,7 @@ fn inside(signal: &dbc::Signal, length: u64) -> bool {
     signal.bits >= 1 && signal.bits <= 64 && last <= length * 8
 }
 
-/// Where a signal lies.
+/// The location of a signal.
 pub fn what(read: Read, laid: &Laid) -> What {
     match read {
         Read::What(what) => what,
@@ -188,7 +189,7 @@ pub fn what(read: Read, laid: &Laid) -> What {
     }
 }
 
-/// Least and greatest SI value that a field can carry.
+/// Least and greatest SI value that a field can represent.
 pub fn carries(field: &Field) -> (f64, f64) {
     let top = |bits: u16| (1u128 << bits) as f64;
     let (low, high) = match field.format {
@@ -201,7 +202,7 @@ pub fn carries(field: &Field) -> (f64, f64) {
     (a.min(b), a.max(b))
 }
 
-/// A node as its bus sees it.
+/// A node from the view of its bus.
 pub struct OnBus<'a> {
     /// Its description.
     pub description: &'a Description,
@@ -213,7 +214,7 @@ pub struct OnBus<'a> {
     pub messages: &'a [Message],
 }
 
-/// Reports identifiers that two claim on one bus.
+/// Reports identifiers that two nodes of one bus use.
 pub fn identifiers(nodes: &[OnBus], diagnostics: &mut Vec<Diagnostic>) {
     let mut taken: Vec<(usize, u32, bool, &Description, String)> = Vec::new();
     for node in nodes {
@@ -274,7 +275,7 @@ pub fn identifiers(nodes: &[OnBus], diagnostics: &mut Vec<Diagnostic>) {
     }
 }
 
-/// Bits per second on a bus in the worst case.
+/// Worst-case load of a bus in bits per second.
 pub fn load(rig: &Rig, bus: usize) -> f64 {
     let bits = |bytes: u8, extended: bool| 55.0 + 10.0 * f64::from(bytes) + if extended { 25.0 } else { 0.0 };
     let (period, watchdog) = (rig.period_ns as f64 * 1e-9, rig.watchdog_ns as f64 * 1e-9);
@@ -284,7 +285,7 @@ pub fn load(rig: &Rig, bus: usize) -> f64 {
         let messages = match &node.kind {
             Kind::Cia402(_) => {
                 canopen = true;
-                // Target and control word out; status, torque and speed in; position in.
+                // Output: target and control word. Input: status, torque and speed in one frame, position in another.
                 sum += (bits(4, false) + bits(8, false) + bits(4, false)) / period + bits(1, false) / DRIVE_HEARTBEAT;
                 continue;
             }
@@ -311,7 +312,7 @@ pub fn load(rig: &Rig, bus: usize) -> f64 {
     sum
 }
 
-/// Says so where a bus is too full.
+/// Reports a bus whose load is too high.
 pub fn crowded(name: &str, span: Span, load: f64, rate: f64, diagnostics: &mut Vec<Diagnostic>) {
     let share = load / rate;
     if rate <= 0.0 || share <= BUSY {

@@ -1,9 +1,10 @@
-//! Which parameters of a rig may change while it runs, and the conditions that they must meet then: those of a start.
+//! Live parameters of a rig: those that may change while it runs, and the conditions on them, which are those of a
+//! start.
 //!
-//! In: the system before its part is crossed out, the expressions from which the plan follows, and later both programs.
-//! Out: [`Live`] and the judge, a program that computes the numbers of all conditions from parameters. A parameter may
-//! change if the step reads it and nothing else does that only a start fixes: then a set gives exactly the program that
-//! a start with the same values would.
+//! In: the system before its partition, the expressions that determine the plan, and later both programs. Out: [`Live`]
+//! and the judge, a program that computes the numbers of all conditions from parameters. A parameter may change if the
+//! step reads it, and if nothing that is fixed at the start depends on it. Setting it then yields exactly the program
+//! that a start with the same values would yield.
 
 use crate::analysis::parameter_checks::unmet;
 use crate::frontend::delays;
@@ -17,13 +18,13 @@ use abi::description::Kind as QuantityKind;
 use abi::live::{Check, Live, Param, Place};
 use abi::unit::Unit;
 
-/// What is known before the programs are.
+/// Result of the analysis before the programs exist.
 #[derive(Clone)]
 pub struct Judged {
     params: Vec<Known>,
     checks: Vec<Check>,
     program: Program,
-    /// The crossed-out part.
+    /// Path of the part that hardware replaces.
     part: String,
 }
 
@@ -34,37 +35,37 @@ struct Known {
     boolean: bool,
     /// Its slot in the judge.
     slot: Option<Slot>,
-    /// Why only a start reads it.
+    /// The reason why only a start reads it.
     start: Option<String>,
 }
 
-/// A command that goes into a field of a frame.
+/// A command that is sent in a field of a frame.
 pub struct Command {
-    /// As written: `panel.lamp`.
+    /// The command as written: `panel.lamp`.
     pub path: String,
     /// Its unit.
     pub unit: Unit,
     /// Its value.
     pub value: ExprId,
-    /// What the field carries, SI.
+    /// Range that the field can represent, SI units.
     pub range: (f64, f64),
 }
 
-/// What a start reads besides values.
+/// What is fixed at the start, in addition to values.
 pub struct Fixed<'a> {
-    /// The crossed-out part: its path, and whether an instance belongs to it.
+    /// The part that hardware replaces: its path, and for each instance whether it belongs to the part.
     pub part: (&'a str, &'a [bool]),
     /// Drives and devices.
     pub nodes: &'a [InstanceId],
-    /// Numbers of the plan.
+    /// Expressions of the plan's numbers.
     pub plan: &'a [ExprId],
-    /// Periods of sampled blocks, each with the step that must divide it, s.
+    /// Periods of sampled blocks, each with the step in s that must divide it.
     pub periods: &'a [(ExprId, f64)],
-    /// Commands that go into fields of frames.
+    /// Commands that are sent in fields of frames.
     pub commands: &'a [Command],
 }
 
-/// Of a system whose values have been checked.
+/// Analyses a system whose values have been checked.
 pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> Judged {
     let mut wanted = Wanted { all: Vec::new(), first: Slot::FIXED + lower::independent(system) };
     let checks = conditions(system, types, files, fixed, &mut wanted);
@@ -104,7 +105,7 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
             _ => None,
         }
     };
-    // A state is named too, so that a set of it is answered with its reason.
+    // States are included, so that an attempt to set one is answered with the reason.
     let named = |id: &VarId| matches!(system.var(*id).kind, VarKind::Param | VarKind::State);
     let params = system.var_ids().filter(named).map(|id| Known {
         path: system.var(id).path.clone(),
@@ -116,10 +117,10 @@ pub fn judged(system: &System, types: &Types, files: &Files, fixed: &Fixed) -> J
     Judged { params: params.collect(), checks, program, part: part.to_string() }
 }
 
-/// What the judge computes.
+/// The values that the judge computes.
 struct Wanted {
     all: Vec<Sought>,
-    /// The slot of the first.
+    /// Output slot of the first value.
     first: u32,
 }
 
@@ -134,7 +135,7 @@ impl Wanted {
     }
 }
 
-/// What a start checks of values, in its order.
+/// The conditions that a start checks, in the order of the start.
 fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, wanted: &mut Wanted) -> Vec<Check> {
     let mut checks = Vec::new();
     for (id, unit) in system.var_ids().zip(&types.units) {
@@ -176,7 +177,7 @@ fn conditions(system: &System, types: &Types, files: &Files, fixed: &Fixed, want
     checks
 }
 
-/// Of each quantity whether one of the expressions depends on it, by way of others too.
+/// For each quantity, whether one of the expressions depends on it, directly or through other quantities.
 pub(super) fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
     let mut vars = vec![false; system.vars.len()];
     let mut seen = std::collections::HashSet::new();
@@ -200,8 +201,8 @@ pub(super) fn reached(system: &System, exprs: &[ExprId]) -> Vec<bool> {
 }
 
 impl Judged {
-    /// With the slots of the control program. A parameter that nothing reads but the start, or the plant reads too, may
-    /// not change either.
+    /// Adds the slots of the control program. Also excludes parameters that only the start reads, and those that the
+    /// plant reads.
     pub fn finish(self, control: &Program, plant: &Program) -> (Live, Program) {
         let steps = [&control.outputs, &control.derivatives].into_iter();
         let others = [&control.tick, &control.transitions, &control.roots].into_iter().flatten();

@@ -1,8 +1,8 @@
-//! Ranges that follow from parameters, watched by their margins.
+//! Guards for ranges that depend on parameters, by means of margins.
 //!
-//! In: the control system of a rig. Out: for each bound that a parameter moves, an expression that is not negative within
-//! the range; and guards on these in place of guards with the bounds of the start. So a range follows a parameter that is
-//! set while the rig runs, and the code of a step stays as it is.
+//! In: the control system of a rig. Out: for each bound that depends on a parameter, an expression that is non-negative
+//! within the range, and a guard on it that replaces the guard with the bound of the start. A range thus follows a
+//! parameter that is set while the rig runs, without a change to the code of a step.
 
 use super::live::reached;
 use crate::frontend::system::*;
@@ -13,19 +13,19 @@ use abi::description::Guard;
 use abi::unit::{Angle, Dimension};
 use grammar::ast::BinaryOp;
 
-/// One end of a range.
+/// The margin of a quantity to one end of its range.
 #[derive(Clone)]
 pub struct Margin {
-    /// The quantity: `fr.z`.
+    /// Path of the quantity: `fr.z`.
     path: String,
-    /// Which end.
+    /// Whether it is the upper end.
     high: bool,
-    /// Its distance from that end, with the tolerance of guards.
+    /// Distance from that end, plus the tolerance of guards.
     pub room: ExprId,
 }
 
 impl Margin {
-    /// The expression to lower, with its name in messages.
+    /// The expression to lower, with its name for messages.
     pub fn wanted(&self) -> Wanted {
         let end = if self.high { "upper" } else { "lower" };
         let text = format!("distance of {} from its {end} bound", self.path);
@@ -33,7 +33,7 @@ impl Margin {
     }
 }
 
-/// The margins of the quantities of a control system that `watched` names.
+/// Margins of those quantities of a control system for which `watched` is true.
 pub fn of(system: &mut System, watched: impl Fn(VarId) -> bool) -> Vec<Margin> {
     let moves = |system: &System, bound: ExprId| {
         let reached = reached(system, &[bound]);
@@ -50,7 +50,7 @@ pub fn of(system: &mut System, watched: impl Fn(VarId) -> bool) -> Vec<Margin> {
             let Some((bound, _)) = bound.filter(|(bound, _)| moves(system, *bound)) else { continue };
             let span = system.span(bound);
             let mut push = |node: Node| system.push(node, span);
-            // As guards do: a millionth of the width or, of a range that is open on the other side, of the bound.
+            // The tolerance of guards: 1e-6 of the width, or of the bound if the range is open on the other side.
             let size = match other {
                 Some((other, _)) => push(Node::Binary(BinaryOp::Subtract, bound, other)),
                 None => bound,
@@ -68,8 +68,7 @@ pub fn of(system: &mut System, watched: impl Fn(VarId) -> bool) -> Vec<Margin> {
     margins
 }
 
-/// Watches the margins, in these slots of the program, in place of the bounds they stand for. Quantities that no guard
-/// watches stay as they are.
+/// Replaces guards on bounds by guards on the margins in these slots. Has no effect on quantities without a guard.
 pub fn watch(margins: &[Margin], slots: &[Slot], program: &mut Program) {
     let description = &mut program.description;
     for (margin, slot) in margins.iter().zip(slots) {

@@ -1,9 +1,9 @@
-//! Reads a rig: the system with one part crossed out, the drives put in its place, and everything that is checked before
-//! anything moves.
+//! Rigs: partitions a system into a control program and a plant, puts drives in the place of the part that hardware
+//! replaces, and performs all checks before anything moves.
 //!
-//! In: a rig's tree. Out: a [`Cut`]: two flat systems, *control* (the part gone, what drives measure as inputs, what they
-//! are told as outputs) and *plant* (the part alone, wires read backwards), and the plan of the rig. [`Cut::finish`] puts
-//! the slots of their programs into the plan. Knows no file and no bus.
+//! In: a rig's syntax tree. Out: a [`Cut`]: the plan of the rig and two flat systems. *Control* lacks the part;
+//! measurements of drives are its inputs, and their commands its outputs. *Plant* is the part alone, with the wires
+//! inverted. [`Cut::finish`] inserts the slots of both programs into the plan. Knows no files and no buses.
 
 mod advice;
 mod partition;
@@ -44,10 +44,10 @@ pub use crate::rig::step_derivative::{Discrete, StepDerivative};
 pub use advice::{Emulated, linear};
 pub use frames::{load as bus_load, of_dbc as dbc_messages};
 
-/// Steps that the plant of a dry run takes in one period unless the experiment says otherwise.
+/// Default number of steps of the plant in one period of a SIL run.
 pub const PLANT_STEPS: u32 = 50;
 
-/// A rig with the descriptions of its drives and devices, which need texts of their own.
+/// A rig with the descriptions of its drives and devices, which come from texts of their own.
 pub struct Prepared {
     ast: Arc<ast::File>,
     item: ItemRef,
@@ -57,7 +57,7 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// The rig as written.
+    /// The syntax tree of the rig.
     pub fn rig(&self) -> &ast::Rig {
         match &self.ast.items[self.item.index as usize] {
             Item::Rig(rig) => rig,
@@ -66,7 +66,7 @@ impl Prepared {
     }
 }
 
-/// Finds the rig that a file calls so.
+/// Finds the rig of this name.
 pub fn find(loaded: &Loaded, file: FileId, name: &Name) -> Result<ItemRef, Diagnostic> {
     match loaded.find(file, Space::Rig, &name.text) {
         Lookup::Found(item, _) => Ok(item),
@@ -92,7 +92,7 @@ pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Pre
     let Item::Rig(rig) = &ast.items[item.index as usize] else { unreachable!("a rig was found here") };
     let mut diagnostics = Vec::new();
     let descriptions = nodes::describe(loaded, sources, item.file, rig, &mut diagnostics);
-    // What a name in the rig may have meant.
+    // The parts and instance of the rig, from which suggestions for misspelt names are made.
     let mut body: Vec<ast::Statement> = Vec::new();
     for statement in &rig.body {
         match statement {
@@ -121,32 +121,32 @@ pub fn prepare(loaded: &mut Loaded, sources: &dyn Sources, item: ItemRef) -> Pre
     Prepared { ast: ast.clone(), item, model, descriptions, diagnostics }
 }
 
-/// A rig as two systems and a plan without slots.
+/// A rig as two flat systems and a plan without slots.
 pub struct Cut {
-    /// The system with the part gone.
+    /// The system without the part that hardware replaces.
     pub control: System,
-    /// Its types.
+    /// Types of `control`.
     pub control_types: Types,
-    /// The part alone.
+    /// The part that hardware replaces, alone.
     pub plant: System,
-    /// Its types.
+    /// Types of `plant`.
     pub plant_types: Types,
-    /// Expressions that were asked for, in the control system.
+    /// The requested expressions, in the control system.
     pub observed: Vec<ExprId>,
-    /// The plan; slots are those of neither program yet.
+    /// The plan; its slots are not yet set.
     rig: Rig,
     inputs: Vec<VarId>,
     outputs: Vec<VarId>,
     commands_read: Vec<ExprId>,
     stops: Vec<ExprId>,
     records: Vec<ExprId>,
-    /// Of quantities whose ranges parameters move.
+    /// Margins of ranges that depend on parameters.
     margins: Vec<margins::Margin>,
     applied: Vec<VarId>,
     seen: Vec<VarId>,
     seen_read: Vec<ExprId>,
     judged: live::Judged,
-    /// Where messages about the rig point.
+    /// Spans for messages about the rig.
     pub places: Places,
 }
 
@@ -158,36 +158,33 @@ pub struct Lowered {
     pub control: Program,
     /// The plant program.
     pub plant: Program,
-    /// Which parameters may change while it runs, and what must hold of them.
+    /// Which parameters may change during the run, and the conditions on them.
     pub live: Live,
-    /// What computes the numbers of that from parameters, as `Outputs`.
+    /// The judge, whose `Outputs` computes the numbers of those conditions from parameters.
     pub judge: Program,
 }
 
-/// Places of a rig for messages.
+/// Spans of a rig for messages.
 #[derive(Clone, Default)]
 pub struct Places {
     /// The name of the rig.
     pub name: Span,
     /// The period.
     pub rate: Span,
-    /// What it runs.
+    /// The instance that it runs.
     pub run: Span,
     /// The name of its method, or else the period.
     pub solver: Span,
-    /// Of each node its kind.
+    /// For each node the span of its kind.
     pub nodes: Vec<Span>,
-    /// Of each output its wire.
+    /// For each output the span of its wire.
     pub wires: Vec<Span>,
     /// Lints that the rig allows.
     pub allows: Vec<String>,
 }
 
-/// Reads a rig around the instance it runs. `overrides` win over what the text says; `observed` are read with the rig's
-/// names and those of the instance.
-///
-/// # Errors
-/// Everything that is wrong.
+/// Reads a rig around the instance it runs. `overrides` take precedence over the text; `observed` are read in the scope
+/// of the rig and of the instance. Returns `None` after errors, which are reported.
 pub fn read<'a>(
     loaded: &'a Loaded,
     sources: &'a dyn Sources,
@@ -235,7 +232,7 @@ pub fn read<'a>(
         }),
     };
     let mut flat = flatten(loaded, sources, &request);
-    // Where the part is not there, neither are its inputs.
+    // If the part does not exist, the errors about its inputs are consequences.
     if let Some(hardware) = statements.hardware
         && flat.diagnostics.iter().any(|d| d.span() == hardware.part.span)
     {
@@ -252,23 +249,23 @@ pub fn read<'a>(
     cut
 }
 
-/// Whether a place lies in another.
+/// Whether a span lies within another.
 fn within(outer: Span, inner: Span) -> bool {
     inner.file == outer.file && outer.start <= inner.start && inner.end <= outer.end
 }
 
-/// Numbers of a rig's expressions among all that are read.
+/// Indices of the rig's expressions among all expressions of the frame.
 #[derive(Default)]
 struct Lists {
     rate: usize,
     step: Option<usize>,
     watchdog: Option<usize>,
     overrun: Option<usize>,
-    /// Of each bus its bit rate.
+    /// For each bus its bit rate.
     bit_rates: Vec<Option<usize>>,
     /// Commands.
     sends: Vec<Send>,
-    /// What the part gives: the wire in `hardware`, and its value.
+    /// Outputs of the part: the wire in `hardware`, and its value.
     gives: Vec<(usize, usize)>,
     stops: Vec<usize>,
     records: Vec<usize>,
@@ -279,7 +276,7 @@ struct Send {
     node: usize,
     read: Read,
     unit: Unit,
-    /// In `hardware`, rather than beside it.
+    /// Whether it is written inside `hardware`.
     inside: bool,
     value: usize,
     limit: Option<(usize, usize)>,
@@ -308,7 +305,7 @@ impl<'a> Reader<'a, '_> {
         self.diagnostics.push(diagnostic);
     }
 
-    /// Names of buses, drives, devices and parts stand once.
+    /// Checks that names of buses, drives, devices and parts are unique.
     fn names(&mut self) {
         let mut first: Vec<&Name> = Vec::new();
         let buses = self.statements.buses.iter().map(|bus| &bus.name);
@@ -324,7 +321,7 @@ impl<'a> Reader<'a, '_> {
         self.diagnostics.extend(found);
     }
 
-    /// Names of drives and devices whose description is wrong.
+    /// Names of drives and devices with invalid descriptions.
     fn broken(&self) -> Vec<&'a Name> {
         let drives = self.rig.body.iter().filter_map(|statement| match statement {
             ast::RigStatement::Drive(drive) => Some(&drive.name),
@@ -337,11 +334,11 @@ impl<'a> Reader<'a, '_> {
         self.descriptions.iter().position(|node| node.name.text == name)
     }
 
-    /// E0204 for a drive or device that is not there.
+    /// E0204: an unknown drive or device.
     fn no_node(&mut self, name: &Name, what: &str) {
         let names = self.descriptions.iter().map(|node| node.name.text.as_str());
         let near = crate::frontend::names::nearest(&name.text, names).map(str::to_string);
-        // A drive whose description is wrong has been reported.
+        // A drive with an invalid description has been reported.
         let declared = self
             .rig
             .body
@@ -358,7 +355,7 @@ impl<'a> Reader<'a, '_> {
         });
     }
 
-    /// Everything that is read with the names of the rig.
+    /// Collects all expressions that are read in the scope of the rig.
     fn lists(&mut self) -> Lists {
         let mut lists = Lists::default();
         let seconds = unit("s");
@@ -483,7 +480,7 @@ impl<'a> Reader<'a, '_> {
                 _ => None,
             };
             let Some(found) = found else {
-                // A command in its place has been reported.
+                // The misplaced command has been reported.
                 if self.hardware_is_wrong() {
                     continue;
                 }
@@ -505,7 +502,7 @@ impl<'a> Reader<'a, '_> {
         }
     }
 
-    /// Crosses the part out, both ways, and checks everything.
+    /// Partitions the system: replaces the part in both directions, and performs all checks.
     fn cut(
         &mut self,
         mut system: System,
@@ -517,7 +514,7 @@ impl<'a> Reader<'a, '_> {
         let top_span = self.rig.span;
         let part = framed.hardware;
         let at = |number: usize| framed.expressions[number];
-        // Numbers that must be known become params, so that units and constancy are checked like those of params.
+        // Numbers that must be known become parameters, so that their units and constancy are checked in the same way.
         let mut constants = Vec::new();
         for constant in &expressions.constants {
             let value = at(constant.at);
@@ -538,7 +535,7 @@ impl<'a> Reader<'a, '_> {
             commands.push(id);
         }
         let stops = self.latched(&mut system, &framed, &lists);
-        // Nodes that read what is wanted.
+        // Nodes that read the requested quantities.
         let commands_read: Vec<ExprId> = commands.iter().map(|id| system.push(Node::Var(*id), top_span)).collect();
         let values: Vec<ExprId> = constants.iter().map(|id| system.push(Node::Var(*id), top_span)).collect();
         let of_nodes = |id: &VarId| {
@@ -578,7 +575,7 @@ impl<'a> Reader<'a, '_> {
         self.unsent(&system, &framed, &lists, part);
         let plant = self.plant(&system, &framed, &lists, &commands, &gives, &of_part);
 
-        // The control system: what the part gives comes from signals, everything else of it is gone.
+        // The control system: outputs of the part come from signals, and the rest of the part is removed.
         let mut control = system.clone();
         for id in system.var_ids().filter(|id| of_part(&system, *id)) {
             let var = &mut control.vars[id.0 as usize];
@@ -664,7 +661,7 @@ impl<'a> Reader<'a, '_> {
             fielded.push(live::Command { path, unit: send.unit.clone(), value: at(send.value), range });
         }
         for live::Command { path, unit, value: expr, range } in &fielded {
-            // NaN of what is not known before it runs.
+            // NaN for values that are not known before the run.
             let value = evaluate(&system, &types, &[*expr])[0];
             if value < range.0 || value > range.1 {
                 let [low, high] = [range.0, range.1].map(|end| units::three_digits(unit.from_si(end)));
@@ -732,7 +729,7 @@ impl<'a> Reader<'a, '_> {
         Some(cut)
     }
 
-    /// Whether something is wrong with a wire of the part: then others may seem to be missing.
+    /// Whether a wire of the part has an error. Missing wires are then not reported.
     fn hardware_is_wrong(&self) -> bool {
         let Some(hardware) = self.statements.hardware else { return false };
         self.diagnostics.iter().any(|said| said.is_error() && within(hardware.span, said.span()))
@@ -772,7 +769,8 @@ impl<'a> Reader<'a, '_> {
         VarId(system.vars.len() as u32 - 1)
     }
 
-    /// What each `stop` looks at: its condition; of an instant a state that it sets, so that it is remembered.
+    /// The observed condition of each `stop`. A condition with a crossing, which holds for an instant only, sets a
+    /// state that keeps it.
     fn latched(&mut self, system: &mut System, framed: &Framed, lists: &Lists) -> Vec<ExprId> {
         let mut out = Vec::new();
         for stop in &lists.stops {
@@ -795,7 +793,7 @@ impl<'a> Reader<'a, '_> {
         out
     }
 
-    /// The system before anything is crossed out: what is wrong with it is told as of any other.
+    /// Checks the system before the partition, like any other system.
     fn check_whole(&mut self, system: &System) -> Option<Types> {
         let mut found = Vec::new();
         let types = analyse(system, self.files, Depth::Values, &Diagnostic::is_error, &mut found);
@@ -806,7 +804,7 @@ impl<'a> Reader<'a, '_> {
     }
 }
 
-/// Whether an instant stands in an expression.
+/// Whether an expression contains a crossing.
 fn has_crossing(system: &System, id: ExprId) -> bool {
     matches!(system.node(id), Node::Crossing(_)) || system.node(id).operands().any(|a| has_crossing(system, a))
 }
@@ -818,7 +816,7 @@ struct Give {
     span: Span,
 }
 
-/// The crossed-out part as a system.
+/// The part that hardware replaces, as a system.
 struct PlantSystem {
     system: System,
     applied: Vec<VarId>,

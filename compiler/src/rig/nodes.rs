@@ -1,7 +1,8 @@
-//! Drives and devices as models: their arguments are params, the signals read from the bus are inputs. So arguments and
-//! signals have units, ranges, defaults and did-you-mean like everything else.
+//! Drives and devices as models: their arguments are parameters, and the signals read from the bus are inputs.
+//! Arguments and signals thus have units, ranges, defaults and suggestions like any quantity.
 //!
-//! In: the statements of a rig and the descriptions they name. Out: a [`Description`] for each.
+//! In: the statements of a rig and the descriptions that they name. Out: a [`Description`] for each. Knows nothing of
+//! identifiers on the bus.
 
 use super::dbc;
 use crate::frontend::names::nearest;
@@ -13,7 +14,7 @@ use grammar::ast::{self, BinaryOp, Declaration, DeclarationKind, Expr, ExprKind,
 use grammar::diagnostic::Diagnostic;
 use grammar::span::{FileId, Span};
 
-/// The arguments and signals of every CiA 402 drive. What nobody gives is read from the drive.
+/// The arguments and signals of every CiA 402 drive. An argument that is not given is read from the drive.
 const CIA402: &str = "\
 /// A drive that speaks CANopen with the profile CiA 402.
 model Cia402 {
@@ -41,45 +42,45 @@ model Cia402 {
 }
 ";
 
-/// Kinds of drive that the program knows without a description.
+/// Built-in drive profiles.
 pub const PROFILES: [&str; 3] = ["cia402", "fc302", "vlt5000"];
 
-/// A drive or device of a rig, described.
+/// A drive or device of a rig with its description.
 pub struct Description {
-    /// As the rig calls it.
+    /// Name in the rig.
     pub name: Name,
-    /// The statement.
+    /// Its statement in the rig.
     pub statement: ast::DriveDecl,
-    /// Its model.
+    /// Its description as a model.
     pub model: ast::Model,
-    /// Where the model stands.
+    /// File of the model.
     pub file: FileId,
-    /// What the rig gives it.
+    /// The instance with the arguments of the rig.
     pub instance: ast::Instance,
-    /// How it speaks.
+    /// Protocol of the node.
     pub speaks: Speaks,
 }
 
-/// How a node speaks.
+/// Protocol of a node.
 pub enum Speaks {
-    /// CiA 402.
+    /// CANopen with the profile CiA 402.
     Cia402 {
-        /// What is commanded.
+        /// The commanded quantity.
         mode: Mode,
-        /// Commands act with the next SYNC.
+        /// Whether commands take effect at the next SYNC.
         at_sync: bool,
-        /// `cia402`, `fc302`, `vlt5000`.
+        /// Name of the profile: `cia402`, `fc302`, `vlt5000`.
         profile: String,
     },
-    /// Frames by hand.
+    /// Frames described by hand.
     Frames(Vec<ast::FrameSignal>),
     /// Messages of a DBC file.
     Dbc(Vec<dbc::Message>),
 }
 
 impl Description {
-    /// The signals that can be read, by the name of the input, and what they are. Of frames by hand the index of the
-    /// signal in the text: which message it belongs to is known once identifiers are.
+    /// The readable signals: name of the input, and which signal it is. A signal described by hand is identified by its
+    /// index in the text, because its message is not known before identifiers are.
     pub fn reads(&self) -> Vec<(&str, Read)> {
         match &self.speaks {
             Speaks::Cia402 { .. } => CIA402_SIGNALS.iter().map(|(name, what)| (*name, Read::What(*what))).collect(),
@@ -91,10 +92,9 @@ impl Description {
         }
     }
 
-    /// The unit, name and place of a signal that can be commanded; or what can be.
+    /// Unit, identity and span of a signal that can be commanded.
     ///
-    /// # Errors
-    /// The names of all that can.
+    /// # Errors The names of all signals that can be commanded.
     pub fn sends(&self, name: &str) -> Result<(Option<Unit>, Read, Span), Vec<String>> {
         match &self.speaks {
             Speaks::Cia402 { mode, .. } => {
@@ -133,14 +133,14 @@ impl Description {
     }
 }
 
-/// Which signal, before identifiers are known.
+/// Identity of a signal before identifiers are known.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Read {
-    /// One of CiA 402.
+    /// A CiA 402 signal.
     What(What),
-    /// This signal of a description by hand.
+    /// The signal of this index in a description by hand.
     Written(usize),
-    /// This message and field of a DBC file.
+    /// Message and field of a DBC file.
     Field(usize, usize),
 }
 
@@ -160,7 +160,7 @@ fn fields(messages: &[dbc::Message]) -> impl Iterator<Item = (usize, usize, &dbc
     all.into_iter().map(|(m, f)| (m, f, &messages[m].signals[f]))
 }
 
-/// Describes the drives and devices of a rig; what cannot be described is left out and reported.
+/// Describes the drives and devices of a rig. Omits those with errors, which it reports.
 pub fn describe(
     loaded: &mut Loaded,
     sources: &dyn Sources,
@@ -274,7 +274,7 @@ impl Describer<'_> {
         self.diagnostics.push(error.help("only `travel` takes a range"));
     }
 
-    /// Signals come from the bus: nobody gives them.
+    /// Reports arguments for signals, which come from the bus.
     fn no_signals(&mut self, model: &ast::Model, args: &[ast::Bind], statement: &ast::DriveDecl) {
         for arg in args {
             let input = model.body.iter().any(|one| {
@@ -347,7 +347,7 @@ impl Describer<'_> {
         let taken = |body: &[ast::Statement], name: &str| {
             body.iter().any(|one| matches!(one, ast::Statement::Declaration(d) if d.name.text == name))
         };
-        // What a drive must not exceed; what it does not tell is not watched.
+        // Limits of a drive; a limit that the drive does not state is not monitored.
         let within = [
             ("speed_max", "rad/s", false),
             ("power_max", "W", false),
@@ -377,7 +377,8 @@ impl Describer<'_> {
         Some(described(statement, model, home, args, speaks))
     }
 
-    /// Params as written; of every signal where and how it stands in its frame, as params whose names have a blank.
+    /// Parameters as written, followed by the position and format of each signal as hidden parameters, whose names
+    /// contain a blank.
     fn by_hand(&mut self, params: &[Declaration], frames: &[ast::FrameSignal]) -> Vec<Declaration> {
         let mut out = params.to_vec();
         for signal in frames {
@@ -421,7 +422,7 @@ impl Describer<'_> {
         out
     }
 
-    /// The messages that a device names, from its file.
+    /// The messages that a device names, from its DBC file.
     fn messages(
         &mut self,
         home: FileId,
@@ -494,7 +495,7 @@ impl Describer<'_> {
         (out.len() == names.len()).then_some(out)
     }
 
-    /// Inputs in the units of the file.
+    /// Inputs in the units of the DBC file.
     fn by_dbc(&mut self, messages: &[dbc::Message]) -> Vec<Declaration> {
         let one = |(_, _, signal): (usize, usize, &dbc::Signal)| {
             let unit = signal.unit.as_ref().map(|unit| unit.text.as_str()).filter(|unit| !unit.is_empty());
@@ -504,7 +505,7 @@ impl Describer<'_> {
     }
 }
 
-/// Some of many names.
+/// At most eight of the names.
 fn few(names: &[&str]) -> String {
     match names {
         [first @ .., _] if names.len() > 8 => format!("{}, …", first[..8].join(", ")),
@@ -532,7 +533,7 @@ fn number(value: f64, unit: Option<UnitText>, span: Span) -> Expr {
     Expr { kind: ExprKind::Number { value, unit }, span }
 }
 
-/// `inf`, or `-inf`: of any unit.
+/// `inf` or `-inf`, which match every unit.
 fn infinite(below: bool, span: Span) -> Expr {
     let name = Name { text: "inf".into(), span };
     let path = ast::Path { segments: vec![ast::Segment { name, index: None }], span };
@@ -549,7 +550,7 @@ fn declared(kind: DeclarationKind, name: &str, unit: Option<&str>, value: Option
     Declaration { kind, name: Name { text: name.into(), span }, unit, value, range: None, doc: None, span }
 }
 
-/// Formats of frames by hand: name, bits, how they are read.
+/// Formats of frames described by hand: name, bits, interpretation.
 const FORMATS: &[(&str, u16, Format)] = &[
     ("u8", 8, Format::Unsigned),
     ("i8", 8, Format::Signed),
@@ -560,7 +561,7 @@ const FORMATS: &[(&str, u16, Format)] = &[
     ("f32", 32, Format::Float32),
 ];
 
-/// Number of bits, how they are read, and whether the most significant byte comes first.
+/// Number of bits, interpretation, and whether the most significant byte comes first.
 pub fn format_of(text: &str) -> Option<(u16, Format, bool)> {
     let (plain, big_endian) = match text.strip_suffix("_be") {
         Some(plain) => (plain, true),

@@ -1,11 +1,14 @@
-//! Crosses a part out: what is left of a system when only some of its quantities are wanted, and wires read backwards.
+//! Partition of a system: prunes it to what some of its quantities need (a backward slice), and inverts affine wires.
+//!
+//! In: a flat system, and quantities and expressions to keep. Out: a system with the same indices. Knows nothing of
+//! drives.
 
 use crate::frontend::system::*;
 use abi::unit::{Angle, Dimension};
 use grammar::ast::BinaryOp;
 use grammar::span::Span;
 
-/// What lives: quantities, expressions, automata, blocks.
+/// Liveness of quantities, expressions, automata, blocks and crossings.
 struct Live<'a> {
     system: &'a System,
     vars: Vec<bool>,
@@ -88,8 +91,8 @@ impl Live<'_> {
     }
 }
 
-/// The system with only what these quantities and expressions need. Numbers of quantities and expressions stay what
-/// they are; what is gone has no definition.
+/// Prunes the system to what these quantities and expressions need. Indices of quantities and expressions stay the
+/// same; removed quantities have no definition.
 pub fn pruned(system: &System, vars: impl Iterator<Item = VarId>, exprs: &[ExprId]) -> System {
     let mut live = Live {
         system,
@@ -104,7 +107,7 @@ pub fn pruned(system: &System, vars: impl Iterator<Item = VarId>, exprs: &[ExprI
         live.var(var);
     }
     live.drain();
-    // Whatever resets a state that lives, lives too; and so on.
+    // Events and automata that reset a live state are live too, and so is what they need, up to a fixed point.
     let mut events = vec![false; system.events.len()];
     loop {
         let before = (live.vars.clone(), live.automata.clone());
@@ -174,12 +177,12 @@ pub fn pruned(system: &System, vars: impl Iterator<Item = VarId>, exprs: &[ExprI
     out
 }
 
-/// Whether the quantity still has a value.
+/// Whether the quantity still has a definition.
 pub fn lives(system: &System, id: VarId) -> bool {
     !matches!(system.var(id).definition, Definition::Missing)
 }
 
-/// Quantities that an expression mentions, in order, each once.
+/// Quantities that an expression mentions, in order, without repetition.
 pub fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     let mut out = Vec::new();
     let mut stack = vec![id];
@@ -195,15 +198,15 @@ pub fn mentioned(system: &System, id: ExprId) -> Vec<VarId> {
     out
 }
 
-/// Σ coefficient · quantity + rest.
+/// An affine form: Σ coefficient · quantity + rest.
 pub struct Affine {
-    /// Quantities, each once, and the coefficient of each.
+    /// Quantities without repetition, each with its coefficient.
     pub terms: Vec<(VarId, ExprId)>,
-    /// What is left.
+    /// The constant term.
     pub rest: ExprId,
 }
 
-/// An expression as an affine form in some quantities; none if it is not one.
+/// Writes an expression as an affine form in the quantities for which `unknown` is true; `None` if it is not affine.
 pub fn affine(system: &mut System, id: ExprId, unknown: &dyn Fn(VarId) -> bool) -> Option<Affine> {
     let span = system.span(id);
     if !mentioned(system, id).into_iter().any(unknown) {
@@ -261,7 +264,7 @@ fn scaled(system: &mut System, form: Affine, by: &dyn Fn(&mut System, ExprId) ->
     Affine { terms, rest }
 }
 
-/// (value − rest) / Σ coefficients: what each quantity of the form must be, all being equal.
+/// (value − rest) / Σ coefficients: the common value of the form's quantities, for which the form equals `value`.
 pub fn solved(system: &mut System, form: &Affine, value: ExprId, span: Span) -> Option<ExprId> {
     let mut coefficients = form.terms.iter().map(|(_, coefficient)| *coefficient);
     let first = coefficients.next()?;
@@ -270,12 +273,12 @@ pub fn solved(system: &mut System, form: &Affine, value: ExprId, span: Span) -> 
     Some(system.push(Node::Binary(BinaryOp::Divide, difference, sum), span))
 }
 
-/// 0, which fits every unit.
+/// 0, which matches every unit.
 pub fn nothing() -> Node {
     Node::Number { value: 0.0, dimension: None, angle: Angle::Silent }
 }
 
-/// The pure number 1.
+/// The dimensionless number 1.
 pub fn one() -> Node {
     Node::Number { value: 1.0, dimension: Some(Dimension::NONE), angle: Angle::Silent }
 }

@@ -1,4 +1,7 @@
-//! The plan of a rig: numbers, nodes, messages, limits; and, once there are programs, the slots of everything.
+//! The plan of a rig: numbers, nodes, messages and limits, and the slots of both programs.
+//!
+//! In: the descriptions and expressions of a rig, later its programs. Out: an [`abi::rig::Rig`]. Knows nothing of buses
+//! beyond their frames.
 
 use super::margins::{self, Margin};
 use super::*;
@@ -7,7 +10,7 @@ use crate::lower::{self, lower};
 use frames::{Laid, OnBus};
 
 impl Reader<'_, '_> {
-    /// Everything of the plan but signals and slots.
+    /// Everything of the plan except signals and slots.
     pub(super) fn plan(
         &mut self,
         system: &System,
@@ -210,7 +213,7 @@ impl Reader<'_, '_> {
         out
     }
 
-    /// A node of the plan.
+    /// One node of the plan.
     fn described(
         &mut self,
         k: usize,
@@ -323,7 +326,7 @@ impl Reader<'_, '_> {
             let number = units::three_digits(send.unit.from_si(value));
             if send.unit.text.is_empty() { number } else { format!("{number} {}", send.unit) }
         };
-        // The narrowest thing a command must fit.
+        // The narrowest representation that the command must fit.
         let (carried, because) = match (&node.kind, signal.what) {
             (rig::Kind::Cia402(drive), What::Torque) => {
                 let by_message = 32.767 * drive.rated_torque;
@@ -372,7 +375,7 @@ impl Reader<'_, '_> {
             let message = format!("a slew of {} never gets anywhere", units::three_digits(slew));
             refuse("E0802", message, "not positive".into(), "give the greatest change per second".into());
         }
-        // Without a limit of its own a command keeps to what the drive allows.
+        // Without a stated limit, a command is limited to what the drive permits.
         let (low, high) = match (&node.kind, send.limit) {
             (rig::Kind::Cia402(_), None) if carried.1.is_finite() && !because_of_message(node, signal.what) => carried,
             _ => (low, high),
@@ -468,7 +471,7 @@ impl Reader<'_, '_> {
         cut.rig.plant.seen = seen;
     }
 
-    /// Where the signals of a description by hand lie: as they were laid out.
+    /// The location of the signals of a description by hand.
     fn laid_fields(&self, node: &rig::Node, description: &Description) -> Laid {
         let (rig::Kind::Frames(messages), Speaks::Frames(signals)) = (&node.kind, &description.speaks) else {
             return Laid::default();
@@ -481,7 +484,7 @@ impl Reader<'_, '_> {
         Laid { messages: Vec::new(), fields }
     }
 
-    /// W0806
+    /// W0806: a signal of a DBC file with an unknown unit.
     fn unit_of_dbc(&mut self, description: &Description, read: Read, used: ExprId, control: &System) {
         let (Speaks::Dbc(messages), Read::Field(m, f)) = (&description.speaks, read) else { return };
         let signal = &messages[m].signals[f];
@@ -499,7 +502,7 @@ impl Reader<'_, '_> {
         self.diagnostics.push(warning.help("multiply it with its unit, as in `x * 1 bar`, or `allow dbc-unit \"…\"`"));
     }
 
-    /// What is recorded, in its unit.
+    /// Recorded quantities, each in its unit.
     pub(super) fn shows(&mut self, cut: &mut Cut) {
         for (show, expr) in self.statements.records.iter().zip(cut.records.clone()) {
             let boolean = cut.control_types.boolean[expr.0 as usize];
@@ -534,7 +537,7 @@ impl Reader<'_, '_> {
 }
 
 impl Cut {
-    /// What the control program is to give besides what an experiment wants: in front of that.
+    /// The outputs of the control program; they precede those that an experiment requests.
     pub fn wanted(&self, control: &System) -> Vec<Wanted> {
         let commands = self.outputs.iter().zip(&self.commands_read);
         let commands = commands.map(|(id, read)| (*read, control.var(*id).path.clone()));
@@ -545,7 +548,7 @@ impl Cut {
         all.chain(self.margins.iter().map(Margin::wanted)).collect()
     }
 
-    /// What the plant program is to give.
+    /// The outputs of the plant program.
     pub fn wanted_of_plant(&self) -> Vec<Wanted> {
         let one =
             |(id, read): (&VarId, &ExprId)| Wanted { expr: *read, text: self.plant.var(*id).path.clone(), unit: None };
@@ -557,14 +560,14 @@ impl Cut {
         self.rig.period_ns as f64 * 1e-9
     }
 
-    /// The plan and the plant, for a control program that was lowered with more wanted behind the first `own`.
+    /// The plan and the plant program, for a control program whose first `own` outputs are those of the rig.
     pub fn with_plant(self, control: &lower::Lowered, own: usize) -> (Rig, Program) {
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
         let rig = self.finish(&control.program, &control.observed[..own], &plant);
         (rig, plant.program)
     }
 
-    /// Both programs, and the plan; says what deserves a look.
+    /// Lowers both systems and completes the plan. Adds warnings.
     pub fn lowered(&self, warnings: &mut Vec<Diagnostic>) -> super::Lowered {
         let control = lower(&self.control, &self.control_types, &self.wanted(&self.control));
         let plant = lower(&self.plant, &self.plant_types, &self.wanted_of_plant());
@@ -581,14 +584,14 @@ impl Cut {
         super::Lowered { rig, control, plant, live, judge }
     }
 
-    /// What deserves a look, but for what the rig allows.
+    /// Warnings about the rig, except those that it allows.
     pub fn advice(&self, rig: &Rig, control: &Program, plant: &Program) -> Vec<Diagnostic> {
         let mut found = advice::check(rig, control, plant, &self.places);
         found.retain(|warning| !self.allowed(warning));
         found
     }
 
-    /// What is to be said of the steps of the control program, but for what the rig allows.
+    /// Warnings about the steps of the control program, except those that the rig allows.
     pub fn steps(&self, lowered: &super::Lowered, files: &Files) -> Vec<Diagnostic> {
         let super::Lowered { rig, control, .. } = lowered;
         let ends: Vec<(ExprId, Slot)> =
@@ -643,7 +646,7 @@ impl Cut {
     }
 }
 
-/// Whether a quantity of a drive's kind is bounded by its message only.
+/// Whether a quantity of a drive is bounded only by the message format.
 fn because_of_message(node: &rig::Node, what: What) -> bool {
     match (&node.kind, what) {
         (rig::Kind::Cia402(drive), What::Torque) => drive.max_torque.is_none(),
@@ -653,7 +656,7 @@ fn because_of_message(node: &rig::Node, what: What) -> bool {
     }
 }
 
-/// Whether an expression needs the present value of a quantity.
+/// Whether an expression depends on the present value of a quantity.
 fn reaches(system: &System, expr: ExprId, id: VarId) -> bool {
     let mut seen = vec![false; system.nodes.len()];
     let mut stack = vec![expr];

@@ -1,5 +1,6 @@
-//! The statements of a rig sorted by kind, each where there is one; and the numbers in them that must be known before
-//! anything runs.
+//! The statements of a rig by kind, and its numbers that must be known before the run.
+//!
+//! In: a rig's syntax tree. Out: [`Statements`] and [`Expressions`]. Knows nothing of values.
 
 use crate::frontend::flatten::Scope;
 use abi::unit::Unit;
@@ -7,7 +8,7 @@ use grammar::ast::{self, Expr, Name, RigStatement};
 use grammar::diagnostic::Diagnostic;
 use grammar::span::Span;
 
-/// What a rig says.
+/// The statements of a rig, by kind.
 #[derive(Default)]
 #[allow(missing_docs)]
 pub struct Statements<'a> {
@@ -28,7 +29,7 @@ pub struct Statements<'a> {
 }
 
 impl<'a> Statements<'a> {
-    /// Sorts them; reports what stands twice and what is missing. Nothing if the rest would make no sense.
+    /// Sorts the statements. Reports repeated and missing ones. Returns `None` if the rest would be meaningless.
     pub fn of(rig: &'a ast::Rig, misread: bool, diagnostics: &mut Vec<Diagnostic>) -> Option<Statements<'a>> {
         let mut out = Statements::default();
         let mut first: Vec<(&str, Span)> = Vec::new();
@@ -93,35 +94,35 @@ impl<'a> Statements<'a> {
     }
 }
 
-/// Expressions of a rig that are read with its names.
+/// Expressions that are read in the scope of a rig.
 #[derive(Default)]
 pub struct Expressions<'a> {
-    /// In the order in which they are read.
+    /// All expressions in the order of reading, with their scopes.
     pub all: Vec<(Scope, &'a Expr)>,
-    /// Those that must be numbers before anything runs.
+    /// Those that must be constant.
     pub constants: Vec<Constant>,
 }
 
-/// A number that must be known before anything runs.
+/// A number that must be known before the run.
 pub struct Constant {
-    /// Number of the expression.
+    /// Index of the expression.
     pub at: usize,
-    /// What it is called in messages.
+    /// Name for messages.
     pub name: String,
-    /// The unit it must fit, and where that comes from.
+    /// Required unit, and the span that requires it.
     pub unit: Unit,
     /// See `unit`.
     pub span: Span,
 }
 
 impl<'a> Expressions<'a> {
-    /// One more; its number.
+    /// Adds an expression; returns its index.
     pub fn read(&mut self, scope: Scope, expr: &'a Expr) -> usize {
         self.all.push((scope, expr));
         self.all.len() - 1
     }
 
-    /// One that must be a number; its number among those.
+    /// Adds an expression that must be constant; returns its index among the constants.
     pub fn constant(&mut self, scope: Scope, expr: &'a Expr, name: &str, unit: Unit, span: Span) -> usize {
         let at = self.read(scope, expr);
         self.constants.push(Constant { at, name: name.into(), unit, span });

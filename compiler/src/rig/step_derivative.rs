@@ -1,5 +1,8 @@
-//! The derivative of a compiled step: what small changes of states, memory and inputs do to the next ones and to what is
-//! given. The step itself is differentiated, with its sampled blocks and its held commands, not the equations behind it.
+//! Derivative of a compiled step with respect to states, memory and inputs. Differentiates the step itself, including
+//! sampled blocks and held commands, rather than the underlying equations.
+//!
+//! In: a program, a method, inputs and outputs. Out: the matrices of a discrete-time linear system. Knows nothing of
+//! rigs.
 
 use crate::ir::Func;
 use crate::ir::build::{Build, Env};
@@ -10,7 +13,7 @@ use crate::numerics::autodiff;
 use abi::Slot;
 use abi::series::Method;
 
-/// What stands for 0 in a state, SI: far from everything physical, and from what a step takes for 0.
+/// Stands for 0 in a state, SI units: far below physical values, but not flushed to 0 by a step.
 const AT_REST: f64 = 1e-20;
 
 /// One step of a program, ready to be differentiated at any point of its block.
@@ -18,14 +21,14 @@ pub struct StepDerivative {
     func: Func,
     size: usize,
     states: Vec<Slot>,
-    /// How many of them are states of differential equations: the first.
+    /// Number of continuous states; they come first.
     continuous: usize,
     inputs: usize,
     outputs: usize,
     pool: std::sync::Arc<[f64]>,
 }
 
-/// s' = A s + B y, u = C s + D y around a point, over one step; SI, row by row.
+/// s' = A s + B y, u = C s + D y around a point, over one step; SI units, row-major.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Discrete {
@@ -39,7 +42,8 @@ pub struct Discrete {
 }
 
 impl StepDerivative {
-    /// Of a program's step by a method, along these inputs, of these outputs.
+    /// The derivative of a program's step by a method, with respect to states and these inputs, of states and these
+    /// outputs.
     pub fn new(program: &Program, method: Method, inputs: &[Slot], outputs: &[Slot]) -> StepDerivative {
         let layout = &program.description.layout;
         let stored = layout.states.range().chain(layout.memory.range());
@@ -55,7 +59,8 @@ impl StepDerivative {
             let gradient = gradients.get(row);
             for k in 0..directions.len() {
                 let entry = gradient.and_then(|gradient| autodiff::entry(gradient, k as u32));
-                // What the step does not write stays; of what it writes, a derivative that is not there is 0.
+                // A state that the step does not write keeps its value (derivative 1); an absent entry of a written one
+                // is 0.
                 let entry = entry.unwrap_or_else(|| build.real(f64::from(gradient.is_none() && itself == Some(k))));
                 build.store(Slot(next as u32), entry);
                 next += 1;
@@ -72,11 +77,11 @@ impl StepDerivative {
         }
     }
 
-    /// The matrices at a block, for so many steps with the inputs held.
+    /// The matrices at a block, for this number of steps with the inputs held.
     pub fn at(&self, block: &[f64], steps: u32) -> Discrete {
         let (n, m, p) = (self.states.len(), self.inputs, self.outputs);
         let mut block = block.to_vec();
-        // A step makes 0 of what has died away: at rest that would be the branch taken, and nothing would answer.
+        // A step flushes decayed states to 0, and at exactly 0 would take that branch, whose derivative is 0.
         for slot in &self.states[..self.continuous] {
             let value = &mut block[slot.index()];
             if value.abs() < AT_REST {
@@ -93,7 +98,7 @@ impl StepDerivative {
         let (c1, d1) = (part(n, n + p, 0, n), part(n, n + p, n, n + m));
         let (mut a, mut b, mut c, mut d) = (a1.clone(), b1.clone(), c1.clone(), d1.clone());
         for _ in 1..steps {
-            // u = C (A s + B y) + D y of the steps before.
+            // u = C (A s + B y) + D y of the preceding steps.
             (c, d) = (product(&c1, &a, p, n, n), sum(&product(&c1, &b, p, n, m), &d1));
             (a, b) = (product(&a1, &a, n, n, n), sum(&product(&a1, &b, n, n, m), &b1));
         }

@@ -1,10 +1,14 @@
-//! The wires of the crossed-out part: as written they make commands of its inputs and its outputs of signals; read
-//! backwards they drive the part alone by what the drives apply, and say what the drives measure.
+//! Wires of the part that hardware replaces. As written, they compute commands from the part's inputs, and the part's
+//! outputs from signals. Inverted, they drive the part alone from what the drives apply, and compute what the drives
+//! measure.
+//!
+//! In: the system, its frame and the wires. Out: the definitions of both systems, or diagnostics. Knows nothing of
+//! buses.
 
 use super::*;
 
 impl Reader<'_, '_> {
-    /// The quantities that the part gives, by the wires that say so.
+    /// The quantities of the part that wires define.
     pub(super) fn gives(&mut self, system: &mut System, framed: &Framed, lists: &Lists, part: InstanceId) -> Vec<Give> {
         let Some(hardware) = self.statements.hardware else { return Vec::new() };
         let mut out: Vec<Give> = Vec::new();
@@ -67,7 +71,7 @@ impl Reader<'_, '_> {
         out
     }
 
-    /// Every input of the part goes to a drive, and every drive has a command.
+    /// Checks that every input of the part drives a command, and that every drive has a command.
     pub(super) fn unsent(&mut self, system: &System, framed: &Framed, lists: &Lists, part: InstanceId) {
         let Some(hardware) = self.statements.hardware else { return };
         let inputs: Vec<VarId> = system
@@ -149,8 +153,8 @@ impl Reader<'_, '_> {
         }
     }
 
-    /// The part alone. Each of its inputs follows from what the drive that takes it applies; each signal of a drive
-    /// from what the part gives by it.
+    /// The plant: the part alone. Each of its inputs follows from what the drive applies, and each signal of a drive
+    /// from the outputs of the part.
     pub(super) fn plant(
         &mut self,
         system: &System,
@@ -180,12 +184,12 @@ impl Reader<'_, '_> {
                 failed = true;
                 continue;
             };
-            // One drive that does the work of several inputs: the part feels their sum as the first of them.
+            // One drive serves several inputs: the part receives their sum through the first of them.
             for (other, _) in form.terms.split_off(1) {
                 let none = plant.push(nothing(), span);
                 plant.vars[other.0 as usize].definition = Definition::Value(none, Origin::Default);
             }
-            // The same name is what is commanded and what is applied.
+            // The commanded and the applied quantity have the same name.
             let signal = self.applied_signal(&mut plant, framed, send, *command);
             let signal_value = plant.push(Node::Var(signal), span);
             let solution = solved(&mut plant, &form, signal_value, span);
@@ -237,7 +241,7 @@ impl Reader<'_, '_> {
         let seen_read: Vec<ExprId> = seen.iter().map(|id| plant.push(Node::Var(*id), self.rig.span)).collect();
         let pruned = pruned(&plant, states, &seen_read);
         applied.retain(|id| lives(&pruned, *id) || matches!(pruned.var(*id).definition, Definition::Free));
-        // What feeds the part from elsewhere would have to come from the control program.
+        // Any other input of the part would have to come from the control program.
         let foreign = pruned.var_ids().find(|id| {
             let var = pruned.var(*id);
             let framing = framed.nodes.contains(&var.instance) || var.instance == framed.rig;
@@ -257,7 +261,7 @@ impl Reader<'_, '_> {
         Some(PlantSystem { system: pruned, applied, seen, seen_read })
     }
 
-    /// What a drive applies: its own measurement of what it is told, or of a device a quantity of its own.
+    /// The quantity that a drive applies: its own measurement of the command, or for a device a quantity of its own.
     fn applied_signal(&mut self, plant: &mut System, framed: &Framed, send: &Send, command: VarId) -> VarId {
         let node = framed.nodes[send.node];
         let name = self.files.slice(send.path).rsplit('.').next().unwrap_or_default().trim().to_string();
@@ -268,7 +272,7 @@ impl Reader<'_, '_> {
         match own {
             Some(own) => own,
             None => {
-                // Nothing reports it: the command itself, as an input.
+                // There is no measurement, so the command itself becomes an input.
                 let var = &mut plant.vars[command.0 as usize];
                 (var.kind, var.definition) = (VarKind::Input, Definition::Free);
                 command
@@ -276,7 +280,8 @@ impl Reader<'_, '_> {
         }
     }
 
-    /// Drives of one rig turn one shaft: speed and position that no wire mentions are those of the drive that has them.
+    /// All drives of one rig turn the same shaft: speed and position without a wire equal those of the drive that has
+    /// them.
     fn same_shaft(&mut self, plant: &mut System, framed: &Framed, seen: &mut Vec<VarId>, applied: &[VarId]) {
         for name in ["speed", "position"] {
             let Some(known) = seen.iter().copied().find(|id| plant.var(*id).name == name) else { continue };
@@ -297,7 +302,7 @@ impl Reader<'_, '_> {
         }
     }
 
-    /// E0801 for what the rest of the system, or the rig, reads of the part and no wire gives.
+    /// E0801: the rest of the system or the rig reads a quantity of the part for which there is no wire.
     pub(super) fn not_given(
         &mut self,
         control: &System,
