@@ -1,26 +1,26 @@
-//! The syntax tree: what was written, with the place of every part.
+//! The syntax tree: the text as written, with the span of every part.
 //!
-//! Nothing here is checked beyond the concrete syntax, with one exception: inside a model the declared
-//! names decide whether `dz/dt` is a derivative or a division (docs/language.md), so the tree holds the answer.
+//! Nothing is checked beyond the concrete syntax, with one exception: within a model, the declared names decide whether
+//! `dz/dt` is a derivative or a division (docs/language.md), so the tree holds that decision. Knows nothing of meaning.
 
 use crate::span::Span;
 
 /// A whole text.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct File {
-    /// The items in the order of the text. Items that could not be read are left out; they have been reported.
+    /// Items in the order of the text, without unreadable ones, which have been reported.
     pub items: Vec<Item>,
-    /// Names that are declared outside of all items, or by an item that could not be read. That has been reported;
-    /// whoever uses such a name makes no mistake of its own.
+    /// Names declared outside of all items or by an unreadable item, which has been reported. Uses of these names are
+    /// not further errors.
     pub lost: Vec<String>,
 }
 
-/// A word that names something.
+/// An identifier.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Name {
-    /// The word.
+    /// The characters.
     pub text: String,
-    /// Its place.
+    /// Span of the identifier.
     pub span: Span,
 }
 
@@ -29,7 +29,7 @@ pub struct Name {
 pub struct UnitText {
     /// The characters.
     pub text: String,
-    /// Their place.
+    /// Span of the characters.
     pub span: Span,
 }
 
@@ -38,11 +38,11 @@ pub struct UnitText {
 pub struct Text {
     /// The characters.
     pub text: String,
-    /// Their place, with the quotes.
+    /// Span including the quotes.
     pub span: Span,
 }
 
-/// One item at the top of a file.
+/// One top-level item of a file.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub enum Item {
@@ -63,7 +63,7 @@ pub enum Item {
 pub struct Import {
     /// What is imported.
     pub source: ImportSource,
-    /// The whole item.
+    /// Span of the whole item.
     pub span: Span,
 }
 
@@ -99,7 +99,7 @@ pub struct Function {
     pub span: Span,
 }
 
-/// An argument of a function or table; without a unit it is a pure number.
+/// An argument of a function or table. Without a unit it is dimensionless.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Argument {
@@ -120,21 +120,21 @@ pub struct Table {
     pub span: Span,
 }
 
-/// How a table goes from point to point.
+/// Interpolation of a table.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum TableShape {
-    /// Straight lines.
+    /// Linear interpolation.
     Linear,
-    /// Monotone cubics.
+    /// Monotone cubic interpolation.
     Smooth,
 }
 
 /// The points of a table.
 #[derive(Clone, PartialEq, Debug)]
 pub enum TablePoints {
-    /// Written out: (argument, value).
+    /// Listed as (argument, value).
     Listed(Vec<(Expr, Expr)>),
-    /// In a file of two columns.
+    /// Two columns of a file.
     File(Text),
 }
 
@@ -187,7 +187,7 @@ pub struct Declaration {
     pub span: Span,
 }
 
-/// What a declaration declares.
+/// Kind of a declaration.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum DeclarationKind {
@@ -211,7 +211,7 @@ impl DeclarationKind {
     }
 }
 
-/// What stands behind `in`.
+/// A range, written after `in`.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Range {
     /// `a .. b`, both ends included.
@@ -236,31 +236,31 @@ pub enum Target {
     Name(Name),
     /// `dz/dt`, `dx/ds`; `span` covers both words. The names are without the `d`.
     Derivative {
-        /// What changes.
+        /// The differentiated state.
         of: Name,
-        /// Along what: `t` or a state.
+        /// The variable of differentiation: `t` or a state.
         along: Name,
-        /// Both words.
+        /// Span of both words.
         span: Span,
     },
     /// `next(x)`; `span` covers all of it.
     Next {
         /// The sampled state.
         name: Name,
-        /// All of `next(x)`.
+        /// Span of all of `next(x)`.
         span: Span,
     },
 }
 
 impl Target {
-    /// The quantity it gives a value to.
+    /// The quantity that the equation defines.
     pub fn name(&self) -> &Name {
         match self {
             Target::Name(name) | Target::Derivative { of: name, .. } | Target::Next { name, .. } => name,
         }
     }
 
-    /// The place of the whole left side.
+    /// The span of the whole left side.
     pub fn span(&self) -> Span {
         match self {
             Target::Name(name) => name.span,
@@ -299,7 +299,7 @@ pub struct SlotType {
     pub interface: Name,
 }
 
-/// `LuGre(v = body.v, Fc = 2 N)`, perhaps with `rotary` before it.
+/// `LuGre(v = body.v, Fc = 2 N)`, optionally preceded by `rotary`.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Instance {
@@ -318,7 +318,7 @@ pub struct Bind {
     pub span: Span,
 }
 
-/// What an argument is bound to.
+/// Value of an argument.
 #[derive(Clone, PartialEq, Debug)]
 pub enum BindValue {
     /// A value.
@@ -349,13 +349,13 @@ pub enum EveryStatement {
 #[allow(missing_docs)]
 pub struct Mode {
     pub name: Name,
-    /// The word `initial`, if it stands there.
+    /// Span of the word `initial`, if it is present.
     pub initial: Option<Span>,
     pub equations: Vec<Equation>,
     pub transitions: Vec<Go>,
-    /// From the keyword to the closing brace.
+    /// Span from the keyword to the closing brace.
     pub span: Span,
-    /// `mode NAME`, for labels.
+    /// Span of `mode NAME`, for labels.
     pub head: Span,
 }
 
@@ -440,7 +440,7 @@ pub enum ExperimentStatement {
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Run {
-    /// A model, or a rig when the name begins with a small letter.
+    /// A model, or a rig if the name begins with a lower-case letter.
     pub instance: Instance,
     pub duration: Option<Expr>,
     pub span: Span,
@@ -465,7 +465,7 @@ pub struct Sweep {
     pub span: Span,
 }
 
-/// What a sweep goes through.
+/// Values of a sweep.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(clippy::large_enum_variant)] // there are few
 pub enum SweepOver {
@@ -477,9 +477,9 @@ pub enum SweepOver {
     Grid {
         /// First value.
         first: Expr,
-        /// Last value, included when the steps meet it.
+        /// Last value, included if it is a whole number of steps from the first.
         last: Expr,
-        /// Distance.
+        /// Step.
         step: Expr,
     },
 }
@@ -503,7 +503,7 @@ pub struct Plot {
     pub span: Span,
 }
 
-/// An expression with the unit it is shown in.
+/// An expression with its display unit.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Show {
@@ -520,7 +520,7 @@ pub struct Expect {
     pub value: Expr,
     /// `~= target +- tolerance`
     pub near: Option<(Expr, Expr)>,
-    /// Of `show`: nothing is expected, and the value is shown in this unit if one is given.
+    /// `Some` for `show`, which expects nothing: the display unit, if one is given.
     pub shows: Option<Option<UnitText>>,
     pub after: Option<Expr>,
     pub before: Option<Expr>,
@@ -558,7 +558,7 @@ pub struct Device {
     pub span: Span,
 }
 
-/// How a device is described.
+/// Description of a device.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub enum DeviceBody {
@@ -570,7 +570,7 @@ pub enum DeviceBody {
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct FrameSignal {
-    /// `send` rather than `read`.
+    /// Whether it is `send` rather than `read`.
     pub send: bool,
     pub name: Name,
     pub unit: Option<UnitText>,
@@ -641,7 +641,7 @@ pub enum BusArg {
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct DriveDecl {
-    /// `drive` rather than `device`.
+    /// Whether it is a `drive` rather than a `device`.
     pub moves: bool,
     pub name: Name,
     pub kind: Name,
@@ -681,13 +681,13 @@ pub struct Wire {
 /// `body.x`, `el[2].f`, `Fs`: one or more names.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Path {
-    /// At least one.
+    /// At least one segment.
     pub segments: Vec<Segment>,
-    /// From the first to the last.
+    /// Span from the first to the last segment.
     pub span: Span,
 }
 
-/// One name of a path, with the index that follows it.
+/// One name of a path and its optional index.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Segment {
@@ -696,7 +696,7 @@ pub struct Segment {
 }
 
 impl Path {
-    /// The name, if the path is a single one without index.
+    /// The name, if the path is a single name without index.
     pub fn single(&self) -> Option<&Name> {
         match self.segments.as_slice() {
             [Segment { name, index: None }] => Some(name),
@@ -705,12 +705,12 @@ impl Path {
     }
 }
 
-/// An expression and its place.
+/// An expression and its span.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Expr {
-    /// What it is.
+    /// Kind and operands.
     pub kind: ExprKind,
-    /// Where it stands; parentheses around it are not part of it.
+    /// Span without surrounding parentheses.
     pub span: Span,
 }
 
@@ -719,18 +719,18 @@ pub struct Expr {
 pub enum ExprKind {
     /// `10 mm`: the number as written times the unit as written.
     Number {
-        /// Before the unit is applied.
+        /// Value before the unit is applied.
         value: f64,
-        /// Directly behind the number.
+        /// Unit that directly follows the number.
         unit: Option<UnitText>,
     },
     /// A name or path; also `t`, `pi`, `inf`, `true`, `false`.
     Path(Path),
     /// `dz/dt`, `dx/ds`, names without the `d`.
     Derivative {
-        /// What changes.
+        /// The differentiated state.
         of: Name,
-        /// Along what: `t` or a state.
+        /// The variable of differentiation: `t` or a state.
         along: Name,
     },
     /// `max(a, b)`
@@ -739,7 +739,7 @@ pub enum ExprKind {
         function: Name,
         /// At least one.
         args: Vec<Expr>,
-        /// Of a measure: over which part of the run it is taken.
+        /// For a measure: the part of the run over which it is taken.
         window: Option<Box<Window>>,
     },
     /// `-a`, `not a`
@@ -750,7 +750,7 @@ pub enum ExprKind {
     If(Box<Expr>, Box<Expr>, Box<Expr>),
     /// `?`
     Hole,
-    /// Something that could not be read and has been reported.
+    /// An unreadable expression, which has been reported.
     Error,
 }
 
@@ -762,7 +762,7 @@ pub struct Window {
     pub before: Option<Expr>,
 }
 
-/// Operators before one operand.
+/// Unary operators.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum UnaryOp {
@@ -770,7 +770,7 @@ pub enum UnaryOp {
     Not,
 }
 
-/// Operators between two operands.
+/// Binary operators.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 #[allow(missing_docs)]
 pub enum BinaryOp {
@@ -793,7 +793,7 @@ pub enum BinaryOp {
 }
 
 impl UnaryOp {
-    /// How tightly it binds, among [`BinaryOp::binds`].
+    /// Precedence, on the scale of [`BinaryOp::binds`].
     pub fn binds(self) -> u8 {
         match self {
             UnaryOp::Not => 3,
@@ -803,7 +803,7 @@ impl UnaryOp {
 }
 
 impl BinaryOp {
-    /// How tightly it binds, from 1 on; loosest first.
+    /// Precedence: 1 is the lowest.
     pub fn binds(self) -> u8 {
         match self {
             BinaryOp::Or => 1,
@@ -823,7 +823,7 @@ impl BinaryOp {
         }
     }
 
-    /// As written.
+    /// The operator as written.
     pub fn text(self) -> &'static str {
         match self {
             BinaryOp::Add => "+",

@@ -1,17 +1,19 @@
-//! What is said about a text: plain data, rendered elsewhere.
+//! Diagnostics: errors and warnings about a text, as plain data.
+//!
+//! Produced by every stage of the compiler; rendered elsewhere.
 
 use crate::span::Span;
 
-/// How bad it is.
+/// Severity of a diagnostic.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Severity {
     /// The text cannot be compiled.
     Error,
-    /// The text compiles, but something in it deserves a look.
+    /// The text compiles, but the user should look at the marked place.
     Warning,
 }
 
-/// Mistakes that are met again at each place that leads to them. Of each kind one message is shown: the first.
+/// Kinds of errors that are found again at each place that leads to them. Only the first of each kind is shown.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Recurring {
     /// A model contains itself.
@@ -28,7 +30,7 @@ pub enum Recurring {
     Operations,
 }
 
-/// One mistake: what is wrong, where, and what would mend it.
+/// One error or warning: the problem, its place, and a suggestion.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Diagnostic {
     /// Stable code with a page of its own, such as `E0101`.
@@ -37,42 +39,42 @@ pub struct Diagnostic {
     pub severity: Severity,
     /// One sentence in the words of the file.
     pub message: String,
-    /// Places; the first is where the change is to be made.
+    /// Labelled spans; the first is where the user should make the change.
     pub labels: Vec<Label>,
-    /// What to do, if possible as text to paste. May have several lines.
+    /// Suggestion, if possible as text to paste. May have several lines.
     pub help: Option<String>,
     /// Its kind, if it recurs.
     pub recurring: Option<Recurring>,
 }
 
-/// A marked place with a few words.
+/// A span with a short text.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Label {
-    /// The marked bytes.
+    /// The labelled bytes.
     pub span: Span,
-    /// The words; may be empty.
+    /// The text of the label; may be empty.
     pub text: String,
 }
 
 impl Diagnostic {
-    /// An error without a place yet: [`label`](Diagnostic::label) gives it one.
+    /// An error without a span; add one by [`label`](Diagnostic::label).
     pub fn error(code: &'static str, message: impl Into<String>) -> Diagnostic {
         let (severity, message) = (Severity::Error, message.into());
         Diagnostic { code, severity, message, labels: Vec::new(), help: None, recurring: None }
     }
 
-    /// A warning.
+    /// A warning without a span.
     pub fn warning(code: &'static str, message: impl Into<String>) -> Diagnostic {
         Diagnostic { severity: Severity::Warning, ..Diagnostic::error(code, message) }
     }
 
-    /// Adds a marked place. The first one added is the primary place.
+    /// Adds a label. The first label is the primary one.
     pub fn label(mut self, span: Span, text: impl Into<String>) -> Diagnostic {
         self.labels.push(Label { span, text: text.into() });
         self
     }
 
-    /// Says what would mend it.
+    /// Sets the suggestion.
     pub fn help(mut self, help: impl Into<String>) -> Diagnostic {
         self.help = Some(help.into());
         self
@@ -89,7 +91,7 @@ impl Diagnostic {
         self.labels.first().map(|label| label.span).unwrap_or_default()
     }
 
-    /// Whether the text cannot be compiled because of this.
+    /// Whether it prevents compilation.
     pub fn is_error(&self) -> bool {
         self.severity == Severity::Error
     }

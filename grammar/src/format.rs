@@ -1,8 +1,8 @@
-//! Writes a text in its canonical form.
+//! Formatter: writes a text in its canonical form.
 //!
-//! In: a text without mistakes. Out: the same text with one statement a line, canonical blanks and units, and the
-//! columns of neighbouring declarations and equations aligned; comments, blank lines and the line breaks inside
-//! statements stay. It moves tokens and never changes the tree.
+//! In: a text without errors. Out: the same text with one statement per line, canonical blanks and units, and aligned
+//! columns of adjacent declarations and equations. Keeps comments, blank lines and line breaks within statements. Moves
+//! tokens only and never changes the syntax tree.
 
 use std::collections::{HashMap, HashSet};
 
@@ -12,18 +12,18 @@ use crate::span::FileId;
 use crate::split::{Piece, Place, Source};
 use crate::tokens::{Token, TokenKind, is_context_word, is_keyword, tokens};
 
-/// Where ranges and comments stand if nothing needs more room.
+/// Default columns of ranges and comments.
 const RANGE_COLUMN: usize = 27;
 const COMMENT_COLUMN: usize = 53;
 
-/// How often a text is laid out again at most.
+/// Limit on the number of layout passes over a text.
 const PASSES_MAX: usize = 16;
 
-/// The canonical form of `text`, or its mistakes. A line longer than `width` is broken behind a comma in brackets,
-/// where it has one.
+/// The canonical form of `text`, or its errors. A line longer than `width` is broken after a comma in brackets, if it
+/// has one.
 pub fn format(text: &str, width: usize) -> Result<String, Vec<Diagnostic>> {
     let mut text = once(text, width)?;
-    // A broken line may move a column, and a moved column may break a line; breaks are only ever added.
+    // A broken line may move a column, and a moved column may break a line. Breaks are only added, so this terminates.
     for _ in 0..PASSES_MAX {
         let next = once(&text, width)?;
         if next == text {
@@ -50,7 +50,7 @@ fn once(text: &str, width: usize) -> Result<String, Vec<Diagnostic>> {
     Ok(layout.write())
 }
 
-/// Canonical form of a unit: products before quotients, `·` for products, ASCII for everything else.
+/// Canonical form of a unit: products before quotients, `·` for products, ASCII otherwise.
 pub fn canonical_unit(unit: &str) -> String {
     let plain = unit.replace('*', "·").replace(['µ', 'μ'], "u").replace('°', "deg").replace('Ω', "Ohm");
     let (mut over, mut under): (Vec<String>, Vec<String>) = (Vec::new(), Vec::new());
@@ -89,37 +89,37 @@ pub fn canonical_unit(unit: &str) -> String {
     result
 }
 
-/// A line of the result.
+/// A line of the output.
 struct Line {
-    /// The marks on it; empty if it is a comment alone.
+    /// Marks of the line; empty for a line with only a comment.
     piece: Piece,
     comment: Option<Token>,
-    /// A blank line stands before it.
+    /// Whether a blank line precedes it.
     gap: bool,
 }
 
-/// A statement or item at its beginning.
+/// The start of a statement or item.
 #[derive(Clone, Copy)]
 struct Start {
     level: usize,
     place: Option<Place>,
-    /// Which block it stands in: the index of its `{`, or `usize::MAX`.
+    /// The enclosing block: the index of its `{`, or `usize::MAX`.
     block: usize,
 }
 
 struct Layout<'s, 't> {
     source: &'s Source<'t>,
-    /// Where the strokes of derivatives stand.
+    /// Offsets of the slashes of derivatives.
     strokes: HashSet<usize>,
-    /// The characters of each mark, canonical.
+    /// The canonical characters of each mark.
     words: Vec<String>,
     starts: Vec<Option<Start>>,
-    /// For a `}` on a line of its own: the level of its statement.
+    /// For a `}` on a line of its own: the nesting level of its statement.
     closers: HashMap<usize, usize>,
     lines: Vec<Line>,
-    /// Extra blanks before a mark.
+    /// Additional blanks before a mark.
     pads: HashMap<usize, usize>,
-    /// Where the comment of a line stands.
+    /// Column of the comment of a line.
     comments: HashMap<usize, usize>,
 }
 
@@ -180,7 +180,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Cuts the text into lines: at the line breaks it has, and before each statement of a block.
+    /// Splits the text into lines: at its own line breaks, and before each statement of a block.
     fn lines(&mut self) {
         let mut lines: Vec<Line> = Vec::new();
         let (mut mark, mut newlines) = (0, 2);
@@ -219,7 +219,7 @@ impl<'s, 't> Layout<'s, 't> {
         self.lines = lines;
     }
 
-    /// Breaks lines that are too long behind a comma of the outermost brackets.
+    /// Breaks lines that are too long after a comma of the outermost brackets.
     fn fold(&mut self, width: usize) {
         let mut folded: Vec<Line> = Vec::with_capacity(self.lines.len());
         for line in std::mem::take(&mut self.lines) {
@@ -229,7 +229,7 @@ impl<'s, 't> Layout<'s, 't> {
                 None => self.source.marks.get(start).map_or(0, |mark| self.old_column(mark.token.start)),
             };
             let (mut gap, mut depth, mut column, mut open) = (line.gap, 0usize, indent, 0);
-            // The last comma that may be broken behind, with the column it ends in.
+            // The last comma after which the line may be broken, with its end column.
             let mut comma: Option<(usize, usize)> = None;
             for at in line.piece.start..end {
                 column += self.space(at, start) + self.pad(at) + self.width(at);
@@ -265,12 +265,12 @@ impl<'s, 't> Layout<'s, 't> {
         self.words[at].chars().count()
     }
 
-    /// Blanks before `at` on a line that begins with `first`, without those that align.
+    /// Blanks before `at` on a line that begins with `first`, without alignment.
     fn space(&self, at: usize, first: usize) -> usize {
         if at == first { 0 } else { self.separates(at - 1, at) as usize }
     }
 
-    /// Whether this mark is a word that asks for an expression behind it.
+    /// Whether this mark is a word that is followed by an expression.
     fn asks(&self, at: usize) -> bool {
         let word = self.source.word(at);
         self.source.kind(at) == Some(TokenKind::Word)
@@ -278,7 +278,7 @@ impl<'s, 't> Layout<'s, 't> {
                 || is_context_word(word) && (self.starts[at].is_some() || at > 0 && self.ends(at - 1)))
     }
 
-    /// Whether an operand ends here.
+    /// Whether an operand ends with this mark.
     fn ends(&self, at: usize) -> bool {
         self.source.ends_operand(at) && !self.asks_after_operand(at)
     }
@@ -323,13 +323,13 @@ impl<'s, 't> Layout<'s, 't> {
         true
     }
 
-    /// Whether a colon belongs to the slot of a part, not to a point of a table.
+    /// Whether a colon belongs to the slot of a part rather than to a point of a table.
     fn slot(&self, colon: usize) -> bool {
         let start = (0..=colon).rev().find(|&at| self.starts[at].is_some()).unwrap_or(0);
         self.source.is_word(start, "part")
     }
 
-    /// Whether a minus sign is the hyphen in the name of a warning: `allow large-step`.
+    /// Whether a minus sign is the hyphen in the name of a lint: `allow large-step`.
     fn hyphen(&self, minus: usize) -> bool {
         let start = (0..=minus).rev().find(|&at| self.starts[at].is_some()).unwrap_or(0);
         self.source.is_word(start, "allow")
@@ -337,7 +337,7 @@ impl<'s, 't> Layout<'s, 't> {
 
     // ---- columns
 
-    /// The column of a mark, as far as blanks are decided.
+    /// The column of a mark, including the blanks decided so far.
     fn column(&self, line: &Line, at: usize) -> usize {
         let first = line.piece.start;
         let indent = self.starts[first].map_or(0, |start| 2 * start.level);
@@ -354,18 +354,18 @@ impl<'s, 't> Layout<'s, 't> {
         self.column(line, last) + self.width(last)
     }
 
-    /// The column of a byte in the text as it was, if it was set apart by two blanks or more; else 0.
+    /// The original column of a byte if at least two blanks precede it; otherwise 0.
     fn chosen_column(&self, at: usize) -> usize {
         if self.source.text[..at].ends_with("  ") { self.old_column(at) } else { 0 }
     }
 
-    /// The column of a byte in the text as it was.
+    /// The original column of a byte.
     fn old_column(&self, at: usize) -> usize {
         let line = self.source.text[..at].rfind('\n').map_or(0, |newline| newline + 1);
         self.source.text[line..at].trim_start_matches('\u{feff}').chars().count()
     }
 
-    /// Makes the words that begin statements equally wide.
+    /// Pads the words that begin statements to the same width.
     fn heads(&mut self) {
         let mut widths: HashMap<usize, usize> = HashMap::new();
         let mut heads: Vec<(usize, Start)> = Vec::new();
@@ -397,7 +397,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Lines that begin a statement, in runs without a gap or a comment between them.
+    /// Runs of consecutive lines that begin a statement, without a blank line or a comment between them.
     fn runs(&self) -> Vec<Vec<usize>> {
         let mut runs: Vec<Vec<usize>> = Vec::new();
         let mut block = None;
@@ -420,7 +420,7 @@ impl<'s, 't> Layout<'s, 't> {
         runs
     }
 
-    /// Aligns neighbouring statements of the same kind: names, units and equals signs.
+    /// Aligns adjacent statements of the same kind: names, units and equals signs.
     fn names(&mut self, runs: &[Vec<usize>]) {
         for run in runs {
             let groups: Vec<&[usize]> = run.chunk_by(|&a, &b| self.kind(a) == self.kind(b)).collect();
@@ -434,7 +434,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Aligns ranges and comments of neighbouring statements, and what else stands in columns.
+    /// Aligns ranges, comments and other columns of adjacent statements.
     fn columns(&mut self, runs: &[Vec<usize>]) {
         for run in runs {
             for word in COLUMN_WORDS {
@@ -451,7 +451,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// What must agree for two statements to be aligned.
+    /// The key that two statements must share to be aligned.
     fn kind(&self, line: usize) -> (&str, bool) {
         let first = self.lines[line].piece.start;
         let word = self.source.word(first);
@@ -469,7 +469,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// The mark behind the name that a statement declares.
+    /// The mark after the name that a statement declares.
     fn name_stop(&self, line: usize) -> Option<(usize, usize)> {
         let first = self.lines[line].piece.start;
         let mark = match self.kind(line).0 {
@@ -480,7 +480,7 @@ impl<'s, 't> Layout<'s, 't> {
         (mark < self.lines[line].piece.end).then_some((line, mark))
     }
 
-    /// The equals sign of a statement, unless it stands behind the name.
+    /// The equals sign of a statement, unless it directly follows the name.
     fn equals_stop(&self, line: usize) -> Option<(usize, usize)> {
         let Piece { start, end } = self.lines[line].piece;
         let (kind, unit) = self.kind(line);
@@ -493,7 +493,7 @@ impl<'s, 't> Layout<'s, 't> {
         Some((line, mark))
     }
 
-    /// The word `word` of a statement, outside of brackets.
+    /// The word `word` of a statement, outside brackets.
     fn word_stop(&self, line: usize, word: &str) -> Option<(usize, usize)> {
         let Piece { start, end } = self.lines[line].piece;
         let mut depth = 0i32;
@@ -517,7 +517,7 @@ impl<'s, 't> Layout<'s, 't> {
         None
     }
 
-    /// Brings `stops` to one column. `loose`: one name that is much longer than all others stays out.
+    /// Aligns `stops` to one column. `loose`: excludes one name that is much longer than all others.
     fn align(&mut self, stops: &[(usize, usize)], loose: bool) {
         let mut columns: Vec<usize> = stops.iter().map(|&(line, at)| self.column(&self.lines[line], at)).collect();
         columns.sort_unstable();
@@ -530,7 +530,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Leaves `stops` in the column they share, or brings them to one with two blanks before it.
+    /// Keeps the column that `stops` share, or aligns them to one that is preceded by two blanks.
     fn keep_or_align(&mut self, stops: &[(usize, usize)], least: usize) {
         let natural: Vec<usize> = stops.iter().map(|&(line, at)| self.column(&self.lines[line], at)).collect();
         let old: Vec<usize> =
@@ -557,7 +557,7 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Aligns the equals signs of arguments that stand each on a line of its own.
+    /// Aligns the equals signs of arguments on lines of their own.
     fn arguments(&mut self) {
         let mut open: Vec<Vec<usize>> = Vec::new();
         let mut groups: Vec<Vec<usize>> = Vec::new();
@@ -578,7 +578,7 @@ impl<'s, 't> Layout<'s, 't> {
             }
         }
         for group in groups {
-            // The first argument stands behind the bracket if that does not end its line.
+            // The first argument follows the bracket unless the bracket ends its line.
             let Some(&first) = group.first() else { continue };
             if !self.source.is_symbol(first - 2, "(") {
                 continue;
@@ -590,8 +590,8 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// Blanks by which something stands exactly under or above something of the neighbouring statement stay:
-    /// `F_ext >  Fs` over `F_ext < -Fs`.
+    /// Keeps blanks that place a mark exactly below or above a mark of the adjacent statement: `F_ext >  Fs` over
+    /// `F_ext < -Fs`.
     fn chosen(&mut self) {
         type Mark = (usize, usize);
         let mut kept: Vec<(usize, Mark, Mark)> = Vec::new();
@@ -608,7 +608,7 @@ impl<'s, 't> Layout<'s, 't> {
             let (above, below) = (self.marks_of(upper), self.marks_of(lower));
             for (line, marks, other, others) in [(upper, &above, lower, &below), (lower, &below, upper, &above)] {
                 for &(column, at, _) in marks.iter().filter(|(_, _, extra)| *extra) {
-                    // Columns ascend along a line.
+                    // Columns increase along a line.
                     if let Ok(k) = others.binary_search_by_key(&column, |(column, ..)| *column)
                         && !others[k].2
                     {
@@ -624,8 +624,8 @@ impl<'s, 't> Layout<'s, 't> {
         }
     }
 
-    /// The marks of a line but the first, if it was one before: the column each had, and whether it had more blanks
-    /// before it than it has now.
+    /// The marks of a line except the first, provided that it was a single line before: the original column of each,
+    /// and whether it had more blanks before it than it has now.
     fn marks_of(&self, line: usize) -> Vec<(usize, usize, bool)> {
         let Piece { start, end } = self.lines[line].piece;
         let begins = |at: usize| self.source.marks[at].token.start;
@@ -640,7 +640,7 @@ impl<'s, 't> Layout<'s, 't> {
             column += before.text(self.source.text).chars().count();
             let blanks = begins(at) - before.end;
             column += blanks;
-            // What stands in a column of its own is brought there afterwards.
+            // Marks in a column of their own are aligned later.
             if !columns.contains(&at) {
                 out.push((column, at, blanks > self.space(at, start) + self.pad(at)));
             }
@@ -652,10 +652,10 @@ impl<'s, 't> Layout<'s, 't> {
 
     fn write(&self) -> String {
         let mut text = String::with_capacity(self.source.text.len() + 64);
-        // For each open bracket, the column behind it, or nothing if it ends its line; and where `if`s stand.
+        // For each open bracket the column after it, or `None` if it ends its line; and the columns of `if`s.
         let mut open: Vec<Option<usize>> = Vec::new();
         let mut ifs: Vec<(usize, usize)> = Vec::new();
-        // An `if` behind an `else` goes on with the one before it: its own `else` stands under that one.
+        // An `if` after an `else` continues the preceding `if`, so its `else` is aligned with that of the former.
         let mut before = None;
         let mut indent = 0;
         for (index, line) in self.lines.iter().enumerate() {
@@ -664,7 +664,7 @@ impl<'s, 't> Layout<'s, 't> {
             }
             let Piece { start, end } = line.piece;
             if start == end {
-                // A comment belongs to what follows it, in a block also before the end of the block.
+                // A comment is indented like the line that follows it, or as a statement before the end of a block.
                 let level = match self.closers.get(&start) {
                     Some(level) => 2 * level + 2,
                     None => self.starts.get(start).copied().flatten().map_or(indent + 2, |start| 2 * start.level),
@@ -725,7 +725,8 @@ impl<'s, 't> Layout<'s, 't> {
     }
 }
 
-/// The column for things that want at least `natural`: the one they share, or the least that fits all.
+/// The column for marks that need at least the columns `natural`: the one they share, or the least that suffices for
+/// all.
 fn goal(natural: &[usize], old: &[usize], least: usize) -> Option<usize> {
     let needed = *natural.iter().max()?;
     let shared = old.iter().all(|&column| column == old[0]) && old[0] >= needed;

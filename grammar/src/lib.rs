@@ -1,7 +1,7 @@
-//! Text to syntax tree and diagnostics, and tree back to canonical text.
+//! Parser and formatter: text to syntax tree and diagnostics, and text to its canonical form.
 //!
-//! In: a text. Out: always a [`ast::File`], with what is wrong as [`diagnostic::Diagnostic`]s. Does no input or
-//! output and knows no units, models or names beyond the model that it is reading.
+//! In: a text. Out: always an [`ast::File`], with errors as [`diagnostic::Diagnostic`]s. Performs no input or output.
+//! Knows no units, no models, and no names beyond the model that is being parsed.
 
 pub mod span;
 

@@ -1,8 +1,8 @@
-//! Reads a text into its syntax tree. The only file that names pest.
+//! Parser: text to syntax tree. The only file that uses pest.
 //!
-//! In: a text. Out: always a tree, and what is wrong with the text in its own words. Each item and each statement is
-//! read by itself (`split` finds them), so that one mistake neither hides nor causes another. Of a declaration or an
-//! equation that cannot be read the head is kept, with [`ExprKind::Error`] for its value.
+//! In: a text. Out: always a tree, and diagnostics in terms of the text. Each item and each statement is parsed
+//! separately (`split` finds them), so that one error neither hides nor causes another. For an unreadable declaration
+//! or equation the head is kept, with [`ExprKind::Error`] as its value. Knows nothing of meaning.
 
 use std::collections::HashSet;
 
@@ -17,27 +17,27 @@ use crate::span::{FileId, Span};
 use crate::split::{Piece, Place, Source, begins_item};
 use crate::tokens::TokenKind;
 
-/// How deep brackets and conditions may lie in each other.
+/// Limit on the nesting of brackets and conditions.
 pub const DEPTH_LIMIT: usize = 256;
-/// How high the tree of an expression may grow: no sum or product has more terms, and whoever walks a tree by
-/// recursion needs no more than this many calls.
+/// Limit on the height of an expression tree. It bounds the number of terms of a sum or product, and the depth of a
+/// recursion over the tree.
 pub const HEIGHT_LIMIT: usize = 1000;
-/// How many mistakes of one text are returned.
+/// Limit on the number of diagnostics for one text.
 pub const DIAGNOSTIC_LIMIT: usize = 100;
 
-/// More than one level of brackets needs on the stack, in bytes, without optimisation.
+/// Upper bound on the stack in bytes for one level of brackets, without optimisation.
 const STACK_PER_LEVEL: usize = 64 << 10;
 
-/// What a text says, and what is wrong with it.
+/// Result of parsing a text.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Parsed {
-    /// All that could be read.
+    /// The tree of everything readable.
     pub file: File,
-    /// In the order of the text; empty if all of it could be read.
+    /// Errors in the order of the text; empty if all of it is readable.
     pub diagnostics: Vec<Diagnostic>,
 }
 
-/// Reads a whole text.
+/// Parses a whole text.
 pub fn parse(file: FileId, text: &str) -> Parsed {
     let mut reader = Reader::new(file, text);
     let items = reader.items();
@@ -45,7 +45,7 @@ pub fn parse(file: FileId, text: &str) -> Parsed {
     Parsed { file: File { items, lost }, diagnostics: reader.finish() }
 }
 
-/// For the formatter: where the strokes of derivatives stand, unlike those of divisions.
+/// For the formatter: the offsets of slashes of derivatives, as opposed to divisions.
 pub(crate) fn derivatives(text: &str) -> Result<HashSet<usize>, Vec<Diagnostic>> {
     let mut reader = Reader::new(FileId::default(), text);
     reader.items();
@@ -54,7 +54,7 @@ pub(crate) fn derivatives(text: &str) -> Result<HashSet<usize>, Vec<Diagnostic>>
     if diagnostics.is_empty() { Ok(derivatives) } else { Err(diagnostics) }
 }
 
-/// Reads one expression, as on a command line. Outside models `dz/dt` is a division.
+/// Parses one expression, as on a command line. Outside models `dz/dt` is a division.
 pub fn parse_expr(file: FileId, text: &str) -> (Expr, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
     let expr = reader.alone(Rule::one_expr, "an expression").map(|pair| reader.expr(pair));
@@ -62,28 +62,28 @@ pub fn parse_expr(file: FileId, text: &str) -> (Expr, Vec<Diagnostic>) {
     (expr.unwrap_or(Expr { kind: ExprKind::Error, span: whole }), reader.finish())
 }
 
-/// Reads one instance: `LuGre(vd = 10 mm/s)`.
+/// Parses one instance: `LuGre(vd = 10 mm/s)`.
 pub fn parse_instance(file: FileId, text: &str) -> (Option<Instance>, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
     let instance = reader.alone(Rule::one_inst, "a model with its arguments").map(|pair| reader.instance(pair));
     (instance, reader.finish())
 }
 
-/// Reads one path: `fr.Fs`.
+/// Parses one path: `fr.Fs`.
 pub fn parse_path(file: FileId, text: &str) -> (Option<Path>, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
     let path = reader.alone(Rule::one_path, "a name").map(|pair| reader.path(pair));
     (path, reader.finish())
 }
 
-/// Reads one setting: `fr.Fs = 2 N`.
+/// Parses one setting: `fr.Fs = 2 N`.
 pub fn parse_setting(file: FileId, text: &str) -> (Option<(Path, Expr)>, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
     let setting = reader.alone(Rule::one_set, "`name = value`").map(|pair| reader.setting(pair));
     (setting, reader.finish())
 }
 
-/// Reads statements of an experiment: `expect max(F) < 2 N`, `plot x [mm]`.
+/// Parses statements of an experiment: `expect max(F) < 2 N`, `plot x [mm]`.
 pub fn parse_statements(file: FileId, text: &str) -> (Vec<ExperimentStatement>, Vec<Diagnostic>) {
     let mut reader = Reader::new(file, text);
     let whole = Piece { start: 0, end: reader.source.marks.len() };
@@ -103,7 +103,7 @@ mod pest_rules {
 }
 use pest_rules::{Fric, Rule};
 
-/// The names that decide about derivatives: those of the model that is being read, and those of the file.
+/// Names that distinguish derivatives from divisions: those of the present model, and those of the file.
 #[derive(Default)]
 struct Names<'t> {
     in_model: bool,
@@ -115,44 +115,44 @@ struct Names<'t> {
 struct Reader<'t> {
     source: Source<'t>,
     names: Names<'t>,
-    /// Where the piece that is being built begins in the text.
+    /// Offset of the present piece in the text.
     base: usize,
-    /// Whether something is wrong with the braces.
+    /// Whether the braces do not match.
     braces: bool,
     /// Whether a `;` has been reported.
     semicolon: bool,
-    /// Whether the piece that is being built has been reported as too high.
+    /// Whether the present piece has been reported as too high.
     too_high: bool,
-    /// Where the strokes of derivatives stand.
+    /// Offsets of the slashes of derivatives.
     derivatives: HashSet<usize>,
-    /// What is declared outside of all items, or by one that cannot be read.
+    /// Names declared outside of all items or by an unreadable item.
     lost: Vec<String>,
     diagnostics: Vec<Diagnostic>,
 }
 
-/// An expression while it is built.
+/// An expression under construction.
 struct Built {
     expr: Expr,
-    /// With the parentheses around it.
+    /// Span including surrounding parentheses.
     outer: Span,
     height: usize,
 }
 
-/// Operands and operators in the order of the text.
+/// An expression as a flat list: operands and operators in the order of the text.
 enum Flat<'t> {
     Operand(Built),
-    /// `dz/dt`, with both whole words.
+    /// `dz/dt` with its span and both words: a derivative or a division.
     Ratio(Span, &'t str, &'t str),
     Unary(UnaryOp, Span),
     Binary(BinaryOp, Span),
 }
 
-/// Whether a rule is a word or a sign of the language: these stand together at the end of the grammar.
+/// Whether a rule is a keyword or a symbol. These are together at the end of the grammar.
 fn is_fixed(rule: Rule) -> bool {
     (Rule::open..=Rule::kw_when).contains(&rule)
 }
 
-/// What a rule matched, without the words and signs of the language.
+/// The children of a match, without keywords and symbols.
 struct Children<'t>(std::iter::Peekable<std::vec::IntoIter<Pair<'t, Rule>>>);
 
 impl<'t> Children<'t> {
@@ -162,7 +162,7 @@ impl<'t> Children<'t> {
         )
     }
 
-    /// What the grammar says must stand here.
+    /// The next child, which the grammar guarantees.
     fn one(&mut self) -> Pair<'t, Rule> {
         self.0.next().expect("the grammar asks for it")
     }
@@ -176,7 +176,7 @@ impl<'t> Children<'t> {
     }
 }
 
-/// Whether one of the words of the language stands directly in `pair`.
+/// Whether this keyword is a direct child of `pair`.
 fn says(pair: &Pair<Rule>, word: Rule) -> bool {
     pair.clone().into_inner().any(|child| child.as_rule() == word)
 }
@@ -186,7 +186,7 @@ impl<'t> Reader<'t> {
         let mut source = Source::new(file, text);
         let mut diagnostics = std::mem::take(&mut source.complaints);
         let braces = !diagnostics.is_empty();
-        // A brace that stands in a comment without end is missing because of that.
+        // A brace inside an unterminated comment is missing because of the comment.
         if source.block_comments.iter().any(|span| !text[span.range()].ends_with("*/")) {
             diagnostics.clear();
         }
@@ -206,10 +206,10 @@ impl<'t> Reader<'t> {
 
     fn finish(mut self) -> Vec<Diagnostic> {
         self.diagnostics.sort_by_key(|diagnostic| diagnostic.span().start);
-        // A name in foreign letters is read wherever it is used: said once.
+        // A name with foreign letters is an error at each use; reported once.
         let mut names = HashSet::new();
         self.diagnostics.retain(|d| !d.message.ends_with(slips::NO_NAME) || names.insert(d.message.clone()));
-        // A word of the language as a name: said where it is declared, not where it is used.
+        // A keyword as a name is reported at its declaration, not at its uses.
         let reserved = |d: &Diagnostic| d.message.strip_suffix(slips::RESERVED).map(str::to_string);
         let words: HashSet<String> = self.diagnostics.iter().filter_map(reserved).collect();
         let misfit = |d: &Diagnostic| d.message.strip_suffix(slips::MISFIT).is_some_and(|word| words.contains(word));
@@ -225,7 +225,7 @@ impl<'t> Reader<'t> {
 
     // ---- from pieces of the text to rules
 
-    /// The whole text as one rule.
+    /// Parses the whole text by one rule.
     fn alone(&mut self, rule: Rule, what: &str) -> Option<Pair<'t, Rule>> {
         let piece = Piece { start: 0, end: self.source.marks.len() };
         if piece.start == piece.end {
@@ -236,7 +236,7 @@ impl<'t> Reader<'t> {
         self.read(rule, piece)
     }
 
-    /// A piece as one rule; reports what is wrong with it.
+    /// Parses a piece by one rule; reports its error.
     fn read(&mut self, rule: Rule, mut piece: Piece) -> Option<Pair<'t, Rule>> {
         while piece.end > piece.start + 1 && self.source.is_symbol(piece.end - 1, ";") {
             piece.end -= 1;
@@ -276,7 +276,7 @@ impl<'t> Reader<'t> {
             _ if rule == Rule::one_stmt && matches!(self.source.word(piece.start + 1), "=" | "/") => Rule::one_eq,
             _ => rule,
         };
-        // The rules of pest need many calls for each bracket.
+        // pest's generated rules need many nested calls for each bracket.
         match stacker::maybe_grow(STACK_PER_LEVEL * (depth + 4), STACK_PER_LEVEL * (depth + 4), || {
             Fric::parse(rule, text)
         }) {
@@ -293,7 +293,7 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// Where pest stopped, as a mark, and what it would have taken, in words.
+    /// Where pest stopped, as a mark, and what it expected, in words.
     fn stop(&self, piece: Piece, error: &pest::error::Error<Rule>) -> slips::Stop {
         let offset = match error.location {
             InputLocation::Pos(at) => at,
@@ -346,7 +346,7 @@ impl<'t> Reader<'t> {
         items
     }
 
-    /// What stands outside of all items.
+    /// Reports text outside of all items.
     fn stray(&mut self, piece: Piece) {
         let first = piece.start;
         if self.braces && matches!(self.source.word(first), "{" | "}") {
@@ -415,7 +415,7 @@ impl<'t> Reader<'t> {
             return None;
         };
         let head = self.read(Rule::one_item, Piece { start: piece.start, end: open });
-        // A block is read even if its head is not, for the mistakes in it.
+        // A block is parsed even if its head is unreadable, to report the errors in it.
         let name = head.map(|head| self.name(Children::of(head).one()));
         let missing = Name { text: String::new(), span };
         let named = name.is_some();
@@ -438,7 +438,7 @@ impl<'t> Reader<'t> {
         named.then_some(item)
     }
 
-    /// An item without statements.
+    /// Parses an item without statements.
     fn plain_item(&mut self, piece: Piece) -> Option<Item> {
         let pair = self.read(Rule::one_item, piece)?;
         let (doc, span) = (self.source.doc(piece), self.span(&pair));
@@ -499,10 +499,10 @@ impl<'t> Reader<'t> {
         })
     }
 
-    /// A statement that stands where it may not.
+    /// Reports a statement in a place where it is not allowed.
     fn misplaced(&mut self, piece: Piece, place: Place) {
         if self.braces {
-            // A brace is missing somewhere: where this stands may be right.
+            // A brace is missing somewhere, so the place may be correct.
             return;
         }
         let word = self.source.word(piece.start);
@@ -528,7 +528,7 @@ impl<'t> Reader<'t> {
         ports
     }
 
-    /// A declaration where nothing else may stand.
+    /// Parses a statement in a place where only declarations are allowed.
     fn declaration_alone(&mut self, piece: Piece, place: Place) -> Option<Declaration> {
         match self.statement(piece, place)? {
             Statement::Declaration(declaration) => Some(declaration),
@@ -564,7 +564,7 @@ impl<'t> Reader<'t> {
         body
     }
 
-    /// The head of a statement with a block, up to its `{`; reports a missing block.
+    /// The head of a statement with a block, up to its `{`. Reports a missing block.
     fn head(&mut self, piece: Piece) -> (Option<Pair<'t, Rule>>, Option<Piece>) {
         match self.source.block(piece) {
             Some((open, _)) if open == piece.start => (self.read(Rule::one_stmt, piece), None),
@@ -634,7 +634,7 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// Keeps the head of a statement that could not be read, so that what it declares or defines is known.
+    /// Keeps the head of an unreadable statement, so that the name it declares or defines is known.
     fn rescue(&mut self, piece: Piece) -> Option<Statement> {
         let (start, end) = (self.source.marks[piece.start].token.start, self.source.marks[piece.end - 1].token.end);
         let (text, span) = (&self.source.text[start..end], self.source.span_of(piece));
@@ -645,7 +645,7 @@ impl<'t> Reader<'t> {
             let mut children = Children::of(pair);
             let name = self.name(children.one());
             let unit = self.maybe_unit(&mut children);
-            // What stands behind the name may have been meant as the value.
+            // The text after the name may have been intended as the value.
             let value = Some(unknown);
             return Some(Statement::Declaration(Declaration {
                 kind,
@@ -898,7 +898,7 @@ impl<'t> Reader<'t> {
 
     fn span(&self, pair: &Pair<Rule>) -> Span {
         let span = pair.as_span();
-        // Blanks and comments behind the last token are no part of it.
+        // Blanks and comments after the last token are not part of it.
         let length = pair.as_str().len();
         debug_assert_eq!(length, span.end() - span.start());
         Span::new(self.source.file, self.base + span.start(), self.base + span.end())
@@ -926,7 +926,7 @@ impl<'t> Reader<'t> {
         Argument { name: self.name(children.one()), unit: self.maybe_unit(&mut children) }
     }
 
-    /// The next expression, behind the equals sign if there is one.
+    /// The next expression, after an optional equals sign.
     fn value(&mut self, children: &mut Children<'t>) -> Expr {
         children.maybe(Rule::eq);
         let pair = children.one();
@@ -1092,7 +1092,7 @@ impl<'t> Reader<'t> {
         let mut children = Children::of(pair);
         let name = match children.maybe(Rule::ident) {
             Some(name) => self.name(name),
-            // `mode` is a word of the language that is free here.
+            // `mode` is a keyword that is allowed as a name here.
             None => {
                 Name { text: "mode".into(), span: Span::new(span.file, span.start as usize, span.start as usize + 4) }
             }
@@ -1279,7 +1279,7 @@ impl<'t> Reader<'t> {
         }
     }
 
-    /// A name of the model, or a derivative, that stands where a unit is read.
+    /// Reports a name of the model, or a derivative, in a place where a unit is read.
     fn no_unit(&self, digits: &str, unit: &UnitText) -> Option<Diagnostic> {
         let text = unit.text.as_str();
         if let Some((upper, lower)) = text.split_once('/')
@@ -1297,13 +1297,13 @@ impl<'t> Reader<'t> {
         })
     }
 
-    /// Whether two whole words are a derivative here: a state of this model, along time or a name of it.
+    /// Whether two words form a derivative here: of a state of this model, with respect to time or a name of the model.
     fn is_derivative(&self, upper: &str, lower: &str) -> bool {
         let (Some(of), Some(along)) = (upper.strip_prefix('d'), lower.strip_prefix('d')) else { return false };
         self.names.in_model && self.names.states.contains(of) && (along == "t" || self.names.model.contains(along))
     }
 
-    /// Decides for each ratio what it is, and puts a division into the list as if it were written with spaces.
+    /// Decides for each ratio whether it is a derivative. Replaces a division by its operands and operator in the list.
     fn splice(&mut self, flat: Vec<Flat<'t>>) -> Vec<Flat<'t>> {
         if !flat.iter().any(|item| matches!(item, Flat::Ratio(..))) {
             return flat;
@@ -1383,7 +1383,8 @@ impl<'t> Reader<'t> {
         spliced
     }
 
-    /// Builds the tree of a flat list by the strength of its operators, without recursion.
+    /// Builds the tree of a flat list by operator precedence, without recursion (Dijkstra's shunting-yard algorithm,
+    /// 1961).
     fn climb(&mut self, flat: Vec<Flat<'t>>) -> Built {
         enum Pending {
             Unary(UnaryOp, Span),
@@ -1403,7 +1404,7 @@ impl<'t> Reader<'t> {
                 None => 0,
                 Some(Flat::Operand(_) | Flat::Ratio(..) | Flat::Unary(..)) => u8::MAX,
             };
-            // Powers are taken right to left, everything else left to right.
+            // Powers are right-associative, all other operators left-associative.
             let waits = |top: &Pending| {
                 strength(top) > incoming || strength(top) == incoming && incoming != BinaryOp::Power.binds()
             };
@@ -1444,7 +1445,7 @@ impl<'t> Reader<'t> {
 
     fn chained(&mut self, left: &Built, first: BinaryOp, span: Span, middle: &Built, second: BinaryOp, place: Span) {
         let text = |span: Span| &self.source.text[span.range()];
-        // The operand behind the second operator has not been read yet; its first words are enough.
+        // The operand after the second operator has not been read yet; its first words suffice.
         let behind = self.source.marks.partition_point(|mark| mark.token.start < place.end as usize);
         let (a, b, c) = (text(left.outer), text(middle.outer), self.source.word(behind));
         let short = a.len() + b.len() < 60 && !a.contains('\n') && !b.contains('\n') && first != BinaryOp::Equal;
@@ -1461,7 +1462,7 @@ impl<'t> Reader<'t> {
         );
     }
 
-    /// Cuts a tree that has grown too high.
+    /// Replaces a tree that exceeds [`HEIGHT_LIMIT`] by an error.
     fn limited(&mut self, built: Built) -> Built {
         if built.height <= HEIGHT_LIMIT {
             return built;
@@ -1477,7 +1478,7 @@ impl<'t> Reader<'t> {
         Built { expr: Expr { kind: ExprKind::Error, span: built.outer }, outer: built.outer, height: 1 }
     }
 
-    /// As much of a span as stands on its first line.
+    /// The part of a span on its first line.
     fn first_line(&self, span: Span) -> Span {
         let text = &self.source.text[span.range()];
         let length = text.find('\n').unwrap_or(text.len());
@@ -1522,7 +1523,7 @@ fn declaration_kind(pair: &Pair<Rule>) -> DeclarationKind {
     }
 }
 
-/// A rule in words, if it has any that help.
+/// A description of a rule for messages, if there is a helpful one.
 fn words(rule: Rule) -> Option<String> {
     if rule == Rule::kw_rotary {
         return Some("a model with its arguments, such as `LuGre()`".to_string());
@@ -1579,7 +1580,7 @@ fn words(rule: Rule) -> Option<String> {
 mod tests {
     use super::*;
 
-    /// Whether `rule` takes all of `text`.
+    /// Whether `rule` matches all of `text`.
     fn takes(rule: Rule, text: &str) -> bool {
         Fric::parse(rule, text).is_ok_and(|mut pairs| pairs.next().is_none_or(|pair| pair.as_str() == text))
     }
@@ -1589,8 +1590,8 @@ mod tests {
         *found.unwrap_or_else(|| panic!("no rule {name}"))
     }
 
-    /// The grammar writes its words by their first letters. None is taken that is not in the lists: those that share
-    /// all but their last letters with one, and every run of letters in the grammar.
+    /// The grammar spells its keywords by their first letters. Checks that it accepts no word beyond the lists: neither
+    /// words that differ from a listed one only in their last letters, nor any run of letters in the grammar.
     #[test]
     fn the_word_lists_agree_with_the_grammar() {
         use crate::tokens::{CONTEXT_WORDS, KEYWORDS, is_context_word, is_keyword};

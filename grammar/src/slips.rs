@@ -1,21 +1,21 @@
-//! Recognises the commonest slips in a statement that could not be read, and says what was probably meant.
+//! Common mistakes: recognises them in a statement that could not be parsed, and suggests what was probably meant.
 //!
-//! In: the marks of one statement and where reading stopped. Out: one diagnostic in the words of the text. Knows
-//! nothing of rules; what would have fitted comes as words.
+//! In: the marks of one statement and the position at which parsing stopped. Out: one diagnostic in terms of the text.
+//! Knows nothing of grammar rules; the expected tokens come as words.
 
 use crate::diagnostic::Diagnostic;
 use crate::span::Span;
 use crate::split::{Piece, Source};
 use crate::tokens::{TokenKind, is_keyword};
 
-/// Where reading a piece stopped, and what would have fitted there, in words.
+/// Position at which parsing a piece stopped, and what was expected there, in words.
 pub(crate) struct Stop {
-    /// The mark that did not fit; the end of the piece if something is missing behind it.
+    /// The mark that did not match; the end of the piece if something is missing after it.
     pub at: usize,
     pub expected: Vec<String>,
 }
 
-/// What is wrong with `piece`.
+/// The diagnostic for an unreadable piece.
 pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     let finders = [
         unit_in_parentheses,
@@ -36,7 +36,7 @@ pub(crate) fn explain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic 
     finders.iter().find_map(|find| find(source, piece, stop)).unwrap_or_else(|| plain(source, piece, stop))
 }
 
-/// Brackets of `piece`: one that is not closed, or one too many. Braces are matched elsewhere.
+/// Reports an unclosed or superfluous bracket of `piece`. Braces are matched in `split`.
 pub(crate) fn brackets(source: &Source, piece: Piece) -> Option<Diagnostic> {
     let mut open: Vec<usize> = Vec::new();
     for at in piece.start..piece.end {
@@ -81,9 +81,9 @@ fn unclosed(source: &Source, open: usize, last: usize) -> Diagnostic {
         .help(help)
 }
 
-/// How deep brackets and conditions lie in each other, and the first mark beyond `limit`.
+/// The nesting depth of brackets and conditions, and the first mark beyond `limit`.
 pub(crate) fn depth(source: &Source, piece: Piece, limit: usize) -> (usize, Option<usize>) {
-    // For each open bracket, how many conditions stand in it so far: each lies in the one before it.
+    // For each open bracket the number of conditions in it so far, each of which is nested in the preceding one.
     let mut open = vec![0usize];
     let (mut depth, mut deepest) = (0, 0);
     for at in piece.start..piece.end {
@@ -112,7 +112,7 @@ pub(crate) fn depth(source: &Source, piece: Piece, limit: usize) -> (usize, Opti
     (deepest, None)
 }
 
-/// Whether `word` is one of the known units, perhaps with a prefix.
+/// Whether `word` is a known unit, with or without a prefix.
 pub(crate) fn is_unit(word: &str) -> bool {
     const UNITS: [&str; 20] = [
         "m", "g", "s", "A", "K", "N", "J", "W", "Pa", "V", "Ohm", "Ω", "Hz", "rad", "deg", "rev", "rpm", "bit", "min",
@@ -125,14 +125,14 @@ pub(crate) fn is_unit(word: &str) -> bool {
         || word.strip_prefix(PREFIXES).is_some_and(|rest| known(rest) || rest == "Nm")
 }
 
-/// Whether a word could be a name: no sign of a unit in it.
+/// Whether a word could be a name: it contains no character of a unit.
 fn is_name(word: &str) -> bool {
     word.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// A character that the language does not have.
+/// Reports a character that the language does not use.
 fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
-    // A bracket with something strange in it does not fit as a whole.
+    // A bracket with an invalid character in it fails as a whole.
     let end = match source.is_symbol(stop.at, "[") {
         true => (stop.at..piece.end).find(|&at| source.is_symbol(at, "]")).unwrap_or(stop.at),
         false => stop.at,
@@ -148,7 +148,7 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         );
     }
     let found = source.word(at).chars().next()?;
-    // Signs as wide as Chinese letters.
+    // Full-width forms of ASCII characters.
     if let '\u{ff01}'..='\u{ff5e}' = found {
         let plain = char::from_u32(found as u32 - 0xff01 + 0x21).filter(|_| !found.is_alphanumeric());
         if let Some(plain) = plain {
@@ -200,10 +200,10 @@ fn character(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", format!("{shown} has no place here")).label(source.span(at), "").help(instead))
 }
 
-/// How the message about a name in foreign letters ends.
+/// Ending of the message about a name with foreign letters.
 pub(crate) const NO_NAME: &str = "is no name here";
 
-/// A name with letters that no name has: the whole of it, and how it can be written.
+/// Reports a name with letters that names cannot contain: the whole name, and how it can be written.
 fn foreign(source: &Source, piece: Piece, at: usize) -> Diagnostic {
     let letters = |at: usize| {
         let foreign = source.kind(at) == Some(TokenKind::Unknown)
@@ -231,7 +231,7 @@ fn foreign(source: &Source, piece: Piece, at: usize) -> Diagnostic {
     )
 }
 
-/// A letter of another alphabet in plain ones, as it is written where there are no others.
+/// A letter of another alphabet, transliterated to ASCII.
 fn plain_letters(letter: char) -> Option<&'static str> {
     const GREEK: [&str; 25] = [
         "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu", "nu",
@@ -278,7 +278,7 @@ fn plain_letters(letter: char) -> Option<&'static str> {
     })
 }
 
-/// `/* … */`, which many languages have.
+/// Reports `/* … */`, the comment of many other languages.
 pub(crate) fn block_comment(source: &Source) -> Option<Diagnostic> {
     let span = *source.block_comments.first()?;
     Some(
@@ -288,7 +288,7 @@ pub(crate) fn block_comment(source: &Source) -> Option<Diagnostic> {
     )
 }
 
-/// `run M(fr.Fs = 1 N)`: an argument of a part.
+/// Reports `run M(fr.Fs = 1 N)`: an argument of a part.
 fn deeper(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     let names = at > piece.start
@@ -312,7 +312,8 @@ fn deeper(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     )
 }
 
-/// The first words: a declaration in another language's words, an assignment, a derivative in another form.
+/// Reports the head of a statement: a declaration with a keyword of another language, an assignment, a derivative in
+/// another notation.
 fn head(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let first = piece.start;
     let word = source.word(first);
@@ -389,7 +390,7 @@ fn head(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     })
 }
 
-/// `dz / dt =` at the start of a piece: its place and both words.
+/// The span and both words of `dz / dt =` at the start of a piece.
 pub(crate) fn spaced_derivative<'t>(source: &Source<'t>, piece: Piece) -> Option<(Span, &'t str, &'t str)> {
     let first = piece.start;
     let word = |at: usize| {
@@ -404,7 +405,7 @@ pub(crate) fn spaced_derivative<'t>(source: &Source<'t>, piece: Piece) -> Option
     shape.then(|| (source.span(first).to(source.span(first + 2)), source.word(first), source.word(first + 2)))
 }
 
-/// Operators of other languages.
+/// Reports operators of other languages.
 fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at >= piece.end {
@@ -422,7 +423,7 @@ fn operator(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", format!("`{here}` does not fit here")).label(source.span(at), "").help(instead))
 }
 
-/// What other languages have and this one says otherwise.
+/// Reports notations of other languages that are written differently here.
 fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let (first, at) = (piece.start, stop.at);
     if at <= first || at >= piece.end {
@@ -488,7 +489,7 @@ fn habit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     None
 }
 
-/// Something at the end that is always there.
+/// Reports a missing end of a statement.
 fn missing(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let last = piece.end - 1;
     if stop.at < piece.end || last <= piece.start {
@@ -506,7 +507,7 @@ fn missing(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     Some(Diagnostic::error("E0001", message).label(source.span(last), "behind this").help(help))
 }
 
-/// A unit with blanks: `2 N m`, `[N m]`.
+/// Reports a unit with blanks: `2 N m`, `[N m]`.
 fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at <= piece.start || at >= piece.end {
@@ -538,7 +539,7 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
                     )),
             );
     }
-    // In brackets: from the bracket to its end there are only unit words and signs between them.
+    // In brackets: between the brackets are only unit words and signs.
     let open = (piece.start..at + 1).rev().find(|&mark| source.is_symbol(mark, "["))?;
     let close = (open..piece.end).find(|&mark| source.is_symbol(mark, "]"))?;
     let inside: Vec<&str> = (open + 1..close).map(|mark| source.word(mark)).collect();
@@ -564,10 +565,10 @@ fn unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     )
 }
 
-/// `=` where values are compared.
+/// Reports `=` in a comparison.
 fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
-    // After the word that begins the statement there must be something to compare.
+    // There must be an operand after the word that begins the statement.
     if at <= piece.start + 1 || at >= piece.end || !source.is_symbol(at, "=") {
         return None;
     }
@@ -584,7 +585,7 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
         false => "...",
     };
     Some(error.help(match measured {
-        // Measures are real numbers: that two are equal to the last bit is hardly meant.
+        // Measures are real numbers, so a comparison to the last bit is hardly intended.
         true => {
             let left = slice(source, piece.start + 1, at - 1);
             format!("a measure is compared with a tolerance: `expect {left} ~= {right} +- 1 %`")
@@ -593,11 +594,11 @@ fn condition(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     }))
 }
 
-/// `if` without `then` or `else`.
+/// Reports `if` without `then` or `else`.
 fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let missing = ["then", "else"].into_iter().find(|word| stop.expected.contains(&format!("`{word}`")))?;
     let condition = (piece.start..stop.at).rev().find(|&at| source.is_word(at, "if"))?;
-    // If the word comes later, something before it is wrong.
+    // If the word occurs later, the mistake is before it.
     if (stop.at..piece.end).any(|at| source.is_word(at, missing)) {
         return None;
     }
@@ -613,11 +614,11 @@ fn branch(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     )
 }
 
-/// How the message about a word of the language in the place of a name ends, and that about what does not fit.
+/// Endings of the messages about a keyword in the place of a name, and about a token that does not fit.
 pub(crate) const RESERVED: &str = " is a word of the language";
 pub(crate) const MISFIT: &str = " does not fit here";
 
-/// A reserved word where a name should stand.
+/// Reports a keyword in the place of a name.
 fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at >= piece.end || source.kind(at) != Some(TokenKind::Word) || !is_keyword(source.word(at)) {
@@ -633,7 +634,7 @@ fn reserved(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     })
 }
 
-/// Two operands without an operator between them.
+/// Reports two operands without an operator between them.
 fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at <= piece.start || at >= piece.end || !stop.expected.iter().any(|expected| expected == "an operator") {
@@ -648,7 +649,7 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     if !begins || !source.ends_operand(at - 1) || source.kind(at - 1) == Some(TokenKind::Text) {
         return None;
     }
-    // `2 k x`: what reads as a unit is none.
+    // `2 k x`: the word in the place of a unit is not a unit.
     let at = match source.kind(at - 1) {
         Some(TokenKind::Unit)
             if at - 1 > piece.start && !is_unit(source.word(at - 1)) && is_name(source.word(at - 1)) =>
@@ -687,7 +688,7 @@ fn neighbours(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     )
 }
 
-/// `1 1/(N·m)`, `[N/(m*s)]`: a unit is read from left to right and has no parentheses.
+/// Reports parentheses in a unit, such as `1 1/(N·m)` or `[N/(m*s)]`: a unit is read from left to right.
 fn unit_in_parentheses(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     if piece.start >= piece.end {
         return None;
@@ -715,7 +716,7 @@ fn unit_in_parentheses(source: &Source, piece: Piece, stop: &Stop) -> Option<Dia
     })
 }
 
-/// The unit of a declaration without its brackets: `input v m/s`.
+/// Reports the unit of a declaration without brackets: `input v m/s`.
 fn bare_unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at != piece.start + 2
@@ -741,7 +742,7 @@ fn bare_unit(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     })
 }
 
-/// The name of a model in small letters.
+/// Reports the name of a model that begins with a lower-case letter.
 fn model_name(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> {
     let at = stop.at;
     if at >= piece.end || source.kind(at) != Some(TokenKind::Word) {
@@ -758,13 +759,13 @@ fn model_name(source: &Source, piece: Piece, stop: &Stop) -> Option<Diagnostic> 
     )
 }
 
-/// What `expected` says for a name that begins with a capital letter.
+/// The entry of `expected` for a name that begins with a capital letter.
 pub(crate) const CAPITAL: &str = "a name with a capital letter";
 
-/// No slip that we know: what stands there, and what would have fitted.
+/// The general message for an unrecognised mistake: the token found, and what was expected.
 fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     let mut expected = stop.expected.clone();
-    // Where an expression may go on, an operator is always possible; what matters is what may follow it.
+    // An operator is always possible where an expression may continue; what may follow the expression is more helpful.
     if expected.len() > 1 {
         expected.retain(|word| word != "an operator");
     }
@@ -793,7 +794,7 @@ fn plain(source: &Source, piece: Piece, stop: &Stop) -> Diagnostic {
     Diagnostic::error("E0001", format!("`{shown}`{MISFIT}")).label(source.span(stop.at), wanted)
 }
 
-/// The operand that ends before `at`, if it is short enough to be shown.
+/// The operand that ends before `at`, if it is short enough for a message.
 fn operand_before(source: &Source, piece: Piece, at: usize) -> String {
     let last = at - 1;
     let mut first = last;

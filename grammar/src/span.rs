@@ -1,6 +1,6 @@
-//! Places in source text.
+//! Spans: positions in source text, as a file id and a byte range.
 
-/// Which text of a compilation a place lies in. The caller numbers the texts.
+/// Index of a text in a compilation, assigned by the caller.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Debug, Default)]
 pub struct FileId(pub u32);
 
@@ -11,7 +11,7 @@ pub struct Span {
     pub file: FileId,
     /// Offset of the first byte.
     pub start: u32,
-    /// Offset behind the last byte.
+    /// Offset after the last byte.
     pub end: u32,
 }
 
@@ -22,7 +22,7 @@ impl Span {
         Span { file, start: start as u32, end: end as u32 }
     }
 
-    /// The smallest span that covers both; both lie in one file.
+    /// The smallest span that covers both, which must lie in the same file.
     pub fn to(self, other: Span) -> Span {
         debug_assert_eq!(self.file, other.file);
         Span { file: self.file, start: self.start.min(other.start), end: self.end.max(other.end) }

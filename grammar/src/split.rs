@@ -1,44 +1,45 @@
-//! Cuts a text into items, blocks and statements without reading them, so that each is read, and fails, by itself.
+//! Splits a text into items, blocks and statements without parsing them, so that each is parsed, and fails, separately
+//! (error recovery).
 //!
-//! In: the tokens of a text. Out: ranges of tokens, and what is wrong with the braces. It goes by keywords, braces
-//! and the heads `name =`, `dz/dt =`, `next(`; it knows nothing of what a statement may contain.
+//! In: the tokens of a text. Out: ranges of tokens, and errors of the braces. Relies on keywords, braces and the heads
+//! `name =`, `dz/dt =`, `next(`. Knows nothing of the contents of statements.
 
 use crate::diagnostic::Diagnostic;
 use crate::span::{FileId, Span};
 use crate::tokens::{Token, TokenKind, is_keyword, tokens};
 
-/// A token that is no blank and no comment.
+/// A token that is neither blank nor comment.
 #[derive(Clone, Copy)]
 pub(crate) struct Mark {
     pub token: Token,
-    /// Nothing but blanks stands before it on its line.
+    /// Whether only blanks precede it on its line.
     pub first_on_line: bool,
-    /// Counted from 0.
+    /// Line, counted from 0.
     pub line: u32,
 }
 
 /// One line of documentation.
 struct DocLine {
-    /// How many marks stand before it.
+    /// Number of marks before it.
     after: usize,
-    /// Nothing but blanks stands before it on its line.
+    /// Whether only blanks precede it on its line.
     own_line: bool,
     line: u32,
     start: usize,
     end: usize,
 }
 
-/// A text, cut into tokens and with its braces matched.
+/// A text as tokens, with matched braces.
 pub(crate) struct Source<'t> {
     pub file: FileId,
     pub text: &'t str,
     pub marks: Vec<Mark>,
     docs: Vec<DocLine>,
-    /// For the index of each `{`: the end of its block, and where the text goes on.
+    /// For the index of each `{`: the end of its block, and where the text continues.
     blocks: Vec<(usize, usize)>,
-    /// What is wrong with the braces.
+    /// Errors of the braces.
     pub complaints: Vec<Diagnostic>,
-    /// `/* … */`: left out.
+    /// `/* … */` comments, which are skipped.
     pub block_comments: Vec<Span>,
 }
 
@@ -49,7 +50,7 @@ pub(crate) struct Piece {
     pub end: usize,
 }
 
-/// What kind of block statements stand in.
+/// Kind of a block that contains statements.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum Place {
     Interface,
@@ -65,7 +66,7 @@ pub(crate) enum Place {
 }
 
 impl Place {
-    /// In words.
+    /// A description for messages.
     pub fn words(self) -> &'static str {
         match self {
             Place::Interface => "an interface",
@@ -81,7 +82,7 @@ impl Place {
         }
     }
 
-    /// Words that begin a statement here and are free as names elsewhere.
+    /// Words that begin a statement in this block and are allowed as names elsewhere.
     fn starters(self) -> &'static [&'static str] {
         match self {
             Place::Experiment => &["run", "solver", "sweep", "data", "plot", "expect", "show"],
@@ -96,18 +97,18 @@ impl Place {
     }
 }
 
-/// Begin an item.
+/// Words that begin an item.
 const ITEMS: [&str; 10] =
     ["import", "const", "fn", "table", "interface", "model", "experiment", "fit", "device", "rig"];
-/// Reserved words that begin a statement.
+/// Keywords that begin a statement.
 const STARTERS: [&str; 15] = [
     "param", "input", "output", "state", "let", "require", "storage", "allow", "part", "every", "when", "mode", "go",
     "next", "reset",
 ];
-/// Words after which the name of a declaration stands.
+/// Words that are followed by the name of a declaration.
 const DECLARERS: [&str; 11] =
     ["param", "input", "output", "state", "let", "part", "const", "bus", "drive", "device", "sweep"];
-/// Words that go on with a statement although they may begin a line.
+/// Words that continue a statement even at the start of a line.
 const CONTINUATIONS: [&str; 25] = [
     "then", "else", "and", "or", "in", "crosses", "rises", "falls", "initial", "for", "by", "after", "before",
     "against", "step", "tol", "limit", "slew", "at", "byte", "as", "scale", "from", "message", "when",
@@ -151,17 +152,17 @@ impl<'t> Source<'t> {
         source
     }
 
-    /// The characters of a mark; nothing behind the last one.
+    /// The characters of a mark; empty after the last one.
     pub fn word(&self, at: usize) -> &'t str {
         self.marks.get(at).map_or("", |mark| &self.text[mark.token.start..mark.token.end])
     }
 
-    /// What a mark is.
+    /// The kind of a mark.
     pub fn kind(&self, at: usize) -> Option<TokenKind> {
         self.marks.get(at).map(|mark| mark.token.kind)
     }
 
-    /// The place of a mark; behind the last one, the place of the last one.
+    /// The span of a mark; after the last one, the span of the last one.
     pub fn span(&self, at: usize) -> Span {
         match self.marks.get(at).or(self.marks.last()) {
             Some(mark) => Span::new(self.file, mark.token.start, mark.token.end),
@@ -169,12 +170,12 @@ impl<'t> Source<'t> {
         }
     }
 
-    /// The place of a range of marks that is not empty.
+    /// The span of a non-empty range of marks.
     pub fn span_of(&self, piece: Piece) -> Span {
         self.span(piece.start).to(self.span(piece.end.max(piece.start + 1) - 1))
     }
 
-    /// Whether no blank stands before this mark.
+    /// Whether no blank precedes this mark.
     pub fn glued(&self, at: usize) -> bool {
         at > 0 && self.marks[at - 1].token.end == self.marks[at].token.start
     }
@@ -185,7 +186,7 @@ impl<'t> Source<'t> {
         Some((open, Piece { start: open + 1, end: self.blocks[open].0 }))
     }
 
-    /// Where the text goes on behind the block that opens at `open`.
+    /// Where the text continues after the block that opens at `open`.
     pub fn behind(&self, open: usize) -> usize {
         self.blocks[open].1
     }
@@ -196,7 +197,7 @@ impl<'t> Source<'t> {
         let to = self.docs.partition_point(|doc| doc.after <= piece.end);
         let before: Vec<&DocLine> =
             self.docs[from..to].iter().filter(|doc| doc.own_line && doc.after == piece.start).collect();
-        // Only the last run of lines without a gap: what stands further up belongs to nothing.
+        // Only the last run of lines without a gap; earlier lines belong to no item.
         let run = before.windows(2).rposition(|pair| pair[1].line != pair[0].line + 1).map_or(0, |gap| gap + 1);
         let behind = self.docs[from..to].iter().filter(|doc| !doc.own_line && doc.after > piece.start);
         let lines: Vec<&str> = before[run..]
@@ -219,7 +220,7 @@ impl<'t> Source<'t> {
         self.kind(at) == Some(TokenKind::Word) && self.word(at) == word
     }
 
-    /// Whether an item surely begins here, even inside a block that is not closed.
+    /// Whether an item certainly begins here, even inside an unclosed block.
     fn surely_item(&self, at: usize) -> bool {
         if !self.marks[at].first_on_line || self.kind(at) != Some(TokenKind::Word) {
             return false;
@@ -256,8 +257,8 @@ impl<'t> Source<'t> {
         }
     }
 
-    /// Matches the braces of `from..to`, in which one is not closed, by the indentation of their lines, and says
-    /// which one it is.
+    /// Matches the braces of `from..to`, of which one is unclosed, by the indentation of their lines, and reports the
+    /// unclosed one.
     fn rematch(&mut self, from: usize, to: usize) {
         let indents: Vec<usize> = self.indents(from, to);
         let (mut open, mut guilty): (Vec<usize>, Option<usize>) = (Vec::new(), None);
@@ -299,7 +300,7 @@ impl<'t> Source<'t> {
         );
     }
 
-    /// For each mark of `from..to`, how far its line is indented.
+    /// For each mark of `from..to`, the indentation of its line.
     fn indents(&self, from: usize, to: usize) -> Vec<usize> {
         let mut first = (0..=from).rev().find(|&at| self.marks[at].first_on_line).unwrap_or(from);
         let mut indents = Vec::with_capacity(to - from);
@@ -316,7 +317,7 @@ impl<'t> Source<'t> {
         indents
     }
 
-    /// The items of the whole text, with pieces of what is no item between them.
+    /// The items of the whole text, interleaved with pieces outside of items.
     pub fn items(&self) -> Vec<Piece> {
         let mut pieces = Vec::new();
         let (mut start, mut at) = (0, 0);
@@ -330,7 +331,7 @@ impl<'t> Source<'t> {
             }
             if self.is_symbol(at, "{") {
                 at = self.behind(at).max(at + 1);
-                // What stands behind the block of an item is no part of it.
+                // Text after the block of an item is not part of the item.
                 pieces.push(Piece { start, end: at });
                 start = at;
             } else {
@@ -375,7 +376,7 @@ impl<'t> Source<'t> {
         end
     }
 
-    /// Whether a new statement begins at `at`, in a statement that began at `first`; `inside`: in brackets.
+    /// Whether a new statement begins at `at`, within a statement that began at `first`. `inside`: within brackets.
     fn starts(&self, place: Place, first: usize, at: usize, inside: bool) -> bool {
         if self.kind(at) == Some(TokenKind::Number) {
             return !inside && self.marks[at].first_on_line && self.ends_operand(at - 1);
@@ -389,7 +390,7 @@ impl<'t> Source<'t> {
             return false;
         }
         let head = DECLARERS.contains(&before) && self.kind(at - 1) == Some(TokenKind::Word);
-        // One word alone is no statement: what follows on its line belongs to it.
+        // A single word is not a statement: the text after it on its line belongs to it.
         let ended = self.ends_operand(at - 1) && (fresh || at - 1 > first);
         let begins = |sure: bool| if inside { fresh && sure } else { fresh || ended };
         if STARTERS.contains(&word) || begins_item(word) {
@@ -411,7 +412,7 @@ impl<'t> Source<'t> {
         !inside && fresh && ended && !CONTINUATIONS.contains(&word)
     }
 
-    /// The mark behind `a`, `a.b`, `el[1].f`, `dz/dt` or `dz / dt`.
+    /// The mark after `a`, `a.b`, `el[1].f`, `dz/dt` or `dz / dt`.
     fn behind_path(&self, at: usize) -> Option<usize> {
         let derivative = |word: &str| word.len() > 1 && word.starts_with('d');
         if self.is_symbol(at + 1, "/") && derivative(self.word(at)) && derivative(self.word(at + 2)) {
@@ -429,7 +430,7 @@ impl<'t> Source<'t> {
         }
     }
 
-    /// Whether what follows a free word makes it the beginning of a statement.
+    /// Whether the marks after a word that is no keyword make it the start of a statement.
     fn fits(&self, at: usize) -> bool {
         let next = self.word(at + 1);
         match (self.word(at), self.kind(at + 1)) {
@@ -450,7 +451,7 @@ impl<'t> Source<'t> {
         }
     }
 
-    /// Whether an operand may end with this mark, so that a word behind it cannot belong to the same expression.
+    /// Whether an operand may end with this mark, so that a word after it cannot belong to the same expression.
     pub fn ends_operand(&self, at: usize) -> bool {
         match self.kind(at) {
             Some(TokenKind::Word) => !is_keyword(self.word(at)) || self.word(at) == "initial",

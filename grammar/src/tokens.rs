@@ -1,8 +1,8 @@
-//! A text as a row of tokens that together are the text, blanks and comments included.
+//! Tokeniser: a text as a sequence of tokens without gaps, including blanks and comments.
 //!
-//! In: any text. Out: [`Token`]s without a gap. This is what the reader cuts statements with, what the formatter
-//! moves around, and what an editor colours. It knows words, not rules; only the extent of a unit is decided here,
-//! because without it `2 N*m` would be a product.
+//! In: any text. Out: [`Token`]s, which together are the text. Used to split statements, to format, and to colour text
+//! in editors. Knows words but no grammar rules. Only the extent of a unit is decided here, because otherwise `2 N*m`
+//! would be a product.
 
 /// Words that are reserved everywhere.
 pub const KEYWORDS: [&str; 36] = [
@@ -44,7 +44,8 @@ pub const KEYWORDS: [&str; 36] = [
     "when",
 ];
 
-/// Words that mean something only in experiments, fits, tables, devices and rigs. Free as names, never a unit.
+/// Words with a meaning only in experiments, fits, tables, devices and rigs. They are allowed as names, but never a
+/// unit.
 pub const CONTEXT_WORDS: [&str; 40] = [
     "after", "against", "as", "at", "before", "bus", "by", "byte", "data", "drive", "expect", "for", "from",
     "hardware", "hold", "limit", "linear", "message", "minimise", "overrun", "plot", "predict", "rate", "read",
@@ -57,12 +58,12 @@ pub fn is_keyword(word: &str) -> bool {
     KEYWORDS.binary_search(&word).is_ok()
 }
 
-/// Whether `word` means something in some places only.
+/// Whether `word` has a meaning in some contexts only.
 pub fn is_context_word(word: &str) -> bool {
     CONTEXT_WORDS.binary_search(&word).is_ok()
 }
 
-/// What a token is.
+/// Kind of a token.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum TokenKind {
     /// Spaces, tabs, carriage returns, or a byte order mark at the start.
@@ -77,7 +78,7 @@ pub enum TokenKind {
     Word,
     /// `3`, `0.5`, `1e-3`, `0x200`.
     Number,
-    /// A unit behind a number or in brackets.
+    /// A unit after a number or in brackets.
     Unit,
     /// `"…"`.
     Text,
@@ -85,28 +86,28 @@ pub enum TokenKind {
     OpenText,
     /// An operator or a bracket.
     Symbol,
-    /// A character that has no place in the language, or `/* … */`.
+    /// A character that the language does not use, or `/* … */`.
     Unknown,
 }
 
-/// A piece of the text.
+/// A token: a range of bytes and its kind.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Token {
     /// What it is.
     pub kind: TokenKind,
     /// Offset of its first byte.
     pub start: usize,
-    /// Offset behind its last byte.
+    /// Offset after its last byte.
     pub end: usize,
 }
 
 impl Token {
-    /// The characters.
+    /// The characters of the token.
     pub fn text(self, source: &str) -> &str {
         &source[self.start..self.end]
     }
 
-    /// Whether it only separates others: a blank, a line feed or a comment.
+    /// Whether it only separates tokens: a blank, a line feed or a comment.
     pub fn is_trivia(self) -> bool {
         match self.kind {
             TokenKind::Blank | TokenKind::Newline | TokenKind::Comment | TokenKind::Doc => true,
@@ -121,11 +122,11 @@ impl Token {
     }
 }
 
-/// All of `text`, in order and without a gap.
+/// The tokens of `text`, in order and without gaps.
 pub fn tokens(text: &str) -> Vec<Token> {
     let mut found: Vec<Token> = Vec::with_capacity(text.len() / 3);
     let mut at = 0;
-    // What decides whether a word is a unit: a number on this line with only blanks behind it, or a bracket.
+    // Determines whether a word is a unit: after a number on the same line with only blanks between, or in brackets.
     let mut behind = Behind::Other;
     while at < text.len() {
         let bytes = text.as_bytes();
@@ -137,7 +138,7 @@ pub fn tokens(text: &str) -> Vec<Token> {
                 let doc = bytes[at..].starts_with(b"///") && !bytes[at..].starts_with(b"////");
                 (if doc { TokenKind::Doc } else { TokenKind::Comment }, end)
             }
-            // Not a comment here: what another language would have as one.
+            // Not a comment in this language, but in others.
             b'/' if bytes[at..].starts_with(b"/*") => {
                 let end = text[at + 2..].find("*/").map_or(text.len(), |close| at + 2 + close + 2);
                 (TokenKind::Unknown, end)
@@ -159,7 +160,7 @@ pub fn tokens(text: &str) -> Vec<Token> {
         behind = match (kind, behind) {
             (TokenKind::Number, _) => Behind::Number,
             (TokenKind::Symbol, _) if &text[at..end] == "[" => Behind::Bracket,
-            // A carriage return is a blank here, but no unit stands behind one.
+            // A carriage return counts as a blank, but a unit cannot follow it.
             (TokenKind::Blank, before) if !text[at..end].contains('\r') || before == Behind::Bracket => before,
             (TokenKind::Newline | TokenKind::Comment | TokenKind::Doc, Behind::Bracket) => Behind::Bracket,
             _ => Behind::Other,
@@ -207,7 +208,7 @@ fn number_end(bytes: &[u8], start: usize) -> usize {
     end
 }
 
-/// Where the unit that begins at `at` ends, if a unit may stand there.
+/// The end of the unit that begins at `at`, if a unit is allowed there.
 fn unit_behind(text: &str, at: usize, behind: Behind) -> Option<usize> {
     match behind {
         Behind::Number => unit_end(text, at),
@@ -216,7 +217,7 @@ fn unit_behind(text: &str, at: usize, behind: Behind) -> Option<usize> {
     }
 }
 
-/// Where the unit that begins at `start` ends, if one begins there. The same rule as `unit` in the grammar.
+/// The end of the unit that begins at `start`, if there is one. The same rule as `unit` in the grammar.
 fn unit_end(text: &str, start: usize) -> Option<usize> {
     let rest = &text[start..];
     let word = &rest[..run(rest.as_bytes(), is_name)];
@@ -251,7 +252,7 @@ fn unit_atom_end(text: &str, start: usize) -> Option<usize> {
     Some(start + letters + exponent)
 }
 
-/// Whether only blanks stand between `at` and a closing bracket.
+/// Whether only blanks precede the next closing bracket after `at`.
 fn closes(bytes: &[u8], at: usize) -> bool {
     let blanks = run(&bytes[at..], |b| b.is_ascii_whitespace());
     bytes.get(at + blanks) == Some(&b']')
