@@ -3,8 +3,8 @@
 //! In: texts with their syntax trees ([`Loaded`]), and [`Sources`] for imports. Out: runnable instances, plans,
 //! programs, and diagnostics. Opens no file and reads no clock.
 //!
-//! Order of the stages: resolve, flatten, unit check, causality check, analyses, lowering, numerics, optimisation, code
-//! generation.
+//! Order of the stages: resolve, flatten, unit check, causality check, lowering, numerics, optimisation, code generation.
+//! Analyses run on the flat system and on the lowered program.
 
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]
 
@@ -53,7 +53,7 @@ pub struct Case {
     pub label: String,
     /// The compiled instance.
     pub instance: Instance,
-    /// What to run.
+    /// The plan of the run.
     pub experiment: abi::plan::Experiment,
     /// Notes for the user, such as: this processor lacks instructions that machine code needs.
     pub notes: Vec<String>,

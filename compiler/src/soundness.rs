@@ -126,7 +126,7 @@ fn condition(c: &C, name: &dyn Fn(usize) -> String) -> String {
     }
 }
 
-// ---- texts by chance
+// ---- random texts
 
 struct Maker {
     random: Random,
@@ -592,7 +592,7 @@ fn search(seed: u64, runs: u64) -> (Option<(u64, Text, String)>, u64) {
 }
 
 #[test]
-fn what_is_accepted_gives_numbers() {
+fn accepted_texts_yield_finite_outputs() {
     let (seed, runs) = (from_environment("FRIC_SEED", 23), from_environment("FRIC_RUNS", 600));
     let (found, accepted) = search(seed, runs);
     if let Some((run, text, message)) = found {
@@ -603,7 +603,7 @@ fn what_is_accepted_gives_numbers() {
 }
 
 #[test]
-fn planted_mistakes_are_found() {
+fn injected_faults_are_detected() {
     let seed = from_environment("FRIC_SEED", 23);
     let mut missed = Vec::new();
     for name in planted::ALL.iter().filter(|name| **name != "ends do not round") {
@@ -620,7 +620,7 @@ fn planted_mistakes_are_found() {
 
 /// The compiler's elementary functions stay within the limits that proofs rely on, to the last bit.
 #[test]
-fn elementary_functions_keep_their_limits() {
+fn elementary_functions_stay_within_their_limits() {
     use crate::ir::build::Build;
     use crate::ir::{Binary, Unary};
     use abi::Slot;

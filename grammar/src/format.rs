@@ -139,7 +139,7 @@ impl<'s, 't> Layout<'s, 't> {
         Layout { source, strokes, words, starts, closers, lines: Vec::new(), pads, comments }
     }
 
-    // ---- what is where
+    // ---- structure
 
     fn structure(&mut self) {
         for piece in self.source.items() {
@@ -648,7 +648,7 @@ impl<'s, 't> Layout<'s, 't> {
         out
     }
 
-    // ---- the text
+    // ---- output
 
     fn write(&self) -> String {
         let mut text = String::with_capacity(self.source.text.len() + 64);

@@ -223,7 +223,7 @@ impl<'t> Reader<'t> {
         self.diagnostics.push(diagnostic);
     }
 
-    // ---- from pieces of the text to rules
+    // ---- parsing pieces by rules
 
     /// Parses the whole text by one rule.
     fn alone(&mut self, rule: Rule, what: &str) -> Option<Pair<'t, Rule>> {
@@ -1612,7 +1612,7 @@ mod tests {
     }
 
     #[test]
-    fn rules_take_their_ok_lines_and_refuse_their_no_lines() {
+    fn rules_accept_their_ok_lines_and_reject_their_no_lines() {
         let (mut cases, mut count) = (Vec::new(), 0);
         for line in include_str!("../fric.pest").lines() {
             if let Some(text) = line.strip_prefix("// ok: ") {
@@ -1631,7 +1631,7 @@ mod tests {
     }
 
     #[test]
-    fn words_and_signs_are_the_last_rules() {
+    fn keywords_and_symbols_are_the_last_rules() {
         const SIGNS: [&str; 7] = ["open", "close", "comma", "dots", "colon", "near", "margin"];
         for rule in Rule::all_rules() {
             let name = format!("{rule:?}");
@@ -1640,7 +1640,7 @@ mod tests {
     }
 
     #[test]
-    fn the_whole_file_rule_takes_the_samples() {
+    fn the_whole_file_rule_accepts_the_samples() {
         for entry in std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data")).unwrap() {
             let path = entry.unwrap().path();
             if path.is_file() {

@@ -30,7 +30,7 @@ pub enum Verdict {
     Holds(usize),
     /// The model supplies power at this point.
     Fails(Counterexample),
-    /// Not decidable: a model with states needs a `storage` function.
+    /// Not checked: a model with states needs a `storage` function; sampled blocks and delays are not supported.
     NotChecked,
 }
 
@@ -198,7 +198,7 @@ fn creep(system: &System, bench: &mut Bench, force: &Var, found: &mut Vec<Diagno
         .filter(|value| *value > 0.0);
     let largest = (-60..=10).map(|k| bench.force_at(decade(k, 10), 0.0)).fold(0.0, f64::max);
     if largest <= 0.0 {
-        return; // No friction at all: nothing that could hold.
+        return; // No friction, so no load can be held.
     }
     let load = 0.5 * coulomb.unwrap_or(largest);
     // The least speed at which the force reaches the load: bracketed by a grid, then bisected.

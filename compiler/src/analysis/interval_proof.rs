@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cancels_on_paper_cancels() {
+    fn terms_cancel_symbolically() {
         // (x + y)² − x² − 2xy = y²
         assert!(proven(|b, x, y| {
             let sum = b.add(x, y);
@@ -619,7 +619,7 @@ mod tests {
     }
 
     #[test]
-    fn boxes_are_halved_where_it_is_needed() {
+    fn boxes_are_bisected_where_needed() {
         // x² − x + 0.3 has its minimum, 0.05, at 0.5; with 0.2 it is negative there.
         let parabola = |c: f64| {
             move |b: &mut Build, x: Value, _: Value| {
@@ -642,7 +642,7 @@ mod tests {
     }
 
     #[test]
-    fn a_branch_is_taken_where_its_condition_holds() {
+    fn conditions_decide_branches_within_a_box() {
         // min(x, 0.25) − x ≤ 0, and exactly 0 below.
         let clipped = |sign: f64| {
             move |b: &mut Build, x: Value, _: Value| {
@@ -669,7 +669,7 @@ mod tests {
     }
 
     #[test]
-    fn where_a_condition_holds_nothing_is_claimed() {
+    fn exceptions_exclude_their_part_of_the_box() {
         let mut build = Build::new("claim");
         let (x, zero) = (build.load(X), build.real(0.0));
         let (negative, one) = (build.less(x, zero), build.real(1.0));

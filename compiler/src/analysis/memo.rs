@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_question_is_answered_once() {
+    fn each_result_is_computed_once() {
         let answers = Memo::new();
         let program = Program::default();
         let other = Program { params: vec![1.0], ..Program::default() };

@@ -319,7 +319,7 @@ impl<'a> Bench<'a> {
     /// amplifies a deviation about three times as much as the model does. The growth happens once, while the point is
     /// passed, so a run from there does not diverge, and [`Bench::unstable`] does not find it.
     ///
-    /// Searches each input and state at the subdivision [`EIGHTHS`], because such a region is narrow: on a Stribeck
+    /// Searches each input and state at the subdivision `EIGHTHS`, because such a region is narrow: on a Stribeck
     /// curve, the speeds at which it falls.
     pub fn singular(&self, h: f64) -> Option<Singular> {
         let (limit, n) = (0.75 / (fixed_step::GAMMA * h), self.n);

@@ -683,7 +683,7 @@ fn variant(
         return Err(diagnostics);
     }
     if loaded.has_errors() {
-        return Err(Vec::new()); // What could not be read has been reported, and left gaps.
+        return Err(Vec::new()); // Unreadable declarations have been reported.
     }
     warnings.extend(diagnostics);
     on_stage("lower");

@@ -53,7 +53,7 @@ pub fn check(system: &System, files: &Files, diagnostics: &mut Vec<Diagnostic>) 
             diagnostics.push(message(system, files, phase, &walk));
         }
         if !circles.is_empty() {
-            return; // Later phases would repeat it.
+            return; // Later phases would repeat the report.
         }
     }
 }

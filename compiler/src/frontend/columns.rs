@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_first_line_with_a_number_is_no_heading() {
+    fn a_first_line_with_a_number_is_not_a_heading() {
         assert_eq!(numbers("0 1x\n1 2\n").unwrap_err(), "line 1, column 2: `1x` is no finite number");
         assert_eq!(numbers("# a comment\nt x\n1 2\n"), Ok(vec![vec![1.0], vec![2.0]]));
     }
@@ -220,7 +220,7 @@ mod tests {
 
     /// Numbers written in any of the usual formats are read back to the bit or refused, never read as other numbers.
     #[test]
-    fn what_is_written_is_read() {
+    fn written_numbers_are_read_back_or_refused() {
         let seed = std::env::var("FRIC_SEED").ok().and_then(|seed| seed.parse().ok()).unwrap_or(16);
         let mut random = Random(seed);
         let (mut read_back, mut refused) = (0, 0);

@@ -29,7 +29,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn slips_of_the_finger_are_found_and_strangers_are_not() {
+    fn finds_misspelt_names_and_ignores_unrelated_ones() {
         let names = ["sigma0", "sigma1", "Fc", "v"];
         assert_eq!(nearest("sigma_0", names), Some("sigma0"));
         assert_eq!(nearest("simga1", names), Some("sigma1"));

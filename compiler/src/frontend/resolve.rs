@@ -54,7 +54,7 @@ pub struct ItemRef {
 
 /// Result of a name lookup.
 pub enum Lookup<'a> {
-    /// The only item of that name.
+    /// The name refers to this item.
     Found(ItemRef, &'a Item),
     /// Defined by two imports.
     Ambiguous(ItemRef, ItemRef),
@@ -69,7 +69,7 @@ pub struct ExperimentInfo {
     pub name: String,
     /// Span of the name.
     pub span: Span,
-    /// Whether it has an `expect` with a condition.
+    /// Whether it has an `expect`; a `show` does not count.
     pub has_expect: bool,
 }
 

@@ -374,7 +374,7 @@ mod tests {
     const NOT_NEGATIVE: Interval = Interval { low: 0.0, high: 1e40, away: 0.0 };
 
     #[test]
-    fn what_is_kept_out_stays_out() {
+    fn zero_stays_excluded_unless_a_result_underflows() {
         assert!(!POSITIVE.has_zero() && NOT_NEGATIVE.has_zero());
         assert!(!POSITIVE.multiply(POSITIVE).has_zero());
         assert!(!POSITIVE.divide(POSITIVE).has_zero());
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_has_no_sign() {
+    fn negative_zero_equals_zero() {
         let negative = Interval::to(-LEAST);
         assert!(negative.negate().hull(NOT_NEGATIVE).has_zero());
         assert!(negative.negate().min(NOT_NEGATIVE).has_zero());
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn contradictions_leave_nothing() {
+    fn operations_on_the_empty_interval_are_empty() {
         let nothing = Interval::to(-1.7).and(Interval::point(2.0));
         assert!(nothing.is_empty() && !nothing.has_zero());
         assert!(Interval::point(1.0).divide(Interval::point(1.0).plus(nothing.square())).is_empty());
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn products_cover_their_corners() {
+    fn results_span_the_values_at_the_ends() {
         let a = Interval::closed(-2.0, 3.0);
         let b = Interval::closed(-5.0, 4.0);
         let product = a.multiply(b);
@@ -416,12 +416,12 @@ mod tests {
     /// Results of operations on numbers of two intervals lie in the interval of the result, for numbers of all
     /// magnitudes.
     #[test]
-    fn numbers_stay_inside() {
+    fn results_lie_in_the_interval_of_the_result() {
         inside();
     }
 
     #[test]
-    fn ends_that_do_not_round_are_found() {
+    fn unrounded_ends_are_detected() {
         planted::plant("ends do not round");
         let found = std::panic::catch_unwind(inside);
         planted::plant("");

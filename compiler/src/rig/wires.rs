@@ -71,7 +71,7 @@ impl Reader<'_, '_> {
         out
     }
 
-    /// Checks that every input of the part drives a command, and that every drive has a command.
+    /// Checks that every input of the part is sent to a drive, and that every drive has a command.
     pub(super) fn unsent(&mut self, system: &System, framed: &Framed, lists: &Lists, part: InstanceId) {
         let Some(hardware) = self.statements.hardware else { return };
         let inputs: Vec<VarId> = system
@@ -172,7 +172,7 @@ impl Reader<'_, '_> {
             let span = system.span(value);
             let input = |id: VarId| system.var(id).kind == VarKind::Input && of_part(system, id);
             if !mentioned(system, value).into_iter().any(input) {
-                continue; // It does not depend on what the part gets: nothing of the part feels it.
+                continue; // Independent of the inputs of the part, so it does not act on the part.
             }
             let form = affine(&mut plant, value, &input);
             let Some(mut form) = form.filter(|form| !form.terms.is_empty()) else {
@@ -212,7 +212,7 @@ impl Reader<'_, '_> {
                 .into_iter()
                 .all(|id| signal(system, id) || system.var(id).kind == VarKind::Param);
             if !direct {
-                continue; // By way of a part of the rig: what that reads is given elsewhere, or reported.
+                continue; // Computed by a part of the rig, whose inputs are defined elsewhere or reported.
             }
             let form = affine(&mut plant, value, &|id| signal(system, id));
             let Some(form) = form.filter(|form| !form.terms.is_empty()) else {

@@ -81,7 +81,7 @@ impl<'a> Flattener<'a> {
         let name = &declaration.name;
         let Some(var) = self.var_named(id, &name.text) else { return };
         if self.system.var(var).span != name.span {
-            return; // Declared twice: the first one counts.
+            return; // Declared twice, reported; the first declaration is used.
         }
         if let Some(range) = &declaration.range {
             let (range, span) = self.range(range, env);
@@ -589,7 +589,7 @@ impl<'a> Flattener<'a> {
                     Definition::Continuous { initial, rate: speed, .. } if initial != speed => {
                         self.times_speed(rate.value, speed, rate.span)
                     }
-                    _ => rate.value, // Reported: the path has no equation.
+                    _ => rate.value, // The path variable has no equation, which has been reported.
                 };
                 self.set_rate(var, product, Some((rate.value, path)), rate.span);
             }

@@ -365,7 +365,7 @@ impl<'a> Flattener<'a> {
     /// Whether the program exceeds a limit. Reports that once, at the place where it grows.
     fn full(&mut self, span: Span) -> bool {
         if self.diagnostics.len() >= MOST_MISTAKES {
-            return true; // Thousands of parts with the same mistake say no more than some.
+            return true; // Further reports of the same error would not help.
         }
         let made = self.system.vars.len() + self.system.instances.len();
         let (most, what, recurring) = match () {
