@@ -7,7 +7,7 @@ use super::*;
 
 /// Everything that a rig adds to the instance it runs.
 pub struct Frame<'a> {
-    /// The rig as an empty model, for its name and for suggestions; its body is not read.
+    /// The rig as a model, for its name and for suggestions; its statements are not read.
     pub model: &'a ast::Model,
     /// File of the rig.
     pub file: FileId,
