@@ -474,7 +474,8 @@ impl<'a> Bounds<'a> {
     }
 
     /// Bisects the box: at the number with which an undecided comparison compares an input; otherwise the widest
-    /// relevant input, at its geometric mean if it has one sign.
+    /// relevant input, at 0, at its geometric mean if it has one sign and spans more than a factor of 2, or at its
+    /// midpoint.
     fn halves(&self, claim: &Claim) -> Option<[Cell; 2]> {
         let mut matters = vec![false; self.func.ops.len()];
         claim.any.iter().chain(claim.unless).for_each(|value| matters[value.index()] = true);

@@ -35,7 +35,7 @@ struct Known {
     boolean: bool,
     /// Its slot in the judge.
     slot: Option<Slot>,
-    /// The reason why only a start reads it.
+    /// The reason why it cannot change during a run; `None` if it can.
     start: Option<String>,
 }
 
@@ -51,7 +51,7 @@ pub struct Command {
     pub range: (f64, f64),
 }
 
-/// What is fixed at the start, in addition to values.
+/// Everything but values that a start fixes.
 pub struct Fixed<'a> {
     /// The part that hardware replaces: its path, and for each instance whether it belongs to the part.
     pub part: (&'a str, &'a [bool]),
