@@ -1,19 +1,19 @@
-//! Numbers as people read them in messages: three digits and a unit.
+//! Formats numbers for messages: three significant digits and a unit.
 
 use abi::unit::Unit;
 
-/// A value in SI, shown in `unit` with three digits: `1.63 N`, `-0.0125`, `3.46e-8 m/s`.
+/// A value in SI, shown in `unit` with three significant digits: `1.63 N`, `-0.0125`, `3.46e-8 m/s`.
 pub fn quantity(si: f64, unit: &Unit) -> String {
     let number = digits(unit.from_si(si), 3);
     if unit.text.is_empty() { number } else { format!("{number} {unit}") }
 }
 
-/// A time in s with seven digits, so that neighbouring steps can be told apart: `12.3401 s`.
+/// A time in s with seven significant digits, enough to distinguish neighbouring steps: `12.3401 s`.
 pub fn time(seconds: f64) -> String {
     format!("{} s", digits(seconds, 7))
 }
 
-/// A number rounded to so many significant digits, without trailing zeros.
+/// A number rounded to `significant` digits, without trailing zeros.
 fn digits(value: f64, significant: usize) -> String {
     if value == 0.0 || !value.is_finite() {
         return value.to_string();
@@ -22,7 +22,7 @@ fn digits(value: f64, significant: usize) -> String {
     plain(rounded)
 }
 
-/// The shortest decimal that reads back as the same number, with an exponent where that is far shorter.
+/// The shortest decimal that parses to the same number, with an exponent where that is far shorter.
 pub fn plain(value: f64) -> String {
     let magnitude = value.abs();
     if magnitude == 0.0 || (1e-4..1e15).contains(&magnitude) || !magnitude.is_finite() {
@@ -32,7 +32,7 @@ pub fn plain(value: f64) -> String {
     }
 }
 
-/// An instant, s since 1970, as a date and time of UTC: `2026-11-24 15:30:12 UTC`.
+/// An instant in seconds since 1970, as a date and time in UTC: `2026-11-24 15:30:12 UTC`.
 ///
 /// Source of the calendar: H. Hinnant, "chrono-compatible low-level date algorithms", `civil_from_days`.
 pub fn utc(seconds: u64) -> String {

@@ -1,7 +1,7 @@
-//! A compiled model from a file, ready to run: no compiler, no linker, no relocation.
+//! Loads a compiled model from a file: no compiler, no linker, no relocation.
 //!
-//! In: the bytes of an [`Image`]. Out: the model, or why it is refused. Its code is written to memory that can then be
-//! executed and no longer written, and is given back when the last instance goes.
+//! In: the bytes of an [`Image`]. Out: the model, or why it is refused. Its code is copied to memory that is then made
+//! executable and read-only. The memory is released with the last instance.
 
 use abi::image::{Image, Refusal};
 use abi::table::{Code, Entry, Machine};
@@ -12,35 +12,36 @@ use std::sync::Arc;
 /// A compiled model.
 #[derive(Clone)]
 pub struct Model {
-    /// What it says of itself.
+    /// Its parameters, inputs, states and outputs.
     pub description: Arc<Description>,
-    /// Defaults of its parameters, SI.
+    /// Default values of its parameters, SI.
     pub params: Vec<f64>,
     /// Its functions.
     pub code: Code,
 }
 
 impl Model {
-    /// A copy with its parameters at their defaults.
+    /// An instance with all parameters at their defaults.
     pub fn instance(&self) -> Instance {
         Instance::new(self.description.clone(), self.code.clone(), &self.params)
     }
 }
 
-/// Reads a file that the compiler made with `--emit blob`.
+/// Reads a file that the compiler wrote with `--emit blob`.
 ///
 /// # Errors
-/// If it is not whole, was changed, or is not for this processor.
+/// If the image is truncated, was changed, or is for another processor.
 ///
 /// # Safety
-/// The code in it is run as it is. What has changed by accident is found and refused; whether its maker is to be trusted
-/// is for the caller to know, by a signature or by having made it.
+/// The code in the image is executed as it is. Accidental changes are detected and refused. The caller must know that
+/// the origin of the image is trustworthy, by a signature or because it made the image itself.
 pub unsafe fn load(bytes: &[u8]) -> Result<Model, Refusal> {
     let image = Image::read(bytes)?;
     image.fits()?;
     let code = executable(&image.code).map_err(|error| Refusal::Memory(error.to_string()))?;
-    // SAFETY: `Image::read` has checked that every entry lies in the code. That the code there has the signature of
-    // `Entry`, stays in a block of this size and a pool of this length and does not unwind is what the caller vouches for.
+    // SAFETY: `Image::read` has checked that every entry point lies in the code. The caller vouches that the code there
+    // has the signature of `Entry`, stays within a block of this size and a constant pool of this length, and does not
+    // unwind.
     let machine = unsafe {
         let begin = code.as_ptr();
         let entries =
@@ -51,7 +52,7 @@ pub unsafe fn load(bytes: &[u8]) -> Result<Model, Refusal> {
     Ok(Model { description: Arc::new(image.description), params: image.params, code: Code::Machine(machine) })
 }
 
-/// Memory that holds the code: first written, then executable, never both.
+/// Maps memory for the code: writable first, then executable, never both.
 fn executable(code: &[u8]) -> std::io::Result<Mmap> {
     let mut memory = MmapMut::map_anon(code.len().max(1))?;
     memory[..code.len()].copy_from_slice(code);
@@ -60,11 +61,11 @@ fn executable(code: &[u8]) -> std::io::Result<Mmap> {
     Ok(memory)
 }
 
-/// x86-64 keeps what is fetched as instructions the same as what was written.
+/// x86-64 keeps instruction fetch coherent with data writes.
 #[cfg(target_arch = "x86_64")]
 fn seen_by_instruction_fetch(_: &[u8]) {}
 
-/// Arm does not: lines are cleaned to where both caches meet, then the instruction side forgets what it had.
+/// Arm does not: clean the data cache to the point of unification, then invalidate the instruction cache.
 #[cfg(target_arch = "aarch64")]
 fn seen_by_instruction_fetch(code: &[u8]) {
     let (begin, end) = (code.as_ptr() as usize, code.as_ptr() as usize + code.len());
@@ -92,7 +93,7 @@ mod tests {
     use abi::image::Target;
     use abi::{Function, Layout};
 
-    /// A step that gives back its count as status.
+    /// An image whose step returns its count as the status.
     fn image() -> Image {
         let target = Target::here().expect("tests run where code is made for");
         let code = match target {

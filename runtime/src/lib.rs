@@ -1,7 +1,8 @@
-//! Instances and time to results: experiments, their measures and recordings, sweeps.
+//! Instances and simulated time to results: experiments, their measures and recordings, sweeps, and rigs.
 //!
-//! In: an [`abi::Instance`] and the plan of an experiment. Out: verdicts, recordings, final values, or the reason
-//! why the run stopped. Knows neither the language nor the compiler: a model is whatever fills the contract of `abi`.
+//! In: an [`abi::Instance`] and the plan of an experiment. Out: verdicts, recordings, final values, or the reason why
+//! the run stopped. Knows neither the language nor the compiler: any code that fulfils the contract of `abi` is a
+//! model.
 
 #![cfg_attr(rtsan, feature(sanitize))]
 #![cfg_attr(test, allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions"))]

@@ -1,13 +1,14 @@
-//! Chance that can be repeated: the same numbers from the same seed on every machine.
+//! A reproducible pseudorandom generator: the same numbers from the same seed on every machine.
 //!
-//! In: a seed. Out: numbers. Source: Steele, Lea, Flood: Fast splittable pseudorandom number generators (2014), SplitMix64.
+//! In: a seed. Out: numbers. Source: Steele, Lea, Flood, "Fast splittable pseudorandom number generators", 2014
+//! (SplitMix64).
 
-/// A seeded generator.
+/// A SplitMix64 generator; the field is its state, at first the seed.
 #[derive(Clone, Debug)]
 pub struct Chance(pub u64);
 
 impl Chance {
-    /// 64 bits.
+    /// The next 64 bits.
     pub fn number(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;

@@ -1,65 +1,66 @@
-//! A queue between two threads that never waits, neither allocates nor locks: how the cycle hears and is heard.
+//! A bounded, wait-free queue from one thread to another (SPSC). It neither blocks, allocates nor locks, so the
+//! real-time cycle can use it.
 //!
-//! In and out: small values. Full is an answer, not a reason to wait.
+//! In and out: small values. A full queue is reported to the sender, which decides what to drop.
 
 use rtrb::{Consumer, Producer, RingBuffer};
 
-/// The end into which values go.
+/// The sending end.
 pub struct Sender<T>(Producer<T>);
 
-/// The end out of which they come.
+/// The receiving end.
 pub struct Receiver<T>(Consumer<T>);
 
-/// A queue for so many values.
+/// A queue with room for `capacity` values.
 pub fn queue<T: Copy>(capacity: usize) -> (Sender<T>, Receiver<T>) {
     let (sender, receiver) = RingBuffer::new(capacity);
     (Sender(sender), Receiver(receiver))
 }
 
 impl<T: Copy> Sender<T> {
-    /// Places that are free.
+    /// Number of free places.
     pub fn free(&self) -> usize {
         self.0.slots()
     }
 
-    /// Whether nobody will take anything any more.
+    /// Whether the receiver has been dropped.
     pub fn is_abandoned(&self) -> bool {
         self.0.is_abandoned()
     }
 
-    /// Hands a value over; false if there is no place for it.
+    /// Sends a value; false if the queue is full.
     pub fn push(&mut self, value: T) -> bool {
         self.0.push(value).is_ok()
     }
 
-    /// Hands all of them over, or none: false if there is no place for all.
+    /// Sends all values or none; false if there is not room for all.
     pub fn push_all(&mut self, values: &[T]) -> bool {
         self.0.push_entire_slice(values).is_ok()
     }
 }
 
 impl<T: Copy> Receiver<T> {
-    /// Values that wait.
+    /// Number of values waiting.
     pub fn len(&self) -> usize {
         self.0.slots()
     }
 
-    /// Whether none waits.
+    /// Whether no value is waiting.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The first of them, which stays.
+    /// The first value waiting, without removing it.
     pub fn first(&self) -> Option<T> {
         self.0.peek().ok().copied()
     }
 
-    /// The first of them.
+    /// Removes and returns the first value waiting.
     pub fn pop(&mut self) -> Option<T> {
         self.0.pop().ok()
     }
 
-    /// Appends the first `n` to `out`; false if fewer wait.
+    /// Moves the first `n` values to the end of `out`; false, moving none, if fewer are waiting.
     pub fn take(&mut self, n: usize, out: &mut Vec<T>) -> bool {
         let Ok(chunk) = self.0.read_chunk(n) else { return false };
         out.extend(chunk);

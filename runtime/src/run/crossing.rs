@@ -1,7 +1,7 @@
-//! Where a course that is seen at points passes a level.
+//! Level crossings of a sampled signal.
 //!
-//! In: points in order of time. Out: how often it changes its sign by more than errors, its period, when it settles. Knows no
-//! windows.
+//! In: points in order of time. Out: the number of sign changes that exceed numerical errors, the period, the settling
+//! time. Knows no windows.
 
 use crate::run::peak::Point;
 use crate::run::quadrature::Sum;
@@ -9,14 +9,16 @@ use crate::run::quadrature::Sum;
 /// Values below this, in SI, are rounding errors.
 const NOTHING: f64 = 1e-15;
 
-/// Parts of a course between two changes of sign, of which those that rise above rounding errors and errors of the run count.
+/// Segments of a signal between two sign changes. A segment counts if its peak exceeds rounding errors and the errors
+/// of the run.
 #[derive(Default)]
 pub(crate) struct Lobes {
-    /// A value smaller than this part of the largest one is as good as zero.
+    /// A value smaller than this fraction of the largest one counts as zero.
     pub(crate) band: f64,
-    /// Largest value of the run so far, inside the window or not.
+    /// Largest magnitude of the run so far, inside the window or outside it.
     pub(crate) largest: f64,
-    /// For each lobe its first instant in s and the value farthest from zero. Those that cannot count are dropped.
+    /// For each segment its first instant in s and the value farthest from zero. Segments that cannot count any more
+    /// are dropped.
     kept: Vec<Point>,
 }
 
@@ -30,7 +32,7 @@ impl Lobes {
             None => {
                 let least = self.least();
                 self.kept.pop_if(|(_, peak)| peak.abs() <= least);
-                // Of the same sign as the one before that: both are one.
+                // Same sign as the previous segment, because the one between was dropped: merge the two.
                 match self.kept.last_mut().filter(|(_, peak)| (*peak > 0.0) == (v > 0.0)) {
                     Some((_, peak)) => *peak = if v.abs() > peak.abs() { v } else { *peak },
                     None => self.kept.push((t, v)),
@@ -39,12 +41,12 @@ impl Lobes {
         }
     }
 
-    /// What is no more than this counts for zero.
+    /// Magnitudes up to this count as zero.
     fn least(&self) -> f64 {
         (self.band.max(1e-12) * self.largest).max(NOTHING)
     }
 
-    /// How often the sign changes, and when it last did.
+    /// The number of sign changes, and the time of the last one.
     pub(crate) fn crossings(&self) -> (u64, Option<f64>) {
         let least = self.least();
         let (mut sign, mut count, mut time) = (0.0, 0, None);
@@ -60,7 +62,7 @@ impl Lobes {
     }
 }
 
-/// Mean distance of upward crossings through the mean over time.
+/// Mean time between upward crossings of the signal's time average.
 pub(crate) fn period(points: &[Point]) -> Result<f64, String> {
     let mut area = Sum::default();
     for pair in points.windows(2) {
@@ -68,7 +70,8 @@ pub(crate) fn period(points: &[Point]) -> Result<f64, String> {
     }
     let width = points[points.len() - 1].0 - points[0].0;
     let mean = if width > 0.0 { area.total() / width } else { points[0].1 };
-    // Upward means from below to at or above; a value that only touches the mean from above does not cross.
+    // An upward crossing goes from below the mean to the mean or above; a value that only touches the mean from above
+    // does not cross.
     let upward = (1..points.len()).filter(|&i| points[i - 1].1 < mean && mean <= points[i].1);
     let mut crossings = upward.map(|i| crossing(&points[i.saturating_sub(2)..points.len().min(i + 2)], mean));
     let (mut first, mut last, mut count) = (0.0, 0.0, 0);
@@ -85,8 +88,9 @@ pub(crate) fn period(points: &[Point]) -> Result<f64, String> {
     Ok((last - first) / f64::from(count - 1))
 }
 
-/// When the cubic through four points passes `level` between the middle two; a line where there are not four, or two
-/// of them lie at one time. A line alone would be as coarse as the points.
+/// The time when the cubic through four points passes `level` between the middle two; a straight line where there are
+/// fewer than four points, or two of them have the same time. A line everywhere would be only as accurate as the
+/// spacing of the points.
 fn crossing(points: &[Point], level: f64) -> f64 {
     let middle = points.windows(2).position(|pair| pair[0].1 < level && level <= pair[1].1).expect("one pair crosses");
     let (from, to) = (points[middle], points[middle + 1]);
@@ -124,7 +128,7 @@ fn crossing(points: &[Point], level: f64) -> f64 {
     t
 }
 
-/// The last time the value leaves the band around `end`, or none if it never is outside.
+/// The last time when the value leaves the band around `end`; none if it is never outside.
 pub(crate) fn settling(points: &[Point], end: f64, band: f64) -> Option<f64> {
     let outside = points.iter().rposition(|(_, v)| (v - end).abs() > band)?;
     let (from, to) = (points[outside], *points.get(outside + 1)?);

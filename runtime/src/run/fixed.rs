@@ -1,4 +1,4 @@
-//! A run by a whole number of fixed steps, which are the model's own code.
+//! A run with fixed steps, each a call of the model's compiled step function.
 
 use crate::format;
 use crate::run::observe::{Observer, check_finite, check_status};
@@ -9,23 +9,23 @@ use abi::table::keep_time;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
-/// Steps between two looks at the caller and at the whole block.
+/// Steps between two calls of the progress callback and two checks of the whole block.
 const BATCH: u64 = 4096;
 
-/// Such a run under way.
+/// A fixed-step run in progress.
 pub(crate) struct Fixed {
     rest: Rest,
     /// In s.
     step: f64,
     /// Number of steps.
     total: u64,
-    /// Whether somebody looks at every step.
+    /// Whether an observer needs every step.
     each: bool,
-    /// The block at the beginning of the batch, the number of its steps, and how many are done.
+    /// The block at the beginning of the batch, the number of steps in the batch, and how many are done.
     saved: Vec<f64>,
     batch: u64,
     done: u64,
-    /// Slots that are looked at.
+    /// Slots that the observer reads.
     seen: Vec<Range<usize>>,
 }
 
@@ -80,7 +80,7 @@ impl Fixed {
         (self.batch, self.done) = (BATCH.min(self.total - self.rest.work.steps), 0);
     }
 
-    /// Keeps what is wanted at an instant that this step is nearest to.
+    /// Records the requested values if this step is the nearest to the next requested instant.
     fn probe(&mut self) {
         let Rest { instance, observer, .. } = &mut self.rest;
         let time = instance.get(Slot::TIME);
@@ -89,7 +89,7 @@ impl Fixed {
         }
     }
 
-    /// Repeats the batch step by step up to where a state or output is not finite.
+    /// Repeats the batch step by step up to the first state or output that is not finite.
     fn first_not_finite(&mut self) -> Stop {
         let instance = &mut self.rest.instance;
         instance.block_mut().copy_from_slice(&self.saved);
@@ -136,12 +136,12 @@ impl Stepper for Fixed {
         if self.done < self.batch && status == 0 {
             return Ok(());
         }
-        // In a batch, what was not finite may have become so many steps ago, and may be why a guard fired.
+        // Within a batch, a value may have become non-finite many steps ago, and that may be why a guard fired.
         if check_finite(&self.rest.instance).is_err() {
             return Err(self.first_not_finite());
         }
         if status != 0 && !self.each {
-            // The step that went too far is worth seeing.
+            // Show the step that violated the guard, too.
             self.rest.observer.see(&self.rest.instance)?;
         }
         check_status(&self.rest.instance, status)
@@ -157,7 +157,7 @@ impl Stepper for Fixed {
         if !whole {
             for range in &self.seen {
                 from(range.clone(), block);
-                // Why it is not finite, other slots may tell.
+                // Other slots may show why this one is not finite, so fetch the whole block.
                 whole |= !block[range.start].is_finite();
             }
         }

@@ -1,12 +1,12 @@
-//! Peaks of a quantity: local maxima that stand out of the errors of the run.
+//! Peaks of a signal: local maxima that exceed the errors of the run.
 //!
-//! In: the points of a course in order of time. Out: its peaks. A maximum counts if the quantity rose to it and fell from it
-//! by more than a threshold, so that rounding makes no peak. The first and the last value of a window are no peaks, and a
-//! plateau is one peak, at its first instant.
+//! In: points in order of time. Out: the peaks. A maximum counts if the signal rose to it and fell from it by more than
+//! a threshold, so that rounding errors make no peaks. The first and last values of a window are not peaks. A plateau
+//! is one peak, at its first instant.
 
 use crate::run::peak::{Peak, Point};
 
-/// A turning point, with the points seen just before and after it.
+/// A turning point, with the points just before and after it.
 #[derive(Clone, Copy)]
 pub(crate) struct Turn {
     /// Time in s and value in SI.
@@ -16,7 +16,7 @@ pub(crate) struct Turn {
 }
 
 impl Turn {
-    /// A maximum as an extreme between its neighbours: how far the course between may exceed it.
+    /// The maximum with its neighbours, to estimate how far the signal may exceed it between the points.
     pub(crate) fn seen(&self) -> Peak {
         let mut peak = Peak::greatest();
         for (t, v) in self.before.into_iter().chain([self.at]).chain(self.after) {
@@ -29,19 +29,19 @@ impl Turn {
 /// Turning points found so far.
 #[derive(Default)]
 pub(crate) struct Hills {
-    /// A rise or fall up to this part of the largest value does not count.
+    /// A rise or fall of up to this fraction of the largest magnitude does not count.
     pub(crate) band: f64,
     largest: f64,
     last: Option<Point>,
-    /// Least and greatest value so far, until they are apart.
+    /// Least and greatest value so far, until they differ by more than the threshold.
     begin: Option<(Turn, Turn)>,
-    /// Lows and highs in turn; the last one may still grow.
+    /// Alternating minima and maxima; the last one may still move.
     turns: Vec<Turn>,
     overflowed: bool,
 }
 
 impl Hills {
-    /// One more point; at most `most` turning points are kept.
+    /// Adds a point; keeps at most `most` turning points.
     pub(crate) fn push(&mut self, point: Point, most: usize) {
         self.largest = self.largest.max(point.1.abs());
         let least = self.least();
@@ -65,7 +65,8 @@ impl Hills {
         if self.overflowed {
             return None;
         }
-        // Points were judged by the largest value that was known then.
+        // Each point was compared with a threshold from the largest magnitude known at that time: repeat with the final
+        // one.
         let (mut begin, mut turns) = (None, Vec::new());
         self.turns.iter().for_each(|turn| add(&mut begin, &mut turns, *turn, self.least()));
         let high = |three: &&[Turn]| three[0].at.1 < three[1].at.1;

@@ -1,10 +1,10 @@
-//! Numbers taken from the course of a run.
+//! Measures: numbers computed from the points of a run.
 //!
-//! In: the points of a run in order of time, as blocks. Out: a [`Verdict`] for each expectation. Most measures look
-//! at each point once and forget it; `period` and `settling` keep theirs, up to [`KEPT_POINTS`]. Knows neither
-//! solver nor clock: an event is two points at one time, and at the edge of a window a quantity lies on the straight line
-//! between two points. An adaptive run shows a point at each edge and gives the areas under its own course; of other runs
-//! the areas are those of the trapezoidal rule with the end corrections of Gregory, of order four where steps are even.
+//! In: the points of a run in order of time, as blocks. Out: a [`Verdict`] for each expectation. Most measures are
+//! streaming; `period` and `settling` keep their points, up to [`KEPT_POINTS`]. Knows neither solver nor clock. An
+//! event is two points at one time; at the edge of a window the value is interpolated linearly between two points. An
+//! adaptive run adds a point at each edge and integrates its own dense output. For other runs, integrals use the
+//! trapezoidal rule with Gregory's end corrections, of order four where the steps are even.
 
 use crate::format;
 use crate::run::crossing::{Lobes, period, settling};
@@ -15,41 +15,42 @@ use crate::run::verdict::{self, Reading, Verdict};
 use abi::Slot;
 use abi::plan::{Edge, Expect, Measure, MeasureKind, Moment};
 
-/// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. Beyond, the measure fails and says so.
+/// Most points that one `period` or `settling` keeps: 2²⁵, half a gigabyte. With more points the measure fails with a
+/// message.
 pub const KEPT_POINTS: usize = 1 << 25;
 
-/// All expectations of an experiment, filled point by point.
+/// All expectations of an experiment, updated point by point.
 pub struct Expectations {
     expects: Vec<Expect>,
     meters: Vec<Vec<Meter>>,
-    /// Instants in s, ascending, at which quantities may jump and at which points are shown.
+    /// Instants in s, ascending, at which quantities may jump. The run shows a point at each.
     corners: Vec<f64>,
 }
 
-/// What an adaptive run must know of one measure to show it the right points.
+/// The points and areas that a measure needs from an adaptive run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Demand {
     pub(crate) slot: Slot,
     pub(crate) what: Wants,
 }
 
-/// What it takes from the course between two points.
+/// What a measure needs of the signal between two points.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum Wants {
-    /// The area under the quantity.
+    /// The integral of the quantity.
     Area,
-    /// The area under its square.
+    /// The integral of its square.
     Square,
-    /// Where it turns.
+    /// Its turning points.
     Turns,
-    /// Points close enough for the straight line or the cubic between them.
+    /// Points dense enough for linear or cubic interpolation.
     Points,
-    /// No more than the points at the edges of the window.
+    /// Only the points at the edges of the window.
     Edges,
 }
 
 impl Expectations {
-    /// Nothing seen yet.
+    /// Expectations before the first point.
     pub fn new(expects: &[Expect]) -> Expectations {
         let meters = expects.iter().map(|expect| {
             expect.measures.iter().map(|measure| Meter::new(measure, expect.after, expect.before)).collect()
@@ -57,12 +58,12 @@ impl Expectations {
         Expectations { expects: expects.to_vec(), meters: meters.collect(), corners: Vec::new() }
     }
 
-    /// Instants in s, ascending, at which quantities may jump. The run shows points there.
+    /// Sets the instants in s, ascending, at which quantities may jump. The run shows a point at each.
     pub(crate) fn jumps_at(&mut self, corners: &[f64]) {
         self.corners = corners.to_vec();
     }
 
-    /// Whether only the last point of the run counts, so that the others need not be shown.
+    /// Whether all measures need only the last point of the run.
     pub fn only_last(&self) -> bool {
         let last = |meter: &Meter| {
             matches!(meter.tally, Tally::Final) && meter.before == f64::INFINITY && meter.ends.is_none()
@@ -70,7 +71,7 @@ impl Expectations {
         self.meters.iter().flatten().all(last)
     }
 
-    /// The slots that are read.
+    /// The slots that the measures read.
     pub fn slots(&self) -> impl Iterator<Item = Slot> {
         self.meters
             .iter()
@@ -78,18 +79,19 @@ impl Expectations {
             .flat_map(|meter| [Some(meter.slot), meter.begins, meter.ends, meter.moment].into_iter().flatten())
     }
 
-    /// What each measure takes, in the order of [`Expectations::give_area`].
+    /// What each measure needs, in the order of [`Expectations::give_area`].
     pub(crate) fn demands(&self) -> Vec<Demand> {
         self.meters.iter().flatten().map(Meter::demand).collect()
     }
 
-    /// The window of measure number `k` in s, as far as it is known: an event that has not happened yet is infinitely far.
+    /// The window of measure number `k` in s, as far as it is known: an edge set by an event that has not happened yet
+    /// is at infinity.
     pub(crate) fn window(&self, k: usize) -> (f64, f64) {
         let meter = self.meters.iter().flatten().nth(k).expect("it was one of the demands");
         (meter.after, meter.before)
     }
 
-    /// Instants in s at which a window begins or ends or a value is wanted, ascending.
+    /// Instants in s at which a window begins or ends or a value is sampled, ascending.
     pub(crate) fn instants(&self) -> Vec<f64> {
         let of = |meter: &Meter| {
             let at = if let Tally::At { instant, .. } = meter.tally { instant } else { meter.after };
@@ -101,8 +103,9 @@ impl Expectations {
         instants
     }
 
-    /// The caller that shows the points also gives the areas between them, by [`Expectations::give_area`], and shows a point
-    /// wherever a quantity turns whose extreme is wanted; and sides that are told apart differ by more than this part of the largest value.
+    /// The caller promises to pass the integrals between points by [`Expectations::give_area`], and to show a point at
+    /// each turning point of a quantity whose extreme is measured. `tol` is its relative error: a sign change counts
+    /// only if the values exceed this fraction of the largest one.
     pub(crate) fn expect_areas(&mut self, tol: f64) {
         for meter in self.meters.iter_mut().flatten() {
             match &mut meter.tally {
@@ -118,7 +121,7 @@ impl Expectations {
         }
     }
 
-    /// The area under the quantity of measure number `k`, or under its square, over one more part of its window.
+    /// Adds the integral of the quantity of measure number `k`, or of its square, over the next part of its window.
     pub(crate) fn give_area(&mut self, k: usize, area: f64) {
         let meter = self.meters.iter_mut().flatten().nth(k).expect("it was one of the demands");
         match &mut meter.tally {
@@ -161,26 +164,26 @@ fn verdict(expect: &Expect, meters: &[Meter], corners: &[f64]) -> Verdict {
     }
 }
 
-/// One measure at work: cuts its window exactly and tallies what lies inside.
+/// The state of one measure: clips points to its window and accumulates those inside.
 struct Meter {
     slot: Slot,
     /// Conditions that open and close the window, until they first hold.
     begins: Option<Slot>,
     ends: Option<Slot>,
-    /// What tells the moment at which the value is wanted, and its present value.
+    /// The slot that defines the moment at which the value is taken, and its present value.
     moment: Option<Slot>,
     telling: f64,
     after: f64,
     before: f64,
-    /// The last point seen, inside the window or not; in the beginning none, at an infinite time.
+    /// The last point, inside the window or outside it; at an infinite time before the first.
     last: Point,
-    /// First and last point counted, inside the window; valid once there is one.
+    /// First and last point inside the window; valid once there is one.
     first: Point,
     end: Point,
     counted: bool,
-    /// The greatest magnitude counted.
+    /// The greatest magnitude inside the window.
     scale: f64,
-    /// Whether a point is shown wherever a quantity turns.
+    /// Whether the run shows a point at each turning point.
     located: bool,
     tally: Tally,
 }
@@ -211,15 +214,15 @@ enum Tally {
         time: f64,
         gap: f64,
     },
-    /// `rises`: only where the condition `was` not true at the point before.
+    /// `rises`: only where the condition was false at the previous point.
     AtMoment {
         rises: bool,
         was: bool,
         found: Option<Point>,
         gap: f64,
     },
-    /// The value at an extreme of what tells the moment. `near`: how far the values beside it are from it; the second
-    /// once it is there.
+    /// The value at the time when another quantity has its extreme. `near`: differences to the values before and after
+    /// it; the second is set by the next point.
     AtPeak {
         peak: Peak,
         found: f64,
@@ -253,11 +256,11 @@ enum Tally {
 /// What is counted of a condition.
 #[derive(Clone, Copy)]
 enum Counted {
-    /// Phases in which it holds.
+    /// Intervals in which it holds.
     Phases,
     /// Changes from false to true.
     Rises,
-    /// Changes.
+    /// All changes.
     Turns,
 }
 
@@ -265,17 +268,17 @@ enum Counted {
 #[derive(Clone, Copy)]
 enum Hill {
     Number,
-    /// Of the peak of this number, from 1.
+    /// The height of the peak with this number, from 1.
     Height(f64),
     Time(f64),
 }
 
-/// What a condition must have been before it counts as first.
+/// What a condition must have been before its first occurrence counts.
 #[derive(Clone, Copy)]
 enum Before {
     Anything,
     False,
-    /// The other of what it is then.
+    /// The opposite of its value at the occurrence.
     Other,
 }
 
@@ -335,7 +338,7 @@ impl Meter {
             MeasureKind::TimeOfPeak(number) => peaks(Hill::Time(number)),
         };
         let none = (f64::INFINITY, 0.0);
-        // An edge that an event sets is out of reach until then.
+        // An edge set by an event is at infinity until the event happens.
         let (mut after, mut before, mut begins, mut ends) = (after, before, None, None);
         match measure.window.after {
             Edge::Open => {}
@@ -372,7 +375,7 @@ impl Meter {
         }
     }
 
-    /// One more point, as a block: events may open or close the window there.
+    /// Adds a point, as a block; events may open or close the window there.
     fn see_block(&mut self, t: f64, block: &[f64]) {
         let holds = |slot: Option<Slot>| slot.is_some_and(|slot| block[slot.index()] != 0.0);
         if holds(self.begins) {
@@ -406,7 +409,7 @@ impl Meter {
         Demand { slot: self.slot, what }
     }
 
-    /// One more point; at the edges of the window, the point on the line to the one before.
+    /// Adds a point; at the edges of the window, adds the interpolated point.
     fn see(&mut self, t: f64, v: f64) {
         let last = self.last;
         if let Tally::Crossings { lobes } = &mut self.tally {
@@ -424,7 +427,7 @@ impl Meter {
         self.last = (t, v);
     }
 
-    /// The value at an edge between two points. A condition keeps its value until the next point.
+    /// The value at a window edge between two points. A condition keeps its value until the next point.
     fn between(&self, from: Point, to: Point, t: f64) -> f64 {
         match self.tally {
             Tally::First { .. } | Tally::Count { .. } | Tally::Duration { .. } => from.1,
@@ -468,7 +471,7 @@ impl Meter {
                 if found.is_none() && holds && !(*rises && *was) {
                     *found = Some((t, v));
                     if self.counted && t > previous.0 {
-                        // It lies somewhere since the point before.
+                        // The event lies somewhere after the previous point.
                         *gap = (v - previous.1).abs();
                     }
                 }
@@ -493,7 +496,7 @@ impl Meter {
                 };
                 if now && *time == f64::INFINITY {
                     *time = t;
-                    // It became true somewhere since the point before.
+                    // The condition became true somewhere after the previous point.
                     *gap = if self.counted { t - previous.0 } else { 0.0 };
                 }
             }
@@ -513,7 +516,7 @@ impl Meter {
                     sum.add(t - previous.0);
                 }
                 if self.counted && (previous.1 != 0.0) != (v != 0.0) {
-                    // It turned somewhere since the point before.
+                    // The condition changed somewhere after the previous point.
                     *gap += t - previous.0;
                 }
             }
@@ -525,7 +528,7 @@ impl Meter {
         self.counted = true;
     }
 
-    /// How far the reading may be off because only points were looked at, SI.
+    /// The error of the reading due to the spacing of the points, SI.
     fn resolution(&self) -> f64 {
         match &self.tally {
             Tally::First { gap, .. } | Tally::AtMoment { gap, .. } | Tally::Duration { gap, .. } => *gap,
@@ -543,8 +546,8 @@ impl Meter {
         }
     }
 
-    /// How far an extreme between the points may be from the one that was seen, SI: its value, its time, or what another
-    /// quantity is then.
+    /// How far an extreme between the points may be from the largest point, SI: in its value, its time, or the value of
+    /// another quantity then.
     fn unseen(&self, corners: &[f64]) -> f64 {
         match &self.tally {
             _ if self.located => 0.0,
@@ -576,7 +579,7 @@ impl Meter {
         }
     }
 
-    /// Value in SI, and the time in s where it happened; or the reason why there is none.
+    /// Value in SI, and the time in s where it occurred; or the reason why there is no value.
     fn reading(&self) -> Result<(f64, Option<f64>), String> {
         if !self.counted {
             let end = match self.last.0 {
@@ -604,7 +607,7 @@ impl Meter {
                 let total = sum.total() + even.correction();
                 let value = match kind {
                     Average::Integral => total,
-                    // A window of one instant: the limit of ever narrower ones.
+                    // A window of zero width: the limit for ever narrower windows.
                     Average::Mean if width == 0.0 => last.1,
                     Average::Root if width == 0.0 => last.1.abs(),
                     Average::Mean => total / width,
@@ -614,7 +617,7 @@ impl Meter {
             }
             Tally::Final => Ok((last.1, Some(last.0))),
             Tally::At { instant, value } => {
-                // The last step may end a rounding error before the instant asked for.
+                // The last step may end one rounding error before the requested instant.
                 let near_end = *instant > last.0 && *instant - last.0 <= 1e-9 * last.0.abs();
                 let value = value.or(near_end.then_some(last.1)).ok_or_else(|| {
                     format!(
@@ -642,7 +645,7 @@ impl Meter {
             Tally::Peaks { what, hills } => {
                 let peaks = hills.peaks().ok_or_else(too_many)?;
                 let of = |number: f64| {
-                    // A whole number from 1, as the plan promises.
+                    // The plan guarantees a whole number from 1.
                     let words = match peaks.len() {
                         0 => "there is no peak in the window".to_string(),
                         1 => "there is one peak in the window".into(),
@@ -671,7 +674,7 @@ fn line(from: Point, to: Point, t: f64) -> f64 {
     from.1 + part * (to.1 - from.1)
 }
 
-/// Points kept whole, up to the limit.
+/// All points, up to the limit.
 #[derive(Default)]
 struct Kept {
     points: Vec<Point>,
@@ -713,7 +716,7 @@ mod tests {
         Measure { text: "m".into(), kind, slot: Slot(3), unit: Unit::parse("m").unwrap(), window: Window::default() }
     }
 
-    /// One measure over these points, and its time.
+    /// Value and time of one measure over these points.
     fn taken(kind: MeasureKind, (after, before): (f64, f64), points: &[Point]) -> Result<(f64, Option<f64>), String> {
         let mut meter = Meter::new(&measure(kind), after, before);
         points.iter().for_each(|(t, v)| meter.see(*t, *v));
@@ -780,7 +783,7 @@ mod tests {
     fn a_condition_holds_from_its_first_point_on() {
         let points = [(0.0, 0.0), (1.0, 0.0), (2.0, 1.0), (3.0, 1.0)];
         assert_eq!(taken(MeasureKind::First, WHOLE, &points), Ok((2.0, Some(2.0))));
-        // Between two points a condition is what it was: 1.5 is not yet true.
+        // Between two points a condition keeps its earlier value: at 1.5 it is not yet true.
         assert_eq!(value(MeasureKind::First, (1.5, 3.0), &points), 2.0);
         assert_eq!(value(MeasureKind::First, (2.5, 3.0), &points), 2.5);
         assert_eq!(taken(MeasureKind::First, (0.0, 1.0), &points), Ok((f64::INFINITY, None)));
@@ -788,19 +791,19 @@ mod tests {
 
     #[test]
     fn phases_of_a_condition() {
-        // True from the start to 1, from 2 to 3 by way of an event, and from 4 on.
+        // True from the start to 1, from 2 to 3 (through an event), and from 4 on.
         let points = [(0.0, 1.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (3.0, 1.0), (3.0, 0.0), (4.0, 1.0), (5.0, 1.0)];
         assert_eq!(taken(MeasureKind::Count, WHOLE, &points), Ok((3.0, Some(4.0))));
         assert_eq!(taken(MeasureKind::CountRises, WHOLE, &points), Ok((2.0, Some(4.0))));
         assert_eq!(taken(MeasureKind::CountTurns, WHOLE, &points), Ok((4.0, Some(4.0))));
         assert_eq!(value(MeasureKind::Duration, WHOLE, &points), 3.0);
-        // A window cuts phases: the one that holds at its begin counts, and its time from there on.
+        // A window clips intervals: one that is true at the window's begin counts, with its duration from there on.
         assert_eq!(value(MeasureKind::Count, (2.5, 4.5), &points), 2.0);
         assert_eq!(value(MeasureKind::CountRises, (2.5, 4.5), &points), 1.0);
         assert_eq!(value(MeasureKind::Duration, (2.5, 4.5), &points), 1.0);
         assert_eq!(value(MeasureKind::Count, (1.2, 1.8), &points), 0.0);
         assert_eq!(value(MeasureKind::Duration, (1.2, 1.8), &points), 0.0);
-        // Where it turned between two points is not known, where it turned at an event is.
+        // The time of a change between two points is uncertain; the time of a change at an event is exact.
         let mut meter = Meter::new(&measure(MeasureKind::Duration), 0.0, f64::INFINITY);
         points.iter().for_each(|(t, v)| meter.see(*t, *v));
         assert_eq!(meter.resolution(), 2.0);
@@ -822,7 +825,7 @@ mod tests {
         assert_eq!(reason, "there are 3 peaks in the window");
     }
 
-    /// One measure over points of a quantity and of what tells when.
+    /// One measure over points of time, the quantity, and the condition or quantity that defines the moment.
     fn told(kind: MeasureKind, window: Window, points: &[(f64, f64, f64)]) -> Result<(f64, Option<f64>), String> {
         let mut meter = Meter::new(&Measure { window, ..measure(kind) }, 0.0, f64::INFINITY);
         points.iter().for_each(|(t, v, w)| meter.see_block(*t, &[*t, 0.0, *w, *v]));
@@ -867,7 +870,7 @@ mod tests {
         assert!((value(MeasureKind::Period, (0.1, 3.0), &points) - 0.37).abs() < 1e-9);
         let rough = sine(0.37, 3.0, 0.02);
         assert!((value(MeasureKind::Period, WHOLE, &rough) - 0.37).abs() < 1e-4);
-        // Jumps have no cubic.
+        // A cubic does not fit across jumps.
         let square: Vec<Point> = (0..20)
             .flat_map(|n| [(n as f64, 0.0), (n as f64, 1.0), (n as f64 + 0.5, 1.0), (n as f64 + 0.5, 0.0)])
             .collect();

@@ -1,7 +1,7 @@
-//! One run: steps of a model, what observers see of them, and what is found of what they saw.
+//! A single run: steps of a model, its observers, and the results of what they observe.
 //!
-//! In: an instance, the plan of an experiment. Out: a run that stands still between calls of its model's code, measures with their
-//! verdicts, recordings, or the reason why it stopped.
+//! In: an instance and the plan of an experiment. Out: a resumable run that pauses at each call of its model's code;
+//! measures with their verdicts; recordings; or the reason why it stopped.
 
 pub mod verdict;
 pub(crate) mod peak;

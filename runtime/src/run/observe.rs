@@ -1,7 +1,7 @@
-//! Looks at the points of a run: measures, recordings, and whether every number is one.
+//! Observes the points of a run: measures, recordings, and the check that every number is finite.
 //!
-//! In: instances after a step, or on one side of an event. Out: what [`measure`](crate::run::measure) and
-//! [`record`](crate::record) make of them, or the reason to stop. Knows no solver.
+//! In: instances after a step, or on one side of an event. Out: the results of [`measure`](crate::run::measure) and
+//! [`record`](crate::record), or the reason to stop. Knows no solver.
 
 use crate::record::Recorder;
 use crate::run::measure::Expectations;
@@ -10,22 +10,22 @@ use abi::description::Kind;
 use abi::plan::Experiment;
 use abi::{Instance, Slot};
 
-/// Everything that looks at the points of a run.
+/// All observers of a run.
 pub(crate) struct Observer {
     pub(crate) expectations: Expectations,
     pub(crate) recorder: Recorder,
     /// Slots that are read; each must be finite.
     slots: Vec<Slot>,
-    /// Values that are wanted at given instants.
+    /// Values to record at given instants.
     pub(crate) probe: Probe,
 }
 
-/// Values of some slots at given instants, ascending.
+/// Records the values of some slots at given instants, in ascending order.
 #[derive(Default)]
 pub(crate) struct Probe {
     instants: Vec<f64>,
     slots: Vec<Slot>,
-    /// Row by row, one for each instant passed.
+    /// Row-major, a row for each instant passed.
     values: Vec<f64>,
 }
 
@@ -34,7 +34,7 @@ impl Probe {
         Probe { instants: instants.to_vec(), slots: slots.to_vec(), values: Vec::new() }
     }
 
-    /// The slots that are wanted.
+    /// The slots to record.
     pub(crate) fn slots(&self) -> &[Slot] {
         &self.slots
     }
@@ -45,7 +45,7 @@ impl Probe {
         self.instants.get(row).copied()
     }
 
-    /// The values at that instant.
+    /// Records the values at that instant.
     pub(crate) fn take(&mut self, block: &[f64]) {
         self.values.extend(self.slots.iter().map(|slot| block[slot.index()]));
     }
@@ -58,7 +58,7 @@ impl Probe {
 impl Observer {
     pub(crate) fn new(experiment: &Experiment) -> Observer {
         let mut expects = experiment.expects.clone();
-        // A window to the end is open: the last step may end a rounding error beside the duration.
+        // A window that ends with the run has an open end: the last step may end one rounding error off the duration.
         for expect in expects.iter_mut().filter(|expect| expect.before >= experiment.duration) {
             expect.before = f64::INFINITY;
         }
@@ -71,7 +71,7 @@ impl Observer {
         Observer { expectations, recorder, slots, probe: Probe::default() }
     }
 
-    /// Whether only the last point of a run matters.
+    /// Whether all observers need only the last point of a run.
     pub(crate) fn only_last(&self) -> bool {
         self.recorder.is_empty() && self.expectations.only_last()
     }
@@ -81,10 +81,11 @@ impl Observer {
         &self.slots
     }
 
-    /// One point of the run: the block after a step, or on one side of an event.
+    /// Adds a point of the run: the block after a step, or on one side of an event.
     pub(crate) fn see(&mut self, instance: &Instance) -> Result<(), Stop> {
         let block = instance.block();
-        // Zero times a value is zero unless it is infinite or not a number.
+        // Zero times a value is zero unless the value is infinite or not a number: one sum checks all slots without a
+        // branch.
         let doubt: f64 = self.slots.iter().map(|slot| 0.0 * block[slot.index()]).sum();
         if doubt != 0.0 {
             self.check(instance)?;
@@ -93,13 +94,13 @@ impl Observer {
         Ok(())
     }
 
-    /// One point whose values are known to be finite.
+    /// Adds a point whose values are known to be finite.
     pub(crate) fn show(&mut self, time: f64, block: &[f64]) {
         self.expectations.see(time, block);
         self.recorder.see(time, block);
     }
 
-    /// Names what is read and not finite. A state that went wrong explains the expression that was asked for.
+    /// Names the observed value that is not finite. States come first, because a bad state explains a bad expression.
     pub(crate) fn check(&self, instance: &Instance) -> Result<(), Stop> {
         check_finite(instance)?;
         match self.slots.iter().find(|slot| !instance.get(**slot).is_finite()) {
@@ -109,7 +110,7 @@ impl Observer {
     }
 }
 
-/// States and outputs must be finite; private quantities may be infinite in a branch that is not taken.
+/// Checks that states and outputs are finite. Private quantities may be infinite in a branch that is not taken.
 pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
     let layout = &instance.description().layout;
     let finite = |slot: &usize| instance.block()[*slot].is_finite();
@@ -124,7 +125,8 @@ pub(crate) fn check_finite(instance: &Instance) -> Result<(), Stop> {
     }
 }
 
-/// What is not finite, or the quantity whose range was left at the same instant: results rest on ranges, so that is the cause.
+/// Reports the value that is not finite, or the quantity that left its range at the same instant: results are valid
+/// only within ranges, so that is the cause.
 fn not_finite(instance: &Instance, slot: Slot) -> Stop {
     let time = instance.get(Slot::TIME);
     let left = instance.description().guards.iter().find_map(|guard| {
@@ -139,7 +141,7 @@ fn not_finite(instance: &Instance, slot: Slot) -> Stop {
     Stop { cause: Cause::NotFinite { path, value: instance.get(slot) }, time }
 }
 
-/// What a status that is not 0 means.
+/// Converts a status other than 0 to the reason to stop.
 pub(crate) fn check_status(instance: &Instance, status: u64) -> Result<(), Stop> {
     if status == 0 {
         return Ok(());

@@ -1,4 +1,4 @@
-//! How a run ends: what it gives, or why it stopped.
+//! The outcome of a run: its results, or why it stopped.
 
 use crate::format;
 use crate::record::Recording;
@@ -9,41 +9,41 @@ use abi::unit::Unit;
 use std::fmt;
 use std::ops::ControlFlow;
 
-/// Whether to go on.
+/// Whether a callback wants the run to continue.
 pub type Continue = ControlFlow<()>;
 
-/// How an experiment ended that ran to its end.
+/// The results of an experiment that ran to its end.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Outcome {
     /// One for each expectation, in order.
     pub verdicts: Vec<Verdict>,
-    /// What is drawn and written.
+    /// The signals to plot and to write.
     pub recording: Recording,
     /// Outputs at the end, in the order of the description.
     pub finals: Vec<Final>,
     /// Time at the end in s.
     pub time: f64,
-    /// What it took.
+    /// The number of steps and evaluations.
     pub work: Work,
-    /// What the reader should know besides: in words, a sentence each.
+    /// Notes for the user, a sentence each.
     pub notes: Vec<String>,
-    /// How the errors of the readings were found; none where nobody asked.
+    /// How the errors of the readings were estimated; none if that was not requested.
     pub estimate: Option<Estimate>,
 }
 
-/// How the errors of an outcome were found.
+/// How the errors of an outcome were estimated.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Estimate {
-    /// Runs of the same by a finer solver that came to their end.
+    /// More accurate solvers whose runs of the same experiment reached the end.
     pub companions: Vec<Solver>,
-    /// One that did not, and why, in words: then no error is known.
+    /// One that failed, and why, in words: the errors are then unknown.
     pub failed: Option<(Solver, String)>,
-    /// Where verdicts are open: a solver that decides all of them, tried.
+    /// Where verdicts are undecided: a solver that decides all of them, as tried.
     pub decides: Option<Solver>,
 }
 
 impl Outcome {
-    /// Whether every expectation held, without a doubt where errors were estimated.
+    /// Whether every expectation held, and is decided where errors were estimated.
     pub fn passed(&self) -> bool {
         self.verdicts.iter().all(Verdict::passed)
     }
@@ -58,26 +58,26 @@ pub struct Final {
     pub value: f64,
     /// The unit it is shown in.
     pub unit: Unit,
-    /// True (1) or false (0) rather than a quantity.
+    /// Whether the value is a truth value, 1 or 0, rather than a quantity.
     pub boolean: bool,
 }
 
-/// What a run took.
+/// The number of operations of a run.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Work {
-    /// Steps that count, of any kind.
+    /// Accepted steps of any kind.
     pub steps: u64,
-    /// Of these, in an adaptive run, steps of the stiff method; the others were explicit.
+    /// Of these, in an adaptive run, steps of the stiff method; the others are explicit.
     pub stiff_steps: u64,
-    /// Steps of an adaptive run that were tried and found too long.
+    /// Rejected steps of an adaptive run.
     pub rejected: u64,
     /// Evaluations of the derivatives in an adaptive run.
     pub evaluations: u64,
-    /// Jacobians of an adaptive run.
+    /// Jacobian evaluations in an adaptive run.
     pub jacobians: u64,
     /// Events at which a step of an adaptive run ended.
     pub events: u64,
-    /// Instants at which an adaptive run met sampled blocks.
+    /// Instants at which sampled blocks executed in an adaptive run.
     pub ticks: u64,
 }
 
@@ -102,21 +102,21 @@ impl fmt::Display for Work {
     }
 }
 
-/// Why a run stopped before its end.
+/// A run that stopped before its end.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Failure {
     /// The reason.
     pub cause: Cause,
-    /// When, in s.
+    /// Time of the stop, in s.
     pub time: f64,
-    /// The run up to there.
+    /// The recording up to then.
     pub recording: Recording,
 }
 
 /// The reason of a [`Failure`].
 #[derive(Clone, PartialEq, Debug)]
 pub enum Cause {
-    /// A watched quantity left its range.
+    /// A guarded quantity left its range.
     Guard {
         /// The quantity and its range.
         guard: Box<Guard>,
@@ -130,45 +130,45 @@ pub enum Cause {
         /// Its value.
         value: f64,
     },
-    /// The model changes regime or branch without end, so that time does not go on.
+    /// The model changes regime or branch without end, so time does not advance (Zeno behaviour or chattering).
     Chatter(Box<Chatter>),
-    /// No step was short enough for the tolerance.
+    /// Even the shortest step missed the tolerance.
     StepTooShort {
-        /// Length of the last in s.
+        /// Length of the last step in s.
         step: f64,
         /// The state with the largest error.
         path: String,
     },
-    /// The run needs more steps than are worth waiting for.
+    /// The run exceeds the limit of steps.
     TooManySteps {
         /// Steps tried.
         steps: u64,
         /// The state with the largest error in the last one.
         path: String,
     },
-    /// The model offers no derivatives, so there is nothing to solve adaptively.
+    /// The model has no derivatives, so it cannot be integrated adaptively.
     NoDerivatives,
-    /// A `stop` of the rig.
+    /// A `stop` condition of the rig.
     Rig {
         /// As written.
         condition: String,
-        /// What the operator is told.
+        /// The message to the operator.
         why: String,
     },
-    /// The caller said to stop.
+    /// The caller stopped the run.
     Stopped,
 }
 
-/// What a model did that chattered.
+/// The regimes and conditions involved in chattering.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Chatter {
     /// The regime of each automaton, with its part: `fr.stick`.
     pub regimes: Vec<String>,
-    /// The conditions that turned, as written: `fr: v < 0`.
+    /// The conditions that changed, as written: `fr: v < 0`.
     pub conditions: Vec<String>,
-    /// How often at least.
+    /// The least number of changes.
     pub times: usize,
-    /// Over which time in s; 0 if at one instant.
+    /// The time span of these changes in s; 0 if at one instant.
     pub within: f64,
 }
 
@@ -227,7 +227,7 @@ impl fmt::Display for Chatter {
 
 impl std::error::Error for Failure {}
 
-/// A reason to stop, and when.
+/// A reason to stop, and the time.
 pub(crate) struct Stop {
     pub(crate) cause: Cause,
     pub(crate) time: f64,

@@ -1,22 +1,23 @@
-//! The greatest of values seen one by one at fixed steps, and by how much the course between them may exceed it.
+//! The maximum of a signal sampled at fixed steps, and how far the signal may exceed it between the samples.
 //!
-//! In: points in order of time. Out: the greatest, and an estimate of its distance to the maximum of the course: through the
-//! two points on either side a parabola where they show a smooth course, else straight lines from both sides. Runs with half
-//! the step have a point at the same place, so their agreement says nothing about the course between.
+//! In: points in order of time. Out: the greatest point, and an estimate of its distance to the maximum of the signal:
+//! from the parabola through the neighbouring points where the signal looks smooth, else from straight lines
+//! extrapolated from both sides. A run with half the step has a point at the same time, so its agreement there gives no
+//! information about the signal in between.
 
 /// A point: time in s, value in SI.
 pub(crate) type Point = (f64, f64);
 
-/// The greatest of values, or the least.
+/// The running maximum or minimum.
 pub(crate) struct Peak {
-    /// 1 for the greatest, −1 for the least.
+    /// 1 for the maximum, −1 for the minimum.
     sign: f64,
-    /// The greatest so far; −∞ before the first.
+    /// The greatest point so far, times `sign`; −∞ before the first.
     at: Point,
-    /// The two points before the greatest, nearer one first; those after it.
+    /// The two points before the greatest, nearer one first; then those after it.
     before: [Option<Point>; 2],
     after: [Option<Point>; 2],
-    /// The last two points seen, later one first.
+    /// The last two points, later one first.
     last: [Option<Point>; 2],
 }
 
@@ -29,7 +30,7 @@ impl Peak {
         Peak { sign: -1.0, ..Peak::greatest() }
     }
 
-    /// One more point; says whether it is the new extreme.
+    /// Adds a point; returns whether it is the new extreme.
     pub(crate) fn see(&mut self, t: f64, v: f64) -> bool {
         let point = (t, self.sign * v);
         let higher = point.1 > self.at.1;
@@ -43,15 +44,15 @@ impl Peak {
         higher
     }
 
-    /// The extreme as it was seen: time in s, value in SI.
+    /// The extreme among the points: time in s, value in SI.
     pub(crate) fn found(&self) -> Point {
         (self.at.0, self.sign * self.at.1)
     }
 
-    /// By how much the course may exceed the extreme between the points, SI. `corners`: instants in s, ascending, at which the
-    /// course may jump and of which it is known that points lie there.
+    /// How far the signal may exceed the extreme between the points, SI. `corners`: instants in s, ascending, at which
+    /// the signal may jump and the run has a point.
     pub(crate) fn unseen(&self, corners: &[f64]) -> f64 {
-        // Two points at one time are the sides of a jump: beyond it lies another course, and so it does at a corner.
+        // Two points at one time are the two sides of a jump. Extrapolation stops there, and at each corner.
         let one_side = |points: [Option<Point>; 2]| {
             let near = points[0].filter(|point| point.0 != self.at.0);
             [near, points[1].filter(|point| near.is_some_and(|near| near.0 != point.0))]
@@ -73,7 +74,7 @@ impl Peak {
         if unseen.is_finite() { unseen } else { 0.0 }
     }
 
-    /// Time in s between the extreme and its neighbours, the longer one.
+    /// The longer of the times in s between the extreme and its neighbours.
     pub(crate) fn gap(&self) -> f64 {
         let far = |point: Option<Point>| point.map_or(0.0, |point| (point.0 - self.at.0).abs());
         far(self.before[0]).max(far(self.after[0]))
@@ -95,7 +96,7 @@ fn bend([a, b, c]: [Point; 3]) -> f64 {
     2.0 * (slope(b, c) - slope(a, b)) / (c.0 - a.0)
 }
 
-/// Whether the bend about the middle of five points is, to a half, that about its neighbours.
+/// Whether the second difference at the middle of five points agrees within half with those at its neighbours.
 fn is_smooth([a, b, c, d, e]: [Point; 5]) -> bool {
     let middle = bend([b, c, d]);
     let alike = |other: f64| (other - middle).abs() <= 0.5 * middle.abs();
@@ -117,9 +118,9 @@ fn above(points: [Point; 3], peak: Point, (from, to): (f64, f64)) -> f64 {
     (height - peak.1).max(0.0)
 }
 
-/// How far the course may rise above `peak` before the next point `down`, from what it does before and after. Where the lines
-/// through both sides meet, it has a kink at most: a concave course stays below them. Where the line of the right side
-/// lies below the peak, the course jumps; from a peak it may have risen up to there.
+/// How far the signal may rise above `peak` before the next point `down`, extrapolated linearly from both sides. If the
+/// two lines meet above, the signal has at most a kink: a concave signal stays below the lines. If the right line lies
+/// below the peak, the signal jumps, and may have risen until the jump.
 fn by_lines([before, peak, down, after]: [Point; 4]) -> f64 {
     let h = down.0 - peak.0;
     let (rise, back) = ((slope(before, peak) * h).max(0.0), -slope(down, after) * h);
@@ -131,7 +132,7 @@ fn by_lines([before, peak, down, after]: [Point; 4]) -> f64 {
 mod tests {
     use super::*;
 
-    /// What was found and what may be unseen of a course at steps of 1 s, shifted by a part of a step.
+    /// Maximum of the samples and `unseen` for a signal sampled at 1 s, shifted by a fraction of a step.
     fn seen(course: impl Fn(f64) -> f64, shift: f64) -> (f64, f64) {
         let mut peak = Peak::greatest();
         (-10..=10).for_each(|k| {

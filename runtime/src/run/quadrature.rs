@@ -1,9 +1,9 @@
-//! Areas under a course that is seen at points.
+//! Integrals of a sampled signal.
 //!
-//! In: points in order of time. Out: the compensated sum of the trapezoidal rule, and its end corrections where points are evenly
-//! apart. Knows no windows.
+//! In: points in order of time. Out: the trapezoidal sum with compensated summation, and its end corrections where
+//! points are equidistant. Knows no windows.
 
-/// A run of points at even distances: its first and last values, for the end corrections of Gregory that raise the
+/// A sequence of equidistant points: its first and last values, for Gregory's end corrections, which raise the
 /// trapezoidal rule to order four,
 ///
 ///   h/12 (Δf_0 − ∇f_n) − h/24 (Δ²f_0 + ∇²f_n).
@@ -17,18 +17,18 @@ pub(crate) struct Even {
 }
 
 impl Even {
-    /// One more point; gives the correction of a run that ends with the one before.
+    /// Adds a point. If it ends a sequence, returns the correction of that sequence.
     pub(crate) fn push(&mut self, t: f64, v: f64) -> Option<f64> {
         let step = t - self.last;
         let goes_on = match self.points {
             0 => true,
             1 => step > 0.0,
-            // Times are multiples of the step, each rounded.
+            // Times are multiples of the step, rounded independently.
             _ => (step - self.step).abs() <= 1e-9 * self.step + 8.0 * f64::EPSILON * t.abs(),
         };
         let correction = if goes_on { None } else { Some(self.correction()) };
         if !goes_on {
-            // The last point begins the next run, unless something jumps there.
+            // The last point begins the next sequence, unless the signal jumps there.
             let from = self.tail[2];
             self.points = u64::from(step > 0.0);
             self.head[0] = from;
@@ -46,7 +46,7 @@ impl Even {
         correction
     }
 
-    /// What the trapezoidal rule lacks over the run so far; nothing of fewer than five points.
+    /// The end correction of the sequence so far; 0 for fewer than five points.
     pub(crate) fn correction(&self) -> f64 {
         if self.points < 5 {
             return 0.0;
@@ -56,7 +56,7 @@ impl Even {
     }
 }
 
-/// A compensated sum (Neumaier): ten million steps lose nothing that matters.
+/// A compensated sum (Neumaier, 1974): rounding errors stay negligible over ten million steps.
 #[derive(Default, Clone, Copy)]
 pub(crate) struct Sum {
     sum: f64,

@@ -1,59 +1,58 @@
-//! Runs that stand still between calls of their model's code, so that whoever makes the calls may make those of many
-//! together.
+//! Resumable runs: a run pauses at each call of its model's code, so that a scheduler can batch the calls of many runs.
 //!
-//! In: an instance, a plan and an observer. Out: a [`Stepper`], and when it has ended its [`Rest`]. What a run does between
-//! two calls depends on what the calls left in its block alone: with whom they were made cannot be told.
+//! In: an instance, a plan and an observer. Out: a [`Stepper`], and at its end a [`Rest`]. A run depends only on what
+//! the calls leave in its own block, so results do not depend on how calls were batched.
 
 use crate::run::observe::Observer;
 use crate::run::outcome::{Continue, Stop, Work};
 use abi::{Function, Instance};
 use std::ops::Range;
 
-/// A run under way.
+/// A run in progress.
 pub(crate) trait Stepper {
-    /// The function that makes its steps.
+    /// The function that advances it.
     fn function(&self) -> Function;
 
-    /// Goes on up to where the function is to be called, at most so often as said. None at the end of the run. `watch` sees
-    /// the fraction done and may end it.
+    /// Continues to the next call of the function, and returns how often it is to be called at most. None at the end of
+    /// the run. `watch` receives the fraction done and may stop the run.
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop>;
 
-    /// Takes over what `done` calls have left in the block, the last of them with this status, all others with 0.
+    /// Accepts the block after `done` calls, the last of which returned `status`; all others returned 0.
     fn take(&mut self, done: u64, status: u64) -> Result<(), Stop>;
 
-    /// The instance on whose block the calls are made.
+    /// The instance whose block the calls work on.
     fn instance(&mut self) -> &mut Instance;
 
-    /// Where the calls were made on another block: brings those slots from there that `take` will read.
+    /// If the calls were made on another block: copies from there the slots that `take` reads.
     fn fetch(&mut self, done: u64, status: u64, from: &dyn Fn(Range<usize>, &mut [f64]));
 
-    /// And brings those slots there that have changed since the last call.
+    /// Copies to that other block the slots that have changed since the last call.
     fn bring(&self, to: &mut dyn FnMut(Range<usize>, &[f64]));
 
-    /// What is left of it.
+    /// Consumes the run and returns its instance and results.
     fn rest(self: Box<Self>) -> Rest;
 }
 
-/// What is left of a run.
+/// The parts of a run after its end.
 pub(crate) struct Rest {
-    /// Where it ended.
+    /// The instance in its final state.
     pub(crate) instance: Instance,
-    /// What was seen.
+    /// The observer with its results.
     pub(crate) observer: Observer,
-    /// What it cost.
+    /// The number of operations.
     pub(crate) work: Work,
-    /// What the user should know.
+    /// Notes for the user.
     pub(crate) notes: Vec<String>,
 }
 
 impl Rest {
-    /// Of a run that did not begin.
+    /// The parts of a run that did not begin.
     pub(crate) fn of(instance: Instance, observer: Observer) -> Rest {
         Rest { instance, observer, work: Work::default(), notes: Vec::new() }
     }
 }
 
-/// Runs it to its end or to the reason why not.
+/// Runs it alone to its end, or to the reason to stop.
 pub(crate) fn alone(course: &mut dyn Stepper, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
     let function = course.function();
     while let Some(count) = course.next(watch)? {

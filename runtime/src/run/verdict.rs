@@ -1,40 +1,40 @@
 //! The verdict on an expectation, from the readings of its measures.
 //!
-//! In: an [`Expect`] and the readings of one run, or of one run and of the same computed more finely. Out: a [`Verdict`] with
-//! the comparison that decided, and with more than one run the numerical error of each number and whether the verdict
-//! stands in spite of it. Knows neither points nor solvers.
+//! In: an [`Expect`] and the readings of one run, or of a run and of more accurate runs of the same experiment. Out: a
+//! [`Verdict`] with the deciding comparison, and with more than one run the numerical error of each number and whether
+//! the verdict holds within that error. Knows neither points nor solvers.
 
 use abi::plan::{Expect, Formula};
 use abi::unit::Unit;
 
-/// Differences below this part of the greatest magnitude that a measured quantity reaches are rounding and doubt nothing: that a
-/// power is nowhere negative is not in doubt because it is -1e-25 W at rest.
+/// Differences below this fraction of the greatest magnitude of a measured quantity are rounding errors and never make
+/// a verdict undecided: a power that is −1e-25 W at rest still counts as not negative.
 const ROUNDING: f64 = 1e-11;
 
 /// A quantity that never exceeds this in SI consists of rounding errors.
 const NOTHING: f64 = 1e-15;
 
-/// What became of one expectation.
+/// The result of one expectation.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Verdict {
-    /// As written.
+    /// The expectation as written.
     pub text: String,
-    /// Whether it held. Never where there is a `problem`.
+    /// Whether it holds. False where there is a `problem`.
     pub holds: bool,
-    /// Whether the numerical error is too small to turn it over; true where no error was estimated.
+    /// Whether the numerical error is too small to reverse the result; true where no error was estimated.
     pub decided: bool,
-    /// The measures that could be taken, in the order of the text.
+    /// The readings of its measures, in the order of the text.
     pub readings: Vec<Reading>,
-    /// The comparison that decided; none where the condition compares nothing or could not be evaluated.
+    /// The deciding comparison; none where the condition has no comparison or could not be evaluated.
     pub margin: Option<Margin>,
-    /// Why it could not be evaluated, in words: `the window … is empty`.
+    /// Why the condition could not be evaluated, in words: `the window … is empty`.
     pub problem: Option<String>,
-    /// Of what is only shown: the value, with its error. Nothing is judged then: it holds and is decided.
+    /// For a value that is only shown: the value with its error. It is not judged: `holds` and `decided` are true.
     pub shown: Option<Reading>,
 }
 
 impl Verdict {
-    /// Whether it holds and the numerical error leaves no doubt of it.
+    /// Whether it holds and is decided.
     pub fn passed(&self) -> bool {
         self.holds && self.decided
     }
@@ -43,26 +43,26 @@ impl Verdict {
 /// The value of one measure.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Reading {
-    /// As written.
+    /// The measure as written.
     pub text: String,
     /// In SI.
     pub value: f64,
     /// The unit it is shown in.
     pub unit: Unit,
-    /// When it happened, in s, where it happened at an instant: of `max`, when the maximum was reached.
+    /// Time in s, for a measure with an instant: for `max`, when the maximum was reached.
     pub time: Option<f64>,
-    /// How far it may be off because only the points of the run were looked at, SI: half of what a denser set could change.
+    /// Error due to the spacing of the points, SI: half of what denser points could change.
     pub resolution: f64,
-    /// Of extremes seen at the points of fixed steps: how far the one between them may be from it, SI.
+    /// For an extreme at fixed steps: how far the extreme between the points may be from it, SI.
     pub unseen: f64,
     /// The greatest magnitude that the measured quantity reached, SI.
     pub scale: f64,
-    /// Estimated distance to the exact solution of the model, SI; infinite where it could not be estimated, none where nobody
-    /// asked.
+    /// Estimated distance to the exact solution of the model, SI; infinite if it could not be estimated, none if no
+    /// estimate was requested.
     pub error: Option<f64>,
 }
 
-/// How far a comparison was from turning over.
+/// The distance of a comparison from its opposite result.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Margin {
     /// Distance to the limit in SI: positive where the comparison holds.
@@ -73,17 +73,17 @@ pub struct Margin {
     pub limit: f64,
     /// The unit of all three.
     pub unit: Unit,
-    /// The instant that matters, in s, if one of the measures compared has one.
+    /// The relevant instant in s, if one of the compared measures has one.
     pub time: Option<f64>,
-    /// Estimated numerical error of value less limit, SI, as of [`Reading::error`].
+    /// Estimated numerical error of value − limit, SI, as in [`Reading::error`].
     pub error: Option<f64>,
 }
 
-/// One run of an experiment and finer ones of the same, and how much their results say about the error of the first.
+/// A run of an experiment with more accurate runs of the same, and the error estimator for the first.
 pub struct Runs<'a> {
-    /// The readings of one expectation: those of the run itself, then those of finer ones.
+    /// The readings of one expectation: those of the run itself, then those of the more accurate runs.
     pub readings: &'a [&'a [Reading]],
-    /// The error of the first of these values, all of the same number; none where it is not asked for.
+    /// The error of the first of several values of the same number; none where no estimate was requested.
     pub error: &'a dyn Fn(&[f64]) -> Option<f64>,
 }
 
@@ -92,17 +92,17 @@ pub fn verdict(expect: &Expect, readings: Vec<Reading>) -> Verdict {
     judged(expect, &Runs { readings: &[&readings], error: &|_| None })
 }
 
-/// The verdict on the first of several runs, with its error.
+/// The verdict on the first of several runs, with its numerical error.
 pub fn judged(expect: &Expect, runs: &Runs) -> Verdict {
     let mut readings = runs.readings[0].to_vec();
     let finest = runs.readings[runs.readings.len() - 1];
     for (k, reading) in readings.iter_mut().enumerate() {
         let values: Vec<f64> = runs.readings.iter().map(|readings| readings[k].value).collect();
-        // Points that several runs have in common are no news of the course between them: that is as wide open as in the
-        // finest of the runs.
+        // Points that several runs share give no information about the signal in between: that is as uncertain as in
+        // the finest run.
         let moved = distance(reading.value, finest[k].value);
         let beyond = if finest[k].unseen > 0.0 { finest[k].unseen + moved } else { 0.0 };
-        // The instant of an event lies as far from that of the finest run as the two say, if that one has located it.
+        // If the finest run has located the event, the error of this instant is the distance between the two.
         let resolution = reading.resolution.min(finest[k].resolution + moved);
         let rounding = if reading.scale <= NOTHING { reading.value.abs() } else { 0.0 };
         reading.error = (runs.error)(&values).map(|error| error.max(resolution).max(beyond).max(rounding));
@@ -133,7 +133,7 @@ pub fn unable(expect: &Expect, readings: Vec<Reading>, problem: String) -> Verdi
     Verdict { text, holds: false, decided: true, readings, margin: None, problem: Some(problem), shown: None }
 }
 
-/// What is shown and not judged.
+/// The value of an expectation that is only shown, not judged.
 fn shown(expect: &Expect, runs: &Runs, readings: Vec<Reading>, unit: &Unit, formula: &Formula) -> Verdict {
     let value = match number(formula, runs.readings[0]) {
         Ok(value) => value,
@@ -161,7 +161,7 @@ fn shown(expect: &Expect, runs: &Runs, readings: Vec<Reading>, unit: &Unit, form
 struct Evaluated {
     value: f64,
     margin: Option<Margin>,
-    /// Of a condition: whether no error within the estimate turns it over (Kleene's logic of three values).
+    /// For a condition: whether no error within the estimate can reverse it (Kleene's three-valued logic).
     known: bool,
 }
 
@@ -170,8 +170,8 @@ struct Evaluation<'a> {
 }
 
 impl Evaluation<'_> {
-    /// A formula over the readings of the first run; a result that is not a number (0/0) is an error, since no comparison
-    /// with it means anything.
+    /// Evaluates a formula over the readings of the first run. A result that is not a number (0/0) is an error, because
+    /// comparisons with NaN have no meaning.
     fn of(&self, formula: &Formula) -> Result<Evaluated, String> {
         match formula {
             Formula::Less(a, b) => self.compared(formula, a, b, 1.0, true),
@@ -222,7 +222,7 @@ impl Evaluation<'_> {
             | Formula::Min(..)
             | Formula::Max(..) => {
                 let value = number(formula, self.runs.readings[0])?;
-                // A truth value that was measured: the finer runs must agree.
+                // A measured truth value is decided if the more accurate runs agree.
                 let same =
                     |readings: &&[Reading]| number(formula, readings).is_ok_and(|v| (v != 0.0) == (value != 0.0));
                 let known = self.runs.readings.iter().all(same) && self.error(formula).is_none_or(f64::is_finite);
@@ -241,7 +241,7 @@ impl Evaluation<'_> {
     ) -> Result<Evaluated, String> {
         let readings = self.runs.readings[0];
         let (value, limit) = (number(left, readings)?, number(right, readings)?);
-        // Equal infinities leave no room.
+        // Equal infinities: the margin is 0.
         let amount = if value == limit { 0.0 } else { sign * (limit - value) };
         let holds = if strict { amount > 0.0 } else { amount >= 0.0 };
         Ok(self.margin(holds, amount, (value, limit), formula))
@@ -254,7 +254,8 @@ impl Evaluation<'_> {
         let unit = used().next().map_or_else(Unit::none, |reading| reading.unit.clone());
         let time = used().find_map(|reading| reading.time);
         let error = self.error(formula);
-        // A measure that is a whole side is as large as what it is of; arithmetic is as large as its value.
+        // If a whole side is one measure, rounding is relative to the magnitude of its quantity; for arithmetic, to the
+        // value.
         let scale = match formula {
             Formula::Less(a, b)
             | Formula::LessEqual(a, b)
@@ -272,12 +273,12 @@ impl Evaluation<'_> {
         Evaluated { value: f64::from(holds), margin: Some(margin), known }
     }
 
-    /// The error of what a comparison compares: of the distance between its two sides, or of a number.
+    /// The error of a comparison's difference, or of a number.
     fn error(&self, formula: &Formula) -> Option<f64> {
         let all: Vec<(f64, f64)> = self.runs.readings.iter().map(|readings| sides(formula, readings)).collect();
         let of = |part: fn(&(f64, f64)) -> f64| (self.runs.error)(&all.iter().map(part).collect::<Vec<f64>>());
         let error = of(|side| side.0)?.max(of(|side| side.1)?);
-        // What a denser look could change in each measure, through the formula.
+        // The error due to the spacing of points in each measure, propagated through the formula.
         let readings = self.runs.readings;
         let finest = readings[readings.len() - 1];
         let ((own, own_width), (fine, fine_width)) = (all[0], all[all.len() - 1]);
@@ -290,7 +291,7 @@ impl Evaluation<'_> {
     }
 }
 
-/// How far a formula moves where each reading is larger by what `by` says, added up.
+/// The sum of the formula's changes when each reading in turn grows by `by`.
 fn opened(formula: &Formula, readings: &[Reading], by: fn(&Reading) -> f64) -> f64 {
     let (mut moved, mut sum) = (readings.to_vec(), 0.0);
     for (k, reading) in readings.iter().enumerate().filter(|(_, reading)| by(reading) > 0.0) {
@@ -302,7 +303,7 @@ fn opened(formula: &Formula, readings: &[Reading], by: fn(&Reading) -> f64) -> f
     sum
 }
 
-/// Of a comparison, how far its sides are apart, and the width that this may have; of a number it itself.
+/// For a comparison, the difference of its sides and the allowed width; for a number, the number and 0.
 fn sides(formula: &Formula, readings: &[Reading]) -> (f64, f64) {
     let value = |formula: &Formula| number(formula, readings).unwrap_or(f64::NAN);
     let apart = |a: &Formula, b: &Formula| {
@@ -367,8 +368,8 @@ fn number(formula: &Formula, readings: &[Reading]) -> Result<f64, String> {
     }
 }
 
-/// Of two comparisons the one that decides: one that is in doubt where the whole is, else the one whose margin as a fraction of
-/// its limit is the smaller (or larger), since units differ.
+/// The deciding one of two comparisons: an undecided one if the whole is undecided; otherwise the one with the smaller
+/// (or larger) margin relative to its limit, because units may differ.
 fn deciding(a: Evaluated, b: Evaluated, known: bool, better: fn(&f64, &f64) -> bool) -> Option<Margin> {
     let fraction = |margin: &Margin| match margin.limit.abs().max(margin.value.abs()) {
         scale if scale > 0.0 && scale.is_finite() => margin.amount / scale,
@@ -493,7 +494,7 @@ mod tests {
         assert!(!verdict.holds && verdict.problem.unwrap().contains("not a number"));
     }
 
-    /// The same judged with two finer runs; the error is the width that the three span.
+    /// The same with two finer runs; the error is the range that the three values span.
     fn with_error(condition: Formula, finer: [(f64, f64); 2]) -> Verdict {
         let all = [readings(2.0, -2.0), readings(finer[0].0, finer[0].1), readings(finer[1].0, finer[1].1)];
         let slices: Vec<&[Reading]> = all.iter().map(Vec::as_slice).collect();
@@ -513,14 +514,14 @@ mod tests {
         assert!((clear.margin.unwrap().error.unwrap() - 0.012).abs() < 1e-12);
         let open = with_error(below(2.005), finer);
         assert!(open.holds && !open.decided && !open.passed());
-        // One side that is clear decides what the other leaves open.
+        // One decided side can decide the whole.
         let both = |a: f64, b: f64| Formula::And(Box::new(below(a)), Box::new(below(b)));
         assert!(with_error(both(2.005, 1.0), finer).decided);
         let doubtful = with_error(both(2.005, 2.1), finer);
         assert!(!doubtful.decided && doubtful.margin.unwrap().limit == 2.005);
         let either = |a: f64, b: f64| Formula::Or(Box::new(below(a)), Box::new(below(b)));
         assert!(with_error(either(2.005, 2.1), finer).decided && !with_error(either(2.005, 1.0), finer).decided);
-        // Errors that two measures have in common cancel in their difference.
+        // Errors common to both measures cancel in their difference.
         let shifted = [(2.01, -1.99), (2.011, -1.989)];
         let width = Formula::Subtract(max(), min());
         let near =
