@@ -1,8 +1,8 @@
-//! Finds where a model comes to rest under constant inputs.
+//! Finds the equilibrium of a model under constant inputs by simulation.
 //!
-//! In: an instance that has started, with the functions of an adaptive run. Out: the instance with its states settled,
-//! or the state that does not settle. Time is let pass until nothing changes; no equation is solved, so regimes and
-//! branches do what they do in a run.
+//! In: an instance that has started, with the functions of an adaptive run. Out: the instance at rest, or the state
+//! that does not come to rest. Time is advanced until nothing changes. No equation is solved, so regimes and branches
+//! behave as in a run.
 
 use crate::engine::{self, Cause, Continue, Failure};
 use crate::record::Recording;
@@ -11,26 +11,26 @@ use abi::plan::{Experiment, Method, PARTS, Solver};
 use abi::{Function, Instance, Slot};
 use std::fmt;
 
-/// Seconds that are let pass, one after the other, until nothing changes any more.
+/// Durations in s of successive runs; the search ends after the first one after which nothing moves.
 const WAITS: [f64; 4] = [1.0, 1e2, 1e4, 1e6];
-/// With sampled code, every tick costs: less patience.
+/// The same for models with sampled code, where every tick costs time.
 const SAMPLED_WAITS: [f64; 2] = [1.0, 10.0];
-/// What a state may still move in as long a time as has just passed, as a part of its size or scale.
+/// Largest change of a state at rest over as long a time as has just passed, as a fraction of its size or scale.
 const REST: f64 = 1e-6;
 
-/// Why a model did not come to rest.
+/// Why a model did not reach equilibrium.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Restless {
-    /// This state still moves after so many seconds; its rate in SI units per second.
+    /// This state still moves after the longest wait.
     Moves {
         /// Dotted path.
         path: String,
-        /// Its rate, SI.
+        /// Its rate, SI units per second.
         rate: f64,
-        /// Seconds that have passed.
+        /// Seconds simulated.
         after: f64,
     },
-    /// The run stopped.
+    /// A run stopped with a failure.
     Failed(Failure),
 }
 
@@ -47,10 +47,10 @@ impl fmt::Display for Restless {
 
 impl std::error::Error for Restless {}
 
-/// Lets an instance come to rest. `tol`: relative tolerance of the runs, between 0 and 1.
+/// Advances an instance to equilibrium. `tol`: relative tolerance of the runs, between 0 and 1.
 ///
 /// # Errors
-/// The state that moves the most if it never rests, or why a run stopped.
+/// The state that moves most if there is no equilibrium, or why a run stopped.
 pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Instance, Restless> {
     let mut now = instance;
     if moving(&mut now, 1.0).is_none() {
@@ -90,7 +90,7 @@ pub fn settle(instance: Instance, tol: f64, watch: &mut dyn FnMut(f64) -> Contin
     Err(moved.expect("there is at least one wait"))
 }
 
-/// The state that moves the most for its size, with its rate, if any would move noticeably in `wait` seconds.
+/// The state that moves most relative to its size, with its rate, if any would move noticeably within `wait` seconds.
 fn moving(instance: &mut Instance, wait: f64) -> Option<(String, f64)> {
     let description = instance.description().clone();
     let layout = &description.layout;

@@ -1,19 +1,21 @@
-//! How far the measures of a run are from the exact solution of its model.
+//! Numerical error of the measures of a run: their distance to the exact solution of the model, estimated by companion
+//! runs.
 //!
-//! In: an instance as it was before its run, the plan, and the outcome. Out: the same outcome whose readings and margins carry
-//! their numerical error, whose verdicts are open where that error may turn them over, and an [`Estimate`] of how it was
-//! found, by companion runs. The run itself is over by then: nothing here can change its bits.
+//! In: an instance as it was before its run, the plan, and the outcome. Out: the same outcome with the numerical error
+//! in its readings and margins, with verdicts marked undecided where that error could reverse them, and an [`Estimate`]
+//! of how the errors were found. The run itself is complete by then, so nothing here changes its bits.
 //!
-//! An adaptive run has companions at a tenth and a hundredth of its tolerance. A run with fixed steps is compared with two
-//! adaptive runs of the same program, which share no points with it, locate events and extremes, and have an error control of
-//! their own. The error of a number is the width that all three results span. Two companions rather than one since two
-//! results may agree by accident. A method that is exact for a model is more accurate than those: where that leaves a verdict
-//! open, finer steps besides say how accurate it is.
+//! An adaptive run has companions at a tenth and a hundredth of its tolerance. A run with fixed steps is compared with
+//! two adaptive runs of the same program, which share no points with it, locate events and extremes, and have their own
+//! error control. The error of a number is the range that all three results span. There are two companions because two
+//! results may agree by accident. A method that is exact for a model is more accurate than the adaptive runs. If they
+//! leave a verdict undecided then, additional runs with finer steps determine its accuracy.
 //!
-//! Where a program has no adaptive run, or one that costs too much, companions have a half and a quarter of the step. Their
-//! results are extrapolated to the step 0 besides (Richardson) with the order that three runs show, at least 1 and at most
-//! that of the method. Points that all of these runs share are no accident: what an extreme may reach between those of the
-//! finest run is added, and the end of an experiment lies within a step of each companion.
+//! If a program has no adaptive run, or one that costs too much, the companions use a half and a quarter of the step.
+//! Their results are also extrapolated to step 0 (Richardson) with the observed order of the three runs, at least 1 and
+//! at most that of the method. All of these runs share points, and their agreement there is no coincidence. So the
+//! amount by which an extreme may exceed the points of the finest run is added, and each companion ends within one step
+//! of the end of the experiment.
 
 use crate::engine::{self, Cause, Continue, Estimate, Outcome};
 use crate::run::verdict::{Reading, Runs, Verdict, judged};
@@ -21,27 +23,30 @@ use abi::plan::{Experiment, Method, PARTS, Solver};
 use abi::{Description, Instance};
 use std::ops::Range;
 
-/// Tolerances of companions, as parts of that of the run.
+/// Tolerances of companions, as fractions of that of the run.
 const TOLERANCES: [f64; 2] = [0.1, 0.01];
 
-/// No companion has a smaller tolerance: below, rounding is all there is.
+/// Smallest tolerance of a companion: below it, rounding dominates.
 const LEAST_TOL: f64 = 1e-13;
 
-/// Tolerances of the adaptive runs that fixed steps are compared with, and how many times finer their longest step is: where that
-/// alone decides all steps, two runs with the same one agree whatever their tolerance.
+/// Tolerances of the adaptive runs that fixed steps are compared with, and the factors by which their longest step is
+/// shorter. Where the longest step limits all steps, two runs with the same limit would agree whatever their tolerance.
 const REFERENCES: [(f64, f64); 2] = [(1e-8, 1.0), (1e-10, 4.0)];
 
-/// Such a run may look at its caller so often for each thousand fixed steps, and so often besides. It does so every few dozen steps.
+/// Limit on progress callbacks of such a run: so many for each fixed step, plus a constant. The run makes one every few
+/// dozen steps, so this limits its cost.
 const LOOKS_PER_STEP: f64 = 2e-3;
 const LOOKS: f64 = 400.0;
 
-/// Steps of companions, as parts of that of the run. Powers of two: whatever divides into steps still does.
+/// Steps of companions, as fractions of that of the run. Powers of two, so that an interval of a whole number of steps
+/// still is one.
 const STEPS: [f64; 2] = [0.5, 0.25];
 
-/// A run that is tried to see whether it decides takes so many times the steps of the run itself at most.
+/// Most steps of a run that is tried to see whether it decides, as a multiple of the steps of the run itself.
 const MOST_WORK: f64 = 64.0;
 
-/// Estimates the errors of an outcome, as [`errors`] does, and looks for a solver that decides what they leave open.
+/// Estimates the errors of an outcome, as [`errors`] does, and searches for a solver that decides the undecided
+/// verdicts.
 pub fn judge(
     instance: &Instance,
     experiment: &Experiment,
@@ -56,8 +61,8 @@ pub fn judge(
     }
 }
 
-/// Estimates the errors of an outcome; `instance` and `experiment` as they were given to [`engine::run`]. An experiment that
-/// expects nothing needs no companion. `watch` may end it: then the outcome stays as it was.
+/// Estimates the errors of an outcome; `instance` and `experiment` are those passed to [`engine::run`]. An experiment
+/// without expectations needs no companion. `watch` may stop it, which leaves the outcome unchanged.
 pub fn errors(
     instance: &Instance,
     experiment: &Experiment,
@@ -67,7 +72,7 @@ pub fn errors(
     accompanied(instance, experiment, outcome, watch);
 }
 
-/// Puts the errors into the outcome and gives the runs that they follow from; none where it stays as it was.
+/// Writes the errors into the outcome and returns the companion runs; none where the outcome is unchanged.
 fn accompanied<'a>(
     instance: &'a Instance,
     experiment: &Experiment,
@@ -108,7 +113,8 @@ fn accompanied<'a>(
     Some(companions)
 }
 
-/// The solvers of the companions of a run by the same method, finer and finer; coarser ones where none can be finer.
+/// The solvers of the companions of a run by the same method, in order of accuracy; coarser ones where no finer one is
+/// possible.
 fn finer(solver: &Solver) -> Vec<Solver> {
     match solver.method {
         Method::Adaptive => {
@@ -123,24 +129,25 @@ fn finer(solver: &Solver) -> Vec<Solver> {
     }
 }
 
-/// A run: its solver, and its verdicts or why it did not come to its end.
+/// A run: its solver, and its verdicts or why it did not reach its end.
 type Run = (Solver, Result<Vec<Verdict>, String>);
 
-/// Runs of one experiment.
+/// The runs of one experiment.
 struct Companions<'a> {
     instance: &'a Instance,
-    /// The same program for adaptive runs, if the experiment has fixed steps and is compared with such.
+    /// The same program for adaptive runs, if the experiment has fixed steps and is compared with adaptive runs.
     adaptive: Option<Instance>,
-    /// Without plots.
+    /// The experiment without plots.
     bare: Experiment,
-    /// The run itself, then its companions, finer and finer.
+    /// The run itself, then its companions, in order of accuracy.
     runs: Vec<Run>,
-    /// Runs with finer steps beside those, if any.
+    /// Additional runs with finer fixed steps, if any.
     stepped: Vec<Run>,
 }
 
 impl Companions<'_> {
-    /// Makes the adaptive runs that fixed steps, so many, are compared with; false if that cannot be, none if the caller ended it.
+    /// Makes the adaptive reference runs for `steps` fixed steps; false if that is impossible, none if the caller
+    /// stopped it.
     fn refer(&mut self, steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<bool> {
         let Some(instance) = &self.adaptive else { return Some(false) };
         let most = LOOKS + LOOKS_PER_STEP * steps as f64;
@@ -164,12 +171,12 @@ impl Companions<'_> {
         Some(true)
     }
 
-    /// Makes these runs; none if the caller ended one.
+    /// Makes these runs; none if the caller stopped one.
     fn run_all(&mut self, solvers: Vec<Solver>, watch: &mut dyn FnMut(f64) -> Continue) -> Option<()> {
         solvers.into_iter().all(|solver| self.run(solver, watch)).then_some(())
     }
 
-    /// Makes one more run; false if the caller ended it.
+    /// Makes one more run; false if the caller stopped it.
     fn run(&mut self, solver: Solver, watch: &mut dyn FnMut(f64) -> Continue) -> bool {
         let plant = self.bare.bench.as_ref().map(|bench| &bench.plant);
         let stepped = plant.unwrap_or(self.instance).description();
@@ -178,7 +185,7 @@ impl Companions<'_> {
             let duration = covering(&self.bare, &solver);
             let mut experiment = Experiment { solver, duration, ..self.bare.clone() };
             if duration > self.bare.duration {
-                // No window reaches beyond the experiment.
+                // No window extends past the end of the experiment.
                 experiment.expects.iter_mut().for_each(|expect| expect.before = expect.before.min(self.bare.duration));
             }
             let ended = engine::run(self.instance.clone(), &experiment, watch);
@@ -189,7 +196,7 @@ impl Companions<'_> {
         going
     }
 
-    /// The verdicts of a run, judged by finer ones.
+    /// The verdicts of run `of`, judged by more accurate ones.
     fn verdicts(&self, of: usize, finer: Range<usize>) -> Vec<Verdict> {
         let (solver, Ok(own)) = &self.runs[of] else { return Vec::new() };
         let finer = &self.runs[finer];
@@ -215,7 +222,7 @@ impl Companions<'_> {
             for (_, run) in finer {
                 match run.as_ref().map(|verdicts| &verdicts[k]) {
                     Ok(verdict) if verdict.problem.is_none() => readings.push(&verdict.readings),
-                    // What cannot be measured in a finer run is not known of this one.
+                    // A measure that fails in a more accurate run is unknown in this one.
                     Ok(_) | Err(_) => doubt = true,
                 }
             }
@@ -226,21 +233,21 @@ impl Companions<'_> {
         self.bare.expects.iter().enumerate().map(judge).collect()
     }
 
-    /// The coarsest solver found under which all is decided; `open` are the verdicts of the first run, which took so many
+    /// The coarsest solver found that decides everything. `open`: the verdicts of the first run, which took `steps`
     /// steps.
     fn decides(&mut self, open: &[Verdict], steps: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Option<Solver> {
         let decided = |verdicts: &[Verdict]| !verdicts.is_empty() && verdicts.iter().all(|verdict| verdict.decided);
         let (own, references) = (self.runs[0].0, 1..self.runs.len());
         let adaptive = own.method == Method::Adaptive;
         if self.adaptive.is_none() {
-            // The companions are judged by those after them.
+            // Each companion is judged by the more accurate ones after it.
             for of in 1..self.runs.len() - 1 {
                 if decided(&self.verdicts(of, of + 1..self.runs.len())) {
                     return Some(self.runs[of].0);
                 }
             }
         }
-        // Then as the order of the method foretells; less than a factor of 4 is no news of companions that were tried.
+        // Then extrapolate by the order of the method. A factor below 4 would only repeat companions that were tried.
         let excess = open.iter().filter(|verdict| !verdict.decided).filter_map(|verdict| {
             let margin = verdict.margin.as_ref()?;
             Some(margin.error? / margin.amount.abs())
@@ -288,8 +295,9 @@ impl Companions<'_> {
     }
 }
 
-/// The duration of a companion in s. Fixed steps that do not divide that of the experiment would all end at the same instant
-/// beside it, and agree: a companion goes on to the end of the step in which the experiment ends, and its windows are cut there.
+/// The duration of a companion in s. If the steps do not divide the duration of the experiment, all companions would
+/// end at the same wrong instant, and agree. So a companion runs to the end of the step that contains the end of the
+/// experiment, and its windows are clipped there.
 fn covering(experiment: &Experiment, solver: &Solver) -> f64 {
     let duration = experiment.duration;
     if solver.method == Method::Adaptive || experiment.bench.is_some() {
@@ -303,12 +311,12 @@ fn covering(experiment: &Experiment, solver: &Solver) -> f64 {
     }
 }
 
-/// Whether what is delayed has room in steps of so many s.
+/// Whether the ring buffers of the delays are long enough for this step in s.
 fn has_room(description: &Description, step: f64) -> bool {
     description.delays.iter().all(|delay| (delay.range.1 / step).ceil() + 2.0 <= f64::from(delay.ring.len))
 }
 
-/// The error of the first of the results of finer and finer runs.
+/// The error of the first of the results of runs of increasing accuracy.
 fn error(method: Method, values: &[f64]) -> f64 {
     if values.iter().all(|value| *value == values[0]) {
         return 0.0;
@@ -320,11 +328,11 @@ fn error(method: Method, values: &[f64]) -> f64 {
     let span = most - values.iter().copied().fold(f64::INFINITY, f64::min);
     match (method, values) {
         (Method::Adaptive, _) => span,
-        // Of two steps alone the order is not known: 1 is the least.
+        // Two steps do not show the order: assume 1, the least.
         (_, [coarse, fine]) => 2.0 * (coarse - fine).abs(),
         (_, [coarse, fine, finest, ..]) => {
             let (first, second) = (coarse - fine, fine - finest);
-            // 2^p, where the steps are short enough for the order p to show.
+            // 2^p, if the steps are short enough to show the order p.
             let ratio = (first / second).clamp(2.0, power(2.0, order(method)));
             let ratio = if ratio.is_nan() { 2.0 } else { ratio };
             let limit = finest - second / (ratio - 1.0);
@@ -334,8 +342,9 @@ fn error(method: Method, values: &[f64]) -> f64 {
     }
 }
 
-/// The error of the first of these results of fixed steps: of the run, of finer steps if there are such, and of two adaptive runs.
-/// Where it is as near to the second adaptive run as the first one is, they are not more accurate, and finer steps tell more.
+/// The error of the first of these results: of a run with fixed steps, of finer steps if there are any, and of two
+/// adaptive runs. If the run is as close to the second adaptive run as the first one is, the adaptive runs are not more
+/// accurate, and the finer steps give the better estimate.
 fn compared(method: Method, values: &[f64]) -> f64 {
     let [own, stepped @ .., first, second] = values else { return f64::INFINITY };
     let span = error(Method::Adaptive, &[*own, *first, *second]);
@@ -345,7 +354,7 @@ fn compared(method: Method, values: &[f64]) -> f64 {
     error(method, &values[..values.len() - 2]).min(span)
 }
 
-/// The order of a fixed method.
+/// The order of a fixed-step method.
 fn order(method: Method) -> u32 {
     match method {
         Method::Euler => 1,
@@ -358,7 +367,8 @@ fn power(base: f64, exponent: u32) -> f64 {
     (0..exponent).fold(1.0, |product, _| product * base)
 }
 
-/// The fifth root of what is at least 1, to a factor of 10 ^ 0.2: how many times the steps a smaller tolerance takes.
+/// The fifth root of a number ≥ 1, to a factor of 10^0.2: by how much the number of steps grows with a smaller
+/// tolerance.
 fn power_of_fifth(ratio: f64) -> f64 {
     let (mut rest, mut root) = (ratio, 1.0);
     while rest > 1.0 {
@@ -368,7 +378,7 @@ fn power_of_fifth(ratio: f64) -> f64 {
     root
 }
 
-/// The greatest power of ten that is not above.
+/// The greatest power of ten that is not above `value`.
 fn power_of_ten_below(value: f64) -> f64 {
     let text = format!("{value:e}");
     let exponent = text.split_once('e').map_or("0", |(_, exponent)| exponent);
@@ -393,7 +403,7 @@ mod tests {
         outcome
     }
 
-    /// The error of x = e^-t at 1 s, and its estimate.
+    /// The error of x = e^−t at 1 s, and its estimate.
     fn decay(mut experiment: Experiment) -> (f64, f64) {
         let instance = models::decay();
         experiment.expects.push(reading(&instance, MeasureKind::Final, "x"));
@@ -412,7 +422,7 @@ mod tests {
 
     #[test]
     fn a_run_that_ends_beside_its_duration_is_judged_there() {
-        // Exact but for where it ends: at 1 s and at 1.1 s, with half and a quarter of the step too.
+        // Exact except for where it ends: at 1 s and at 1.1 s, with half and a quarter of the step too.
         let instance = models::decay();
         for (duration, kind) in [(1.004, MeasureKind::Final), (1.096, MeasureKind::Final), (1.004, MeasureKind::Min)] {
             let mut experiment = fixed(duration, 0.1);
@@ -424,7 +434,7 @@ mod tests {
         }
     }
 
-    /// sin t has its maximum of 1 at π/2: at many steps a point that all three runs share is the nearest one to it.
+    /// sin t has its maximum of 1 at π/2. For many steps the nearest point is one that all three runs share.
     #[test]
     fn an_extreme_between_points_that_all_runs_share_is_judged() {
         let instance = models::oscillator();
@@ -452,11 +462,12 @@ mod tests {
     #[test]
     fn an_open_verdict_names_what_decides() {
         let instance = models::decay();
-        // Ten seconds: with the fifty steps of one second the error of this decay is rounding, whatever the tolerance.
+        // Ten seconds: with the fifty steps of one second the error of this decay would be rounding at any tolerance.
         for mut experiment in [fixed(1.0, 0.1), adaptive(10.0, 1e-3)] {
             let solver = experiment.solver;
             let mut expect = reading(&instance, MeasureKind::Final, "x");
-            // Between the truth and what the run gives, nearer to the truth: what decides is on the other side of the limit.
+            // A limit between the exact value and the result, closer to the exact value: a solver that decides lies on
+            // its other side.
             let truth = (-experiment.duration).exp();
             experiment.expects.push(expect.clone());
             let found = judged(&instance, &experiment).verdicts[0].readings[0].value;
@@ -484,7 +495,7 @@ mod tests {
         assert!((error(Method::Expo, &at(2)) - 1.0).abs() < 1e-12);
         assert!((error(Method::Rk4, &at(4)) - 1.0).abs() < 1e-12);
         assert!((error(Method::Rk4, &at(4)[..2]) - 1.875).abs() < 1e-12);
-        // Two that agree by accident do not make a small error.
+        // Two values that agree by accident do not make the error small.
         assert!(error(Method::Expo, &[1.0, 1.0, 1.5]) >= 0.5);
         assert!(error(Method::Adaptive, &[1.0, 1.0, 1.5]) >= 0.5);
         assert_eq!(error(Method::Adaptive, &[f64::INFINITY; 3]), 0.0);

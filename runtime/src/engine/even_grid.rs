@@ -1,8 +1,8 @@
-//! A run recorded on an even grid of time.
+//! Records a run on an even time grid.
 //!
-//! In: an instance, an experiment and a distance of rows. Out: a [`Recording`] whose rows lie at 0, T, 2 T, …. An adaptive
-//! run gives the values of its dense output, the polynomial of the step that holds the instant, after an event at that
-//! instant. Fixed steps give the values of the steps, so the grid consists of whole steps.
+//! In: an instance, an experiment and a sampling interval T. Out: a [`Recording`] with rows at 0, T, 2 T, …. An
+//! adaptive run evaluates its dense output, the polynomial of the step that contains the instant; at an event, the
+//! value after it. Fixed steps are not interpolated, so T is a multiple of the step.
 
 use crate::engine::{Continue, Failure, sample};
 use crate::format;
@@ -11,10 +11,10 @@ use abi::Instance;
 use abi::live::is_multiple;
 use abi::plan::{Experiment, Method};
 
-/// Most rows.
+/// Largest number of rows.
 pub const MOST_ROWS: u64 = 10_000_000;
 
-/// The instants of a grid, in s; `every`: its distance in s.
+/// The instants of a grid, in s; `every`: its interval in s.
 ///
 /// # Errors
 /// Why there is no such grid, in words.
@@ -39,7 +39,7 @@ pub fn instants(every: f64, experiment: &Experiment) -> Result<Vec<f64>, String>
             "rows {rows} apart do not lie on steps of {steps}: give a whole multiple of the step, or run it with `--solver adaptive`"
         ));
     }
-    // A decimal such as 0.1 ms times k, rounded once: 3e-4 and not 3.0000000000000003e-4.
+    // Multiples of a decimal such as 0.1 ms are rounded once: 3e-4 and not 3.0000000000000003e-4.
     let decimal = std::iter::successors(Some(1.0), |ten| Some(10.0 * ten)).take(18).find(|ten| {
         let whole = (every * ten).round();
         whole > 0.0 && whole / ten == every && whole * last < 9e15
@@ -51,7 +51,7 @@ pub fn instants(every: f64, experiment: &Experiment) -> Result<Vec<f64>, String>
     Ok((0..=last as u64).map(|k| instant(k).min(duration)).collect())
 }
 
-/// Runs the experiment once more and records its plots at these instants: as far as it came, and how it ended.
+/// Repeats the experiment and records its plots at these instants, up to where it ended, and how it ended.
 ///
 /// # Panics
 /// As [`crate::engine::run`].

@@ -1,7 +1,7 @@
-//! Runs of one model in the lanes of one program: each call of its code makes a step of all of them.
+//! Runs of one model in the SIMD lanes of one program: each call advances all lanes.
 //!
-//! In: runs, handed over one by one. Out: what became of each, to the bit as it would be alone. A run whose step is
-//! to be looked at leaves its lane for as long as that takes and comes back; a lane whose run has ended takes the next one.
+//! In: runs, delivered one by one. Out: the outcome of each, bit-identical to running it alone. When a run needs
+//! attention, its block is copied out of the lane and back; when a run ends, its lane takes the next one.
 
 use crate::engine::{Failure, Outcome, ended, start};
 use crate::run::observe::Observer;
@@ -11,23 +11,24 @@ use abi::Instance;
 use abi::lanes::{Batch, Lanes};
 use abi::plan::Experiment;
 
-/// What there is to do for a lane that is free.
+/// The answer to a request for another run.
 pub enum Next<T> {
-    /// This run; what its outcome is to be given with.
+    /// A run, with a tag that its outcome is returned with.
     Run(T, Box<(Instance, Experiment)>),
-    /// Nothing yet.
+    /// None at present.
     Later,
-    /// Nothing any more.
+    /// None any more.
     Nothing,
 }
 
-/// Steps of all lanes in one call, at most; and the part that this may be of those since a run was last looked at: the step
-/// at which the loop is left before its end is made twice.
+/// Most steps of all lanes in one call, and the limit of that number as a fraction (1/16) of the steps since a run last
+/// needed attention: when the loop is left early, the step at which it is left is computed twice.
 const MOST: u64 = 4096;
 const PART: u64 = 16;
 
-/// Runs what `next` hands over in lanes, which must be of the function that the solver of all of them calls, until nothing
-/// is left; each outcome goes to `give`. `next` is told whether runs are under way: if not, it must not put off.
+/// Runs everything that `next` delivers, in lanes; the solver of all runs must call the function of these lanes. Passes
+/// each outcome to `give`. `next` receives whether runs are in progress; if none is, it must not answer
+/// [`Next::Later`].
 ///
 /// # Panics
 /// As [`engine::run`](crate::engine::run).
@@ -39,7 +40,7 @@ pub fn run<T>(
 ) {
     let mut batch = Batch::new(lanes.clone());
     let mut all: Vec<Option<Lane<T>>> = (0..batch.width()).map(|_| None).collect();
-    // Which lanes without a run do what no run does.
+    // Idle lanes whose contents may end a step with a status.
     let mut astray = vec![true; batch.width()];
     let mut pool = None;
     let (mut calm, mut total, mut more) = (0, 0, true);
@@ -55,7 +56,7 @@ pub fn run<T>(
             }
         }
         let Some(model) = all.iter().position(Option::is_some) else { break };
-        // A lane without a run does what another one does, so that no step ends for its sake.
+        // An idle lane computes a copy of an active one, so that it never ends a call early.
         for lane in 0..all.len() {
             if all[lane].is_none() && astray[lane] && stride > 1 {
                 batch.copy_lane(model, lane);
@@ -88,16 +89,16 @@ pub fn run<T>(
     }
 }
 
-/// A run in its lane.
+/// A run in a lane.
 struct Lane<T> {
     tag: T,
     course: Box<dyn Stepper>,
-    /// Number of the step, of all that the lanes make, behind which it was looked at last, and behind which it must be again.
+    /// The common step count at which the run was last inspected, and the one at which it must be inspected next.
     since: u64,
     until: u64,
 }
 
-/// Puts a run into a lane, behind so many steps; none if it has ended already.
+/// Loads a run into a lane at this step count; none if it has already ended.
 fn begin<T>(
     tag: T,
     (instance, experiment): (Instance, Experiment),
@@ -127,7 +128,8 @@ fn begin<T>(
 }
 
 impl<T> Lane<T> {
-    /// Lets the run look at what was left in its lane behind so many steps and go on to its next call; how it ended, if it has.
+    /// Lets the run process the block in its lane at this step count and continue to its next call; returns how it
+    /// ended, if it has.
     fn look(
         &mut self,
         batch: &mut Batch,

@@ -1,8 +1,8 @@
-//! Runs one experiment: steps the model, shows each point to measures and recording, and tells how it ended.
+//! Runs one experiment: steps the model, passes each point to measures and recording, and reports how it ended.
 //!
 //! In: an [`Instance`] and an [`Experiment`]. Out: an [`Outcome`], or a [`Failure`] that names quantity, value and
-//! instant. Fixed steps are in the model's own code; adaptive ones in `solver`. Reads no clock and
-//! writes no file: whoever calls may look at the fraction done and stop the run.
+//! instant. Fixed steps are the model's own code; adaptive ones are in `solver`. Reads no clock and writes no file. A
+//! callback receives the fraction done and may stop the run.
 
 pub mod even_grid;
 pub mod estimate;
@@ -24,18 +24,17 @@ use abi::{Instance, Slot};
 
 /// Runs an experiment on an instance whose parameters and inputs are set.
 ///
-/// A fixed step is the model's own `Step`, taken as often as fits the duration. An adaptive run needs `Derivatives`, and
-/// uses `Jacobian`, `Roots`, `Transitions` and `Tick` where the model has them; `corners` are met exactly.
-/// `watch` sees the fraction done, from 0 to 1, every few thousand fixed or few dozen adaptive steps, and may end the
-/// run.
+/// A fixed-step run calls the model's `Step` as often as fits the duration. An adaptive run needs `Derivatives`, and
+/// uses `Jacobian`, `Roots`, `Transitions` and `Tick` where the model has them; it meets `corners` exactly. `watch`
+/// receives the fraction done, from 0 to 1, every few thousand fixed or few dozen adaptive steps, and may stop the run.
 ///
 /// # Errors
-/// A guard that fired, a quantity that is not finite, chattering, steps that are too short or too many, or the caller's
-/// wish to stop; each with instant, cause and the recording so far.
+/// A guard that fired, a quantity that is not finite, chattering, steps that are too short or too many, or a stop by
+/// the caller; each with instant, cause and the recording so far.
 ///
 /// # Panics
-/// If a fixed step is not positive, a tolerance does not lie between 0 and 1, the duration is negative, or a slot of the
-/// plan lies outside the block: such a plan is the mistake of whoever made it.
+/// If a fixed step is not positive, a tolerance is not between 0 and 1, the duration is negative, or a slot of the plan
+/// is outside the block: such a plan is a programming error.
 pub fn run(
     instance: Instance,
     experiment: &Experiment,
@@ -44,8 +43,8 @@ pub fn run(
     run_on(instance, experiment, &mut |_| (), watch).1
 }
 
-/// Runs an experiment as [`run`] does, and gives the instance as it is at the end besides. `begin` sees the instance
-/// once it has started, at t = 0, and may put its states elsewhere.
+/// Runs an experiment as [`run`] does, and also returns the instance in its final state. `begin` receives the instance
+/// at t = 0 after its start, and may change its states.
 ///
 /// # Panics
 /// As [`run`].
@@ -59,8 +58,9 @@ pub fn run_on(
     (rest.instance.clone(), ended(rest, result))
 }
 
-/// Values of `slots` at instants in s, ascending, row by row: the rows up to where the run came, and how it ended. An
-/// adaptive run is read between its steps; of fixed steps the one nearest counts. Nothing is measured or recorded.
+/// Values of `slots` at instants in s, ascending, row-major: the rows up to where the run ended, and how it ended. An
+/// adaptive run is interpolated between its steps; with fixed steps the nearest step is used. Nothing is measured or
+/// recorded.
 ///
 /// # Panics
 /// As [`run`].
@@ -79,7 +79,7 @@ pub fn sample(
     (rest.observer.probe.values(), result.map_err(failed))
 }
 
-/// A run to its end or to the reason why not.
+/// Runs to the end, or to the reason why not.
 fn go(
     instance: Instance,
     experiment: &Experiment,
@@ -106,10 +106,10 @@ fn go(
     }
 }
 
-/// Starts a run. `begin` sees the instance at t = 0 and may put its states elsewhere.
+/// Starts a run. `begin` receives the instance at t = 0 and may change its states.
 ///
 /// # Errors
-/// What is left of a run that did not begin, and why. In boxes, since it is rare.
+/// The parts of a run that did not begin, and why; boxed because it is rare.
 pub(crate) fn start(
     instance: Instance,
     experiment: &Experiment,
@@ -124,7 +124,7 @@ pub(crate) fn start(
     }
 }
 
-/// What became of a run.
+/// Converts a run that has ended to its outcome.
 pub(crate) fn ended(rest: Rest, result: Result<(), Stop>) -> Result<Outcome, Failure> {
     let Rest { instance, observer, work, notes } = rest;
     if let Err(stop) = result {
@@ -169,7 +169,7 @@ mod tests {
         let outcome = go(instance, &experiment).unwrap();
         assert_eq!((outcome.work.steps, outcome.time), (2000, 2.0));
         assert!((outcome.verdicts[0].readings[0].value - (-2f64).exp()).abs() < 1e-13);
-        // Trapezoidal: the error of one step is h³/12 y''.
+        // Trapezoidal rule: the error of one step is h³/12 y''.
         assert!((outcome.verdicts[1].readings[0].value - 2.0 * (1.0 - (-2f64).exp())).abs() < 1e-6);
         assert_eq!(outcome.recording.rows().len(), 2001);
         assert_eq!((outcome.finals[0].path.as_str(), outcome.finals.len()), ("y", 1));
@@ -193,7 +193,7 @@ mod tests {
         let batched = go(instance.clone(), &experiment).unwrap();
         experiment.plots.push(plot(&instance, &["x"]));
         let single = go(instance, &experiment).unwrap();
-        // How large a quantity was on the way is known only where the way was seen.
+        // The greatest magnitude of a quantity is known only if all points were observed.
         let apart_from_size = |outcome: &Outcome| {
             let mut verdicts = outcome.verdicts.clone();
             verdicts.iter_mut().flat_map(|verdict| &mut verdict.readings).for_each(|reading| reading.scale = 0.0);
@@ -253,7 +253,7 @@ mod tests {
         assert!(failure.recording.rows().len() >= 1000);
     }
 
-    /// The cost of looking: `cargo test --release -p runtime -- --ignored --nocapture steps_cost`.
+    /// Measures the cost of observation: `cargo test --release -p runtime -- --ignored --nocapture steps_cost`.
     #[test]
     #[ignore = "prints times, judges nothing"]
     fn steps_cost_little_beyond_the_model() {

@@ -1,7 +1,7 @@
 //! Runs many experiments on all cores.
 //!
-//! In: cases, or numbers of runs. Out: what became of each, in their order. Every run is alone on one thread, so the
-//! results have the same bits for any number of threads.
+//! In: cases, or numbers of runs. Out: the outcome of each, in order. Each run stays on one thread, so the results have
+//! the same bits for any number of threads.
 
 use crate::engine::estimate;
 use crate::engine::{self, Continue, Failure, Outcome};
@@ -17,20 +17,20 @@ use std::time::Duration;
 /// One run of a sweep.
 #[derive(Clone)]
 pub struct Case {
-    /// What sets it apart: `fr = Karnopp()`, `fr.Fs = 1.25 N`.
+    /// How it differs from the others: `fr = Karnopp()`, `fr.Fs = 1.25 N`.
     pub label: String,
-    /// With the parameters of this case.
+    /// The instance with the parameters of this case.
     pub instance: Instance,
-    /// What to run.
+    /// The experiment to run.
     pub experiment: Experiment,
 }
 
-/// Runs all cases; the results are in their order.
+/// Runs all cases; returns the results in their order.
 ///
-/// `watch` sees the fraction of the whole that is done, from several threads, and may end the sweep: cases that are
-/// complete keep their outcome, the others fail as stopped.
+/// `watch` receives the fraction of the whole that is done, from several threads, and may stop the sweep: completed
+/// cases keep their outcome, the others fail as stopped.
 pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Result<Outcome, Failure>> {
-    // In millionths of a case: what is added up must be whole to be the same in any order.
+    // In millionths of a case: sums of integers do not depend on their order.
     let done = AtomicU64::new(0);
     let stopped = AtomicBool::new(false);
     let whole = 1e6 * cases.len() as f64;
@@ -50,7 +50,7 @@ pub fn run(cases: &[Case], watch: &(dyn Fn(f64) -> Continue + Sync)) -> Vec<Resu
     cases.par_iter().with_max_len(1).map(run).collect()
 }
 
-/// Estimates the errors of what became of all cases, as [`estimate::judge`] does.
+/// Estimates the errors of all outcomes, as [`estimate::judge`] does.
 pub fn judge(cases: &[Case], results: &mut [Result<Outcome, Failure>], watch: &(dyn Fn(f64) -> Continue + Sync)) {
     let judge = |(case, result): (&Case, &mut Result<Outcome, Failure>)| {
         if let Ok(outcome) = result {
@@ -60,15 +60,15 @@ pub fn judge(cases: &[Case], results: &mut [Result<Outcome, Failure>], watch: &(
     cases.par_iter().zip(results).with_max_len(1).for_each(judge);
 }
 
-/// Results that wait for an earlier one, at most, for each thread: more than there are lanes.
+/// For each thread, the most results that may wait for an earlier one: more than there are lanes.
 const WAITING: u64 = 128;
 
-/// Where workers get the numbers of what is to be done, and hand in what came of it.
+/// A work queue: workers take numbers and return results, which are released in order.
 pub struct Desk<T> {
     state: Mutex<State<T>>,
     room: Condvar,
     news: Condvar,
-    /// Results that wait for an earlier one, at most.
+    /// The most results that may wait for an earlier one.
     most: u64,
     end: u64,
 }
@@ -80,12 +80,12 @@ struct State<T> {
     closed: bool,
 }
 
-/// What there is to do.
+/// The answer to a request for work.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Ticket {
-    /// This.
+    /// This number.
     Number(u64),
-    /// Nothing before an earlier number is handed in.
+    /// Nothing until an earlier number is handed in.
     Later,
     /// Nothing any more.
     Nothing,
@@ -96,7 +96,8 @@ impl<T> Desk<T> {
         self.state.lock().expect("nobody panics at the desk")
     }
 
-    /// The next number. Who has others under way gets [`Ticket::Later`] rather than waiting for one of them.
+    /// The next number. A worker with other numbers in progress gets [`Ticket::Later`] and does not block on another
+    /// worker.
     pub fn number(&self, has_others: bool) -> Ticket {
         let mut state = self.state();
         while state.next >= state.taken + self.most && !state.closed {
@@ -112,16 +113,16 @@ impl<T> Desk<T> {
         Ticket::Number(state.next - 1)
     }
 
-    /// What came of a number; nothing if it was stopped.
+    /// Hands in the result of a number; none if it was stopped.
     pub fn hand_in(&self, number: u64, result: Option<T>) {
         self.state().waiting.insert(number, result);
         self.news.notify_one();
     }
 }
 
-/// Lets `worker` work on `threads` threads until all numbers of a range are done, and hands the results to `take` one by one
-/// in their order, as soon as they are there. Memory is bounded: nobody runs far ahead of the slowest. Ends early where
-/// `take` says so, or where a number came to nothing because it was stopped.
+/// Runs `worker` on `threads` threads until all numbers of a range are done, and passes the results to `take` in order,
+/// as soon as each is available. Memory is bounded, because no worker runs far ahead of the slowest. Ends early if
+/// `take` requests it, or if a number has no result because it was stopped.
 pub fn ordered<T: Send>(
     numbers: Range<u64>,
     threads: usize,
@@ -142,7 +143,7 @@ pub fn ordered<T: Send>(
                         state.taken = number + 1;
                         break result;
                     }
-                    // A worker that panicked brings no more news: its panic is handed on by the scope.
+                    // A worker that panicked hands in nothing more: the scope propagates its panic.
                     if workers.iter().any(|worker| worker.is_finished()) && state.next < numbers.end {
                         break None;
                     }
@@ -161,7 +162,7 @@ pub fn ordered<T: Send>(
     });
 }
 
-/// A worker that does one job after the other.
+/// A worker that processes one number after the other.
 pub fn one_by_one<T>(desk: &Desk<T>, job: &dyn Fn(u64) -> Option<T>) {
     while let Ticket::Number(number) = desk.number(false) {
         desk.hand_in(number, job(number));

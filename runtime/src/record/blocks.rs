@@ -1,26 +1,26 @@
-//! Append-only files of blocks that survive whatever ends the writer.
+//! Append-only files of blocks that remain readable however the writer ends.
 //!
-//! In: blocks of bytes with a kind. Out: a file whose every prefix can be read: all whole blocks, and where the rest
-//! begins. Knows nothing of what the blocks hold.
+//! In: blocks of bytes with a kind. Out: a file of which every prefix is readable: all complete blocks, and the
+//! position of the first incomplete one. Knows nothing of the contents of blocks.
 //!
 //! ```text
 //! file   "fric log 1\n", then blocks
 //! block  length u32 · kind u32 · checksum u32 · length bytes            all little-endian
 //! ```
-//! The checksum (CRC-32) goes over number of the block, length, kind and bytes, so that a flipped bit, a block that is
-//! missing and one that is out of place are all noticed.
+//! The checksum (CRC-32) covers the number of the block, length, kind and bytes, so that a flipped bit, a missing block
+//! and a block out of order are all detected.
 
 use std::io::{self, Read, Write};
 
-/// What such a file begins with.
+/// The first bytes of such a file.
 pub const MAGIC: &[u8] = b"fric log 1\n";
-/// A longer block is not one that was written here.
+/// A longer block was not written by this module.
 pub const LONGEST: u32 = 1 << 28;
 
-/// Bytes of a block in the file besides its own.
+/// Bytes of a block's header.
 pub const OVERHEAD: u64 = 12;
 
-/// What tells two heads apart: CRC-32.
+/// Identifies a head: its CRC-32.
 pub fn mark(bytes: &[u8]) -> u32 {
     crc32fast::hash(bytes)
 }
@@ -28,9 +28,9 @@ pub fn mark(bytes: &[u8]) -> u32 {
 /// One block.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Block {
-    /// What it holds.
+    /// The kind of its contents.
     pub kind: u32,
-    /// What it holds of it.
+    /// The contents.
     pub bytes: Vec<u8>,
 }
 
@@ -50,7 +50,7 @@ impl<W: Write> BlockWriter<W> {
         Ok(BlockWriter { out, number: 0 })
     }
 
-    /// Appends a block and hands it to the system.
+    /// Appends a block and passes it to the operating system.
     ///
     /// # Errors
     /// Those of the file.
@@ -63,7 +63,7 @@ impl<W: Write> BlockWriter<W> {
         whole.extend(checksum(self.number, length, kind, bytes).to_le_bytes());
         whole.extend(bytes);
         self.number += 1;
-        // One call for one block: what is killed between two calls leaves whole blocks.
+        // One write call per block: a process killed between two calls leaves complete blocks.
         self.out.write_all(&whole)?;
         self.out.flush()
     }
@@ -81,16 +81,16 @@ fn checksum(number: u64, length: u32, kind: u32, bytes: &[u8]) -> u32 {
 /// How the readable part of a file ends.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum End {
-    /// With a whole block, at the end of the file.
+    /// A complete block, at the end of the file.
     Whole,
-    /// The last block is cut off: the writer was killed, or the file is still being written.
+    /// The last block is truncated: the writer was killed, or the file is still being written.
     Cut {
-        /// Byte of the file at which it begins.
+        /// Byte offset of the block.
         at: u64,
     },
-    /// A block is not as it was written.
+    /// The checksum of a block does not match.
     Damaged {
-        /// Byte of the file at which it begins.
+        /// Byte offset of the block.
         at: u64,
     },
 }
@@ -104,7 +104,7 @@ pub struct BlockReader<R: Read> {
 }
 
 impl<R: Read> BlockReader<R> {
-    /// Begins with a file. None if it is not one of these.
+    /// Opens a file. None if it is not a file of blocks.
     ///
     /// # Errors
     /// Those of the file.
@@ -115,7 +115,7 @@ impl<R: Read> BlockReader<R> {
         Ok((magic == MAGIC).then_some(BlockReader { input, number: 0, at, end: None }))
     }
 
-    /// The next block; none at the end of what can be read: see [`BlockReader::end`].
+    /// The next block; none at the end of the readable part: see [`BlockReader::end`].
     ///
     /// # Errors
     /// Those of the file.
@@ -148,7 +148,7 @@ impl<R: Read> BlockReader<R> {
         Ok(Some(Block { kind, bytes }))
     }
 
-    /// How it ended, once there is no further block.
+    /// How the file ended, once there is no further block.
     pub fn end(&self) -> Option<End> {
         self.end
     }

@@ -1,14 +1,15 @@
-//! The right to write a file, for one process at a time.
+//! Exclusive write access to a file, across processes.
 //!
-//! In: a path. Out: a locked file, or that somebody else has it. The lock lies on a neighbour where the file itself may be
-//! renamed or removed meanwhile; the system lets go of it however the process ends.
+//! In: a path. Out: a locked file, or the information that another process holds it. If the file itself may be renamed
+//! or removed meanwhile, a lock file beside it is locked. The operating system releases the lock however the process
+//! ends.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// Opens a file, made if there is none, and locks it; none if somebody else has locked it.
+/// Opens a file, created if missing, and locks it; none if another process has locked it.
 ///
 /// # Errors
 /// Those of the file.
@@ -20,7 +21,8 @@ pub fn open_alone(path: &Path) -> io::Result<Option<File>> {
             Err(TryLockError::WouldBlock) => return Ok(None),
             Err(TryLockError::Error(error)) => return Err(error),
         }
-        // One that has ended in the meantime took its file away: a lock on that keeps nobody out.
+        // A process that has ended meanwhile may have removed its lock file: a lock on the removed file excludes
+        // nobody.
         let ours = file.metadata()?;
         if fs::metadata(path).is_ok_and(|there| (there.dev(), there.ino()) == (ours.dev(), ours.ino())) {
             return Ok(Some(file));
@@ -28,24 +30,24 @@ pub fn open_alone(path: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// Whether somebody has locked a file.
+/// Whether a process has locked a file.
 pub fn is_locked(path: &Path) -> bool {
     let file = File::open(path);
     file.is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
-/// The right to write a file and what is named after it.
+/// Exclusive write access to a file and to files named after it.
 pub struct Claim {
     lock: PathBuf,
     _file: File,
 }
 
 impl Claim {
-    /// Takes it: by a neighbour, `.NAME.lock`, which goes with it. None for a pipe or a device, which keeps nothing that
-    /// could be spoilt.
+    /// Acquires it with a lock file `.NAME.lock` beside the file, removed at the end. None for a pipe or a device,
+    /// which keeps no contents to protect.
     ///
     /// # Errors
-    /// If another process has it, or those of the neighbour.
+    /// If another process holds it, or those of the lock file.
     pub fn on(path: &Path) -> io::Result<Option<Claim>> {
         if fs::metadata(path).is_ok_and(|found| !found.is_file()) {
             return Ok(None);
@@ -62,7 +64,7 @@ impl Claim {
     }
 }
 
-/// The neighbour goes before the lock on it.
+/// Removes the lock file before releasing the lock on it.
 impl Drop for Claim {
     fn drop(&mut self) {
         let _ = fs::remove_file(&self.lock);
@@ -87,7 +89,7 @@ mod tests {
         assert!(Claim::on(Path::new("/dev/null")).unwrap().is_none());
     }
 
-    /// Many at once, again and again: never two of them.
+    /// Many threads, repeatedly: never two owners at once.
     #[test]
     fn never_two_have_it() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,6 +1,6 @@
 //! Writes a recording as comma-separated values: `t [s],body.v [mm/s]`, one row for each point kept.
 //!
-//! Values stand in the units shown, as the shortest decimals that read back to the same bits.
+//! Values are in the units shown, as the shortest decimals that parse to the same bits.
 
 use super::Recording;
 use crate::format;
@@ -8,10 +8,10 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-/// Writes the file whole or not at all: into a neighbour first, which then takes the name.
+/// Writes the file atomically: into a temporary file beside it, which is then renamed.
 ///
 /// # Errors
-/// What the file system answers; a file of that name is then as it was.
+/// Those of the file system; an existing file of that name is then unchanged.
 pub fn save(recording: &Recording, path: &Path) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?;
     let mut part = name.to_os_string();
@@ -25,7 +25,7 @@ pub fn save(recording: &Recording, path: &Path) -> io::Result<()> {
         fs::rename(&part, path)
     });
     if written.is_err() {
-        // The first error is the one worth telling.
+        // Report the first error, not that of the cleanup.
         let _ = fs::remove_file(&part);
     }
     written
@@ -34,7 +34,7 @@ pub fn save(recording: &Recording, path: &Path) -> io::Result<()> {
 /// Writes header and rows.
 ///
 /// # Errors
-/// What the writer answers.
+/// Those of the writer.
 pub fn write(recording: &Recording, to: impl Write) -> io::Result<()> {
     let mut csv = ::csv::Writer::from_writer(to);
     let header = recording.columns().iter().map(|column| match column.boolean {
@@ -91,7 +91,7 @@ mod tests {
         assert!(fs::read_to_string(&path).unwrap().starts_with("t [s],"));
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
 
-        // A folder of that name cannot be replaced; nothing is left behind.
+        // A folder of that name cannot be replaced; no temporary file remains.
         let taken = folder.path().join("taken");
         fs::create_dir(&taken).unwrap();
         assert!(save(&recording(), &taken).is_err());

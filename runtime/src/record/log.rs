@@ -1,14 +1,15 @@
-//! The log of a rig: what a cycle leaves behind, carried to a file by a thread of its own.
+//! The log of a rig: a thread of its own writes the messages of the cycle to a file.
 //!
-//! In: messages of 64-bit words from the cycle, through a queue that never waits. Out: a file of blocks (see
-//! [`blocks`]) with a head, messages and a tail. Knows nothing of what the words mean.
+//! In: messages of 64-bit words from the cycle, through a wait-free queue. Out: a file of blocks (see [`blocks`]) with
+//! a head, messages and a tail. Knows nothing of the meaning of the words.
 //!
-//! A block is closed after a fixed number of messages of kind [`CYCLE`], not after a time: so two equal runs leave equal
-//! files. A full queue drops the message and counts it, and the next one that fits says how many are missing. After an error
-//! of the file the thread goes on to empty the queue and counts what comes: each message is in the file, or is counted.
+//! A block is closed after a fixed number of messages of kind [`CYCLE`], not after a time, so two equal runs write
+//! equal files. If the queue is full, the message is dropped and counted, and the next one that fits carries the number
+//! of those missing. After an error of the file the thread continues to empty the queue and counts the messages: each
+//! message is either in the file or counted.
 //!
-//! The thread packs each block (differences, then deflate) and begins a new file where the last one has become long
-//! enough (see [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
+//! The thread packs each block (differences, then deflate) and begins a new file once the last one is long enough (see
+//! [`parts`]). A new file begins with the same head and a message of kind [`STATE`], so each can be read alone.
 
 use super::blocks::{self, Block, BlockReader, BlockWriter, End, LONGEST as BLOCK_LONGEST};
 use super::claim::Claim;
@@ -28,25 +29,25 @@ use std::time::Duration;
 const TAIL: u32 = 3;
 const PACKED: u32 = 4;
 const PACKED_HEAD: u32 = 5;
-/// Kinds that only older logs have: head and messages that are not packed.
+/// Kinds that only older logs have: head and messages that are not compressed.
 const HEAD: u32 = 1;
 const MESSAGES: u32 = 2;
-/// Name of the section that a file after the first has in its head: number of the part, hash of the first head.
+/// Name of the section in the head of each file after the first: number of the part, checksum of the first head.
 const PART: &str = "part";
 
 /// Kind of message: one cycle.
 pub const CYCLE: u32 = 1;
-/// Kind of message: all that the next cycle depends on. A new file begins with one.
+/// Kind of message: everything on which the next cycle depends. A new file begins with one.
 pub const STATE: u32 = 2;
-/// Kind of message: so many messages were dropped here.
+/// Kind of message: the number of messages dropped here.
 pub const LOST: u32 = 0;
 
-/// Words that fit the queue: some seconds of a rig.
+/// Capacity of the queue in words: some seconds of a rig.
 const QUEUE: usize = 1 << 20;
-/// Messages longer than this are a mistake.
+/// Longest message in words; a longer one is a programming error.
 const LONGEST: usize = 1 << 16;
 
-/// Named texts and bytes: what stands in head and tail.
+/// Named texts and bytes: the contents of head and tail.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Sections(pub Vec<(String, Vec<u8>)>);
 
@@ -95,19 +96,20 @@ impl Sections {
     }
 }
 
-/// Where a log goes.
+/// Destination of a log.
 pub enum Sink {
-    /// Into this file, and those that follow it.
+    /// This file, and the parts that follow it.
     File(PathBuf, Limits),
-    /// So many blocks are kept, and written to this file only if the run ends with a stop: a black box.
+    /// A black box: the last blocks, this many, are kept in memory, and written to this file only if the run ends with
+    /// a stop.
     BlackBox(PathBuf, usize),
-    /// The first, on a disk that may fail, with a queue of so many words.
+    /// As `File`, on a disk that may fail, with a queue of this many words.
     #[cfg(test)]
     On(Box<dyn Disk>, PathBuf, Limits, usize),
 }
 
 impl Sink {
-    /// Words that fit its queue.
+    /// Capacity of the queue in words.
     fn queue(&self) -> usize {
         match self {
             Sink::File(..) | Sink::BlackBox(..) => QUEUE,
@@ -117,39 +119,39 @@ impl Sink {
     }
 }
 
-/// How a log is kept.
+/// How a log is written.
 pub struct Settings {
-    /// Where it goes.
+    /// Its destination.
     pub sink: Sink,
-    /// Cycles in a block.
+    /// Cycles per block.
     pub cycles_per_block: u32,
-    /// A full queue makes the caller wait. For time that stands meanwhile; never for a rig.
+    /// Whether the caller waits when the queue is full. Only where time is simulated; never for a rig.
     pub patient: bool,
 }
 
-/// The end of the queue that the cycle holds.
+/// The cycle's end of the queue.
 pub struct Log {
     queue: Sender<u64>,
     shared: Arc<Shared>,
     patient: bool,
-    /// Only the last blocks are kept: older messages are in no file, and nobody misses them.
+    /// Only the last blocks are kept: older messages are in no file, and do not count as missing.
     boxed: bool,
-    /// Messages dropped since the last that fitted.
+    /// Messages dropped since the last one that fitted.
     lost: u64,
-    /// All messages dropped since the queue was full.
+    /// Total of messages dropped because the queue was full.
     dropped: u64,
     thread: Option<JoinHandle<io::Result<()>>>,
 }
 
 #[derive(Default)]
 struct Shared {
-    /// Nothing more will come.
+    /// No more messages will come.
     over: AtomicBool,
-    /// Messages that came to the thread and will be in no file.
+    /// Messages that reached the thread but will be in no file.
     lost: AtomicU64,
     /// Bytes written.
     written: AtomicU64,
-    /// Bytes that were free on the disk when it was last looked at.
+    /// Free bytes on the disk at the last check.
     free: AtomicU64,
     /// Files begun.
     parts: AtomicU64,
@@ -157,21 +159,21 @@ struct Shared {
     removed: AtomicU64,
 }
 
-/// What is left to say at the end.
+/// Totals of a log at its end.
 #[derive(Debug)]
 pub struct Summary {
-    /// Messages that are not in the files: the queue was full.
+    /// Messages that are not in the files because the queue was full.
     pub dropped: u64,
     /// Bytes of all files.
     pub bytes: u64,
-    /// Files.
+    /// Number of files.
     pub parts: u64,
     /// Old logs that were removed, to stay within [`Limits::keep`].
     pub removed: u64,
 }
 
 impl Summary {
-    /// Which files were written, and what became of older ones.
+    /// Describes which files were written and which older ones removed.
     pub fn words(&self, first: &Path) -> String {
         let size = parts::size(self.bytes);
         let files = match u32::try_from(self.parts).unwrap_or(u32::MAX) {
@@ -200,14 +202,14 @@ impl Log {
         Ok(Log { queue, shared, patient: settings.patient, boxed, lost: 0, dropped: 0, thread: Some(thread) })
     }
 
-    /// Appends a message. Neither waits nor allocates, unless it is patient.
+    /// Appends a message. Neither waits nor allocates, unless `patient`.
     ///
     /// # Panics
-    /// If the message is longer than any cycle's.
+    /// If the message is longer than that of any cycle.
     pub fn push(&mut self, kind: u32, words: &[u64]) {
         assert!(words.len() < LONGEST, "a message of {} words", words.len());
         let needed = words.len() + 1 + if self.lost > 0 { 2 } else { 0 };
-        // The thread empties the queue whatever its file does.
+        // The thread empties the queue even if its file fails.
         while self.patient && self.queue.free() < needed && !self.queue.is_abandoned() {
             std::thread::sleep(Duration::from_micros(100));
         }
@@ -225,12 +227,12 @@ impl Log {
         put(words);
     }
 
-    /// Bytes that were free on the disk of the log when it was last looked at.
+    /// Free bytes on the disk of the log at the last check.
     pub fn free(&self) -> u64 {
         self.shared.free.load(Ordering::Relaxed)
     }
 
-    /// Messages that are in no file and will be in none, until now.
+    /// Messages so far that are and will be in no file.
     pub fn dropped(&self) -> u64 {
         self.dropped + self.shared.lost.load(Ordering::Relaxed)
     }
@@ -238,7 +240,7 @@ impl Log {
     /// Ends the log. `stopped`: a black box is written out.
     ///
     /// # Errors
-    /// What kept the file from being written, and how many messages it lacks.
+    /// Why the file could not be written, and how many messages it lacks.
     pub fn end(mut self, tail: &Sections, stopped: bool) -> io::Result<Summary> {
         let words = pack(&tail.bytes());
         self.patient = true;
@@ -260,7 +262,7 @@ impl Log {
     }
 }
 
-/// A log that is dropped was not ended: what has come is written, without a tail.
+/// A log that is dropped without `end`: its messages so far are written, without a tail.
 impl Drop for Log {
     fn drop(&mut self) {
         self.shared.over.store(true, Ordering::Release);
@@ -274,7 +276,7 @@ impl Drop for Log {
 const TAIL_PART: u32 = u32::MAX - 1;
 const TAIL_END: u32 = u32::MAX;
 
-/// Messages of the caller in this one: what the log itself has to say is none.
+/// Number of the caller's messages among these words; the log's own messages do not count.
 fn records(words: &[u64]) -> u64 {
     u64::from(![LOST, TAIL_PART, TAIL_END].contains(&((words[0] >> 32) as u32)))
 }
@@ -283,7 +285,7 @@ fn word(kind: u32, length: usize) -> u64 {
     u64::from(kind) << 32 | length as u64
 }
 
-/// Bytes as words, the last filled up with zeros.
+/// Bytes as words, the last one padded with zeros.
 fn pack(bytes: &[u8]) -> Vec<u64> {
     let word = |chunk: &[u8]| {
         let mut whole = [0; 8];
@@ -293,7 +295,7 @@ fn pack(bytes: &[u8]) -> Vec<u64> {
     bytes.chunks(8).map(word).collect()
 }
 
-/// The thread's side.
+/// The state of the writing thread.
 struct Carrier {
     queue: Receiver<u64>,
     shared: Arc<Shared>,
@@ -301,7 +303,7 @@ struct Carrier {
     cycles_per_block: u32,
     cycles: u32,
     block: Vec<u8>,
-    /// Messages in it.
+    /// Messages in the open block.
     held: u64,
     tail: Vec<u8>,
 }
@@ -317,7 +319,7 @@ struct Parts {
     limits: Limits,
     disk: Box<dyn Disk>,
     writer: BlockWriter<Box<dyn Write + Send>>,
-    /// Nobody else writes a log of this name.
+    /// Excludes other processes from writing a log of this name.
     _claim: Option<Claim>,
     /// Number of the file being written, from 1.
     number: u32,
@@ -356,15 +358,15 @@ impl Parts {
         Ok(added)
     }
 
-    /// Removes old logs where all together may have so many bytes; returns how many.
+    /// Removes old logs if the total size is limited; returns how many files.
     fn make_room(&self) -> io::Result<u64> {
-        // Room for this file: its part, and as much again for its head and for what it grows by until the next state.
+        // Reserve room for this file: one part, and as much again for its head and its growth until the next state.
         let room = |keep: u64| keep.saturating_sub(2 * self.limits.part);
         let current = parts::path(&self.first, self.number);
         self.limits.keep.map_or(Ok(0), |keep| parts::remove_oldest(&current, room(keep)))
     }
 
-    /// Bytes that are free on the disk; an error where a log must not take more.
+    /// Free bytes on the disk; an error if the log must not take more.
     fn free(&self) -> io::Result<u64> {
         let free = self.disk.free(&parts::path(&self.first, self.number))?;
         if free < self.limits.reserve {
@@ -406,7 +408,7 @@ impl Carrier {
         Ok(())
     }
 
-    /// Carries until all is over; after an error it counts what comes.
+    /// Writes until the log ends; after an error, only counts messages.
     fn carry(mut self) -> io::Result<()> {
         let mut words = Vec::new();
         let mut carried = Ok(());
@@ -435,7 +437,7 @@ impl Carrier {
         }
     }
 
-    /// After an error, what is held will never be written.
+    /// After an error, counts the messages in memory as lost.
     fn give_up(&mut self, carried: &io::Result<()>) {
         if carried.is_err() {
             self.shared.lost.fetch_add(std::mem::take(&mut self.held), Ordering::Relaxed);
@@ -470,7 +472,7 @@ impl Carrier {
         Ok(())
     }
 
-    /// Closes the block under way.
+    /// Closes the open block.
     fn close(&mut self) -> io::Result<()> {
         self.cycles = 0;
         let block = std::mem::take(&mut self.block);
@@ -498,7 +500,7 @@ impl Carrier {
         match &mut self.out {
             Out::File(parts) => {
                 let added = parts.write(kind, &bytes)?;
-                // From here on they are in the file, whatever its disk says next.
+                // From here on they are in the file, even if the disk fails later.
                 self.held = if kind == PACKED { 0 } else { self.held };
                 self.shared.written.fetch_add(added, Ordering::Relaxed);
                 self.look_at_disk()?;
@@ -542,15 +544,15 @@ pub struct Message {
     pub words: Vec<u64>,
 }
 
-/// Reads a log from the beginning of a file on, and through the files that follow it.
+/// Reads a log from the beginning of a file, and continues through the files that follow it.
 pub struct Reader {
     blocks: BlockReader<BufReader<File>>,
-    /// What stands at its beginning.
+    /// The head of the log.
     pub head: Sections,
     tail: Option<Sections>,
     bytes: Vec<u8>,
     at: usize,
-    /// The file being read, the number of its part, and what all parts of the log have in common.
+    /// The file being read, the number of its part, and the checksum that all parts of the log share.
     path: PathBuf,
     number: u32,
     mark: u32,
@@ -587,7 +589,7 @@ impl Reader {
         Ok((blocks, head))
     }
 
-    /// Goes on with the next file of the log; false if there is none.
+    /// Continues with the next file of the log; false if there is none.
     fn follow(&mut self) -> bool {
         let path = parts::following(&self.path, self.number);
         let Ok((blocks, head)) = Reader::begin(&path) else { return false };
@@ -598,7 +600,7 @@ impl Reader {
         true
     }
 
-    /// The next message; none at the end of what can be read.
+    /// The next message; none at the end of the readable part.
     ///
     /// # Errors
     /// Those of the file.
@@ -641,7 +643,7 @@ impl Reader {
         &self.path
     }
 
-    /// What stands at its end; none if it has not been reached or was never written.
+    /// The tail; none if it has not been reached or was never written.
     pub fn tail(&self) -> Option<&Sections> {
         self.tail.as_ref()
     }
@@ -652,7 +654,7 @@ impl Reader {
     }
 }
 
-/// Number and mark in the head of a file after the first.
+/// Part number and checksum in the head of a file after the first.
 fn part_of(head: &Sections) -> Option<(u32, u32)> {
     let (number, mark) = head.text(PART)?.split_once(' ')?;
     Some((number.parse().ok().filter(|number| *number > 1)?, u32::from_str_radix(mark, 16).ok()?))
@@ -781,7 +783,8 @@ mod tests {
         assert!(matches!(reader.end(), Some(End::Cut { .. })));
     }
 
-    /// Writes messages at random, with a state now and then, into parts of `limits`; returns the first file and what was written.
+    /// Writes random messages, with a state now and then, into parts of `limits`; returns the first file and the
+    /// messages.
     fn in_parts(folder: &Path, seed: u64, limits: Limits) -> (PathBuf, Vec<Message>) {
         let (mut chance, path) = (Chance(seed), folder.join(format!("{seed}.friclog")));
         let mut log = Log::begin(settings(Sink::File(path.clone(), limits)), &head()).unwrap();
@@ -879,12 +882,12 @@ mod tests {
         (0..25).for_each(|k| first.push(CYCLE, &[k]));
         let why = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).err().unwrap().to_string();
         assert!(why.contains("another process writes this file"), "{why}");
-        // Also once it goes on in another file and the first is gone.
+        // Also after it continues in another file and the first is gone.
         std::fs::remove_file(&path).unwrap();
         assert!(Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).is_err() && !path.exists());
         std::fs::write(&path, []).unwrap();
         first.end(&Sections::default().with("end", "as asked"), false).unwrap();
-        // It is free again, and nobody waits for a device.
+        // It is free again, and a device is never locked.
         assert!(Log::begin(settings(Sink::File(path, Limits::default())), &head()).is_ok());
         let null = || Log::begin(settings(Sink::File("/dev/null".into(), Limits::default())), &head());
         let both = (null(), null());

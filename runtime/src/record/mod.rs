@@ -1,7 +1,7 @@
-//! Keeps the course of a run for plots and files in bounded memory.
+//! Recordings of a run for plots and files, in bounded memory.
 //!
-//! In: the points of a run in order of time. Out: a [`Recording`]: rows of time and values that show every minimum
-//! and maximum of every column, and no fewer than 1,000 of them if there were that many. Measures do not read it.
+//! In: the points of a run in order of time. Out: a [`Recording`]: rows of time and values that include every minimum
+//! and maximum of every column, at least 1,000 rows if the run had that many. Measures do not read it.
 
 pub mod blocks;
 pub mod claim;
@@ -14,7 +14,7 @@ use abi::Slot;
 use abi::plan::{Plot, Series};
 use abi::unit::Unit;
 
-/// Buckets at most. When they are full, neighbours are joined, so at least half of them hold a row or more.
+/// Largest number of buckets. When they are full, neighbours are merged, so at least half of them hold a row or more.
 const BUCKETS: usize = 4096;
 
 /// A column of a recording.
@@ -24,15 +24,15 @@ pub struct Column {
     pub label: String,
     /// The unit it is shown in; rows hold SI.
     pub unit: Unit,
-    /// True (1) or false (0) rather than a quantity.
+    /// Whether the values are truth values, 1 or 0, rather than a quantity.
     pub boolean: bool,
 }
 
-/// What a run was seen to do: one row for each point kept, in order of time. An event has two rows at one time.
+/// A decimated record of a run: one row for each point kept, in order of time. An event has two rows at one time.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Recording {
     columns: Vec<Column>,
-    /// Time in s, then the columns in SI; row by row.
+    /// Time in s, then the columns in SI; row-major.
     numbers: Vec<f64>,
     seen: u64,
 }
@@ -58,7 +58,7 @@ impl Recording {
         self.columns.iter().position(|column| column == &Column::of(series))
     }
 
-    /// Time in s and value in SI of one column, for drawing.
+    /// Time in s and value in SI of one column, for plotting.
     pub fn points(&self, column: usize) -> impl Iterator<Item = (f64, f64)> {
         self.rows().map(move |row| (row[0], row[column + 1]))
     }
@@ -70,23 +70,24 @@ impl Column {
     }
 }
 
-/// A recording in the making.
+/// Builds a recording.
 ///
 /// Points are gathered in buckets of 1, 2, 4, … consecutive points. A bucket keeps whole rows: its first, and for each
-/// column those with the least and the greatest value. Whole rows, so that a plot of one quantity against another
-/// shows points that occurred. When all buckets are full, each two become one: the extremes of both are among theirs.
+/// column those with the least and the greatest value. The rows are whole so that a plot of one quantity against
+/// another shows points that occurred. When all buckets are full, neighbours are merged in pairs: the extremes of both
+/// are among their rows.
 pub struct Recorder {
     columns: Vec<Column>,
     slots: Vec<Slot>,
-    /// Buckets behind each other, each of 2 · columns + 1 rows, some of which may be the same.
-    /// A row is the number of its point, its time, and the columns.
+    /// Buckets one after the other, each of 2 · columns + 1 rows, some of which may be equal. A row is the number of
+    /// its point, its time, and the columns.
     buckets: Vec<f64>,
-    /// Points a full bucket stands for.
+    /// Points per full bucket.
     capacity: u64,
     /// Points in the last bucket.
     filled: u64,
     seen: u64,
-    /// The row seen last, which ends the recording.
+    /// The last row, which ends the recording.
     last: Vec<f64>,
 }
 
@@ -106,8 +107,8 @@ impl Recorder {
         Recorder { columns, slots, buckets: Vec::new(), capacity: 1, filled: 1, seen: 0, last }
     }
 
-    /// A recording of these rows instead of points seen: times in s, ascending, and as many rows of values in SI as there
-    /// are, in the order of [`Recorder::slots`].
+    /// A recording of given rows instead of observed points: times in s, ascending, and as many rows of values in SI,
+    /// in the order of [`Recorder::slots`].
     pub fn rows(self, times: &[f64], values: &[f64]) -> Recording {
         let rows = times.iter().zip(values.chunks_exact(self.slots.len().max(1)));
         let numbers: Vec<f64> = rows.flat_map(|(t, row)| std::iter::once(*t).chain(row.iter().copied())).collect();
@@ -125,7 +126,7 @@ impl Recorder {
         self.slots.iter().copied()
     }
 
-    /// Shows the state of the model at time `t` in s. Times must not decrease.
+    /// Adds the state of the model at time `t` in s. Times must not decrease.
     pub fn see(&mut self, t: f64, block: &[f64]) {
         if self.slots.is_empty() {
             return;
@@ -151,12 +152,12 @@ impl Recorder {
         }
     }
 
-    /// Length of a bucket.
+    /// Length of a bucket in numbers.
     fn bucket_len(&self) -> usize {
         (2 * self.slots.len() + 1) * self.last.len()
     }
 
-    /// Joins each two neighbouring buckets.
+    /// Merges neighbouring buckets in pairs.
     fn join(&mut self) {
         let (len, width) = (self.bucket_len(), self.last.len());
         for pair in 0..BUCKETS / 2 {
@@ -170,7 +171,7 @@ impl Recorder {
         self.capacity *= 2;
     }
 
-    /// What was recorded.
+    /// The recording so far.
     pub fn recording(&self) -> Recording {
         let mut numbers = Vec::new();
         let mut rows: Vec<&[f64]> = Vec::new();
@@ -188,7 +189,7 @@ impl Recorder {
     }
 }
 
-/// Keeps a later row in a bucket where it sets a new extreme.
+/// Replaces the rows of a bucket for which a later row is a new extreme.
 fn take(bucket: &mut [f64], row: &[f64]) {
     let width = row.len();
     let (_, pairs) = bucket.split_at_mut(width);

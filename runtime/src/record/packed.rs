@@ -1,30 +1,30 @@
-//! Messages of a log in an eighth of their bytes.
+//! Compresses messages of a log to an eighth of their bytes.
 //!
-//! In: a block of messages, each a word of kind and length and that many 64-bit words. Out: the same block packed, and
-//! back. Knows neither files nor what the words mean.
+//! In: a block of messages, each a word of kind and length followed by that many 64-bit words. Out: the block
+//! compressed, and the reverse. Knows neither files nor the meaning of the words.
 //!
-//! From cycle to cycle most words of a message change little: each word is replaced by its difference from the word at
-//! the same place of the last message of the same kind in the block (differences wrap, so that nothing is lost), and
-//! the result is deflated (RFC 1951). A block stands alone: nothing before it is needed to unpack it.
+//! From cycle to cycle most words of a message change little. So each word is replaced by its wrapping difference to
+//! the word at the same place of the previous message of the same kind in the block, and the result is deflated (RFC
+//! 1951). A block is self-contained: nothing before it is needed to decompress it.
 
 use miniz_oxide::deflate::compress_to_vec;
 use miniz_oxide::inflate::decompress_to_vec_with_limit;
 use std::collections::BTreeMap;
 
-/// Between speed and size: 100 MB/s of messages, and 2 % more bytes than the slowest level.
+/// A compromise of speed and size: 100 MB/s of messages, and 2 % more bytes than the slowest level.
 const LEVEL: u8 = 6;
 
-/// Packs texts.
+/// Compresses texts.
 pub fn pack_bytes(bytes: &[u8]) -> Vec<u8> {
     compress_to_vec(bytes, LEVEL)
 }
 
-/// Unpacks texts to `most` bytes at most. None if they are longer, or were not packed.
+/// Decompresses texts to at most `most` bytes. None if they are longer, or were not compressed here.
 pub fn unpack_bytes(packed: &[u8], most: usize) -> Option<Vec<u8>> {
     decompress_to_vec_with_limit(packed, most).ok()
 }
 
-/// Packs a block of whole messages.
+/// Compresses a block of complete messages.
 pub fn pack(block: &[u8]) -> Vec<u8> {
     let mut bytes = block.to_vec();
     let whole = through(&mut bytes, |word, last| (word.wrapping_sub(last), word));
@@ -32,7 +32,7 @@ pub fn pack(block: &[u8]) -> Vec<u8> {
     pack_bytes(&bytes)
 }
 
-/// Unpacks a block to `most` bytes at most. None if it is longer, or was not made by [`pack`].
+/// Decompresses a block to at most `most` bytes. None if it is longer, or was not made by [`pack`].
 pub fn unpack(packed: &[u8], most: usize) -> Option<Vec<u8>> {
     let mut bytes = unpack_bytes(packed, most)?;
     through(&mut bytes, |word, last| {
@@ -42,9 +42,9 @@ pub fn unpack(packed: &[u8], most: usize) -> Option<Vec<u8>> {
     .then_some(bytes)
 }
 
-/// Replaces each word but the first of every message: `change` gets it and the original word at its place in the last message
-/// of the same kind (0 where that was shorter), and gives what takes its place and the original word. Returns whether the
-/// bytes are whole messages.
+/// Replaces each word of every message except the first. `change` receives the word and the original word at the same
+/// place of the previous message of the same kind (0 if that was shorter), and returns the replacement and the original
+/// word. Returns whether the bytes are complete messages.
 fn through(bytes: &mut [u8], change: impl Fn(u64, u64) -> (u64, u64)) -> bool {
     let (words, rest) = bytes.as_chunks_mut::<8>();
     let mut last: BTreeMap<u32, Vec<u64>> = BTreeMap::new();
@@ -105,7 +105,7 @@ mod tests {
             let mut packed = pack(&block);
             let at = chance.below(packed.len() as u64) as usize;
             packed[at] ^= 1 << chance.below(8);
-            // The checksum of the block catches this before; here nothing but the absence of a panic is asked.
+            // The checksum of the block detects this earlier; here it must only not panic.
             let _ = unpack(&packed, 1 << 16);
         }
         assert_eq!(unpack(&compress_to_vec(&[1, 0, 0, 0, 0, 0, 0, 0], 1), 100), None, "a message that is cut off");

@@ -1,10 +1,9 @@
-//! A log in several files: their names, how many of them are kept, and the space that is free for them.
+//! A log in several files: their names, how many are kept, and the free space for them.
 //!
-//! In: the path of a log and how large it may become. Out: files, opened one after the other. Knows nothing of what is
-//! in them.
+//! In: the path of a log and its size limits. Out: files, opened one after the other. Knows nothing of their contents.
 //!
-//! The first part bears the name that was asked for, `rtfs.friclog`; those that follow have their number before the
-//! ending, `rtfs.2.friclog`, `rtfs.3.friclog`, …
+//! The first part has the requested name, `rtfs.friclog`; those that follow have their number before the extension,
+//! `rtfs.2.friclog`, `rtfs.3.friclog`, …
 
 use super::claim::is_locked;
 use std::fs::{self, File};
@@ -12,45 +11,45 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-/// Below this, the free space is reported while a rig runs: some hours of a log at 1 kHz.
+/// Free space below which a running rig reports it: some hours of a log at 1 kHz.
 const LITTLE: u64 = 1_000_000_000;
 
-/// The ending of logs.
+/// The file extension of logs.
 pub const ENDING: &str = "friclog";
 
-/// How large a log may become.
+/// Size limits of a log.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Limits {
-    /// Bytes after which a part is followed by the next one; at most a quarter of `keep`.
+    /// Size in bytes after which the next part begins; at most a quarter of `keep`.
     pub part: u64,
-    /// Bytes that all logs in the folder may have together: the oldest files are removed. None: all are kept.
+    /// Total bytes of all logs in the folder; the oldest files are removed. None: all are kept.
     pub keep: Option<u64>,
     /// Bytes of the disk that a log leaves free; it stops growing there.
     pub reserve: u64,
 }
 
 impl Default for Limits {
-    /// Parts of 256 MB, all of them kept; 64 MB of the disk are left to others.
+    /// Parts of 256 MB, all of them kept; 64 MB of the disk are reserved.
     fn default() -> Limits {
         Limits { part: 256_000_000, keep: None, reserve: 64_000_000 }
     }
 }
 
-/// Where the files of a log lie.
+/// The storage of a log's files.
 pub trait Disk: Send {
     /// Opens part `number` of the log whose first part is `first`.
     ///
     /// # Errors
     /// Those of the files.
     fn create(&self, first: &Path, number: u32) -> io::Result<Box<dyn Write + Send>>;
-    /// Bytes that are free where this file lies.
+    /// Free bytes on the disk of this file.
     ///
     /// # Errors
-    /// Those of the system.
+    /// Those of the operating system.
     fn free(&self, path: &Path) -> io::Result<u64>;
 }
 
-/// The disk that the system knows.
+/// The file system of the operating system.
 pub struct System;
 
 impl Disk for System {
@@ -62,7 +61,7 @@ impl Disk for System {
     }
 }
 
-/// A number of bytes as one types it: `256MB`, `10 GB`, `1.5 TB`; powers of 1000.
+/// Parses a number of bytes: `256MB`, `10 GB`, `1.5 TB`; powers of 1000.
 ///
 /// # Errors
 /// What is wrong with it, in words.
@@ -82,12 +81,12 @@ pub fn bytes(text: &str) -> Result<u64, String> {
     }
 }
 
-/// The same number of bytes as an option: [`bytes`] reads it back.
+/// A number of bytes as the text of an option that [`bytes`] parses.
 pub fn option(bytes: u64) -> String {
     format!("{}kB", bytes as f64 / 1e3)
 }
 
-/// Bytes in words: `12.3 MB`, `45.2 GB`.
+/// Formats a number of bytes: `12.3 MB`, `45.2 GB`.
 pub fn size(bytes: u64) -> String {
     match bytes as f64 {
         bytes if bytes < 1e9 => format!("{:.1} MB", bytes * 1e-6),
@@ -95,7 +94,7 @@ pub fn size(bytes: u64) -> String {
     }
 }
 
-/// What to say of the space that is free for a log: nothing where there is enough, or none is known (0).
+/// A warning about little free space for a log; none if there is enough, or if it is unknown (0).
 pub fn warning(free: u64) -> Option<String> {
     (0 < free && free < LITTLE).then(|| format!("the log has {} left on its disk", size(free)))
 }
@@ -109,7 +108,7 @@ pub fn path(first: &Path, number: u32) -> PathBuf {
     }
 }
 
-/// The path of the part that follows this one of number `number`.
+/// The path of the part after part `number` at this path.
 pub fn following(this: &Path, number: u32) -> PathBuf {
     let name = this.file_name().unwrap_or_default().to_string_lossy();
     let (stem, ending) = name.rsplit_once('.').map_or((&*name, None), |(stem, ending)| (stem, Some(ending)));
@@ -122,10 +121,10 @@ pub fn following(this: &Path, number: u32) -> PathBuf {
     path(&this.with_file_name(first), number + 1)
 }
 
-/// Makes the folder of a file, if there is none.
+/// Creates the folder of a file, if it is missing.
 ///
 /// # Errors
-/// Those of the system.
+/// Those of the operating system.
 pub fn make_folder_of(path: &Path) -> io::Result<()> {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => fs::create_dir_all(folder),
@@ -133,14 +132,14 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Opens part `number`. The first part removes the parts of an earlier log of its name, so that no reader takes them for
-/// its own.
+/// Opens part `number`. The first part removes the parts of an earlier log of its name, so that a reader does not take
+/// them for parts of this one.
 ///
 /// # Errors
 /// Those of the files.
 pub fn create(first: &Path, number: u32) -> io::Result<File> {
     let file = File::create(path(first, number))?;
-    // Others that make room leave it: see `remove_oldest`. A device cannot be locked, and need not be.
+    // A lock keeps other logs from removing it: see `remove_oldest`. A device cannot be locked, and need not be.
     let _ = file.try_lock();
     if number == 1 {
         for old in (2..).map(|number| path(first, number)).take_while(|old| old.is_file()) {
@@ -150,8 +149,8 @@ pub fn create(first: &Path, number: u32) -> io::Result<File> {
     Ok(file)
 }
 
-/// Removes the oldest logs in the folder of `current` until all together have `keep` bytes at most. The current part
-/// stays, and so does one that another process writes. Returns how many files were removed.
+/// Removes the oldest logs in the folder of `current` until all together have at most `keep` bytes. The current part
+/// stays, and so does one that another process is writing. Returns how many files were removed.
 ///
 /// # Errors
 /// Those of the files.
@@ -183,10 +182,10 @@ pub fn remove_oldest(current: &Path, keep: u64) -> io::Result<u64> {
     Ok(removed)
 }
 
-/// Bytes that are free on the disk of this file or folder.
+/// Free bytes on the disk of this file or folder.
 ///
 /// # Errors
-/// Those of the system.
+/// Those of the operating system.
 pub fn free(path: &Path) -> io::Result<u64> {
     let disk = rustix::fs::statvfs(path)?;
     Ok(disk.f_bavail * disk.f_frsize)
@@ -233,7 +232,7 @@ mod tests {
             file.set_modified(now - Duration::from_secs(100 * age)).unwrap();
         }
         assert_eq!(remove_oldest(&named("now.friclog"), 400).unwrap(), 0);
-        // One that somebody writes is left, however old.
+        // A file that is being written stays, however old.
         let written = File::open(named("a.friclog")).unwrap();
         written.try_lock().unwrap();
         assert_eq!(remove_oldest(&named("now.friclog"), 399).unwrap(), 1);

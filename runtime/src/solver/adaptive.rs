@@ -1,9 +1,10 @@
-//! Joins steps to a run: chooses method and length, stops at events, ticks and corners, shows the points.
+//! The driver of adaptive runs: chooses method and step length, stops at events, ticks and corners, and passes the
+//! points on.
 //!
-//! Every state i is controlled by itself: its estimated error stays below tol · (|x| + s), with s half the width of
-//! its declared range, or 1 in its declared unit where that is open. Step lengths follow Gustafsson's predictive
+//! Error control is per state: the estimated error of state i stays below tol · (|x| + s), with s half the width of its
+//! declared range, or 1 in its declared unit where the range is open. Step lengths follow Gustafsson's predictive
 //! control (Hairer & Wanner, Solving ODEs II, sec. IV.8). An event ends its step at the far end of a bracket of 1e-12
-//! of the run; a surface at which neither states nor regimes change and the derivatives do not jump is no event.
+//! of the run. A surface at which neither states nor regimes change and the derivatives do not jump is no event.
 //! Nothing here depends on the platform's elementary functions, so a run has the same bits everywhere.
 
 mod kinks;
@@ -28,117 +29,118 @@ use abi::{Function, Instance, Slot};
 use std::collections::VecDeque;
 use std::ops::Range;
 
-/// Steps tried at most between two stops. A run that needs more is told so; it would take minutes.
+/// Most step attempts between two stops. A run that needs more would take minutes, and ends with a message.
 const MOST_ATTEMPTS: u64 = 5_000_000;
 
-/// More events than this within a millionth of the run are chatter.
+/// More events than this within a millionth of the run are chattering.
 const MOST_EVENTS: usize = 100;
 
-/// And so are more surfaces than this, met by steps of whatever outcome, while no state moves by more than three roots of the
-/// tolerance: what turns ever faster and loses less at each turn than is allowed as error, a part a² of its amplitude a,
-/// goes on for ever at an amplitude of about that root.
+/// So are more surfaces than this, met by accepted or rejected steps, while no state moves by more than three times the
+/// square root of the tolerance. An oscillation with growing frequency that loses a fraction a² of its amplitude a at
+/// each turn loses less than the allowed error once a is about that root, and would then continue for ever.
 const MOST_CROSSINGS: usize = 2000;
 
-/// More tries of a step than this within a millionth of the run lead nowhere.
+/// With more step attempts than this within a millionth of the run, the run makes no progress.
 const MOST_IN_PLACE: u64 = 20_000;
 
-/// A state without a declared range is never measured with less than this, SI; and no error smaller than that is asked for.
+/// Smallest scale of a state without a declared range, SI; and the smallest error that may be requested.
 const LEAST_SCALE: f64 = 1e-9;
 const ROUNDING: f64 = 1e-15;
 
-/// So often a step is made again to end before a surface without anything coming of it.
+/// How often a step is repeated to end before a surface if the surface is then not crossed.
 const MOST_AIMS: u8 = 4;
 
-/// Where the length of a step times the mean eigenvalue is larger, or the square of the one times the mean square of the
-/// other is larger than the square of this, the stiff method suits.
+/// The stiff method is kept without further checks if h times the mean eigenvalue exceeds this, or h² times the mean
+/// squared eigenvalue exceeds its square.
 const STIFF: f64 = 0.5;
 
-/// Tries between two looks at the caller.
+/// Step attempts between two calls of the progress callback.
 const WATCHED: u64 = 64;
 
-/// Such a run under way; it stands still where steps are tried by the model's own function.
+/// An adaptive run in progress; it pauses at each call of the model's own step function.
 pub(crate) struct Adaptive {
     system: System,
     duration: f64,
-    /// The next instant that is met exactly, and the number of tries at the one before.
+    /// The next instant to meet exactly, and the number of attempts at the previous one.
     goal: Option<(f64, u64)>,
-    /// Instants that are met exactly, ascending.
+    /// Instants to meet exactly, ascending.
     corners: Vec<f64>,
     tol: f64,
     /// Scale of each state, SI: half the width of its declared range, or its largest value so far.
     scales: Vec<f64>,
-    /// What a small change of each state is a part of, SI.
+    /// The reference for a small change of each state, SI.
     units: Vec<f64>,
     t: f64,
     x: Vec<f64>,
-    /// Length of the next step in s, and of the longest that is allowed.
+    /// Length of the next step in s, and the longest that is allowed.
     h: f64,
     longest: f64,
     step: Step,
     /// Whether `step.f0` and `jacobian` are those at (t, x).
     slope_known: bool,
-    /// Slope at the end of the last step, and whether the stiff method made it.
+    /// Slope at the end of the last step, and whether the stiff method computed it.
     end_slope: Vec<f64>,
     was_stiff: bool,
     jacobian_known: bool,
     jacobian: Vec<f64>,
     entries: Entries,
     rosenbrock: Rosenbrock,
-    /// The same as one function of the model, if it has it; and whether the last step was made by it.
+    /// The stiff method fused into one function of the model, if the model has it; and whether it made the last step.
     fused: Option<Fused>,
     was_fused: bool,
-    /// Whether it is known to end with everything in its range, and to meet no surface either.
+    /// Whether the step is known to end with all quantities in range, and to meet no surface.
     inside: bool,
     calm: bool,
     explicit: Explicit,
-    /// Which of the two is at work.
+    /// Whether the stiff method is active.
     stiff: bool,
-    /// For each guard the least and the greatest value that are fine, SI.
+    /// For each guard the least and the greatest allowed value, SI.
     fine: Vec<(f64, f64)>,
-    /// How often in a row the Jacobian spoke for the other one, and how often it must before the stiff one goes.
+    /// How many times in a row the Jacobian favoured the other method, and how many are needed to leave the stiff one.
     doubts: u32,
     patience: u32,
     /// Length of the last accepted step, and the fifth root of its error; none after a restart.
     last: Option<(f64, f64)>,
-    /// Trials refused since the last accepted one.
+    /// Attempts rejected since the last accepted one.
     rejected: u64,
-    /// The next step is no longer than this, for a surface is just ahead.
+    /// Limit on the next step because a surface is just ahead.
     creep: f64,
-    /// For each surface, how often of late a step has been made again to end before it, and nothing came of it.
+    /// For each surface, how often recently a step was repeated to end before it, without a crossing.
     aimed: Vec<u8>,
-    /// Number of the try that was to end so little behind a bend that it cannot matter.
+    /// Number of the attempt that is to end so little after a kink that the kink cannot matter.
     bent: Option<u64>,
-    /// Length of the step that was made again: how long steps may be when the condition is behind.
+    /// Length of the step that was repeated: the step length to resume after the condition.
     usual: Option<f64>,
     /// States beside a crossing, and four slopes around it.
     beside: Vec<f64>,
     slopes: Vec<f64>,
     surfaces: Surfaces,
-    /// Those at which only observed quantities change, and how far of the step they have been followed, in θ.
+    /// The surfaces at which only observed quantities change, and how far they have been searched in the step, in θ.
     observed: Surfaces,
     followed: Option<f64>,
-    /// Before this instant, in s, something lets go that a stiff step does not see; infinite if nothing does.
+    /// Up to this instant, in s, a contact may release without a stiff step noticing; infinite if there is no such
+    /// instant.
     suspect: f64,
-    /// Whether the model's own function says that the step meets a surface.
+    /// Whether the model's own function reports that the step meets a surface.
     met: bool,
-    /// Whether anything in the block beside the trial may have changed since the last call.
+    /// Whether anything in the block outside the trial may have changed since the last call.
     moved: bool,
     /// Whether no step has been made since the last restart.
     fresh: bool,
-    /// Time and a crossed surface of each of the last events.
+    /// Time and a crossed surface of each of the most recent events.
     events: VecDeque<(f64, Option<usize>)>,
-    /// How many surfaces were met since when, and where the model was then; whether the last step tried was too long only
-    /// because of one.
+    /// The number of surfaces met since a given time, and the states then; whether the last attempt was too long only
+    /// because of a surface.
     crossings: usize,
     crossings_since: f64,
     crossings_at: Vec<f64>,
     overran: bool,
-    /// Steps tried and time reached when it was looked last whether the run makes way.
+    /// Number of attempts and time at the last check for progress.
     place: (u64, f64),
     /// For each sampled block its period in s and the number of its next tick.
     ticks: Vec<(f64, u64)>,
     points: Points,
-    /// θ of the step up to which the past is kept.
+    /// θ of the step up to which the history is stored.
     kept: f64,
     work: Work,
 }
@@ -178,7 +180,7 @@ impl Adaptive {
         };
         let declared: Vec<Option<f64>> = (0..states.len as usize).map(declared).collect();
         let units: Vec<f64> = declared.iter().map(|half| half.unwrap_or(1.0)).collect();
-        // What a state without a range reaches shows in time; until then rounding errors must not count.
+        // The magnitude of a state without a range shows during the run; until then rounding errors must not count.
         let least = LEAST_SCALE.max(ROUNDING / tol);
         let start = &instance.block()[states.range()];
         let scale = |(half, x): (&Option<f64>, &f64)| half.unwrap_or(least).max(x.abs());
@@ -190,8 +192,8 @@ impl Adaptive {
         };
         let ticks = description.ticks.iter().map(|tick| (period(tick.period), 1)).collect();
         let points = Points::new(&instance, observer, experiment);
-        // Ranges that are watched, with the slack of a millionth that fixed steps have; what error control may be off by
-        // is no way out of a range.
+        // Guarded ranges, with the same slack of a millionth as in fixed steps: a deviation within the error control is
+        // no violation.
         let fine = |guard: &Guard| {
             let (low, high) = guard.range;
             let (width, share) = (high - low, (10.0 * tol).max(1e-6));
@@ -273,7 +275,7 @@ impl Adaptive {
         Ok(())
     }
 
-    /// The outputs at the end, for whoever looks at them.
+    /// Computes the outputs at the end, for observers.
     fn finish(&mut self) -> Result<(), Stop> {
         let (t, x) = (self.t, &self.x);
         self.system.place(t, x);
@@ -291,7 +293,7 @@ impl Adaptive {
         corner.min(tick).min(self.duration)
     }
 
-    /// Whether somebody wants the run to end, or it leads nowhere.
+    /// Calls the progress callback, and checks that the run makes progress.
     fn look_around(&mut self, before: u64, watch: &mut dyn FnMut(f64) -> Continue) -> Result<(), Stop> {
         if self.attempts().is_multiple_of(WATCHED) && watch(self.t / self.duration).is_break() {
             return Err(self.stop(Cause::Stopped));
@@ -311,8 +313,8 @@ impl Adaptive {
         Ok(())
     }
 
-    /// Puts all that the model's own function needs into the block. It settles steps by itself as long as they are ordinary
-    /// ones: no other kind of step is under way, and nobody looks at each.
+    /// Writes the inputs of the model's own step function into the block. That function accepts or rejects steps by
+    /// itself as long as they are ordinary: no special step is in progress, and no observer needs each step.
     fn prepare(&mut self, stop: f64) -> u64 {
         self.know_slope();
         if self.fused.as_ref().is_some_and(|fused| !fused.ready) {
@@ -338,7 +340,7 @@ impl Adaptive {
         if attend { 1 } else { WATCHED - self.attempts() % WATCHED }
     }
 
-    /// Tries a step by the routines for any model and settles it.
+    /// Attempts a step with the general routines and evaluates it.
     fn try_step(&mut self, stop: f64) -> Result<(), Stop> {
         let left = stop - self.t;
         let wanted = self.h.min(self.longest);
@@ -348,7 +350,7 @@ impl Adaptive {
         if self.is_too_short(stop) {
             return Err(self.too_short(self.step.h));
         }
-        // What jumps at the stop has not jumped before it.
+        // A jump at the stop has not happened before it.
         self.step.end = if hits { stop.next_down() } else { self.t + self.step.h };
         copy(&self.x, &mut self.step.x0);
         self.know_slope();
@@ -363,7 +365,7 @@ impl Adaptive {
         self.conclude(error, stop)
     }
 
-    /// Whether the step goes up to the stop.
+    /// Whether the step ends at the stop.
     fn hits(&self, stop: f64) -> bool {
         self.step.h == stop - self.t
     }
@@ -372,7 +374,7 @@ impl Adaptive {
         !self.hits(stop) && self.step.h < (16.0 * f64::EPSILON * self.t).max(f64::MIN_POSITIVE)
     }
 
-    /// dx/dt at the present point.
+    /// Computes dx/dt at the present point, if unknown.
     fn know_slope(&mut self) {
         if !self.slope_known {
             self.system.slope(self.t, &self.x, &mut self.step.f0);
@@ -380,7 +382,7 @@ impl Adaptive {
         }
     }
 
-    /// Settles the step, whose error this is as a part of what is allowed.
+    /// Accepts or rejects the step. `error`: its error relative to the allowed one.
     fn conclude(&mut self, error: f64, stop: f64) -> Result<(), Stop> {
         let wanted = self.h.min(self.longest);
         if !self.judge(error) {
@@ -393,10 +395,10 @@ impl Adaptive {
         self.accept(reached)
     }
 
-    /// Whether the step is accurate enough; chooses the length of the next.
+    /// Whether the step is accurate enough; also chooses the length of the next step.
     fn judge(&mut self, error: f64) -> bool {
         let h = self.step.h;
-        // Where the step runs over a surface within the rounding error of time, a shorter one would be no better.
+        // If the step crosses a surface and is as short as the rounding of time, a shorter one would be no better.
         let blurred = h <= 256.0 * f64::EPSILON * self.t && error.is_finite();
         let error = match error > 1.0 && blurred && self.surfaces.guess(&mut self.system, &self.step).is_some() {
             true => 1.0,
@@ -406,7 +408,7 @@ impl Adaptive {
             self.work.rejected += 1;
             let part = if error.is_finite() { (SAFETY * inverse_fifth_root(error)).max(LEAST_GAIN) } else { 0.1 };
             self.h = part.min(MOST_REFUSED) * h;
-            // Where the step ran over a surface, that may be all that is wrong with it.
+            // If the step crossed a surface, that may be the only reason for its error.
             let ahead = self.surfaces.guess(&mut self.system, &self.step);
             self.overran = ahead.is_some();
             if let Some(theta) = ahead {
@@ -420,7 +422,7 @@ impl Adaptive {
         let inverse = inverse_fifth_root(error);
         let mut part = SAFETY * inverse;
         if let Some((last_h, last_root)) = self.last {
-            // What the error did from step to step, it will do again.
+            // Predictive control: assume that the error changes by the same factor again.
             part = part.min((SAFETY * (h / last_h) * last_root) * (inverse * inverse));
         }
         if self.rejected > 0 {
@@ -436,7 +438,7 @@ impl Adaptive {
         true
     }
 
-    /// A stiff step by the routine for any model. Gives its error as a part of what is allowed.
+    /// A stiff step with the general routine. Returns its error relative to the allowed one.
     fn stiff_attempt(&mut self) -> f64 {
         self.know_jacobian();
         if !self.rosenbrock.attempt(&mut self.system, &mut self.step, &self.jacobian) {
@@ -450,7 +452,7 @@ impl Adaptive {
         error.max(self.defect())
     }
 
-    /// Largest estimated error as a part of what is allowed.
+    /// The largest estimated error relative to the allowed one.
     fn error(&self) -> f64 {
         let mut worst = 0.0;
         for i in 0..self.system.n {
@@ -465,12 +467,13 @@ impl Adaptive {
         worst
     }
 
-    /// By how much the step fails the equations at its end, gathered over the fastest time the Jacobian knows, as a
-    /// part of what is allowed.
+    /// The residual of the equations at the end of the step, integrated over the fastest time constant of the Jacobian,
+    /// relative to the allowed error.
     ///
     /// An error that is small for its own state can be large for a stiffer one: 1 µm/s is little for the speed of a
-    /// mass, yet moves its bristle by more than the 1 pm that it is controlled to. Left alone, such errors keep the
-    /// bristle ringing. Of 300 random stick-slip runs, 11 instead of 49 then differ by more than 1e-3 from tol 1e-8.
+    /// mass, yet moves its bristle by more than the 1 pm that it is controlled to. Without this check such errors keep
+    /// the bristle ringing. With it, of 300 random stick-slip runs 11 instead of 49 differ by more than 1e-3 from tol
+    /// 1e-8.
     fn defect(&self) -> f64 {
         let n = self.system.n;
         let step = &self.step;
@@ -483,23 +486,24 @@ impl Adaptive {
         (0..n).map(part).fold(0.0, |worst, part| if part > worst || part.is_nan() { part } else { worst })
     }
 
-    /// Error that is allowed to state `i` in this step, SI.
+    /// Allowed error of state `i` in this step, SI.
     fn allowed(&self, i: usize) -> f64 {
         let size = self.step.x0[i].abs().max(self.step.x1[i].abs());
         self.tol * (size + self.scales[i])
     }
 
-    /// Now and then, asks the Jacobian at the start of an accepted step which method suits: the explicit one is stable
-    /// up to about 3.3 times its largest eigenvalue, of which only the order of magnitude is known. Each return to the
-    /// stiff method makes the next change away from it slower. Where the stiff one is a function of the model, its step takes
-    /// no longer than the six evaluations of the explicit one, and is larger at the same error.
+    /// Periodically chooses the method from the Jacobian at the start of an accepted step: the explicit method is
+    /// stable up to about 3.3 divided by the largest eigenvalue, of which only the order of magnitude is known. Each
+    /// return to the stiff method makes the next change away from it slower. If the stiff method is fused into a
+    /// function of the model, it is always kept: its step takes no longer than the six evaluations of the explicit one,
+    /// and is larger at the same error.
     fn consider_method(&mut self) {
         if self.fused.is_some() || !self.work.steps.is_multiple_of(8) {
             return;
         }
         self.know_jacobian();
         let n = self.system.n;
-        // The mean eigenvalue is cheap to know, and the mean of their squares.
+        // The mean eigenvalue and the mean squared eigenvalue are cheap to compute.
         let trace = self.entries.trace(&self.jacobian);
         if self.stiff && self.step.h * trace.abs() > STIFF * n as f64 {
             self.doubts = 0;
@@ -523,7 +527,7 @@ impl Adaptive {
         }
     }
 
-    /// The Jacobian at the start of the step.
+    /// Computes the Jacobian at the start of the step, if unknown.
     fn know_jacobian(&mut self) {
         if let Some(fused) = self.fused.as_ref().filter(|fused| fused.ready) {
             self.jacobian.copy_from_slice(fused.jacobian(&self.system));
@@ -535,7 +539,7 @@ impl Adaptive {
         }
     }
 
-    /// Follows an accepted step up to its end at time `reached`, or to its first event.
+    /// Processes an accepted step up to its end at time `reached`, or to its first event.
     fn accept(&mut self, reached: f64) -> Result<(), Stop> {
         self.points.begin();
         self.followed = None;
@@ -564,13 +568,13 @@ impl Adaptive {
             from = crossing.far;
         }
         if !met {
-            // Passes to the end.
+            // Moves the search to the end of the step.
             let crossing = self.surfaces.first(&mut self.system, &self.step, 0.0);
             debug_assert!(crossing.is_none());
         }
         self.fresh = false;
-        // Aims that came to nothing are forgotten when a whole step meets nothing: at rest the last bits of a speed pass
-        // zero at every step.
+        // The counters of unsuccessful aims are reduced when a whole step meets nothing: at rest the last bits of a
+        // speed cross zero at every step.
         if from == 0.0 && self.usual.is_none() {
             self.aimed.iter_mut().for_each(|aimed| *aimed = aimed.saturating_sub(1));
         }
@@ -578,8 +582,8 @@ impl Adaptive {
         if self.inside { Ok(()) } else { self.guard() }
     }
 
-    /// Shows the course of the step up to θ, whose point is said to be at `time`, with both sides of each surface at which
-    /// observed quantities change.
+    /// Shows the step up to θ, whose point has the time `time`, with both sides of each surface at which observed
+    /// quantities change.
     fn show(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
         if self.observed.any() && self.points.are_shown() {
             if self.followed.is_none() {
@@ -588,7 +592,7 @@ impl Adaptive {
             let mut from = self.followed.unwrap_or(0.0);
             while let Some(crossing) = self.observed.first(&mut self.system, &self.step, from) {
                 if crossing.far > theta {
-                    // Not reached, or looked for again from here on.
+                    // Not reached yet, or searched again from here on.
                     break;
                 }
                 let far = self.step.time(crossing.far);
@@ -602,29 +606,29 @@ impl Adaptive {
         self.points.until(&mut self.system, &self.step, theta, time)
     }
 
-    /// The scale of a state grows with what it reaches.
+    /// Enlarges the scale of a state to its largest magnitude.
     fn reach(&mut self) {
         for (scale, x) in self.scales.iter_mut().zip(&self.x) {
             *scale = if *scale < x.abs() { x.abs() } else { *scale };
         }
     }
 
-    /// Follows an accepted step that meets nothing.
+    /// Processes an accepted step that meets nothing.
     fn accept_calm(&mut self, reached: f64) -> Result<(), Stop> {
         let fused = self.fused.as_ref().expect("it made the step");
         self.surfaces.go_on(fused.surfaces(&self.system)[1]);
         self.go_to_end(reached)
     }
 
-    /// Shows a step up to its end at time `reached`, from where the next one starts.
+    /// Shows a step up to its end at time `reached`, where the next one starts.
     fn go_to_end(&mut self, reached: f64) -> Result<(), Stop> {
         if self.creep.is_infinite() {
-            // The condition that a step was aimed at has moved on.
+            // The condition at which the step was aimed was not crossed.
             self.h = self.h.max(self.usual.take().unwrap_or(0.0));
         }
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
-        // Whatever lets go before that instant is found by halving.
+        // A release before that instant has been located by bisection.
         if self.suspect - reached <= 256.0 * f64::EPSILON * reached {
             self.suspect = f64::INFINITY;
         }
@@ -646,8 +650,8 @@ impl Adaptive {
         Ok(())
     }
 
-    /// Does what a crossing asks for. Returns whether the step ends there: where states or regimes change, and where
-    /// derivatives jump.
+    /// Performs the action of a crossing. Returns whether the step ends there: where states or regimes change, and
+    /// where derivatives jump.
     fn acts(&mut self, crossing: Crossing, jumps: bool) -> Result<bool, Stop> {
         let time = self.step.time(crossing.far);
         self.show(crossing.near, time)?;
@@ -682,7 +686,8 @@ impl Adaptive {
         Ok(true)
     }
 
-    /// Keeps what is delayed along the step, from where it was kept last to θ, whose point is said to be at `time`.
+    /// Stores the history of delayed quantities along the step, from where it was stored last up to θ, whose point has
+    /// the time `time`.
     fn keep(&mut self, theta: f64, time: f64) -> Result<(), Stop> {
         if self.system.history.is_empty() || theta <= self.kept {
             return Ok(());
@@ -690,7 +695,7 @@ impl Adaptive {
         let from = std::mem::replace(&mut self.kept, theta);
         let at = |run: &mut Self, theta: f64| {
             run.step.at(theta, &mut run.beside);
-            // What jumps at the end has not jumped before it.
+            // A jump at the end has not happened before it.
             run.system.place(run.step.time(theta).min(run.step.end), &run.beside);
             let status = run.system.instance.call(Function::Outputs);
             check_status(&run.system.instance, status)
@@ -708,7 +713,7 @@ impl Adaptive {
         Ok(())
     }
 
-    /// Keeps what is delayed as it is behind an event or tick; what jumps is met again when it is seen again.
+    /// Stores the values of delayed quantities after an event or tick; a jump is met again one delay later.
     fn keep_here(&mut self) -> Result<(), Stop> {
         if self.system.history.is_empty() {
             return Ok(());
@@ -724,7 +729,7 @@ impl Adaptive {
         Ok(())
     }
 
-    /// Lets transitions happen until none does, at most as often as there are regimes. Returns whether any did.
+    /// Executes transitions until none fires, at most as often as there are regimes. Returns whether any fired.
     fn settle(&mut self) -> Result<bool, Stop> {
         if !self.system.instance.has(Function::Transitions) {
             return Ok(false);
@@ -747,7 +752,7 @@ impl Adaptive {
         Err(self.chatter(0, 0.0))
     }
 
-    /// At a stop: the blocks that are due, what follows from them, and from corners of signals.
+    /// At a stop: executes the sampled blocks that are due, and restarts after them and after corners of signals.
     fn arrive(&mut self) -> Result<(), Stop> {
         let description = self.system.instance.description().clone();
         let mut due = false;
@@ -778,7 +783,7 @@ impl Adaptive {
         Ok(())
     }
 
-    /// Forgets what belongs to the course before an event.
+    /// Discards everything that refers to the solution before an event.
     fn restart(&mut self) {
         self.moved = true;
         self.surfaces.restart(&mut self.system, self.t, &self.x);
@@ -790,8 +795,8 @@ impl Adaptive {
         self.fresh = true;
     }
 
-    /// A length over which no state changes by more than a hundredth of |x| + s, or by as much as its rate makes of it in a
-    /// hundred-thousandth of the run: one that begins at 0 has no scale yet.
+    /// A length over which no state changes by more than a hundredth of |x| + s plus the change that its rate makes in
+    /// a hundred-thousandth of the run: a state that begins at 0 has no scale yet.
     fn first_step(&mut self) -> f64 {
         self.system.slope(self.t, &self.x, &mut self.step.f0);
         self.slope_known = true;
@@ -804,7 +809,7 @@ impl Adaptive {
         if fastest > 0.0 { self.longest.min(0.01 / fastest) } else { self.longest }
     }
 
-    /// Whether a quantity has left its range.
+    /// Checks that no quantity has left its range.
     fn guard(&mut self) -> Result<(), Stop> {
         if self.system.instance.description().guards.is_empty() {
             return Ok(());
@@ -822,7 +827,7 @@ impl Adaptive {
         check_status(&self.system.instance, left.map_or(0, |guard| guard as u64 + 1))
     }
 
-    /// Steps tried so far.
+    /// Number of step attempts so far.
     fn attempts(&self) -> u64 {
         self.work.steps + self.work.rejected
     }
@@ -844,7 +849,7 @@ impl Adaptive {
         named.map_or_else(|| "t".into(), |quantity| quantity.path.clone())
     }
 
-    /// Why steps became too short: something is not finite, or something jumps where no surface says so.
+    /// Why steps became too short: a value is not finite, or something jumps without a switching surface.
     fn too_short(&self, h: f64) -> Stop {
         let bad = self.step.f0.iter().chain(&self.step.x1).position(|value| !value.is_finite());
         match bad {
@@ -856,13 +861,13 @@ impl Adaptive {
                 let value = if self.step.f0[i].is_finite() { self.step.x1[i] } else { self.step.f0[i] };
                 self.stop(Cause::NotFinite { path, value })
             }
-            // At a surface that is met again within the shortest step, the model turns faster than time can tell.
+            // At a surface that is met again within the shortest step, the model switches faster than time can resolve.
             None if self.overran => self.chatter(1, h),
             None => self.stop(Cause::StepTooShort { step: h, path: self.worst() }),
         }
     }
 
-    /// Counts surfaces that were met; anew where the model has moved since.
+    /// Counts surfaces met; restarts the count if the model has moved since.
     fn meet(&mut self, times: usize) {
         self.crossings += times;
         let far = 3.0 * self.tol.min(1e-6).sqrt();
@@ -874,7 +879,7 @@ impl Adaptive {
         }
     }
 
-    /// Why the run makes no way: a surface that was met just now turns all steps that are longer.
+    /// Why the run makes no progress: a surface met recently rejects all longer steps.
     fn in_place(&mut self, before: u64) -> Stop {
         let recent = self.t - 1e-3 * self.duration;
         self.events.retain(|(time, _)| *time >= recent);
@@ -892,7 +897,7 @@ impl Adaptive {
             if automaton.path.is_empty() { name.clone() } else { format!("{}.{name}", automaton.path) }
         };
         let mut crossed: Vec<usize> = self.events.iter().filter_map(|(_, surface)| *surface).collect();
-        // Of many, those that turn all the time; the others were passed once.
+        // If there are many, report the ones that switch all the time; the others were crossed once.
         let often = self.surfaces.often();
         if times == MOST_EVENTS || times == 0 {
             crossed.extend(self.surfaces.changed())
@@ -917,7 +922,7 @@ impl Stepper for Adaptive {
     }
 
     fn next(&mut self, watch: &mut dyn FnMut(f64) -> Continue) -> Result<Option<u64>, Stop> {
-        // The end is a goal like any other: what is due there is done.
+        // The end is a goal like any other: actions due there are executed.
         while self.goal.is_some() || self.t < self.duration {
             let (stop, before) = self.goal.unwrap_or_else(|| (self.next_stop(), self.attempts()));
             self.goal = Some((stop, before));
@@ -937,7 +942,7 @@ impl Stepper for Adaptive {
         Ok(None)
     }
 
-    /// Takes over the steps that the function has settled, and settles the one that it left, if any.
+    /// Accepts the steps that the function has completed, and evaluates the one that it left open, if any.
     fn take(&mut self, _: u64, status: u64) -> Result<(), Stop> {
         self.moved = false;
         let (stop, _) = self.goal.expect("there was one when it was prepared");

@@ -1,8 +1,8 @@
-//! The explicit method for what is not stiff: Dormand & Prince 5(4), seven stages, the last of which is the first of
-//! the next step.
+//! The explicit method for non-stiff models: Dormand & Prince 5(4), seven stages, with the last one reused as the first
+//! of the next step (FSAL).
 //!
-//! Source: Dormand & Prince, J. Comput. Appl. Math. 6 (1980); continuous extension of order four: Hairer,
-//! Nørsett & Wanner, Solving ODEs I, sec. II.6.
+//! Source: Dormand & Prince, J. Comput. Appl. Math. 6 (1980); continuous extension of order four: Hairer, Nørsett &
+//! Wanner, Solving ODEs I, sec. II.6.
 
 use super::step::{Step, System};
 
@@ -20,11 +20,11 @@ const A: [[f64; 6]; 7] = [
     [35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
 ];
 
-/// Fifth minus fourth order.
+/// Weights of the error estimate: fifth minus fourth order.
 const E: [f64; 7] =
     [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0];
 
-/// Of the continuous extension.
+/// Weights of the continuous extension.
 const D: [f64; 7] = [
     -12715105075.0 / 11282082432.0,
     0.0,
@@ -35,9 +35,9 @@ const D: [f64; 7] = [
     69997945.0 / 29380423.0,
 ];
 
-/// Room for the stages.
+/// Buffers for the stages.
 pub(crate) struct Explicit {
-    /// Slopes of the stages, one behind the other.
+    /// Slopes of the stages, one after the other.
     k: Vec<f64>,
     /// States at the last stage.
     x: Vec<f64>,
@@ -48,7 +48,7 @@ impl Explicit {
         Explicit { k: vec![0.0; 7 * n], x: vec![0.0; n] }
     }
 
-    /// Fills in the step from its `t`, `h`, `end`, `x0` and `f0`.
+    /// Computes the step from its `t`, `h`, `end`, `x0` and `f0`.
     pub(crate) fn attempt(&mut self, system: &mut System, step: &mut Step) {
         let (n, h) = (system.n, step.h);
         self.k[..n].copy_from_slice(&step.f0);

@@ -1,8 +1,9 @@
-//! Stiff steps by one function of the model: the same method as [`rosenbrock`](super::rosenbrock), unrolled around it.
+//! Stiff steps as one compiled function of the model: the same method as [`rosenbrock`](super::rosenbrock), unrolled
+//! around the model's equations.
 //!
-//! In: a model that has it, and how the run stands. Out: steps that it has settled by itself, and one that somebody has to
-//! look at: a [`Step`], its error, and surfaces on its way. The end of an accepted step stays in the block as the start of
-//! the next.
+//! In: a model with this function, and the state of the run. Out: steps that the function has completed by itself, and
+//! one that needs attention: a [`Step`], its error, and surfaces that it meets. The end of an accepted step stays in
+//! the block as the start of the next.
 
 use super::step::{Step, System, copy};
 use abi::description::Segment;
@@ -12,7 +13,7 @@ use std::ops::Range;
 
 pub(crate) struct Fused {
     pub(crate) trial: Trial,
-    /// Parts of the block that are read, those that are left by steps that were settled, and all that is written.
+    /// Ranges of the block that the function reads, those that completed steps write, and all that it writes.
     read: [Range<usize>; 2],
     settled: [Range<usize>; 2],
     written: Range<usize>,
@@ -20,34 +21,34 @@ pub(crate) struct Fused {
     pub(crate) ready: bool,
 }
 
-/// How far a run is, and how its next step is chosen.
+/// The progress of a run, and the data for the choice of its next step.
 #[derive(Clone, Copy)]
 pub(crate) struct Pace {
     pub(crate) t: f64,
-    /// Length wanted for the next step, in s.
+    /// Requested length of the next step, in s.
     pub(crate) next: f64,
     /// Length of the last accepted step, and the fifth root of its error; none after a restart.
     pub(crate) last: Option<(f64, f64)>,
-    /// Trials refused since the last accepted one.
+    /// Attempts rejected since the last accepted one.
     pub(crate) rejected: u64,
     /// Steps accepted so far.
     pub(crate) accepted: u64,
 }
 
-/// How far a step is off, as parts of what is allowed.
+/// Errors of a step, relative to the allowed ones.
 pub(crate) struct Judged {
-    /// By its estimated error. Not a number where the step is not.
+    /// The estimated error. NaN if the step is not finite.
     pub(crate) error: f64,
-    /// By how it fails the equations at its end.
+    /// The residual of the equations at its end.
     pub(crate) defect: f64,
     /// Whether it crosses a surface or comes close to one.
     pub(crate) met: bool,
-    /// Whether a quantity has left its range where it ends.
+    /// Whether a quantity is out of range at its end.
     pub(crate) outside: bool,
 }
 
 impl Fused {
-    /// None of a model without that function. `fine`: for each guard the least and the greatest value.
+    /// None for a model without that function. `fine`: for each guard the least and the greatest value.
     pub(crate) fn new(instance: &mut Instance, tol: f64, fine: &[(f64, f64)]) -> Option<Fused> {
         let trial = Trial::of(&instance.description().layout).filter(|_| instance.has(Function::Rosenbrock))?;
         instance.set(trial.tol(), tol);
@@ -56,7 +57,7 @@ impl Fused {
             (block[low], block[high]) = (*least, *greatest);
         }
         let (from, last) = (trial.from().whole().range(), trial.defect().index() + 1);
-        // With the scales, which grow with the states.
+        // Includes the scales, which grow with the states.
         let single = trial.single().range().start..trial.scales().range().end;
         Some(Fused {
             trial,
@@ -67,12 +68,12 @@ impl Fused {
         })
     }
 
-    /// Parts of the block that whoever prepares a trial may have changed.
+    /// Ranges of the block that the preparation of an attempt may have changed.
     pub(crate) fn given(&self) -> &[Range<usize>] {
         &self.read
     }
 
-    /// Brings what is to be looked at after trials with this status from where they were made.
+    /// Copies the results of attempts with this status from the block on which they were made.
     pub(crate) fn fetch(&self, status: u64, block: &mut [f64], from: &dyn Fn(Range<usize>, &mut [f64])) {
         match status {
             0 => self.settled.iter().for_each(|range| from(range.clone(), block)),
@@ -90,8 +91,8 @@ impl Fused {
         self.ready = true;
     }
 
-    /// How the run stands and where it goes: to `stop`, by no longer steps than `longest`; those that reach `watched` are
-    /// left to be looked at, and all that somebody attends. `scales`: what the size of each state is measured with, SI.
+    /// Writes the progress of the run and its limits: it goes to `stop`, in steps no longer than `longest`. Steps that
+    /// reach `watched`, and all steps if `attend`, are left open for attention. `scales`: the scale of each state, SI.
     pub(crate) fn prepare(
         &self,
         system: &mut System,
@@ -122,7 +123,7 @@ impl Fused {
         copy(scales, &mut system.instance.block_mut()[trial.scales().range()]);
     }
 
-    /// On which side of each surface the model is, and the values at the start.
+    /// Writes the side of each surface and the values at the start.
     pub(crate) fn prepare_surfaces(&self, system: &mut System, sides: &[f64], here: &[f64]) {
         let block = system.instance.block_mut();
         for (segment, values) in [(self.trial.sides(), sides), (self.trial.here(), here)] {
@@ -130,7 +131,8 @@ impl Fused {
         }
     }
 
-    /// How the run stands after the trials, how many were refused, and how many of these ended behind a surface.
+    /// The progress of the run after the attempts, how many were rejected, and how many of these ended beyond a
+    /// surface.
     pub(crate) fn settled(&self, system: &System) -> (Pace, u64, u64) {
         let (trial, get) = (self.trial, |slot| system.instance.get(slot));
         let last_step = get(trial.last_step());
@@ -144,7 +146,7 @@ impl Fused {
         (pace, get(trial.refused()) as u64, get(trial.overruns()) as u64)
     }
 
-    /// What the size of each state is measured with after the trials, SI.
+    /// The scale of each state after the attempts, SI.
     pub(crate) fn scales<'a>(&self, system: &'a System) -> &'a [f64] {
         &system.instance.block()[self.trial.scales().range()]
     }
@@ -160,8 +162,7 @@ impl Fused {
         &system.instance.block()[self.trial.here().range()]
     }
 
-    /// Fills in the step that was left to be looked at from its length on, and the slope at its end. None where a pivot was
-    /// too small.
+    /// Reads the step that was left open, from its length on, and the slope at its end. None if a pivot was too small.
     pub(crate) fn left(&self, system: &System, step: &mut Step, end_slope: &mut [f64], status: u64) -> Option<Judged> {
         let (trial, block) = (self.trial, system.instance.block());
         (step.h, step.end) = (block[trial.step().index()], block[trial.end().index()]);
@@ -185,7 +186,7 @@ impl Fused {
         })
     }
 
-    /// The end becomes the start.
+    /// Makes the end the start of the next step.
     pub(crate) fn go_on(&mut self, system: &mut System) {
         let (from, to) = (self.trial.from().whole(), self.trial.to().whole());
         system.instance.block_mut().copy_within(to.range(), from.start as usize);

@@ -1,16 +1,16 @@
-//! The past of what is delayed, in an adaptive run: samples at the ends of steps and on both sides of events, with straight
-//! lines between them; before the start, the first.
+//! The history of delayed quantities in an adaptive run: samples at the ends of steps and on both sides of events,
+//! interpolated linearly; constant before the start.
 //!
-//! In: x at increasing instants. Out: x(t − T), and its slope, in the slots that functions of the model read.
+//! In: x at increasing instants. Out: x(t − T) and its slope, in the slots that functions of the model read.
 
 use abi::description::Delay;
 use abi::{Instance, Slot};
 use std::collections::VecDeque;
 
-/// Straight lines along a step at most.
+/// Most linear pieces along a step.
 const MOST_PIECES: f64 = 512.0;
 
-/// The first instant that looks back at `t` or behind it, `time` seconds later.
+/// The first instant whose delayed time is `t` or later, with a delay of `time` seconds.
 fn echo(t: f64, time: f64) -> f64 {
     let mut echo = t + time;
     while echo - time < t {
@@ -19,7 +19,7 @@ fn echo(t: f64, time: f64) -> f64 {
     echo
 }
 
-/// The past of one delay.
+/// The history of one delay.
 struct Line {
     delay: Delay,
     /// T in s.
@@ -28,13 +28,13 @@ struct Line {
     samples: VecDeque<(f64, f64)>,
 }
 
-/// The past of every delay of a model.
+/// The history of every delay of a model.
 pub(crate) struct History {
     lines: Vec<Line>,
 }
 
 impl History {
-    /// Of an instance that stands at its start, with its outputs in place.
+    /// The history of an instance at its start, with its outputs computed.
     pub(crate) fn new(instance: &Instance) -> History {
         let line = |delay: &Delay| Line {
             time: instance.get(delay.time),
@@ -44,7 +44,8 @@ impl History {
         History { lines: instance.description().delays.iter().map(line).collect() }
     }
 
-    /// The instants at which the start is seen again, s, ascending: the past before it is constant, so what is delayed bends there.
+    /// The instants in s, ascending, at which the start is seen again: the history before it is constant, so the
+    /// delayed quantity has a kink there.
     pub(crate) fn echoes_of_start(&self) -> Vec<f64> {
         let seen = self.lines.iter().filter(|line| line.time > 0.0).map(|line| echo(0.0, line.time));
         let mut seen: Vec<f64> = seen.collect();
@@ -56,19 +57,19 @@ impl History {
         self.lines.is_empty()
     }
 
-    /// The longest step that looks at nothing that is not known yet.
+    /// The longest step that needs no value that is still unknown.
     pub(crate) fn longest(&self) -> f64 {
         let least = |line: &Line| if line.delay.weight.is_none() { line.time } else { f64::INFINITY };
         self.lines.iter().map(least).fold(f64::INFINITY, f64::min)
     }
 
-    /// What is delayed, as it is in the block.
+    /// The present values of the delayed quantities in the block.
     pub(crate) fn present(&self, instance: &Instance) -> Vec<f64> {
         self.lines.iter().map(|line| instance.get(line.delay.source)).collect()
     }
 
-    /// How many straight lines from the newest sample to what is in the block miss the course, which was at `middle`
-    /// halfway, by no more than the part `tol` of its size.
+    /// The number of linear pieces from the newest sample to the values in the block so that the interpolation error is
+    /// at most the fraction `tol` of their size; `middle`: the values halfway.
     pub(crate) fn pieces(&self, middle: &[f64], instance: &Instance, tol: f64) -> u32 {
         let needed = |(line, middle): (&Line, &f64)| {
             let (start, end) = (line.samples.back().expect("the start is a sample").1, instance.get(line.delay.source));
@@ -79,8 +80,8 @@ impl History {
         self.lines.iter().zip(middle).map(needed).fold(1.0, f64::max).min(MOST_PIECES).ceil() as u32
     }
 
-    /// Takes the present outputs as samples at `t`; forgets what nobody will ask for. Returns the instants at which what
-    /// jumps now is seen again.
+    /// Stores the present outputs as samples at `t`; discards samples that are no longer needed. Returns the instants
+    /// at which a present jump is seen again.
     pub(crate) fn push(&mut self, t: f64, instance: &Instance) -> Vec<f64> {
         let mut echoes = Vec::new();
         for line in &mut self.lines {
@@ -99,7 +100,7 @@ impl History {
         echoes
     }
 
-    /// Puts what was before in place at `t`.
+    /// Writes the delayed values for time `t` into the block.
     #[inline]
     pub(crate) fn place(&self, t: f64, block: &mut [f64]) {
         for line in &self.lines {
@@ -113,7 +114,7 @@ impl History {
                 }
                 // Before the start.
                 (None, first) => (first.expect("the start is a sample").1, 0.0, 0.0),
-                // Behind the newest: on the way to x at this instant.
+                // After the newest sample: interpolate towards x at this instant.
                 (Some(_), None) if t > newest.0 => (newest.1, 0.0, (asked - newest.0) / (t - newest.0)),
                 (Some(_), None) => (newest.1, 0.0, 0.0),
             };

@@ -1,25 +1,27 @@
-//! What a run asks of the Jacobian of its model, as it lies in the block: all entries, or those that are not always zero.
+//! Spectral estimates from the Jacobian of a model as it is stored in the block: dense, or only the structurally
+//! nonzero entries.
 
 use super::linear;
 
-/// Most states of which a matrix is squared to know its size; of more, a vector is multiplied with it.
+/// Largest number of states for which the matrix is squared to estimate its spectral radius; above, power iteration on
+/// a vector is used.
 const MOST_SQUARED: usize = 64;
 
-/// So often, before it counts and while it does.
+/// Number of power iterations: before the norm is counted, and while it is.
 const MULTIPLIED: (usize, usize) = (8, 16);
 
-/// Where the entries of a Jacobian lie.
+/// Positions of the entries of a Jacobian.
 pub(crate) struct Entries {
     n: usize,
-    /// (row, column) of each; none where all n × n lie there.
+    /// (row, column) of each; empty if all n × n are stored.
     coupled: Vec<(u32, u32)>,
-    /// For each of those in the lower triangle, its place and that of its mirror image.
+    /// For each entry in the lower triangle, its index and that of its transposed entry.
     pairs: Vec<(u32, u32)>,
     room: Vec<f64>,
 }
 
 impl Entries {
-    /// Of n states; `coupled`: (row, column) of each entry by rows, or nothing for all.
+    /// For n states; `coupled`: (row, column) of each entry by rows, or empty for all.
     pub(crate) fn new(n: usize, coupled: &[(u32, u32)]) -> Entries {
         let mirror = |(k, &(row, column)): (usize, &(u32, u32))| {
             let mirror = coupled.binary_search(&(column, row)).ok().filter(|_| column <= row)?;
@@ -36,13 +38,13 @@ impl Entries {
         if self.coupled.is_empty() { self.n * self.n } else { self.coupled.len() }
     }
 
-    /// (row, column) of each entry, if these are not all.
+    /// (row, column) of each entry, if not all are stored.
     pub(crate) fn coupled(&self) -> Option<&[(u32, u32)]> {
         (!self.coupled.is_empty()).then_some(&self.coupled)
     }
 
-    /// The largest square of a frequency that two states have between them, or one of itself, at least `least`: exact
-    /// for a mass on a spring, and for what decays.
+    /// The largest squared frequency of a pair of states, or of a single state, at least `least`: exact for a mass on a
+    /// spring, and for a decay.
     pub(crate) fn fastest(&self, jacobian: &[f64], least: f64) -> f64 {
         let mut fastest = least;
         if self.coupled.is_empty() {
@@ -68,7 +70,7 @@ impl Entries {
         diagonal.map(|(_, entry)| entry).sum()
     }
 
-    /// The sum of the squares of the eigenvalues; 0 where that is not cheap to know.
+    /// The sum of the squared eigenvalues; 0 where it would be expensive.
     pub(crate) fn trace_of_square(&self, jacobian: &[f64]) -> f64 {
         let n = self.n;
         if !self.coupled.is_empty() || n > MOST_SQUARED {
@@ -78,8 +80,8 @@ impl Entries {
         (0..n).flat_map(|row| (0..n).map(move |column| (row, column))).map(|(row, column)| product(row, column)).sum()
     }
 
-    /// Largest magnitude of an eigenvalue, to within a factor of about two; `scales`: one for each state, in which the
-    /// Jacobian is measured so that it is as normal as it can be.
+    /// Largest magnitude of an eigenvalue, to within a factor of about two; `scales`: one for each state, by which the
+    /// Jacobian is scaled to make it as close to normal as possible.
     pub(crate) fn spectral_radius(&mut self, jacobian: &[f64], scales: &[f64]) -> f64 {
         let n = self.n;
         if self.coupled.is_empty() && n <= MOST_SQUARED {
@@ -91,7 +93,7 @@ impl Entries {
             }
             return linear::spectral_radius(n, matrix, room);
         }
-        // Of a vector without a plan every eigenvector has a share.
+        // A pseudorandom vector has a component along every eigenvector.
         let (x, y) = self.room.split_at_mut(n);
         let mut chance = 0x9e37_79b9_7f4a_7c15_u64;
         for x in x.iter_mut() {
@@ -134,7 +136,7 @@ impl Entries {
 mod tests {
     use super::*;
 
-    /// 100 masses on springs, at ±316 i, and 100 states that decay at 20 1/s: of all entries, or of those that are there.
+    /// 100 masses on springs, at ±316 i, and 100 states that decay at 20 1/s: dense, or with nonzero entries only.
     #[test]
     fn of_few_entries_the_same_is_known_as_of_all() {
         let n = 300;

@@ -1,9 +1,9 @@
-//! Small dense systems of linear equations.
+//! Small dense linear systems: LU factors with partial pivoting.
 //!
-//! Matrices are row-major n × n slices. `N` is n where it is known at compile time, so that loops unroll, and 0 where
-//! it is not. One routine for all sizes: the same operations in the same order, so the same bits.
+//! Matrices are row-major n × n slices. `N` is n where it is known at compile time, so that loops unroll, and 0
+//! otherwise. One routine serves all sizes: the same operations in the same order, so the same bits.
 
-/// Replaces `a` by its factors L and U with row exchanges, largest pivot first; the diagonal of U is stored inverted.
+/// Replaces `a` by its factors L and U with partial pivoting by row exchanges; the diagonal of U is stored inverted.
 ///
 /// `rows[k]`: the row exchanged with row k. Returns whether every pivot is a number other than 0.
 pub(crate) fn factor<const N: usize>(n: usize, a: &mut [f64], rows: &mut [usize]) -> bool {
@@ -38,7 +38,7 @@ pub(crate) fn factor<const N: usize>(n: usize, a: &mut [f64], rows: &mut [usize]
     true
 }
 
-/// Replaces the right side `b` by the solution, given what [`factor`] made.
+/// Replaces the right-hand side `b` by the solution, given the factors from [`factor`].
 pub(crate) fn solve<const N: usize>(n: usize, a: &[f64], rows: &[usize], b: &mut [f64]) {
     let n = if N == 0 { n } else { N };
     let (a, rows, b) = (&a[..n * n], &rows[..n], &mut b[..n]);
@@ -63,7 +63,7 @@ pub(crate) fn solve<const N: usize>(n: usize, a: &[f64], rows: &[usize], b: &mut
 
 /// Largest magnitude of an eigenvalue of `a`, to within a factor of about two: |a¹⁶|^(1/16), by squaring four times.
 ///
-/// `a` is used up; `room` is as long.
+/// Overwrites `a`; `room` is a buffer of the same length.
 pub(crate) fn spectral_radius(n: usize, a: &mut [f64], room: &mut [f64]) -> f64 {
     let mut scale = 1.0;
     let mut root = 1.0;
@@ -99,7 +99,7 @@ fn exact_root(mut value: f64, mut root: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Numbers in −1..1 from a seed, by a linear congruence.
+    /// Numbers in −1..1 from a seed, by a linear congruential generator.
     fn numbers(seed: u64, count: usize) -> Vec<f64> {
         let mut state = seed;
         let mut next = || {
@@ -145,7 +145,7 @@ mod tests {
         };
         assert_eq!(radius(&[-3.0]), 3.0);
         assert!((0.5..2.0).contains(&radius(&[0.0, 1.0, -1.0, 0.0])));
-        // A bristle and a mass: ±316 i, though the matrix holds 1e5.
+        // A bristle and a mass: eigenvalues ±316 i, although the matrix contains 1e5.
         assert!((158.0..632.0).contains(&radius(&[0.0, -1e5, 1.0, 0.0])));
         assert_eq!(radius(&[0.0, 0.0, 0.0, 0.0]), 0.0);
         assert_eq!(radius(&[0.0, 1.0, 0.0, 0.0]), 0.0);

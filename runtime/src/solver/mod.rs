@@ -1,10 +1,10 @@
 //! Adaptive runs: a stiff and an explicit method of order five, dense output, events, ticks.
 //!
-//! In: a model that offers derivatives, and if it can its Jacobian, switching surfaces, transitions and sampled
-//! blocks. Out: its points, shown to an observer. [`linear`] solves small systems, [`sparse`] large ones, [`jacobian`] says
-//! how fast a model is, [`rosenbrock`], [`fused`] and [`explicit`] make one [`Step`](step::Step) each, [`history`] keeps what is delayed, [`surfaces`] finds where one
-//! crosses a switching surface,
-//! [`points`] shows it, and [`adaptive`] chooses and joins steps.
+//! In: a model with derivatives and, where it has them, its Jacobian, switching surfaces, transitions and sampled
+//! blocks. Out: its points, passed to an observer. [`linear`] solves small linear systems and [`sparse`] large ones;
+//! [`jacobian`] estimates eigenvalues; [`rosenbrock`], [`fused`] and [`explicit`] compute one [`Step`](step::Step)
+//! each; [`history`] stores delayed quantities; [`surfaces`] locates crossings of switching surfaces; [`points`]
+//! selects the points to show; and [`adaptive`] drives the run.
 
 pub(crate) mod linear;
 pub(crate) mod sparse;

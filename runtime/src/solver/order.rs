@@ -2,8 +2,8 @@
 //!
 //! A Rosenbrock method x1 = x0 + Σ b_i k_i, k_i = h f(x0 + Σ α_ij k_j) + h J Σ γ_ij k_j has order p if for each rooted
 //! tree of up to p vertices Σ b_i Φ_i = 1/γ(tree), where a vertex passes its only child through β = α + γ, and several
-//! children through α. Source: Hairer & Wanner, Solving ODEs II, sec. IV.7, theorem 7.4; Runge-Kutta methods
-//! are the case γ = 0.
+//! children through α. Source: Hairer & Wanner, Solving ODEs II, sec. IV.7, theorem 7.4; Runge-Kutta methods are the
+//! case γ = 0.
 
 /// A rooted tree: the subtrees at its root.
 #[derive(Clone, PartialEq, PartialOrd, Debug)]
@@ -51,7 +51,7 @@ pub fn trees(size: usize) -> Vec<Tree> {
     forests(size - 1, &smaller).into_iter().map(Tree).collect()
 }
 
-/// Largest violation of the conditions of order `size` by weights `b`, at the part `theta` of the step.
+/// Largest violation of the conditions of order `size` by weights `b`, at the fraction `theta` of the step.
 pub fn violation(size: usize, theta: f64, b: &[f64], alpha: &[Vec<f64>], beta: &[Vec<f64>]) -> f64 {
     let worst = |tree: &Tree| {
         let sum: f64 = b.iter().enumerate().map(|(i, b)| b * tree.weight(i, alpha, beta)).sum();

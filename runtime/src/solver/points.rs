@@ -1,9 +1,9 @@
-//! Which points of an adaptive run are shown: the ends of its steps, both sides of events, the edges of windows, and as many
-//! between as make straight lines do; and wherever a quantity turns, so that no extreme is missed. Areas are taken from the
-//! polynomials between them.
+//! Selects the points of an adaptive run to show: the ends of its steps, both sides of events, the edges of windows,
+//! and as many points in between as linear interpolation needs; also each turning point of a quantity, so that no
+//! extreme is missed. Integrals between points are taken from the dense output.
 //!
-//! In: accepted steps in order. Out: points and areas, to an [`Observer`]. Evaluates outputs only if somebody looks, and
-//! changes no step.
+//! In: accepted steps in order. Out: points and integrals, passed to an [`Observer`]. Evaluates outputs only if they
+//! are observed, and never changes a step.
 
 use super::step::{Step, System};
 use crate::run::measure::{Demand, Wants};
@@ -12,37 +12,37 @@ use crate::run::outcome::Stop;
 use abi::plan::Experiment;
 use abi::{Function, Instance};
 
-/// A run is shown by no fewer points than this, if it is shown at all. A prime, so that it falls in with no period.
+/// Least number of points, if the run is shown at all. A prime, so that it does not alias with a period.
 const LEAST_POINTS: f64 = 1009.0;
 
-/// An interval between two shown points is halved at most so often.
+/// Most bisections of an interval between two shown points.
 const DEPTH: usize = 8;
 
-/// A part of a step over which an area is taken is halved at most so often.
+/// Most bisections of an interval over which an integral is taken.
 const MOST_HALVED: usize = 8;
 
-/// Part of the tolerance that an area may be off by.
+/// Allowed error of an integral, as a fraction of the tolerance.
 const OF_TOLERANCE: f64 = 0.01;
 
-/// Nodes of a Lobatto rule of four points and of its extension to seven by Kronrod, from −1 to 1; and their weights. Exact up
-/// to degree five and nine: the square of a state between the ends of a step has degree eight.
-/// Source: Gander & Gautschi, Adaptive Quadrature – Revisited, BIT 40 (2000).
+/// Nodes of the Lobatto rule with four points and of its Kronrod extension with seven, from −1 to 1; and their weights.
+/// Exact up to degree five and nine: the square of a state between the ends of a step has degree eight. Source: Gander
+/// & Gautschi, Adaptive Quadrature – Revisited, BIT 40 (2000).
 const NODES: [f64; 7] =
     [-1.0, -0.816_496_580_927_726, -0.447_213_595_499_957_9, 0.0, 0.447_213_595_499_957_9, 0.816_496_580_927_726, 1.0];
 const FINE: [f64; 7] =
     [77.0 / 1470.0, 432.0 / 1470.0, 625.0 / 1470.0, 672.0 / 1470.0, 625.0 / 1470.0, 432.0 / 1470.0, 77.0 / 1470.0];
 const ROUGH: [f64; 7] = [1.0 / 6.0, 0.0, 5.0 / 6.0, 0.0, 5.0 / 6.0, 0.0, 1.0 / 6.0];
 
-/// An area that a measure takes.
+/// An integral that a measure needs.
 struct Area {
     /// Number of the measure.
     measure: usize,
-    /// Where its quantity stands in a row.
+    /// The column of its quantity in a row.
     column: usize,
     square: bool,
-    /// Whether the part that is looked at lies in its window.
+    /// Whether the present interval lies in its window.
     inside: bool,
-    /// Area of the magnitude so far in this window, and over how many seconds.
+    /// Integral of the magnitude so far in this window, and its duration in s.
     magnitude: (f64, f64),
 }
 
@@ -56,31 +56,31 @@ impl Area {
 pub(crate) struct Points {
     observer: Observer,
     duration: f64,
-    /// Slots that somebody looks at.
+    /// Slots that are observed.
     slots: Vec<usize>,
-    /// Whether all that is looked at are states.
+    /// Whether all observed slots are states.
     only_states: bool,
     tol: f64,
-    /// Instants in s at which windows begin or end, ascending, and the next of them.
+    /// Instants in s at which windows begin or end, ascending, and the index of the next.
     edges: Vec<f64>,
     edge: usize,
     areas: Vec<Area>,
-    /// Columns of which the turns are wanted exactly.
+    /// Columns whose turning points are located exactly.
     turning: Vec<bool>,
-    /// Values at the seven nodes of an area, row by row.
+    /// Values at the seven nodes of an integral, row-major.
     nodes: Vec<f64>,
     /// θ of the last point shown, and of the ends of the part of the step that is being shown.
     theta: f64,
     part: (f64, f64),
-    /// Rows of values of the slots: the last one shown, then room for those between.
+    /// Rows of values of the slots: the last one shown, then buffers for those in between.
     rows: Vec<f64>,
     /// Least and greatest value of each slot.
     spans: Vec<(f64, f64)>,
-    /// A straight line between two points may miss the course by this part of the span.
+    /// Allowed error of linear interpolation between two points, as a fraction of the span.
     bend: f64,
-    /// θ at which quantities turn, between two points, and the column.
+    /// θ and column of each turning point between two points.
     turns: Vec<(f64, usize)>,
-    /// A block in which only time and the slots count.
+    /// A block in which only time and the observed slots are valid.
     block: Vec<f64>,
     x: Vec<f64>,
 }
@@ -121,8 +121,8 @@ impl Points {
             part: (0.0, 0.0),
             rows: vec![0.0; slots.len() * (DEPTH + 4)],
             spans: vec![(f64::INFINITY, f64::NEG_INFINITY); slots.len()],
-            // A plot needs no more than its pixels. Periods and the like take cubics through points, whose error is about the
-            // square of that of lines; areas and extremes find their own way.
+            // A plot needs no more resolution than its pixels. Periods and the like use cubics through points, whose
+            // error is about the square of that of lines; integrals and extremes have their own error control.
             bend: if lines { (1e-2 * tol.sqrt()).min(1e-5) } else { 1e-3 },
             turns: Vec::new(),
             block: instance.block().to_vec(),
@@ -132,9 +132,9 @@ impl Points {
         }
     }
 
-    /// Shows the present point as it is: at the start, behind an event.
+    /// Shows the present point as it is: at the start, or after an event.
     pub(crate) fn here(&mut self, system: &mut System, t: f64, x: &[f64]) -> Result<(), Stop> {
-        // Those at the start. An event comes behind those before it.
+        // Requested instants at the start. At an event, the values after it come after those before it.
         while self.observer.probe.next().is_some_and(|instant| instant <= t) {
             system.place(t, x);
             self.probe(system)?;
@@ -148,7 +148,7 @@ impl Points {
         Ok(())
     }
 
-    /// Who has seen the points.
+    /// Returns the observer.
     pub(crate) fn observer(self) -> Observer {
         self.observer
     }
@@ -158,17 +158,17 @@ impl Points {
         !self.slots.is_empty()
     }
 
-    /// The next instant at which somebody wants a value, in s; infinite if there is none.
+    /// The next instant at which a value is requested, in s; infinite if there is none.
     pub(crate) fn next_probe(&self) -> f64 {
         self.observer.probe.next().unwrap_or(f64::INFINITY)
     }
 
-    /// A new step begins where the last one was shown.
+    /// Begins a new step where the last one ended.
     pub(crate) fn begin(&mut self) {
         self.theta = 0.0;
     }
 
-    /// The outputs of the end are in the block; they are shown if nothing else was.
+    /// Ends the run, with the final outputs in the block; shows them if nothing else was shown.
     pub(crate) fn end(&mut self, system: &System) -> Result<(), Stop> {
         while self.observer.probe.next().is_some_and(|instant| instant <= self.duration) {
             self.observer.probe.take(system.instance.block());
@@ -176,7 +176,7 @@ impl Points {
         if self.observer.only_last() { self.observer.see(&system.instance) } else { Ok(()) }
     }
 
-    /// Shows the course of the step from where it was shown last to θ, whose point is said to be at `time`.
+    /// Shows the step from where it was shown last up to θ, whose point has the time `time`.
     pub(crate) fn until(&mut self, system: &mut System, step: &Step, theta: f64, time: f64) -> Result<(), Stop> {
         while let Some(instant) = self.observer.probe.next().filter(|instant| *instant <= time) {
             step.at(((instant - step.t) / step.h).clamp(0.0, theta), &mut self.x);
@@ -196,7 +196,7 @@ impl Points {
         self.span(system, step, theta, time)
     }
 
-    /// The same without an edge on the way.
+    /// The same for an interval without an edge inside.
     fn span(&mut self, system: &mut System, step: &Step, theta: f64, time: f64) -> Result<(), Stop> {
         let from = self.theta;
         self.part = (from, theta);
@@ -218,7 +218,7 @@ impl Points {
         Ok(())
     }
 
-    /// Takes the areas over a part of the step at whose inside no window begins or ends, by halves where that is not enough.
+    /// Takes the integrals over an interval of the step without an edge inside, with bisection where needed.
     fn area(&mut self, system: &mut System, step: &Step, (from, to): (f64, f64), halves: usize) -> Result<(), Stop> {
         let (middle, half) = (0.5 * (from + to), 0.5 * (to - from));
         let (now, length) = (step.t + middle * step.h, (to - from) * step.h);
@@ -232,7 +232,7 @@ impl Points {
         let width = self.slots.len();
         for (k, node) in NODES.into_iter().enumerate() {
             step.at((middle + half * node).clamp(from, to), &mut self.x);
-            // What jumps at the end has not jumped before it.
+            // A jump at the end has not happened before it.
             system.place(step.time(middle + half * node).min(step.end), &self.x);
             self.compute(system)?;
             let (row, block) = (&mut self.nodes[k * width..(k + 1) * width], system.instance.block());
@@ -248,7 +248,8 @@ impl Points {
             let usual = area.magnitude.0 * (length / area.magnitude.1.max(length));
             let off = (rule(area, &FINE, |x| x) - rule(area, &ROUGH, |x| x)).abs();
             let allowed = OF_TOLERANCE * self.tol * magnitude.max(usual);
-            // The rough rule is of order six, the fine one of order ten: a power of 5/3, of which 7/4 is the next with a root.
+            // The low-order rule has order six, the high-order one order ten: the error scales with the power 5/3. The
+            // next larger exponent that square roots can compute is 7/4.
             let part = off / magnitude.max(usual);
             let foreseen = if part < 1e-3 { 10.0 * off * (part * part.sqrt()).sqrt().min(1.0) } else { off };
             foreseen <= allowed || off <= 1e-15 * magnitude.max(usual) || !off.is_finite()
@@ -269,14 +270,14 @@ impl Points {
         Ok(())
     }
 
-    /// Keeps what is wanted at the instant in the block.
+    /// Records the requested values at the instant in the block.
     fn probe(&mut self, system: &mut System) -> Result<(), Stop> {
         self.compute(system)?;
         self.observer.probe.take(system.instance.block());
         Ok(())
     }
 
-    /// Computes what is looked at, of states and time that are in the block.
+    /// Computes the observed slots from the states and the time in the block.
     fn compute(&self, system: &mut System) -> Result<(), Stop> {
         if self.only_states {
             return Ok(());
@@ -296,7 +297,7 @@ impl Points {
         Ok(())
     }
 
-    /// Shows points between two rows until straight lines between them do; and wherever a quantity turns.
+    /// Shows points between two rows until linear interpolation is accurate enough; and each turning point.
     fn between(
         &mut self,
         system: &mut System,
@@ -317,7 +318,7 @@ impl Points {
             let span = high.max(b) - low.min(b);
             let bend = a - 2.0 * m + b;
             straight &= 0.5 * bend.abs() <= self.bend * span + 1e-15 * m.abs();
-            // On the parabola through the three, with −1 at a and 1 at b.
+            // On the parabola through the three points, with −1 at a and 1 at b.
             let turn = 0.5 * (a - b) / bend;
             let beyond = 0.25 * (b - a) * turn;
             if turn.abs() < 1.0 && beyond.abs() > 1e-9 * span {
@@ -326,7 +327,7 @@ impl Points {
         }
         if !straight && depth > 1 {
             self.between(system, step, (from, row_from), (middle, row), depth - 1)?;
-            // The right half needs the rows below this one only.
+            // The right half needs only the rows below this one.
             self.emit(row, step.time(middle));
             return self.between(system, step, (middle, row), (to, row_to), depth - 1);
         }
@@ -352,8 +353,8 @@ impl Points {
         Ok(())
     }
 
-    /// Where a quantity turns, by Newton's method on its derivative from five points, exact where it is a state. `turn`: about
-    /// where, and the column.
+    /// Locates a turning point by Newton's method on the derivative from five points, exact where the quantity is a
+    /// state. `turn`: its approximate position, and the column.
     fn refine(
         &mut self,
         system: &mut System,
@@ -361,7 +362,7 @@ impl Points {
         (from, to): (f64, f64),
         (turn, column): (f64, usize),
     ) -> Result<f64, Stop> {
-        // The polynomial holds up to the ends of the part that is shown.
+        // The polynomial is valid up to the ends of the part that is shown.
         let (first, last) = self.part;
         let d = (0.02 * (to - from)).min(0.4 * (turn - first).min(last - turn));
         if d < 1e-3 * (to - from) {
@@ -391,7 +392,7 @@ impl Points {
         Ok(theta)
     }
 
-    /// Puts the values at θ into a row.
+    /// Writes the values at θ into a row.
     fn sample(&mut self, system: &mut System, step: &Step, row: usize, theta: f64) -> Result<(), Stop> {
         step.at(theta, &mut self.x);
         system.place(step.time(theta), &self.x);

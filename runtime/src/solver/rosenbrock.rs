@@ -13,24 +13,24 @@ use super::sparse::Sparse;
 use super::step::{Step, System};
 use abi::rosenbrock::coefficients::{A, C, D, GAMMA, H, STAGES, W};
 
-/// Room for the stages and the matrix.
+/// Buffers for the stages and the matrix.
 pub(crate) struct Rosenbrock {
-    /// u_1 … u_8, one behind the other.
+    /// u_1 … u_8, one after the other.
     u: Vec<f64>,
-    /// Factors of I/(γh) − J.
+    /// Factors of I/(γh) − J, dense.
     matrix: Vec<f64>,
     rows: Vec<usize>,
-    /// Instead, of a model that knows its coupling.
+    /// Used instead for a model with a known sparsity pattern.
     sparse: Option<Sparse>,
     x: Vec<f64>,
     f: Vec<f64>,
-    /// Where the stages but the first evaluate f, one behind the other.
+    /// The arguments at which the stages after the first evaluate f, one after the other.
     arguments: Vec<f64>,
     attempt: fn(&mut Rosenbrock, &mut System, &mut Step, &[f64]) -> bool,
 }
 
 impl Rosenbrock {
-    /// Of n states; `coupled`: where the Jacobian has entries, if these are not all.
+    /// For n states; `coupled`: the sparsity pattern of the Jacobian, if it is not dense.
     pub(crate) fn new(n: usize, coupled: Option<&[(u32, u32)]>) -> Rosenbrock {
         let attempt = match n {
             1 => Rosenbrock::stages::<1>,
@@ -56,14 +56,14 @@ impl Rosenbrock {
         }
     }
 
-    /// Fills in the step from its `t`, `h`, `end`, `x0` and `f0`, given the Jacobian at its start: ∂f/∂x, then ∂f/∂t.
+    /// Computes the step from its `t`, `h`, `end`, `x0` and `f0`, given the Jacobian at its start: ∂f/∂x, then ∂f/∂t.
     ///
-    /// Returns false where the matrix is singular; a shorter step then is the remedy.
+    /// Returns false if the matrix is singular; a shorter step then helps.
     pub(crate) fn attempt(&mut self, system: &mut System, step: &mut Step, jacobian: &[f64]) -> bool {
         (self.attempt)(self, system, step, jacobian)
     }
 
-    /// Times in s and states at which the last attempt evaluated f, the start left out.
+    /// Times in s and states at which the last attempt evaluated f, without the start.
     pub(crate) fn arguments(&self, step: &Step) -> impl Iterator<Item = (f64, &[f64])> {
         let n = self.f.len();
         let (t, h, end) = (step.t, step.h, step.end);
@@ -113,7 +113,7 @@ impl Rosenbrock {
         true
     }
 
-    /// Stage `S`, counted from 0. Its own function for each, so that all weights are constants of the code.
+    /// Stage `S`, counted from 0. A separate instance for each stage, so that all weights are constants of the code.
     #[inline(always)]
     fn stage<const N: usize, const S: usize>(&mut self, system: &mut System, step: &Step, df_dt: &[f64]) {
         let n = if N == 0 { system.n } else { N };

@@ -13,7 +13,7 @@ fn go(instance: &Instance, experiment: &Experiment) -> Result<Outcome, Failure> 
     result
 }
 
-/// Runs with one measure of the whole run.
+/// Runs with one measure over the whole run.
 fn measured(instance: &Instance, mut experiment: Experiment, kind: MeasureKind, path: &str) -> f64 {
     experiment.expects.push(reading(instance, kind, path));
     value(&go(instance, &experiment).unwrap_or_else(|failure| panic!("{failure}")), 0)
@@ -78,7 +78,7 @@ fn van_der_pol_keeps_the_stiff_method() {
     assert!(outcome.work.steps < 3000 && outcome.work.stiff_steps > outcome.work.steps / 3);
 }
 
-/// A ball dropped from 1 m; at the ground its speed turns, smaller by a tenth.
+/// A ball dropped from 1 m; at the ground its speed reverses and shrinks by a tenth.
 fn ball() -> Instance {
     Model::new("Ball")
         .state("x", "m")
@@ -140,7 +140,7 @@ fn bounces_without_end_are_chatter() {
     assert!(failure.to_string().contains("`x falls 0` turned more than 100 times within"));
 }
 
-/// A mass of 1 kg on a dry contact of 1 N that only knows sign(v), pushed with 0.5 N; thrown with 1 m/s.
+/// A mass of 1 kg on a dry contact of 1 N modelled as sign(v), pushed with 0.5 N; thrown with 1 m/s.
 fn sign_friction() -> Instance {
     Model::new("Dry")
         .state("v", "m/s")
@@ -159,13 +159,13 @@ fn sign_friction() -> Instance {
 fn a_sign_that_should_stick_is_reported_with_regime_instant_and_remedy() {
     let failure = go(&sign_friction(), &adaptive(20.0, 1e-6)).unwrap_err();
     println!("{failure}");
-    // The first crossing is at 2 s; before they are dense, the first hundred take some time.
+    // The first crossing is at 2 s; the first hundred take some time, until they become dense.
     assert!((failure.time - 2.0).abs() < 1e-4, "{failure}");
     let Cause::Chatter(chatter) = &failure.cause else { panic!("{failure}") };
     assert_eq!((&chatter.regimes[..], &chatter.conditions[..]), (&["sliding".into()][..], &["v < 0".into()][..]));
 }
 
-/// The same contact with a regime of rest: stops at 2/3 s when thrown against the push, and stays.
+/// The same contact with a regime of rest: stops at 2/3 s when thrown against the push, and stays at rest.
 fn holding() -> Instance {
     let sliding = |m: &models::View| m.regime(0) != 0.0;
     Model::new("Holding")
@@ -399,7 +399,7 @@ fn hunting_has_its_period_and_overshoot_without_a_jacobian() {
     let instance = hunting();
     let mut experiment = adaptive(300.0, 1e-8);
     let mut period = reading(&instance, MeasureKind::Period, "x");
-    // A whole number of periods, so that the mean is the middle.
+    // A whole number of periods, so that the mean is the centre.
     (period.after, period.before) = (150.0, 150.0 + 6.0 * 24.436786);
     experiment.expects.push(period);
     experiment.expects.push(reading(&instance, MeasureKind::Max, "x"));
@@ -427,16 +427,16 @@ fn a_large_system_runs_as_a_small_one_does() {
     let last = &mut experiment.expects[0].measures[0];
     last.slot = instance.description().layout.states.slot(N - 1);
     let outcome = go(&instance, &experiment).unwrap();
-    // Behind the slowest mode each member is larger than the one before by rate/(rate − 1).
+    // After the slowest mode dominates, each member is larger than the previous one by rate/(rate − 1).
     let exact = (1..N).fold((-5f64).exp(), |x, i| x * rate(i) / (rate(i) - 1.0));
     assert!((value(&outcome, 0) - exact).abs() < 1e-8, "{} for {exact}", value(&outcome, 0));
-    // As long as nothing has reached the end of the chain, steps are short and the explicit method suits.
+    // Until the signal reaches the end of the chain, steps are short and the explicit method is chosen.
     assert!(outcome.work.stiff_steps > 100 && outcome.work.steps < 1000, "{}", outcome.work);
 }
 
 #[test]
 fn a_surface_that_is_only_grazed_is_found() {
-    // x = 1 − 1.0001 sin t dips below 0 for 28 ms; whoever looks at the ends of steps misses it.
+    // x = 1 − 1.0001 sin t dips below 0 for 28 ms; a check at the ends of steps would miss it.
     let instance = Model::new("Graze")
         .state("x", "m")
         .state("count", "1")
@@ -514,7 +514,7 @@ fn what_blows_up_is_named() {
     println!("{failure}");
 }
 
-/// The mass with LuGre friction under a position controller that runs a thousand times a second.
+/// The mass with LuGre friction under a position controller sampled at 1 kHz.
 #[test]
 fn a_sampled_controller_costs_a_step_a_tick() {
     let instance = Model::new("Sampled")
@@ -545,11 +545,12 @@ fn a_sampled_controller_costs_a_step_a_tick() {
     let outcome = go(&instance, &experiment).unwrap();
     assert_eq!(outcome.work.ticks, 10_000);
     assert!(outcome.work.steps + outcome.work.rejected < 10_500, "{}", outcome.work);
-    // Overshoots about as far as with the continuous controller.
+    // The overshoot is about that of the continuous controller.
     assert!((value(&outcome, 0) - 1.5).abs() < 0.01, "{}", value(&outcome, 0));
 }
 
-/// Pulls with random parameters over several decades each: all end, and no bristle bends beyond what it holds.
+/// Pulls with random parameters over several decades each: all runs end, and no bristle exceeds its largest possible
+/// deflection.
 #[test]
 fn any_bristle_can_be_pulled() {
     for seed in 0..20u64 {
@@ -585,13 +586,13 @@ fn any_bristle_can_be_pulled() {
         experiment.expects.push(reading(&instance, MeasureKind::Min, "z"));
         let outcome = go(&instance, &experiment).unwrap_or_else(|failure| panic!("seed {seed}: {failure}"));
         let reach = value(&outcome, 0).max(-value(&outcome, 1));
-        // At rest the speed is far below its tolerance of 1e-6 m/s, which bends the bristle a little too far.
+        // At rest the speed is far below its tolerance of 1e-6 m/s, which deflects the bristle slightly too far.
         let bound = 1.01 * sliding * rest / stiffness;
         assert!(reach < bound, "seed {seed}: {reach} m, beyond {bound} m");
     }
 }
 
-/// What a run costs: `cargo test --release -p runtime -- --ignored --nocapture adaptive_steps_cost`.
+/// Measures the cost of a run: `cargo test --release -p runtime -- --ignored --nocapture adaptive_steps_cost`.
 #[test]
 #[ignore = "prints times, judges nothing"]
 fn adaptive_steps_cost() {

@@ -1,51 +1,51 @@
-//! Large systems of linear equations of which most entries are zero.
+//! Sparse LU factorisation for large linear systems.
 //!
-//! In: where a matrix has entries, then their values. Out: its factors, and solutions. Columns are eliminated in an order
-//! of least degree, found once; rows by partial pivoting that keeps to the diagonal where that is not much smaller.
-//! Sources: George & Liu, Computer Solution of Large Sparse Positive Definite Systems, ch. 5 (order); Gilbert & Peierls,
-//! Sparse partial pivoting in time proportional to arithmetic operations, SIAM J. Sci. Stat. Comput. 9 (1988).
+//! In: a sparsity pattern, then values. Out: factors and solutions. Columns are eliminated in a minimum-degree order,
+//! computed once; rows are chosen by partial pivoting that prefers the diagonal unless it is much smaller. Sources:
+//! George & Liu, Computer Solution of Large Sparse Positive Definite Systems, ch. 5 (order); Gilbert & Peierls, Sparse
+//! partial pivoting in time proportional to arithmetic operations, SIAM J. Sci. Stat. Comput. 9 (1988).
 
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, BinaryHeap};
 
-/// A pivot on the diagonal may be this part of the largest: what fills in costs more than the digits.
+/// Smallest accepted diagonal pivot relative to the largest candidate: fill-in costs more than the lost digits.
 const LEAST_DIAGONAL: f64 = 0.1;
 
-/// Columns that are left are eliminated as they stand once each has more neighbours than this.
+/// The remaining columns are eliminated in their given order once each has more neighbours than this.
 const MOST_NEIGHBOURS: usize = 100;
 
 const NONE: u32 = u32::MAX;
 
-/// Where a matrix has entries, and its factors.
+/// The sparsity pattern of a matrix, and its factors.
 pub(crate) struct Sparse {
     n: usize,
     /// Column j has the rows and entries `begin[j]..begin[j + 1]`.
     begin: Vec<usize>,
     rows: Vec<u32>,
     entries: Vec<u32>,
-    /// The column that is eliminated k-th, and the row that it takes.
+    /// The column that is eliminated in step k, and its pivot row.
     order: Vec<u32>,
     pivot_rows: Vec<u32>,
-    /// When a row was taken.
+    /// The step in which a row became a pivot row.
     taken: Vec<u32>,
-    /// Factors by step: L below its diagonal of ones with rows of the matrix, U above its diagonal with steps, and the
+    /// Factors by step: L below its unit diagonal, with rows of the matrix; U above its diagonal, with steps; and the
     /// inverse of U's diagonal.
     lower: Columns,
     upper: Columns,
     inverse: Vec<f64>,
-    /// A column while it is eliminated, where it has entries, and whether.
+    /// The column being eliminated, the rows where it has entries, and a flag for each row.
     x: Vec<f64>,
     touched: Vec<u32>,
     marked: Vec<bool>,
-    /// Steps whose column is to be subtracted, the first on top.
+    /// Steps whose column is to be subtracted, as a min-heap.
     due: BinaryHeap<Reverse<u32>>,
     y: Vec<f64>,
 }
 
-/// Columns of a triangle, one behind the other.
+/// Columns of a triangular factor, one after the other.
 #[derive(Default)]
 struct Columns {
-    /// Where each ends.
+    /// End of each column.
     ends: Vec<usize>,
     entries: Vec<(u32, f64)>,
 }
@@ -67,7 +67,7 @@ impl Columns {
 }
 
 impl Sparse {
-    /// Of an n × n matrix with these entries (row, column), by rows and then columns.
+    /// For an n × n matrix with these entries (row, column), sorted by rows and then columns.
     pub(crate) fn new(n: usize, entries: &[(u32, u32)]) -> Sparse {
         let mut begin = vec![0; n + 1];
         entries.iter().for_each(|(_, column)| begin[*column as usize + 1] += 1);
@@ -114,7 +114,7 @@ impl Sparse {
                 self.touch(row);
                 self.x[row as usize] -= values[self.entries[at] as usize];
             }
-            // What earlier columns have to do with this one, in their order. Each reaches later ones only.
+            // Subtract the earlier columns that affect this one, in order. Each affects only later ones.
             while let Some(Reverse(step)) = self.due.pop() {
                 let row = self.pivot_rows[step as usize];
                 let part = self.x[row as usize];
@@ -150,7 +150,7 @@ impl Sparse {
         true
     }
 
-    /// A row of the column at work; a row that is taken brings in what was subtracted then.
+    /// Marks a row of the current column as used; if it is a pivot row, schedules its step.
     fn touch(&mut self, row: u32) {
         if !std::mem::replace(&mut self.marked[row as usize], true) {
             self.touched.push(row);
@@ -160,7 +160,7 @@ impl Sparse {
         }
     }
 
-    /// The row to take: the diagonal one if it is large enough, else the largest.
+    /// The pivot row: the diagonal one if it is large enough, else the largest.
     fn pivot(&self, column: u32) -> Option<u32> {
         let size = |row: u32| self.x[row as usize].abs();
         let free = || self.touched.iter().copied().filter(|row| self.taken[*row as usize] == NONE);
@@ -169,7 +169,7 @@ impl Sparse {
         Some(if diagonal { column } else { largest })
     }
 
-    /// Replaces the right side `b` by the solution.
+    /// Replaces the right-hand side `b` by the solution.
     pub(crate) fn solve(&mut self, b: &mut [f64]) {
         for k in 0..self.n {
             let part = b[self.pivot_rows[k] as usize];
@@ -192,8 +192,8 @@ impl Sparse {
     }
 }
 
-/// Columns by their degree in the graph of the matrix and its transpose, the least first, each joining its neighbours when
-/// it goes; of equals the first.
+/// Minimum-degree order of the columns in the graph of the matrix plus its transpose. Eliminating a column connects its
+/// neighbours; ties go to the lower index.
 fn order(n: usize, entries: &[(u32, u32)]) -> Vec<u32> {
     let mut neighbours: Vec<BTreeSet<u32>> = vec![BTreeSet::new(); n];
     for &(row, column) in entries.iter().filter(|(row, column)| row != column) {
@@ -229,7 +229,7 @@ fn order(n: usize, entries: &[(u32, u32)]) -> Vec<u32> {
 mod tests {
     use super::*;
 
-    /// Numbers in −1..1 from a seed, by a linear congruence.
+    /// Numbers in −1..1 from a seed, by a linear congruential generator.
     fn numbers(seed: u64) -> impl FnMut() -> f64 {
         let mut state = seed;
         move || {
@@ -238,7 +238,7 @@ mod tests {
         }
     }
 
-    /// Largest error of a solution of (d·I − J) x = b, and the entries of the factors.
+    /// Largest error of a solution of (d·I − J) x = b, and the number of entries of the factors.
     fn residual(n: usize, d: f64, entries: &[(u32, u32)], seed: u64) -> (f64, usize) {
         let mut number = numbers(seed);
         let values: Vec<f64> = entries.iter().map(|_| number()).collect();
@@ -248,7 +248,7 @@ mod tests {
             b[*row as usize] -= value * solution[*column as usize];
         }
         let mut sparse = Sparse::new(n, entries);
-        // Twice: nothing of the first matrix stays.
+        // Twice: nothing of the first matrix remains.
         assert!(sparse.factor(2.0 * d + 1.0, &values));
         assert!(sparse.factor(d, &values), "seed {seed}");
         sparse.solve(&mut b);
@@ -278,7 +278,7 @@ mod tests {
             random.sort_unstable();
             random.dedup();
             assert!(residual(20, 0.7, &random, seed).0 < 1e-8, "seed {seed}");
-            // Nothing on the diagonal: rows are exchanged.
+            // Empty diagonal: rows are exchanged.
             assert!(residual(20, 0.0, &random, seed).0 < 1e-6, "seed {seed}");
         }
     }

@@ -1,11 +1,11 @@
-//! The model as a solver sees it, and one step of it as a polynomial.
+//! The model as a solver sees it, and one step as a polynomial.
 
 use super::history::History;
 use abi::{Function, Instance, Slot};
 use std::ops::Range;
 
-/// A model whose derivatives, Jacobian and switching surfaces are functions of time and states; everything else in
-/// its block is held.
+/// A model whose derivatives, Jacobian and switching surfaces are functions of time and states; everything else in its
+/// block is constant.
 pub(crate) struct System {
     pub(crate) instance: Instance,
     /// Number of states.
@@ -16,7 +16,7 @@ pub(crate) struct System {
     roots: Range<usize>,
     /// Evaluations of the derivatives.
     pub(crate) evaluations: u64,
-    /// What is delayed.
+    /// The history of delayed quantities.
     pub(crate) history: History,
 }
 
@@ -41,7 +41,7 @@ impl System {
         self.roots.len()
     }
 
-    /// Puts time in s and states in SI into the block.
+    /// Writes time in s and states in SI into the block.
     pub(crate) fn place(&mut self, t: f64, x: &[f64]) {
         let states = self.states.clone();
         let block = self.instance.block_mut();
@@ -55,7 +55,7 @@ impl System {
         self.sized_slope::<0>(t, x, f);
     }
 
-    /// As `slope`, of `N` states where N is not 0: copies of known length need no call.
+    /// As `slope`, for `N` states where N is not 0: copies of constant length need no call.
     pub(crate) fn sized_slope<const N: usize>(&mut self, t: f64, x: &[f64], f: &mut [f64]) {
         let n = if N == 0 { self.n } else { N };
         self.evaluations += 1;
@@ -70,9 +70,9 @@ impl System {
         copy(&self.instance.block()[derivatives..derivatives + n], &mut f[..n]);
     }
 
-    /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. Of a model without `Jacobian`: one-sided differences
-    /// over √ε of |x| or of the scale `s` of the state, whichever is larger; to the side where no surface is crossed,
-    /// for the derivative is that of the branch taken.
+    /// ∂f/∂x row-major, then ∂f/∂t, at (t, x), where f is `f0`. For a model without `Jacobian`: one-sided differences
+    /// over √ε of |x| or of the scale `s` of the state, whichever is larger, to the side where no surface is crossed,
+    /// because the derivative is that of the active branch.
     pub(crate) fn jacobian(&mut self, t: f64, x: &[f64], f0: &[f64], s: &[f64], j: &mut [f64]) {
         if self.n == 0 {
             return;
@@ -91,7 +91,7 @@ impl System {
             self.roots(t, x, &mut here);
         }
         for column in 0..=n {
-            // The last column is time.
+            // The last column is the derivative by time.
             let by = ROOT * if column < n { x[column].abs().max(s[column]) } else { t.max(1.0) };
             let mut width = by;
             for by in [by, -by] {
@@ -129,7 +129,7 @@ impl System {
     }
 }
 
-/// Copies as many numbers; of as few as models mostly have, without a call.
+/// Copies a slice; for the short lengths of most models, without a call.
 #[inline]
 pub(crate) fn copy(from: &[f64], to: &mut [f64]) {
     fn fixed<const N: usize>(from: &[f64], to: &mut [f64]) {

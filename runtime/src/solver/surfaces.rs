@@ -1,38 +1,38 @@
-//! Where a step first crosses a switching surface.
+//! Locates the crossings of switching surfaces within a step.
 //!
-//! In: a [`Step`] and the values of the surfaces along it. Out: brackets, the earliest first, at whose near end every
-//! condition has its old value and at whose far end some have their new one.
+//! In: a [`Step`] and the values of the surfaces along it. Out: brackets in ascending order. At the near end of a
+//! bracket every condition has its old value; at its far end some have their new one.
 
 use super::fused::Fused;
 use super::step::{Step, System, copy};
 
-/// Where the first crossing of a step lies, in θ.
+/// The bracket of a crossing, in θ of the step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Crossing {
-    /// Nothing has changed yet.
+    /// The end before the change.
     pub(crate) near: f64,
-    /// Something has.
+    /// The end after the change.
     pub(crate) far: f64,
 }
 
-/// On which side of each surface the model is, and the values along one step.
+/// The side of each surface, and the values along one step.
 pub(crate) struct Surfaces {
-    /// −1 or 1; 0 where the model has been on the surface since the last restart.
+    /// −1 or 1; 0 while the model has been on the surface since the last restart.
     sides: Vec<f64>,
-    /// Whether a transition or an event depends on the surface: then leaving it, too, is a crossing.
+    /// Whether a transition or an event depends on the surface: then leaving it is a crossing, too.
     decides: Vec<bool>,
-    /// Whether derivatives at most bend there.
+    /// Whether derivatives have at most a kink there, no jump.
     bends: Vec<bool>,
-    /// Which surfaces are looked for, and whether there is any.
+    /// Which surfaces are searched for, and whether there is any.
     sought: Vec<bool>,
     any: bool,
-    /// Whether of these only conditions are looked for.
+    /// Whether all of these are conditions.
     pub(crate) only_conditions: bool,
-    /// Values at the end of the last step, or where the search stands within this one.
+    /// Values at the end of the last step, or at the present position of the search within this one.
     here: Vec<f64>,
-    /// θ of the points to look at, ascending.
+    /// θ of the points to evaluate, ascending.
     nodes: Vec<f64>,
-    /// Values at those points, one behind the other.
+    /// Values at those points, one after the other.
     values: Vec<f64>,
     /// Values at a trial point, and at the far end of the last bracket.
     trial: Vec<f64>,
@@ -48,8 +48,8 @@ pub(crate) struct Surfaces {
 }
 
 impl Surfaces {
-    /// Looks for the surfaces on which the course depends, or for those at which only what is `observed` changes. Brackets will
-    /// be `width` seconds wide.
+    /// Searches for the surfaces on which the solution depends, or for those at which only `observed` quantities
+    /// change. Brackets will be `width` seconds wide.
     pub(crate) fn new(system: &System, width: f64, observed: bool) -> Surfaces {
         let zeros = || vec![0.0; system.surfaces()];
         let roots = &system.instance.description().roots[..system.surfaces()];
@@ -74,7 +74,7 @@ impl Surfaces {
         }
     }
 
-    /// Takes the sides at (t, x) as they are.
+    /// Sets the sides from the values at (t, x).
     pub(crate) fn restart(&mut self, system: &mut System, t: f64, x: &[f64]) {
         if !self.any {
             return;
@@ -85,7 +85,7 @@ impl Surfaces {
         }
     }
 
-    /// For a step that was too long: roughly where it first crosses, in θ, if it ends behind a surface.
+    /// For a step that was too long: approximately where it first crosses, in θ, if it ends beyond a surface.
     pub(crate) fn guess(&mut self, system: &mut System, step: &Step) -> Option<f64> {
         if !self.any || !step.x1.iter().all(|x| x.is_finite()) {
             return None;
@@ -102,7 +102,7 @@ impl Surfaces {
         first
     }
 
-    /// On which side of each surface the model is.
+    /// The side of each surface.
     pub(crate) fn sides(&self) -> &[f64] {
         &self.sides
     }
@@ -112,17 +112,17 @@ impl Surfaces {
         &self.here
     }
 
-    /// Steps that crossed nothing have led to a point with these values.
+    /// Steps without a crossing have led to a point with these values.
     pub(crate) fn go_on(&mut self, here: &[f64]) {
         copy(here, &mut self.here);
     }
 
-    /// Whether any surface is looked for.
+    /// Whether any surface is searched for.
     pub(crate) fn any(&self) -> bool {
         self.any
     }
 
-    /// Whether the model would be on the other side of a surface at (t, x).
+    /// Whether (t, x) lies on the other side of a surface.
     pub(crate) fn turned(&mut self, system: &mut System, t: f64, x: &[f64]) -> bool {
         system.roots(t, x, &mut self.trial);
         (0..self.sides.len()).any(|i| self.sought[i] && self.sides[i] * self.trial[i] < 0.0)
@@ -134,21 +134,21 @@ impl Surfaces {
         (0..self.met.len()).filter(move |&i| self.met[i] > 0 && 4 * self.met[i] >= most)
     }
 
-    /// Begins to count anew.
+    /// Restarts the counts.
     pub(crate) fn forget(&mut self) {
         self.met.fill(0);
     }
 
-    /// Goes back to the start of the step that was looked at last.
+    /// Returns to the start of the last step.
     pub(crate) fn again(&mut self) {
         copy(&self.start, &mut self.here);
         copy(&self.start_sides, &mut self.sides);
     }
 
-    /// Looks along a step. Between two points that are looked at, a surface that is touched and left again would be
-    /// missed: so a parabola through the values says where to look besides. After a restart (`fresh`) the model may
-    /// stand a rounding error beside a surface that it leaves at once: so the beginning is looked at more closely.
-    /// `known`: the values in the middle and at the end are in the block.
+    /// Evaluates the surfaces along a step. A surface that is touched and left again between two points would be
+    /// missed, so a parabola through the values gives additional points. After a restart (`fresh`) the model may be a
+    /// rounding error beside a surface that it leaves at once, so the beginning gets more points. `known`: the values
+    /// in the middle and at the end are already in the block.
     pub(crate) fn begin(&mut self, system: &mut System, step: &Step, fresh: bool, known: Option<&Fused>) {
         let m = self.sides.len();
         self.nodes.clear();
@@ -195,7 +195,7 @@ impl Surfaces {
                 }
             }
         }
-        // Few, and nearly sorted: by insertion.
+        // Insertion sort: few nodes, nearly sorted.
         for k in 1..self.nodes.len() {
             let mut k = k;
             while k > 0 && self.nodes[k - 1] > self.nodes[k] {
@@ -215,7 +215,7 @@ impl Surfaces {
         self.nodes.push(theta);
     }
 
-    /// The first crossing behind θ = `from`, where the search stands; none up to the end of the step.
+    /// The first crossing after θ = `from`, the present position of the search; none up to the end of the step.
     pub(crate) fn first(&mut self, system: &mut System, step: &Step, from: f64) -> Option<Crossing> {
         let m = self.sides.len();
         let mut near = from;
@@ -243,7 +243,7 @@ impl Surfaces {
         self.changed().any(|i| self.decides[i])
     }
 
-    /// Whether derivatives at most bend at all of them.
+    /// Whether derivatives have at most a kink at all of them.
     pub(crate) fn bend(&self) -> bool {
         self.changed().all(|i| self.bends[i] && !self.decides[i])
     }
@@ -253,7 +253,7 @@ impl Surfaces {
         self.decides.contains(&true)
     }
 
-    /// Goes on behind the last bracket, on the new sides.
+    /// Continues after the last bracket, on the new sides.
     pub(crate) fn pass(&mut self, crossed: bool) {
         for (side, g) in self.sides.iter_mut().zip(&self.far) {
             if crossed || *side == 0.0 {
@@ -267,7 +267,7 @@ impl Surfaces {
         g.iter().enumerate().any(|(i, g)| self.crosses(i, *g))
     }
 
-    /// Whether surface i has been crossed where its value is g.
+    /// Whether the value g of surface i is a crossing.
     fn crosses(&self, i: usize, g: f64) -> bool {
         if !self.sought[i] || self.only_conditions && !self.decides[i] {
             return false;
@@ -275,8 +275,8 @@ impl Surfaces {
         self.sides[i] * g < 0.0 || (self.decides[i] && self.sides[i] == 0.0 && g != 0.0 && !g.is_nan())
     }
 
-    /// Narrows a bracket around the first crossing by secants aimed half a width beside the zero, now on the one side,
-    /// now on the other, so that both ends close in; halved where that is slow.
+    /// Narrows a bracket around the first crossing by the secant method, aimed half a width beside the zero on
+    /// alternate sides, so that both ends close in; with bisection where that is slow.
     fn bracket(&mut self, system: &mut System, step: &Step, mut near: f64, mut far: f64) -> Crossing {
         let width = self.width.max(4.0 * f64::EPSILON * step.t) / step.h;
         let (mut slow, mut aim) = (0, -0.5);
@@ -284,7 +284,7 @@ impl Surfaces {
             let zero = |i: usize| near + (far - near) * (self.here[i] / (self.here[i] - self.far[i]));
             let first = self.changed().map(zero).fold(far, f64::min);
             let theta = if slow == 2 { 0.5 * (near + far) } else { first + aim * width };
-            // Not a number where the values are not: halve.
+            // If the secant is not a number, because the values are not, bisect.
             let theta = if theta > near && theta < far { theta } else { 0.5 * (near + far) };
             let theta = theta.clamp(near + 0.25 * width, far - 0.25 * width);
             step.at(theta, &mut self.x);

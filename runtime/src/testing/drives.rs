@@ -1,4 +1,4 @@
-//! A rig for tests: two servos on one shaft, a switch with a lamp; and both sides of its bus on a table.
+//! A rig for tests: two servos on one shaft, and a switch with a lamp; with both sides of its bus in one process.
 
 use crate::can::Frame;
 use crate::drive::{Bench, Fieldbus, Options, Step};
@@ -143,7 +143,7 @@ pub fn shaft(inertia: f64, viscous: f64) -> Instance {
         .build()
 }
 
-/// Both sides of a bus joined by hand: what one sends the other has at once.
+/// Both sides of a bus connected directly: each frame arrives at once.
 pub struct Table {
     pub fieldbus: Fieldbus,
     pub bench: Bench,
@@ -151,7 +151,7 @@ pub struct Table {
     pub period_ns: u64,
     /// Commands of the model while armed.
     pub commands: Vec<(Signal, f64)>,
-    /// All that was sent: time, from the master?, frame.
+    /// All frames sent: time in ns, whether by the master, frame.
     pub log: Vec<(u64, bool, Frame)>,
 }
 
@@ -172,7 +172,7 @@ impl Table {
         }
     }
 
-    /// Gives frames of the master to the bench and its answers back, until nobody has anything to say.
+    /// Exchanges frames between master and simulated plant until neither has any to send.
     fn exchange(&mut self, mut ours: Vec<Frame>) {
         while !ours.is_empty() {
             let (mut answers, mut more) = (Vec::new(), Vec::new());
@@ -188,7 +188,7 @@ impl Table {
         }
     }
 
-    /// Lets the bench go on by itself to a time.
+    /// Advances the simulated plant alone to a time.
     pub fn run_to(&mut self, until_ns: u64) {
         while self.now_ns < until_ns {
             self.now_ns = self.bench.due_ns().clamp(self.now_ns + 1, until_ns);
@@ -224,7 +224,7 @@ impl Table {
         (0..n).for_each(|_| self.tick());
     }
 
-    /// Ticks until a step is reached; panics where it never is.
+    /// Ticks until a step is reached; panics if it never is.
     pub fn until(&mut self, step: Step) {
         for _ in 0..20_000 {
             if self.fieldbus.step() == step {
@@ -236,7 +236,7 @@ impl Table {
         panic!("stays at {:?}, {refusal:?}", self.fieldbus.step());
     }
 
-    /// The whole start-up.
+    /// Performs the whole start-up.
     pub fn arm(&mut self) {
         self.until(Step::AwaitEnable);
         assert!(self.fieldbus.request(crate::drive::Request::Enable));
@@ -244,7 +244,7 @@ impl Table {
         assert!(self.fieldbus.request(crate::drive::Request::Arm));
     }
 
-    /// The words of the refusal that the start-up ends with.
+    /// The message of the refusal that the start-up ends with.
     pub fn refused(&mut self) -> String {
         for _ in 0..20_000 {
             if let Some(refusal) = self.fieldbus.refusal() {

@@ -1,4 +1,4 @@
-//! Fixtures of tests: models, drives and rigs written by hand.
+//! Test fixtures: hand-written models, drives and rigs.
 
 pub mod models;
 pub mod drives;

@@ -1,4 +1,4 @@
-//! Models written by hand, for tests: what a compiler would make, as closures over a [`View`].
+//! Hand-written models for tests: the functions that a compiler would generate, as closures over a [`View`].
 
 use abi::description::{Automaton, Guard, Kind, Quantity, Root, Tick};
 use abi::plan::{Expect, Experiment, Formula, Measure, MeasureKind, Method, PARTS, Plot, Series, Solver, Window};
@@ -7,7 +7,7 @@ use abi::unit::Unit;
 use abi::{Code, Description, Function, Instance, Layout, Slot};
 use std::sync::Arc;
 
-/// The block of a model while one of its functions runs.
+/// The block of a model during a call of one of its functions.
 pub struct View<'a> {
     block: &'a mut [f64],
     layout: &'a Layout,
@@ -51,7 +51,7 @@ impl View<'_> {
     pub fn set_root(&mut self, i: usize, value: f64) {
         self.block[self.layout.roots.slot(i).index()] = value;
     }
-    /// ∂f/∂x, all rows, then ∂f/∂t.
+    /// ∂f/∂x row-major, then ∂f/∂t.
     pub fn set_jacobian(&mut self, values: &[f64]) {
         self.block[self.layout.jacobian.range()].copy_from_slice(values);
     }
@@ -62,7 +62,7 @@ impl View<'_> {
 
 type Body = Box<dyn Fn(&mut View) + Send + Sync>;
 
-/// A model in the making. Every part is optional.
+/// Builds a model. Every part is optional.
 pub struct Model {
     name: &'static str,
     params: Vec<f64>,
@@ -126,7 +126,7 @@ impl Model {
         self.periods.push(period);
         self
     }
-    /// Watches the state declared last.
+    /// Guards the range of the state declared last.
     pub fn within(mut self, range: (f64, f64)) -> Model {
         self.states.last_mut().unwrap().2 = range;
         self
@@ -136,7 +136,8 @@ impl Model {
         self
     }
 
-    /// The finished instance. `Step` is a classical Runge-Kutta step of the derivatives with what belongs to it.
+    /// The finished instance. `Step` is a classical Runge-Kutta step of the derivatives, with ticks, transitions and
+    /// guards as they apply.
     pub fn build(mut self) -> Instance {
         let n = self.states.len() as u32;
         let layout = Layout::new([
@@ -203,7 +204,7 @@ impl Model {
     }
 }
 
-/// Most states of a model by hand that is stepped.
+/// Largest number of states of a hand-written model with fixed steps.
 const MOST_STATES: usize = 16;
 
 struct Hand {
@@ -218,7 +219,7 @@ impl Hand {
         }
     }
 
-    /// The classical step of fourth order. Asks nothing of the heap, as no step may in a cycle.
+    /// The classical Runge-Kutta step of order four. Does not allocate, as no step in a cycle may.
     fn step(&self, block: &mut [f64]) -> u64 {
         let h = block[Slot::STEP.index()];
         let t = block[Slot::COUNT.index()] * h;
@@ -275,7 +276,7 @@ impl Interpret for Hand {
     }
 }
 
-/// As `decay`, by a step of four operations: what is left is the cost of whoever runs it.
+/// As `decay`, with a step of four operations, so that the remaining cost is that of the engine.
 pub fn cheap() -> Instance {
     struct Cheap(Layout);
     impl Interpret for Cheap {
@@ -333,7 +334,7 @@ pub fn slot(instance: &Instance, path: &str) -> Slot {
     instance.description().quantity(path).unwrap_or_else(|| panic!("no quantity `{path}`")).slot
 }
 
-/// An experiment that neither draws nor expects.
+/// A fixed-step experiment without plots and expectations.
 pub fn fixed(duration: f64, step: f64) -> Experiment {
     let solver = Solver { method: Method::Rk4, step, tol: 0.0, parts: PARTS };
     Experiment {
@@ -348,12 +349,12 @@ pub fn fixed(duration: f64, step: f64) -> Experiment {
     }
 }
 
-/// An adaptive experiment that neither draws nor expects.
+/// An adaptive experiment without plots and expectations.
 pub fn adaptive(duration: f64, tol: f64) -> Experiment {
     Experiment { solver: Solver { method: Method::Adaptive, step: 0.0, tol, parts: PARTS }, ..fixed(duration, 1.0) }
 }
 
-/// `text` over the whole run, for reading one measure: the condition is the measure itself.
+/// `text` over the whole run, to read one measure: the condition is the measure itself.
 pub fn reading(instance: &Instance, kind: MeasureKind, path: &str) -> Expect {
     let quantity = instance.description().quantity(path).unwrap_or_else(|| panic!("no quantity `{path}`"));
     let measure = Measure {
@@ -436,7 +437,7 @@ pub fn stick_slip(sigma1: f64) -> Instance {
         .build()
 }
 
-/// What pulls the mass of [`dry_pull`].
+/// The contact model of [`dry_pull`].
 #[derive(Clone, Copy)]
 pub enum Contact {
     Karnopp,

@@ -1,4 +1,4 @@
-//! A rig written by hand, for tests: a drive that acts as a spring on whatever turns its shaft.
+//! A hand-written rig for tests: a drive that emulates a spring on its shaft.
 
 use crate::hil::live::Judge;
 use crate::testing::models::Model;
@@ -37,7 +37,7 @@ pub fn drive(name: &str, node: u8) -> Node {
     }
 }
 
-/// The same with a greatest torque, N·m.
+/// The same with a torque limit, N·m.
 fn bounded(name: &str, node: u8, most: f64) -> Node {
     let mut made = drive(name, node);
     if let Kind::Cia402(drive) = &mut made.kind {
@@ -86,8 +86,8 @@ pub fn rig() -> (Rig, Instance) {
     (rig, model)
 }
 
-/// The pair with a load that is a bristle of 20 N·m/rad, which breaks away at 0.34 N·m: it holds 2.9 mJ. The servo swings
-/// as there.
+/// The pair with a load that is a bristle of 20 N·m/rad, which breaks away at 0.34 N·m: it stores 2.9 mJ. The servo
+/// oscillates as there.
 pub fn bristle() -> (Rig, Instance, Instance) {
     let (rig, _, plant) = pair();
     let control = Model::new("Bristle")
@@ -120,8 +120,8 @@ pub fn bristle() -> (Rig, Instance, Instance) {
     (rig, control, plant)
 }
 
-/// What must hold of the parameters of [`pair`]: the swing `T` lies in 0 .. 1 N·m, the damping `d` is above 0, and
-/// T ≥ 2 d by number. `end`, from which the model gives no number, is free.
+/// Constraints on the parameters of [`pair`]: the amplitude `T` is in 0 .. 1 N·m, the damping `d` is above 0, and T ≥ 2
+/// d numerically. `end`, the time from which the model returns NaN, is free.
 pub fn judge(control: &Instance) -> Judge {
     let program = Model::new("judge")
         .param(0.4)
@@ -165,8 +165,9 @@ pub fn judge(control: &Instance) -> Judge {
     Judge::new(live, program, control).expect("both have three parameters")
 }
 
-/// Two drives on one shaft of 0.012 kg·m²: the servo swings it with 0.4 N·m at 1 Hz, the load brakes it like a damper of
-/// 0.05 N·m·s/rad; from the time of its third parameter on it gives no number. Rig, control program, plant program.
+/// Two drives on one shaft of 0.012 kg·m²: the servo drives it with 0.4 N·m at 1 Hz, the load brakes it like a damper
+/// of 0.05 N·m·s/rad; from the time in its third parameter on it returns NaN. Returns rig, control program, plant
+/// program.
 pub fn pair() -> (Rig, Instance, Instance) {
     let control = Model::new("Swing")
         .param(0.4)
@@ -214,7 +215,8 @@ pub fn pair() -> (Rig, Instance, Instance) {
         |node, what, i| Input { signal: signal(node, what), slot: inside.inputs.slot(i), start: 0.0, needed: true };
     let rig = Rig {
         name: "pair".into(),
-        // The drives bound themselves too (object 6072): what reaches them wrong in spite of the checksum stays within.
+        // The drives limit torque themselves, too (object 6072): a wrong value that passes the checksum stays within
+        // the limit.
         nodes: vec![bounded("load", 3, 1.0), bounded("servo", 4, 2.0)],
         inputs: vec![input(0, What::Speed, 0), input(1, What::Position, 1)],
         outputs: vec![output(1, 0, 2.0), output(0, 1, 1.0)],

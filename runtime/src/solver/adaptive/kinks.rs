@@ -1,23 +1,25 @@
-//! Surfaces that a step must not run over: where it is made again, and up to where.
+//! Handles steps that cross a surface where derivatives jump or have a kink: decides whether the step is repeated, and
+//! up to where.
 
 use super::{Adaptive, MOST_AIMS, Step, copy};
 use crate::solver::surfaces::Crossing;
 
 impl Adaptive {
-    /// Whether the step is made again, for what it meets on its way; and whether it meets anything.
+    /// Whether the step is repeated because of a surface that it crosses; and whether it crosses any.
     pub(super) fn is_made_again(&mut self) -> (bool, bool) {
         let (mut from, mut again, mut met, mut inside) = (0.0, false, false, false);
         while let Some(crossing) = self.surfaces.first(&mut self.system, &self.step, from) {
             (met, inside) = (true, inside || crossing.near > 0.0);
             let jump = self.jump(crossing);
             let decided = self.surfaces.decided();
-            // What swings through a surface at which nothing jumps is no chatter.
+            // Passing through a surface at which nothing jumps is not chattering.
             if jump > 0.0 || decided {
                 self.meet(1)
             } else {
                 self.crossings = 0
             }
-            // A surface left at the very start needs no other step, unless the Jacobian there still knows the old side.
+            // A surface left at the very start needs no other step, unless the Jacobian there still belongs to the old
+            // side.
             if crossing.near > 0.0 && self.shorten(crossing, jump) {
                 again = true;
                 break;
@@ -38,12 +40,13 @@ impl Adaptive {
         (again, met)
     }
 
-    /// Whether a stiff step ends on the old side of a surface though a stage was behind it, where nothing may hold the states
-    /// any longer.
+    /// Whether a stiff step ends on the old side of a surface although a stage was on the new side, where possibly
+    /// nothing holds the states any longer.
     ///
-    /// The stages are damped by the Jacobian at the start, and so is the estimated error: a contact that holds with 1e6 N·s/m
-    /// up to its stiction, and no longer, would keep a mass for ever within the tolerance of its speed. So where that could
-    /// be, the step is too long; down to where it resolves what the Jacobian knows, and its error is no longer damped.
+    /// The stages are damped by the Jacobian at the start, and so is the estimated error: a contact that holds with 1e6
+    /// N·s/m up to its stiction would hold a mass for ever within the tolerance of its speed. Where that is possible,
+    /// the step is too long. It is shortened until it resolves the time constants of the Jacobian, because its error is
+    /// then no longer damped.
     fn hides(&mut self) -> bool {
         if !self.was_stiff || !self.surfaces.any() || (self.was_fused && !self.met) {
             return false;
@@ -68,10 +71,10 @@ impl Adaptive {
         arguments.iter().any(|(t, x)| self.surfaces.turned(&mut self.system, *t, x) && self.lets_go(*t, x))
     }
 
-    /// Whether a surface on the straight way to a point bends the rates or makes them jump by so much that, over the time in
-    /// which the states answer there, it moves one by more than is allowed.
+    /// Whether a surface on the straight line to a stage's point has a jump or kink in the derivatives that is large
+    /// enough to move a state by more than the allowed error within the response time of the states there.
     fn lets_go(&mut self, t: f64, x: &[f64]) -> bool {
-        // Short against curvature, long against roundoff.
+        // Short relative to curvature, long relative to rounding errors.
         const WIDTH: f64 = 1e-4;
         let n = self.system.n;
         let (t0, x0) = (self.step.t, self.step.x0.clone());
@@ -99,7 +102,7 @@ impl Adaptive {
         let answer = (1.0 / self.entries.fastest(&jacobian, 0.0).sqrt()).min(self.duration);
         let moves = |i: usize| {
             let rise = |a: f64, b: f64, width: f64| if width > 0.0 { (b - a) / width } else { 0.0 };
-            // From the surface itself there is no way back: there the Jacobian knows.
+            // If the step starts on the surface, there is no interval before it: use the Jacobian there.
             let known = || {
                 let row = (0..n).map(|j| self.jacobian[i * n + j] * (x[j] - x0[j]));
                 row.sum::<f64>() + self.jacobian[n * n + i] * (t - t0)
@@ -110,7 +113,7 @@ impl Adaptive {
             };
             let wide = rise(after[i], beyond[i], width) - old(earlier[i], 1.0);
             let narrow = rise(after[i], soon[i], 0.5 * width) - old(lately[i], 0.5);
-            // What is curved bends half as much over half the way, a kink as much.
+            // With curvature, the change of slope halves over half the distance; at a kink it does not.
             let bend = if narrow.abs() > 4.0 * (wide - narrow).abs() { narrow } else { 0.0 };
             let drift = (far - near) * old(lately[i], 0.5);
             let jump = after[i] - before[i] - drift;
@@ -120,9 +123,9 @@ impl Adaptive {
         (0..n).any(moves)
     }
 
-    /// A condition is decided by the last bit of the states: where one may change, the step is made again so that it
-    /// ends just before, and the next one is as short as the bracket. So no stage that looks behind the condition moves
-    /// a state by more than a rounding error: what is at rest is at rest when it breaks away.
+    /// A condition is decided by the last bit of the states. Where one may change, the step is repeated so that it ends
+    /// just before, and the next one is as short as the bracket. So no stage evaluated beyond the condition moves a
+    /// state by more than a rounding error: a body at rest is exactly at rest when it breaks away.
     pub(super) fn ends_before_condition(&mut self) -> bool {
         if !self.surfaces.has_conditions() {
             return false;
@@ -142,7 +145,7 @@ impl Adaptive {
                 ends = true;
                 break;
             }
-            // One that is left at the very start, or is passed at the very end, needs no other step.
+            // A condition that is left at the very start, or crossed at the very end, needs no other step.
             self.surfaces.pass(true);
             from = crossing.far;
         }
@@ -151,7 +154,7 @@ impl Adaptive {
         ends
     }
 
-    /// Takes a step back that is made again.
+    /// Undoes a step that is to be repeated.
     pub(super) fn retake(&mut self) {
         self.last = None;
         self.work.steps -= 1;
@@ -159,9 +162,9 @@ impl Adaptive {
         self.work.rejected += 1;
     }
 
-    /// Stages behind a surface at which derivatives jump or bend spoil a step, though its error seems small. Where that
-    /// could matter, the step is made again: up to just before a jump, and the next one is so short that it cannot
-    /// matter; up to so little behind a bend that it cannot matter.
+    /// Stages beyond a surface at which derivatives jump or have a kink spoil a step even if its estimated error is
+    /// small. Where that could matter, the step is repeated: for a jump it ends just before, and the next one is short
+    /// enough not to matter; for a kink it ends so little after it that the kink cannot matter.
     pub(super) fn shorten(&mut self, crossing: Crossing, jump: f64) -> bool {
         let h = self.step.h;
         let (to, behind) = (crossing.near * h, (1.0 - crossing.near) * h);
@@ -169,7 +172,7 @@ impl Adaptive {
             if jump * behind <= 0.1 {
                 return false;
             }
-            // Not within the bracket: nothing is known there.
+            // Not within the bracket, where the location is unknown.
             let margin = (0.05 / jump).max(4.0 * (crossing.far - crossing.near) * h);
             if to > 2.0 * margin { (to - margin, 2.0 * margin) } else { (to + margin, f64::INFINITY) }
         } else {
@@ -191,8 +194,8 @@ impl Adaptive {
         true
     }
 
-    /// By how much derivatives jump at a crossing, as error tolerances of their states gathered per second; 0 where
-    /// they jump by less than their own tolerance, or change about as much beside the crossing in the same time.
+    /// The jump of the derivatives at a crossing, in error tolerances of their states per second; 0 if it is less than
+    /// their own tolerance, or comparable to their change beside the crossing in the same time.
     pub(super) fn jump(&mut self, crossing: Crossing) -> f64 {
         if self.surfaces.bend() {
             return 0.0;
@@ -208,7 +211,7 @@ impl Adaptive {
         for (i, s) in self.scales.iter().enumerate() {
             let [before, near, far, after] = [0, 1, 2, 3].map(|row| self.slopes[row * n + i]);
             let jump = (far - near).abs();
-            // The polynomial says nothing outside its step.
+            // The polynomial is not valid outside its step.
             let earlier = if beside[0] >= 0.0 { (near - before).abs() } else { 0.0 };
             let later = if beside[3] <= 1.0 { (after - far).abs() } else { 0.0 };
             let drift = earlier.max(later);
@@ -219,10 +222,10 @@ impl Adaptive {
         rate
     }
 
-    /// By how much the rates of the derivatives jump at a crossing, as error tolerances of their states gathered per
-    /// second and second.
+    /// The jump in the rates of the derivatives (a kink) at a crossing, in error tolerances of their states per
+    /// second².
     pub(super) fn bend(&mut self, crossing: Crossing) -> f64 {
-        // Long against roundoff, short against the curvature beside the surface.
+        // Long relative to rounding errors, short relative to the curvature beside the surface.
         const WIDTH: f64 = 1e-6;
         let n = self.system.n;
         let ahead = [crossing.far, crossing.far + WIDTH, crossing.near, crossing.near - WIDTH];
