@@ -1,4 +1,4 @@
-//! From a text to cases that run: the only place that calls the compiler.
+//! From a text to runnable cases: the only module that calls the compiler.
 
 use abi::encode::Encode;
 use abi::image::{Feature, Target};
@@ -46,11 +46,12 @@ pub enum Emit {
     Blob,
 }
 
-/// Makes it. A model on its own is stepped by `solver`, else by `expo`; an experiment by its own; `target`: for which
-/// processor, else for this one; `features`: what it uses there besides.
+/// Emits a model or an experiment. The step of a model without experiment uses `solver`, by default `expo`; an
+/// experiment uses its own. `target`: the processor, by default this one; `features`: instruction set extensions to use
+/// there.
 ///
 /// # Errors
-/// Why it cannot be made, in words.
+/// Why it cannot be emitted, in words.
 pub fn emit(
     built: &Built,
     emit: Emit,
@@ -105,7 +106,7 @@ pub fn emit(
     Ok(text.into_bytes())
 }
 
-/// A table of the passes: what each did with the step, and how long it took.
+/// A table of the passes: what each did to the step, and how long it took.
 fn passes(built: &Built, method: Method) -> String {
     let mut out = format!("; {}, by {}\n", built.program.description.name, method.name());
     out += &format!("{:<18} {:>6} {:>6} {:>9}\n", "pass", "before", "after", "time");
@@ -120,18 +121,19 @@ fn passes(built: &Built, method: Method) -> String {
     out
 }
 
-/// How what was built is stepped.
+/// The integration method of what was built.
 fn method(built: &Built, solver: Option<Method>) -> Method {
     built.solver.map(|solver| solver.method).or(solver).unwrap_or(Method::Expo)
 }
 
-/// Whether it keeps something of the past, but for no step, though it is stepped by fixed ones.
+/// Whether it has a delay without a ring buffer, because no step length is known, although its method has fixed steps.
 pub fn unsized_delays(built: &Built, solver: Option<Method>) -> bool {
     let delays = &built.program.description.delays;
     method(built, solver) != Method::Adaptive && delays.iter().any(|delay| delay.ring.len == 0)
 }
 
-/// What a listing is of, and what its places of the block mean: each by its number times `unit`.
+/// The header of a listing: its method, and the meaning of the addresses in the block, each the slot number times
+/// `unit`.
 fn places(description: &Description, method: Method, unit: usize) -> String {
     let counted = if unit == 1 { "by number" } else { "by bytes from its beginning" };
     let mut out = format!("; {}, by {}. The block, {counted}:\n", description.name, method.name());
@@ -156,7 +158,7 @@ fn places(description: &Description, method: Method, unit: usize) -> String {
     out
 }
 
-/// Features, if code for a target may use them.
+/// The features, if code for the target may use them.
 fn usable(target: Target, features: &[Feature]) -> Result<&[Feature], String> {
     let names = |features: &[Feature]| features.iter().map(|it| it.name()).collect::<Vec<_>>().join(", ");
     let known = |feature: &&Feature| !target.may_use().contains(feature) && !target.needs().contains(feature);
@@ -169,19 +171,19 @@ fn usable(target: Target, features: &[Feature]) -> Result<&[Feature], String> {
     }
 }
 
-/// The step of an experiment, for who wants to know what it costs.
+/// The cost of a step of an experiment.
 pub struct StepCode {
-    /// Operations of the straight line.
+    /// Operations in the straight-line IR.
     pub operations: usize,
     /// Bytes of machine code.
     pub bytes: usize,
-    /// Cycles of the longest chain from one step to the next, by latencies of current processors.
+    /// Length of the longest dependency chain from one step to the next, in cycles, by latencies of current processors.
     pub critical_path: u32,
-    /// The step for many instances at once, or why there is none.
+    /// The step for several instances in SIMD lanes, or why there is none.
     pub lanes: Result<Lanes, String>,
 }
 
-/// What a fixed step is made of.
+/// Compiles a fixed step and reports its cost.
 pub fn step_code(built: &Built, method: Method) -> StepCode {
     let description = &built.program.description;
     let (layout, pool) = (&description.layout, description.pool.len());
@@ -193,12 +195,12 @@ pub fn step_code(built: &Built, method: Method) -> StepCode {
     StepCode { operations, bytes, critical_path, lanes }
 }
 
-/// How long each stage took, in the order in which they ran.
+/// The duration of each stage, in order of execution.
 #[derive(Clone, Debug, Default)]
 pub struct Stages(pub Vec<(&'static str, f64)>);
 
 impl Stages {
-    /// Seconds of all of them.
+    /// Total in s.
     pub fn total(&self) -> f64 {
         self.0.iter().map(|(_, seconds)| seconds).sum()
     }
@@ -211,18 +213,18 @@ pub struct Stopwatch {
 }
 
 impl Stopwatch {
-    /// Begins with a stage.
+    /// Starts with a stage.
     pub fn start(stage: &'static str) -> Stopwatch {
         Stopwatch { stages: Stages::default(), since: Some((stage, Instant::now())) }
     }
 
-    /// Ends the stage under way and begins another.
+    /// Ends the current stage and begins another.
     pub fn stage(&mut self, stage: &'static str) {
         self.end();
         self.since = Some((stage, Instant::now()));
     }
 
-    /// Ends the stage under way.
+    /// Ends the current stage.
     pub fn stop(mut self) -> Stages {
         self.end();
         self.stages
@@ -231,7 +233,7 @@ impl Stopwatch {
     fn end(&mut self) {
         let Some((stage, since)) = self.since.take() else { return };
         let seconds = since.elapsed().as_secs_f64();
-        // A stage may be done in several pieces, as for each case of a sweep.
+        // A stage may consist of several parts, as for the cases of a sweep.
         match self.stages.0.iter_mut().find(|(name, _)| *name == stage) {
             Some((_, sum)) => *sum += seconds,
             None => self.stages.0.push((stage, seconds)),
@@ -239,24 +241,24 @@ impl Stopwatch {
     }
 }
 
-/// A rig for a processor: its programs, as sections of a package.
+/// A rig compiled for a processor: its programs, as sections of a package.
 pub struct PackedRig {
-    /// The same in this process, interpreted.
+    /// The same rig in this process, interpreted.
     pub ready: Ready,
-    /// The system with one part crossed out: an [`abi::image::Image`].
+    /// The system without the part that hardware replaces: an [`abi::image::Image`].
     pub control: Vec<u8>,
-    /// That part alone.
+    /// The replaced part alone, also an image.
     pub plant: Vec<u8>,
-    /// Which parameters may change while it runs, and what must hold of them: [`abi::live::Live`], encoded.
+    /// Which parameters may change during a run, and their constraints: [`abi::live::Live`], encoded.
     pub live: Vec<u8>,
-    /// What computes the numbers of that: an [`abi::image::Image`].
+    /// The program that evaluates these constraints: an [`abi::image::Image`].
     pub judge: Vec<u8>,
 }
 
-/// Compiles a rig for a target such as `aarch64-linux`. Of the changes only `set` counts.
+/// Compiles a rig for a target such as `aarch64-linux`. Only `set` of the changes is used.
 ///
 /// # Errors
-/// In words, or none if what was found says it.
+/// A message, or none if diagnostics explain it.
 pub fn packed_rig(
     loaded: &mut Loaded,
     sources: &dyn Sources,

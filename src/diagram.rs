@@ -1,22 +1,23 @@
-//! The parts of a model and their connections, as text and as SVG.
+//! Block diagrams of a model's parts and connections, as text and as SVG.
 //!
-//! In: a model's tree. Out: one box a part with its ports; wires from outputs to inputs. Knows no files.
+//! In: the syntax tree of a model. Out: a box for each part with its ports, and wires from outputs to inputs. Knows no
+//! files.
 
 use crate::equations::expression;
 use grammar::ast::{BindValue, DeclarationKind, Expr, ExprKind, Model, Statement, Target};
 
-/// A part, or the outside of the model.
+/// A part, or the environment of the model.
 struct Block {
     name: String,
-    /// `LuGre`, `Friction = LuGre`; empty for the outside.
+    /// `LuGre`, `Friction = LuGre`; empty for the environment.
     kind: String,
-    /// Input and what it is wired to, as written.
+    /// Name of each input and the expression it is connected to, as written.
     inputs: Vec<(String, String)>,
-    /// Outputs that somebody reads.
+    /// Outputs that are read.
     outputs: Vec<String>,
 }
 
-/// From the output of a block to the input of another: block and port numbers.
+/// A connection from the output of a block to the input of another: block and port numbers.
 struct Wire {
     from: (usize, usize),
     to: (usize, usize),
@@ -42,7 +43,7 @@ fn paths(expr: &Expr, out: &mut Vec<String>) {
     }
 }
 
-/// What a statement computes: its name, its value, and whether it is an output.
+/// What a statement defines: its name, its value, and whether it is an output.
 fn computed(statement: &Statement) -> Option<(String, &Expr, bool)> {
     match statement {
         Statement::Declaration(d) if matches!(d.kind, DeclarationKind::Output | DeclarationKind::Let) => {
@@ -87,7 +88,7 @@ fn diagram(model: &Model) -> Diagram {
         }
         blocks.push(block);
     }
-    // What leaves the model.
+    // The model's own outputs.
     let end = blocks.len();
     let mut leaving = Block { name: String::new(), kind: String::new(), inputs: Vec::new(), outputs: Vec::new() };
     for (name, value, output) in model.body.iter().filter_map(computed) {
@@ -125,7 +126,7 @@ fn diagram(model: &Model) -> Diagram {
     Diagram { blocks, wires }
 }
 
-/// Boxes in characters, one below the other; at each output stand the inputs that read it.
+/// Text boxes, one below the other; each output lists the inputs that read it.
 pub fn text(model: &Model) -> String {
     let Diagram { blocks, wires } = diagram(model);
     let readers = |block: usize, port: usize| -> String {
@@ -151,7 +152,7 @@ pub fn text(model: &Model) -> String {
         let width = (wide(&inputs) + 3 + wide(outputs)).max(head.chars().count() + 2);
         out += &format!("  ┌ {head} {}┐\n", "─".repeat(width - head.chars().count()));
         for row in 0..inputs.len().max(outputs.len()) {
-            // Ports stand on the edge of the box.
+            // Ports are on the border of the box.
             let left = inputs.get(row).map_or("│", String::as_str);
             let right = outputs.get(row).map_or("│".into(), |name| format!("{name} ├─▸ {}", readers(k, row)));
             let inner = outputs.get(row).map_or(0, |name| name.chars().count() + 1);
@@ -166,12 +167,12 @@ pub fn text(model: &Model) -> String {
     out
 }
 
-/// Size of a letter, of a row of ports, and of the room between boxes.
+/// Width of a letter, height of a row of ports, and space between boxes.
 const LETTER: f64 = 7.4;
 const ROW: f64 = 22.0;
 const GAP: f64 = 70.0;
 
-/// Boxes from left to right; wires that lead back run below them. What comes from no part stands before its input.
+/// Boxes from left to right; feedback wires run below them. An input that no part drives shows its expression.
 pub fn svg(model: &Model) -> String {
     let Diagram { blocks, wires } = diagram(model);
     let letters = |text: &str| text.chars().count() as f64 * LETTER;
@@ -180,7 +181,7 @@ pub fn svg(model: &Model) -> String {
         let loose = block.inputs.iter().enumerate().filter(|(row, _)| !block.name.is_empty() && !is_wired(k, *row));
         loose.map(|(row, (_, value))| (row, value.clone())).collect()
     };
-    // A box has ports; what leaves the model is an equation.
+    // A box has ports; an output of the model is an equation.
     let shown = |block: &Block, (name, value): &(String, String)| match block.name.is_empty() {
         true => format!("{name} = {value}"),
         false => name.clone(),

@@ -1,15 +1,15 @@
-//! Equations as people print them: `σ₀ z + σ₁ dz/dt` for `sigma0 * z + sigma1 * dz/dt`.
+//! Typesets equations in mathematical notation: `σ₀ z + σ₁ dz/dt` for `sigma0 * z + sigma1 * dz/dt`.
 //!
-//! In: the tree of a model. Out: lines of text. What a text means is not changed by it: symbols, raised exponents and
-//! bars for `abs` only.
+//! In: the syntax tree of a model. Out: lines of text. The notation changes, not the expression: symbols, superscript
+//! exponents, and bars for `abs`.
 
 use grammar::ast::{
     BinaryOp, DeclarationKind, Equation, Every, EveryStatement, Expr, ExprKind, Model, Path, Reset, Statement, Target,
     UnaryOp,
 };
 
-/// The equations of a model, left and right side, in the order of the text; regimes have a heading of their own, which
-/// has no right side.
+/// The equations of a model, left and right side, in the order of the text. Each regime has a heading, with an empty
+/// right side.
 pub fn equations(model: &Model) -> Vec<(String, String)> {
     let mut lines = Vec::new();
     for statement in &model.body {
@@ -50,13 +50,13 @@ pub fn equations(model: &Model) -> Vec<(String, String)> {
     lines
 }
 
-/// What states are put on: `slip := 0, Ea := left`.
+/// The resets of a transition: `slip := 0, Ea := left`.
 fn reset(resets: &[Reset]) -> String {
     let one = |reset: &Reset| format!("{} := {}", symbol(&reset.name.text), expression(&reset.value));
     resets.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
-/// One line for each equation, the equals signs below each other.
+/// One line for each equation, aligned at the equals signs.
 pub fn lines(equations: &[(String, String)]) -> String {
     let width = equations.iter().filter(|(_, right)| !right.is_empty()).map(|(left, _)| left.chars().count()).max();
     let mut text = String::new();
@@ -97,28 +97,28 @@ fn derivative(of: &str, along: &str) -> String {
     format!("d{}/d{}", symbol(of), symbol(along))
 }
 
-/// How tightly an operator binds; the higher, the tighter.
+/// Binding strength of an operator as it is printed; higher binds tighter.
 fn tightness(expr: &Expr) -> u8 {
     match &expr.kind {
         ExprKind::If(..) => 0,
         ExprKind::Binary(op, ..) => op.binds(),
-        // A product in print: a − (−b), a · (−b).
+        // Like a product in print: a − (−b), a · (−b).
         ExprKind::Unary(UnaryOp::Negate, _) => BinaryOp::Multiply.binds(),
         ExprKind::Unary(UnaryOp::Not, _) => UnaryOp::Not.binds(),
-        // `dz/dt` squared, or divided by, stands in parentheses.
+        // `dz/dt` squared, or as a divisor, needs parentheses.
         ExprKind::Derivative { .. } => 6,
         ExprKind::Number { unit: Some(_), .. } => 6,
         ExprKind::Number { .. } | ExprKind::Path(_) | ExprKind::Call { .. } | ExprKind::Hole | ExprKind::Error => 9,
     }
 }
 
-/// In parentheses unless it binds at least as tightly as asked for.
+/// An expression, in parentheses unless it binds at least as tightly as `least`.
 fn inside(expr: &Expr, least: u8) -> String {
     let text = expression(expr);
     if tightness(expr) >= least { text } else { format!("({text})") }
 }
 
-/// An expression with symbols.
+/// An expression in symbols.
 pub fn expression(expr: &Expr) -> String {
     match &expr.kind {
         ExprKind::Number { value, unit } => {
@@ -172,7 +172,7 @@ fn binary(op: BinaryOp, a: &Expr, b: &Expr) -> String {
         BinaryOp::NotEqual => joined(" ≠ ", 5, 5),
         BinaryOp::And => joined(" and ", 2, 3),
         BinaryOp::Or => {
-            // It binds tighter, but who remembers.
+            // `and` binds tighter than `or`, but parentheses make that obvious.
             let side = |x: &Expr, least: u8| match &x.kind {
                 ExprKind::Binary(BinaryOp::And, ..) => format!("({})", expression(x)),
                 _ => inside(x, least),
@@ -185,7 +185,7 @@ fn binary(op: BinaryOp, a: &Expr, b: &Expr) -> String {
     }
 }
 
-/// A whole number as raised digits.
+/// A whole number as superscript digits.
 fn exponent(expr: &Expr) -> Option<String> {
     let raised = |value: f64| {
         (value.fract() == 0.0 && (0.0..100.0).contains(&value)).then(|| {
@@ -218,7 +218,7 @@ fn path_text(path: &Path) -> String {
     }
 }
 
-/// A unit as it is printed.
+/// A unit in mathematical notation.
 fn unit_text(unit: &str) -> String {
     let mut text = String::new();
     let mut chars = unit.chars().peekable();
@@ -239,7 +239,7 @@ fn unit_text(unit: &str) -> String {
     text
 }
 
-/// A name as a symbol: Greek letters and lowered digits.
+/// A name as a symbol: Greek letters and subscript digits.
 pub fn symbol(name: &str) -> String {
     const GREEK: [(&str, &str); 21] = [
         ("alpha", "α"),

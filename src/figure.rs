@@ -1,6 +1,7 @@
-//! Recordings as figures.
+//! Turns recordings into figures.
 //!
-//! In: the plots of an experiment and what its cases recorded. Out: one [`Figure`]; cases of a sweep share its axes.
+//! In: the plots of an experiment and the recordings of its cases. Out: one [`Figure`]; the cases of a sweep share its
+//! axes.
 
 use crate::compile::Case;
 use crate::plot::{Axis, Band, Curve, Figure, Panel};
@@ -8,10 +9,10 @@ use abi::plan::{Plot, Series};
 use runtime::engine::{Failure, Outcome};
 use runtime::record::Recording;
 
-/// One case: what sets it apart, empty if it is the only one, and what it recorded.
+/// One case: its label, empty if it is the only one, and its recording.
 pub type Recorded<'a> = (&'a str, &'a Recording);
 
-/// What each case recorded, as far as it came.
+/// The recording of each case, up to where its run ended.
 pub fn recorded<'a>(cases: &'a [Case], results: &'a [Result<Outcome, Failure>]) -> Vec<Recorded<'a>> {
     let of = |(case, result): (&'a Case, &'a Result<Outcome, Failure>)| {
         let recording = match result {
@@ -23,10 +24,10 @@ pub fn recorded<'a>(cases: &'a [Case], results: &'a [Result<Outcome, Failure>]) 
     cases.iter().zip(results).map(of).collect()
 }
 
-/// Draws the plots of an experiment.
+/// The figure of the plots of an experiment.
 ///
-/// Quantities of one unit share axes; further units get axes of their own below. What is true or false shades the
-/// time in which it is true, or has its own axes where several cases would shade over each other.
+/// Quantities of one unit share axes; further units get axes of their own below. A truth value shades the time in which
+/// it is true, or has its own axes if the shades of several cases would overlap.
 pub fn figure(title: &str, subtitle: &str, plots: &[Plot], cases: &[Recorded]) -> Figure {
     let panels = plots.iter().flat_map(|plot| panels(plot, cases)).collect();
     Figure { title: title.into(), subtitle: subtitle.into(), panels }
@@ -37,7 +38,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
         Some(series) => Axis { name: series.label.clone(), unit: series.unit.text.clone(), ..Axis::default() },
         None => Axis { name: "t".into(), unit: "s".into(), ..Axis::default() },
     };
-    // A truth value against another quantity is a curve like any other: it has no time to shade.
+    // A truth value plotted against another quantity is a curve, because there is no time axis to shade.
     let as_curve = |series: &&Series| !series.boolean || plot.against.is_some();
     let mut units: Vec<Vec<&Series>> = Vec::new();
     for series in plot.series.iter().filter(as_curve) {
@@ -68,7 +69,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
             marks: false,
             style: None,
         };
-        // What no case changes, such as a reference, is drawn once.
+        // Signals that are equal in all cases, such as a reference, are drawn once.
         let (common, own): (Vec<&Series>, Vec<&Series>) =
             group.iter().partition(|series| plot.against.is_none() && cases.len() > 1 && same_in_all(cases, series));
         let common = common.into_iter().map(|series| curve(&("", cases[0].1), series));
@@ -87,7 +88,7 @@ fn panels(plot: &Plot, cases: &[Recorded]) -> Vec<Panel> {
     panels
 }
 
-/// The course of a series in the units shown, over time or against another one.
+/// The points of a series in the units shown, over time or against another series.
 fn points(recording: &Recording, series: &Series, against: Option<&Series>) -> Vec<(f64, f64)> {
     let Some(y) = recording.column(series) else { return Vec::new() };
     let x = against.and_then(|against| Some((recording.column(against)?, &against.unit)));
@@ -98,7 +99,7 @@ fn points(recording: &Recording, series: &Series, against: Option<&Series>) -> V
     recording.rows().map(shown).collect()
 }
 
-/// Whether a series has the same course in all cases, as far as a picture shows.
+/// Whether a series is equal in all cases, at the resolution of a picture.
 fn same_in_all(cases: &[Recorded], series: &Series) -> bool {
     const SAMPLES: usize = 200;
     let courses: Vec<Vec<(f64, f64)>> = cases.iter().map(|(_, recording)| points(recording, series, None)).collect();
@@ -114,7 +115,7 @@ fn same_in_all(cases: &[Recorded], series: &Series) -> bool {
     })
 }
 
-/// The value at a time, straight lines between points.
+/// The value at a time, interpolated linearly.
 fn value_at(points: &[(f64, f64)], t: f64) -> f64 {
     let next = points.partition_point(|(time, _)| *time < t);
     match (points.get(next.wrapping_sub(1)), points.get(next)) {

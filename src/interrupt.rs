@@ -1,7 +1,7 @@
-//! Ctrl-C: the only file that knows ctrlc.
+//! Handling of Ctrl-C: the only file that uses the ctrlc crate.
 
-/// Calls `handler` at each Ctrl-C from now on. Set once for the process: a second call, and a system without signals, change
-/// nothing.
+/// Calls `handler` at each Ctrl-C from now on. Can be set once per process: a second call, and a call on a system
+/// without signals, has no effect.
 pub fn on_interrupt(handler: impl FnMut() + Send + 'static) {
     let _ = ctrlc::set_handler(handler);
 }

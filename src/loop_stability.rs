@@ -1,7 +1,7 @@
-//! Whether the contacts that a rig's drives play are stable: for `fric predict`, and before anything moves.
+//! Stability of the contacts that a rig's drives emulate: for `fric predict`, and before anything moves.
 //!
-//! In: a compiled rig. Out: each drive whose torque answers the speed of the shaft, with the loop around it, judged by
-//! runtime::coupling::loop_stability. Knows neither terminal nor files.
+//! In: a compiled rig. Out: each drive whose torque depends on the speed of the shaft, with the control loop around it,
+//! analysed by runtime::coupling::loop_stability. Knows neither terminal nor files.
 
 use crate::compile::{self, Ready, StepDerivative};
 use crate::quantity::significant;
@@ -12,38 +12,39 @@ use runtime::coupling::predictor::Wired;
 
 /// The emulated contact of one drive.
 pub struct Contact {
-    /// Its name.
+    /// The name of the drive.
     pub drive: String,
-    /// How late its commands act.
+    /// The delay and lag of its commands.
     pub late: Late,
     inputs: Vec<Slot>,
-    /// Of each input whether it is read from this drive.
+    /// For each input whether it is measured by this drive.
     own: Vec<bool>,
     derivative: StepDerivative,
     shaft: Shaft,
-    /// The position that this drive sees, from the states of the shaft.
+    /// The position that this drive measures, as a row over the states of the shaft.
     position: Option<Vec<f64>>,
-    /// Inertia as an observer is told, and the sign of the torque; where the rig asks for one.
+    /// The inertia configured for the predictor's observer, and the sign of the torque; none where the rig has no
+    /// predictor for this drive.
     told: Option<(f64, f64)>,
 }
 
-/// How a contact stands at rest.
+/// Stability of a contact at rest.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Standing {
-    /// Spectral radius of one period without looking ahead.
+    /// Spectral radius of one period without the predictor.
     pub plain: f64,
-    /// The same as the rig runs it, where it looks ahead.
+    /// Spectral radius as the rig runs it, if it has a predictor for this drive.
     pub ahead: Option<f64>,
 }
 
 impl Standing {
-    /// Whether every disturbance dies out on the rig.
+    /// Whether every disturbance decays on the rig.
     pub fn is_stable(&self) -> bool {
         self.ahead.unwrap_or(self.plain) < 1.0
     }
 }
 
-/// Drives whose torque answers the speed of the shaft.
+/// The drives whose torque depends on the speed of the shaft.
 pub fn contacts(ready: &Ready) -> Vec<Contact> {
     let rig = &ready.rig;
     let looks = Wired::of(rig, &ready.plant, |_| 0).ok().flatten();
@@ -87,7 +88,7 @@ pub fn contacts(ready: &Ready) -> Vec<Contact> {
 }
 
 impl Contact {
-    /// The loop with these parameters, near a speed that has lasted.
+    /// The loop with these parameters, linearised at a constant speed after transients have decayed.
     pub fn at(&self, ready: &Ready, params: &[(Slot, f64)], speed: f64) -> Loop {
         let rig = &ready.rig;
         let period = rig.period_ns as f64 * 1e-9;
@@ -100,7 +101,7 @@ impl Contact {
         }
         control.start(period / f64::from(rig.steps));
         if speed != 0.0 {
-            // What a contact has to forget is forgotten in so many steps of a speed that lasts.
+            // The contact's memory decays in this many steps at constant speed.
             for _ in 0..2000 * rig.steps {
                 control.advance(1);
             }
@@ -118,24 +119,24 @@ impl Contact {
         Loop { period, step, shaft: self.shaft.clone(), late: vec![self.late] }
     }
 
-    /// The same as the rig runs it; none if it does not look ahead.
+    /// The loop with the predictor, as the rig runs it; none if there is no predictor for this drive.
     pub fn looking(&self, plain: Loop) -> Option<Ahead> {
         let ((inertia, sign), position) = (self.told?, self.position.clone()?);
         Some(Ahead { plain, position, ahead: self.own.clone(), inertia, sign, told: self.late })
     }
 
-    /// How it stands at rest.
+    /// Its stability at rest.
     pub fn standing(&self, ready: &Ready) -> Standing {
         let near = self.at(ready, &[], 0.0);
         Standing { plain: near.radius(), ahead: self.looking(near).map(|ahead| ahead.radius()) }
     }
 
-    /// The shaft alone, dx/dt = A x, row by row: for its resonances.
+    /// The matrix of the shaft alone, dx/dt = A x, row-major, with the number of states: for its resonances.
     pub fn shaft(&self) -> (usize, &[f64]) {
         (self.shaft.states, &self.shaft.a)
     }
 
-    /// How the torque goes on answering a speed, N·m/rad: the stiffness.
+    /// The stiffness that the contact adds, N·m/rad: the rate of its torque at constant speed, per speed.
     pub fn stiffness(&self, near: &Loop) -> f64 {
         let (step, signals) = (&near.step, near.step.signals);
         let kept = |j: usize| (0..step.states).map(|i| step.c[i] * step.b[i * signals + j]).sum::<f64>();
@@ -143,7 +144,7 @@ impl Contact {
     }
 }
 
-/// What forbids to let a rig move, in words; and whether it is stable only while its commands look ahead.
+/// The reasons why a rig must not move, in words; and whether it is stable only with the predictor.
 pub fn objections(ready: &Ready) -> (Vec<String>, bool) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let (mut found, mut needs_look) = (Vec::new(), false);

@@ -1,7 +1,7 @@
-//! The `fric` command: joins the crates and talks to people.
+//! The `fric` command: connects the crates with the user.
 //!
-//! In: arguments, files, a terminal. Out: words, plots, files, an exit code. What a text means is the compiler's
-//! business, what a run does the runtime's; here they meet.
+//! In: arguments, files, a terminal. Out: messages, plots, files, an exit code. The compiler interprets texts and the
+//! runtime executes runs; this crate combines them.
 
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
 

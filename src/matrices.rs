@@ -1,21 +1,21 @@
-//! Matrices as files that other tools read: NumPy's .npz and MATLAB's .mat of version 5.
+//! Writes matrices as files for other tools: NumPy's .npz and MATLAB's .mat, version 5.
 //!
-//! In: names and matrices, row by row. Out: bytes. Both formats are small and have not changed for decades:
+//! In: names and matrices, row-major. Out: bytes. Both formats are small and have not changed for decades:
 //! numpy.lib.format 1.0 in a ZIP archive without compression; "MAT-File Format", MathWorks, chapter 1.
 
 /// A matrix and its name.
 pub struct Matrix<'a> {
-    /// As the other tool will know it.
+    /// Variable name in the other tool.
     pub name: &'a str,
     /// Number of rows.
     pub rows: usize,
     /// Number of columns.
     pub columns: usize,
-    /// Row by row.
+    /// Row-major.
     pub values: &'a [f64],
 }
 
-/// An archive that `numpy.load` reads.
+/// An archive for `numpy.load`.
 pub fn npz(matrices: &[Matrix]) -> Vec<u8> {
     let mut out = Vec::new();
     let mut directory = Vec::new();
@@ -23,7 +23,8 @@ pub fn npz(matrices: &[Matrix]) -> Vec<u8> {
         let bytes = npy(matrix);
         let name = format!("{}.npy", matrix.name);
         let offset = out.len() as u32;
-        // What the local header and the directory share: version, flags, method, date of 1 January 1980, sums.
+        // The fields common to the local header and the directory: version, flags, method, date of 1 January 1980,
+        // checksum and sizes.
         let mut shared = Vec::new();
         for half in [20u16, 0, 0, 0, 0x21] {
             shared.extend(half.to_le_bytes());
@@ -58,7 +59,7 @@ pub fn npz(matrices: &[Matrix]) -> Vec<u8> {
 fn npy(matrix: &Matrix) -> Vec<u8> {
     let mut header =
         format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, {}), }}", matrix.rows, matrix.columns);
-    // The numbers begin at a multiple of 64.
+    // The data begins at a multiple of 64 bytes.
     while !(10 + header.len() + 1).is_multiple_of(64) {
         header.push(' ');
     }
@@ -70,7 +71,7 @@ fn npy(matrix: &Matrix) -> Vec<u8> {
     out
 }
 
-/// The check sum of ZIP: polynomial 0xEDB88320, bit by bit.
+/// The checksum of ZIP: CRC-32 with polynomial 0xEDB88320, bit by bit.
 fn crc32(bytes: &[u8]) -> u32 {
     let step = |crc: u32, byte: &u8| {
         (0..8).fold(crc ^ u32::from(*byte), |crc, _| (crc >> 1) ^ if crc & 1 == 1 { 0xEDB8_8320 } else { 0 })
@@ -78,7 +79,7 @@ fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(u32::MAX, step)
 }
 
-/// A file that MATLAB, Octave and `scipy.io.loadmat` read.
+/// A file for MATLAB, Octave and `scipy.io.loadmat`.
 pub fn mat(matrices: &[Matrix]) -> Vec<u8> {
     const INT8: u32 = 1;
     const INT32: u32 = 5;

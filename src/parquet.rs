@@ -1,7 +1,7 @@
-//! Tables of text → Parquet files, for those who read with pandas, Polars or DuckDB.
+//! Converts CSV tables to Parquet files, for pandas, Polars or DuckDB.
 //!
-//! In: rows of comma-separated values and what each column holds. Out: a file. An empty cell becomes a null. The only home
-//! of the crate `parquet`.
+//! In: rows of comma-separated values and the type of each column. Out: a file. An empty cell becomes a null. The only
+//! file that uses the crate `parquet`.
 
 use ::parquet::basic::{self, LogicalType, Repetition};
 use ::parquet::data_type::{BoolType, ByteArray, ByteArrayType, DataType, DoubleType, Int64Type};
@@ -12,7 +12,7 @@ use ::parquet::schema::types::Type;
 use std::io::{self, Read, Write};
 use std::sync::Arc;
 
-/// What the cells of a column are.
+/// The type of the cells of a column.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Holds {
     Numbers,
@@ -21,14 +21,14 @@ pub enum Holds {
     Words,
 }
 
-/// Rows that are held before they are written, as one row group.
+/// Rows buffered before they are written as one row group.
 const GROUP: usize = 1 << 16;
 
-/// Writes the rows of `csv` as a table with these columns. The first row is left out where it is a header.
+/// Writes the rows of `csv` as a table with these columns. With `header`, the first row is skipped.
 ///
 /// # Errors
-/// A row that is too short or a cell that is not what its column holds, with the number of its row; what the writer
-/// answers.
+/// A row that is too short or a cell that does not match the type of its column, with the number of its row; errors of
+/// the writer.
 pub fn from_csv(csv: impl Read, header: bool, columns: &[(String, Holds)], to: impl Write + Send) -> io::Result<()> {
     let mut file = SerializedFileWriter::new(to, Arc::new(schema(columns)?), Arc::new(WriterProperties::default()))?;
     let mut reader = ::csv::ReaderBuilder::new().has_headers(header).from_reader(csv);
@@ -37,7 +37,7 @@ pub fn from_csv(csv: impl Read, header: bool, columns: &[(String, Holds)], to: i
     loop {
         let more = reader.read_record(&mut record)?;
         if more {
-            // A row of another length is an error of the reader.
+            // The reader reports rows of another length as errors.
             cells.iter_mut().zip(&record).for_each(|(column, cell)| column.push(cell.to_string()));
         }
         let rows = cells.first().map_or(0, Vec::len);
@@ -60,7 +60,7 @@ pub fn from_csv(csv: impl Read, header: bool, columns: &[(String, Holds)], to: i
     }
 }
 
-/// The columns as the format describes them.
+/// The columns as a Parquet schema.
 fn schema(columns: &[(String, Holds)]) -> Result<Type, ParquetError> {
     let column = |(name, holds): &(String, Holds)| {
         let (kind, logical) = match holds {
@@ -76,7 +76,7 @@ fn schema(columns: &[(String, Holds)]) -> Result<Type, ParquetError> {
     Type::group_type_builder("table").with_fields(fields).build()
 }
 
-/// Cells of one column as one chunk. The outer error: a row, from 0, and its cell.
+/// Writes the cells of one column as one chunk. The outer error: a row, from 0, and its cell.
 fn column<W: Write + Send>(
     group: &mut SerializedRowGroupWriter<'_, W>,
     holds: Holds,
@@ -127,7 +127,7 @@ mod tests {
         ]
     }
 
-    /// The table of these rows, read again.
+    /// Writes these rows and reads the table back.
     fn again(name: &str, csv: &str, header: bool) -> SerializedFileReader<File> {
         let path = std::env::temp_dir().join(format!("fric-parquet-{name}-{}", std::process::id()));
         from_csv(csv.as_bytes(), header, &columns(), File::create(&path).unwrap()).unwrap();

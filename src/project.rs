@@ -1,4 +1,4 @@
-//! Texts on disk and in the embedded library, and files written whole.
+//! Reads texts from disk and from the embedded library, and writes files atomically.
 //!
 //! In: paths and imports. Out: texts, or the reason in words why there is none. Knows nothing of the language.
 
@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Component, Path, PathBuf};
 
-/// The library: dotted name of each file (`std.friction.lugre`) and its text, in the order of the names.
+/// The library: dotted name of each file (`std.friction.lugre`) and its text, sorted by name.
 const LIBRARY: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/library.rs"));
 
 /// The library: dotted name and text of each file.
@@ -15,7 +15,7 @@ pub fn library() -> &'static [(&'static str, &'static str)] {
     LIBRARY
 }
 
-/// A text longer than this is not one that somebody wrote.
+/// Longest accepted text; a longer file was not written by hand.
 const MOST_BYTES: u64 = 64 << 20;
 
 /// Reads a text.
@@ -61,11 +61,11 @@ fn text(bytes: Vec<u8>) -> Result<String, String> {
     })
 }
 
-/// Where the compiler finds what a text imports.
+/// Resolves the imports of a text for the compiler, on disk.
 pub struct Disk;
 
 impl crate::compile::Sources for Disk {
-    /// A library name stands for its file, or for all files of its folder.
+    /// A library name refers to its file, or to all files of its folder.
     fn library(&self, module: &str) -> Option<Vec<(String, String)>> {
         let inside = |file: &str| file == module || file.strip_prefix(module).is_some_and(|rest| rest.starts_with('.'));
         let found: Vec<(String, String)> = LIBRARY
@@ -86,7 +86,7 @@ impl crate::compile::Sources for Disk {
     fn file(&self, from: &str, path: &str) -> Result<(String, String), String> {
         let folder = Path::new(from).parent().unwrap_or(Path::new(""));
         let path = tidy(&folder.join(path));
-        // A user who names a pipe waits for it on purpose; a text that names one would make `check` wait for ever.
+        // A pipe named on the command line is intentional; one named in an import would block `check` for ever.
         if fs::metadata(&path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
             return Err("it is a pipe or a device, not a file".into());
         }
@@ -109,8 +109,8 @@ fn tidy(path: &Path) -> PathBuf {
     out
 }
 
-/// All `.fric` files in a folder and its folders, in the order of their names. What is hidden or made by tools is left
-/// out: names that begin with a dot, and folders called `target` or `out`.
+/// All `.fric` files in a folder and its subfolders, sorted by name. Hidden and generated files are skipped: names that
+/// begin with a dot, and folders called `target` or `out`.
 ///
 /// # Errors
 /// Why a folder cannot be read.
@@ -134,7 +134,7 @@ pub fn texts_in(folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// The files a command is given, each folder replaced by the texts in it.
+/// The files given to a command, with each folder replaced by the texts in it.
 ///
 /// # Errors
 /// Which folder cannot be read, and why, in words.
@@ -150,7 +150,7 @@ pub fn expanded(paths: &[PathBuf]) -> Result<Vec<PathBuf>, String> {
     Ok(files)
 }
 
-/// Makes the folder a file is to lie in.
+/// Creates the folder of a file, if it is missing.
 ///
 /// # Errors
 /// Why not.
@@ -161,25 +161,25 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Writes a file whole or not at all: into a neighbour first, which then takes the name.
+/// Writes a file atomically: into a temporary file beside it, which is then renamed.
 ///
 /// # Errors
-/// Why not; a file of that name is then as it was.
+/// Why not; an existing file of that name is then unchanged.
 pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     make_folder_of(path)?;
     match fs::metadata(path) {
-        // A pipe or a device takes what it is given; its name is not ours to take.
+        // A pipe or a device is written directly; it must not be replaced by a file.
         Ok(old) if !old.is_file() => fs::OpenOptions::new().write(true).open(path)?.write_all(bytes),
-        // Who may read the old file may read the new one, and nobody else at any moment.
+        // The new file has the permissions of the old one, and is never readable by anybody else, even briefly.
         Ok(old) => replace(path, bytes, 0o600, Some(old.permissions())),
         Err(_) => replace(path, bytes, 0o666, None),
     }
 }
 
-/// Writes a file that only its owner may read, from its first byte on.
+/// Writes a new file that is readable only by its owner from the first byte on.
 ///
 /// # Errors
-/// Why not, or that there is one of that name already.
+/// Why not, or that the file exists already.
 pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
@@ -190,11 +190,11 @@ pub fn write_secret(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace(path, bytes, 0o600, None)
 }
 
-/// Writes a neighbour with a mode, then gives it permissions and the name.
+/// Writes a temporary file with this mode, then sets its permissions and renames it.
 fn replace(path: &Path, bytes: &[u8], mode: u32, permissions: Option<fs::Permissions>) -> io::Result<()> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let neighbour = path.with_file_name(format!(".{name}.{}", std::process::id()));
-    // One of that name was left by a process that was killed, or is a trap: it is never written through.
+    // A file of that name was left by a killed process, or is a symbolic link set as a trap: never write through it.
     let _ = fs::remove_file(&neighbour);
     let written = fs::OpenOptions::new()
         .write(true)
@@ -215,8 +215,8 @@ mod tests {
     use super::*;
     use std::os::unix::fs::{MetadataExt, PermissionsExt};
 
-    /// A secret, and a file that only its owner may read, are never readable by others: not even half of them, beside their
-    /// names, for a moment.
+    /// A secret, and a file that is readable only by its owner, are never readable by others, not even in part in a
+    /// temporary file.
     #[test]
     fn what_is_secret_is_secret_from_its_first_byte() {
         let folder = tempfile::tempdir().unwrap();

@@ -1,8 +1,8 @@
-//! Numbers with units: as typed on a command line, and as shown.
+//! Parses and formats numbers with units.
 
 use abi::unit::Unit;
 
-/// Reads `10us`, `2 N`, `1e-3`; gives the value in SI and the unit as written.
+/// Parses `10us`, `2 N`, `1e-3`; returns the value in SI and the unit as written.
 ///
 /// # Errors
 /// What is wrong with it, in words.
@@ -13,19 +13,19 @@ pub fn parse(text: &str) -> Result<(f64, Unit), String> {
 
 /// The value in SI of a number in a unit.
 pub fn si(value: f64, unit: &Unit) -> f64 {
-    // 1e-6 is no double, 1e6 is: dividing gives the double nearest to what was written.
+    // 1e-6 is not representable, 1e6 is: dividing gives the double nearest to the decimal as written.
     if unit.scale < 1.0 { value / (1.0 / unit.scale) } else { value * unit.scale }
 }
 
-/// A value in SI, shown in a unit with so many significant digits: `3.30679 m`.
+/// A value in SI, shown in a unit with this many significant digits: `3.30679 m`.
 pub fn show(si: f64, unit: &Unit, digits: usize) -> String {
     let number = significant(unit.from_si(si), digits);
     if unit.text.is_empty() { number } else { format!("{number} {unit}") }
 }
 
-/// A value in SI with its error, in a unit: `6.36281(2) s`, the number in parentheses being the error of the last digits, rounded
-/// up; `0.3 ± 0.5 mm` where the error leaves less than two digits. At most so many significant digits, of which the last may
-/// be off by one then.
+/// A value in SI with its error, in a unit: `6.36281(2) s`, where the number in parentheses is the error of the last
+/// digit, rounded up; `0.3 ± 0.5 mm` where the error leaves fewer than two digits. At most `digits` significant digits;
+/// if that limits them, the last one may be off by one.
 pub fn uncertain(si: f64, error: f64, unit: &Unit, digits: usize) -> String {
     let (value, error) = (unit.from_si(si), (error * (unit.from_si(1.0) - unit.from_si(0.0))).abs());
     let unit = if unit.text.is_empty() { String::new() } else { format!(" {unit}") };
@@ -39,7 +39,7 @@ pub fn uncertain(si: f64, error: f64, unit: &Unit, digits: usize) -> String {
         let text = format!("{x:.*e}", digits);
         text.split_once('e').and_then(|(_, exponent)| exponent.parse::<i32>().ok()).unwrap_or(0)
     };
-    // The error as a digit of 10^last, rounded up.
+    // The error as one digit times 10^last, rounded up.
     let mut last = exponent(error, 17);
     let mut digit = scaled(error, -last).ceil();
     if digit > 9.0 {
@@ -72,13 +72,13 @@ pub fn uncertain(si: f64, error: f64, unit: &Unit, digits: usize) -> String {
     }
 }
 
-/// x · 10^exponent, by the double nearest to that power or its inverse.
+/// x · 10^exponent, using the double nearest to that power or to its inverse.
 fn scaled(x: f64, exponent: i32) -> f64 {
     let power: f64 = format!("1e{}", exponent.abs()).parse().unwrap_or(f64::INFINITY);
     if exponent < 0 { x / power } else { x * power }
 }
 
-/// A number rounded to so many significant digits, without trailing zeros.
+/// A number rounded to this many significant digits, without trailing zeros.
 pub fn significant(value: f64, digits: usize) -> String {
     if value == 0.0 || !value.is_finite() {
         return value.abs().to_string().replacen("inf", if value < 0.0 { "-inf" } else { "inf" }, 1);
@@ -87,7 +87,7 @@ pub fn significant(value: f64, digits: usize) -> String {
     if (1e-3..1e9).contains(&rounded.abs()) { rounded.to_string() } else { format!("{rounded:e}") }
 }
 
-/// A duration with three digits in the unit that suits: `3.1 ms`, `12.5 s`.
+/// A duration with three digits in a suitable unit: `3.1 ms`, `12.5 s`.
 pub fn duration(seconds: f64) -> String {
     let (scale, unit) = match seconds {
         s if s < 1e-3 => (1e6, "µs"),
@@ -98,7 +98,7 @@ pub fn duration(seconds: f64) -> String {
     format!("{} {unit}", significant(seconds * scale, 3))
 }
 
-/// A count with its thousands set apart: `4,000,000`.
+/// A count with thousands separators: `4,000,000`.
 pub fn count(n: u64) -> String {
     let digits = n.to_string();
     let groups: Vec<&str> =

@@ -1,9 +1,9 @@
-//! Shows diagnostics to people and to programs: in full, one line each, or as JSON.
+//! Formats diagnostics for people and programs: in full, one line each, or as JSON.
 //!
-//! In: diagnostics and the texts they speak of. Out: a string, or a JSON value. The only file that knows miette.
+//! In: diagnostics and the texts that they refer to. Out: a string, or a JSON value. The only file that uses miette.
 //!
-//! miette is handed an excerpt instead of the text: whole lines, tabs and control characters made visible, lines
-//! that no screen holds cut to the part that matters. So no text, however odd, upsets its layout or the terminal.
+//! Miette receives an excerpt instead of the text: whole lines, with tabs and control characters made visible, and with
+//! lines wider than a screen cut to the relevant part. So no text can break the layout or the terminal.
 
 use crate::compile::SourceFile;
 use grammar::diagnostic::{Diagnostic, Label, Severity};
@@ -16,22 +16,22 @@ use serde_json::{Value, json};
 use std::collections::HashMap;
 use std::fmt;
 
-/// At most this many are shown of one file; the rest are counted.
+/// Most diagnostics shown per file; the rest are counted.
 const MOST_PER_FILE: usize = 10;
 /// Width of a report in columns: fixed, so that it reads the same everywhere.
 const WIDTH: usize = 100;
-/// A line longer than this is cut around its first label.
+/// A longer line is cut around its first label.
 const LONGEST_LINE: usize = 160;
 /// Columns kept before and after the start of that label.
 const KEPT: (usize, usize) = (60, 80);
-/// A label over more lines than this marks its first line only.
+/// A label over more lines than this marks only its first line.
 const MOST_LINES: usize = 8;
-/// Labels at most this many lines apart are shown in one piece.
+/// Labels at most this many lines apart share one excerpt.
 const GAP: usize = 3;
-/// Width of a tab stop, as the language server and most editors have it.
+/// Width of a tab stop, as in the language server and most editors.
 const TAB: usize = 4;
 
-/// Everything in full, in the order of the files; empty if there is nothing to say.
+/// Everything in full, in the order of the files; empty if there are no diagnostics.
 pub fn full(files: &[SourceFile], diagnostics: &[Diagnostic], colour: bool) -> String {
     let mut out = String::new();
     for group in by_file(diagnostics) {
@@ -62,7 +62,7 @@ pub fn short(files: &[SourceFile], diagnostics: &[Diagnostic]) -> String {
     out
 }
 
-/// `file:line:column` of a place; empty if the file is not known.
+/// `file:line:column` of a span; empty if the file is unknown.
 pub fn place(files: &[SourceFile], span: Span) -> String {
     Places::new(files).of(span).map_or(String::new(), |place| place.to_string())
 }
@@ -103,19 +103,19 @@ fn severity_word(severity: Severity) -> &'static str {
     }
 }
 
-/// In the order of the text, one group a file.
+/// Diagnostics in the order of the text, grouped by file.
 fn by_file(diagnostics: &[Diagnostic]) -> Vec<Vec<&Diagnostic>> {
     let mut sorted: Vec<&Diagnostic> = diagnostics.iter().collect();
     sorted.sort_by_key(|diagnostic| (diagnostic.span().file, diagnostic.span().start));
     sorted.chunk_by(|a, b| a.span().file == b.span().file).map(<[_]>::to_vec).collect()
 }
 
-/// Where a label stands, as people count.
+/// The position of a label as users count it.
 struct Place<'a> {
     file: &'a str,
     line: usize,
     column: usize,
-    /// Line and column behind the last character.
+    /// Line and column after the last character.
     end: (usize, usize),
 }
 
@@ -125,7 +125,7 @@ impl fmt::Display for Place<'_> {
     }
 }
 
-/// The places of many labels: each text is looked through once.
+/// Positions of many labels: the lines of each text are indexed once.
 struct Places<'a> {
     files: &'a [SourceFile],
     lines: HashMap<FileId, Lines<'a>>,
@@ -144,7 +144,7 @@ impl<'a> Places<'a> {
     }
 }
 
-/// Where the lines of a text begin.
+/// The start offsets of the lines of a text.
 struct Lines<'a> {
     text: &'a str,
     starts: Vec<usize>,
@@ -157,7 +157,7 @@ impl<'a> Lines<'a> {
         Lines { text, starts, ascii: text.is_ascii() }
     }
 
-    /// Line and column of a byte, from 1, the column in characters. A byte order mark is no character.
+    /// Line and column of a byte offset, from 1, the column in characters. A byte order mark does not count.
     fn place(&self, offset: usize) -> (usize, usize) {
         let offset = floor_boundary(self.text, offset);
         let line = self.starts.partition_point(|start| *start <= offset);
@@ -169,7 +169,7 @@ impl<'a> Lines<'a> {
 
 const BYTE_ORDER_MARK: char = '\u{feff}';
 
-/// The greatest boundary of a character that is not behind `offset`.
+/// The greatest character boundary ≤ `offset`.
 fn floor_boundary(text: &str, offset: usize) -> usize {
     (0..=offset.min(text.len())).rev().find(|at| text.is_char_boundary(*at)).unwrap_or(0)
 }
@@ -187,7 +187,7 @@ fn one(files: &[SourceFile], diagnostic: &Diagnostic, colour: bool) -> String {
         handler.render_report(&mut out, &shown).expect("excerpts hold all their labels");
         out
     };
-    // A report of miette speaks of one text. Labels in further files become further excerpts before the help.
+    // A miette report refers to one text. Labels in further files become further excerpts before the help.
     let primary = diagnostic.span().file;
     let (here, elsewhere): (Vec<&Label>, Vec<&Label>) =
         diagnostic.labels.iter().partition(|label| label.span.file == primary);
@@ -204,7 +204,7 @@ fn one(files: &[SourceFile], diagnostic: &Diagnostic, colour: bool) -> String {
     out + &help
 }
 
-/// A diagnostic as miette wants it.
+/// A diagnostic in the form that miette expects.
 #[derive(Debug)]
 struct Shown<'a> {
     diagnostic: &'a Diagnostic,
@@ -251,12 +251,12 @@ impl miette::Diagnostic for Shown<'_> {
     }
 }
 
-/// Control characters as pictures; line ends and blanks stay.
+/// Replaces control characters by visible symbols; line ends and blanks stay.
 fn printable(text: &str) -> String {
     text.chars().map(|c| if c == '\n' { c } else { visible(c) }).collect()
 }
 
-/// What stands for a character on the screen: itself, unless it would move the cursor or hide others.
+/// The visible form of a character: itself, unless it would move the cursor or hide others.
 fn visible(c: char) -> char {
     match c {
         '\u{0}'..='\u{1f}' => char::from_u32(0x2400 + c as u32).expect("control pictures are characters"),
@@ -267,11 +267,11 @@ fn visible(c: char) -> char {
     }
 }
 
-/// The lines of one text from the first to the last label, made fit to be shown.
+/// The lines of one text from the first to the last label, prepared for display.
 #[derive(Debug)]
 struct Excerpt {
     name: String,
-    /// Lines, each ended by a newline.
+    /// Lines, each with a newline at its end.
     text: String,
     /// Number of the first line, from 0.
     first_line: usize,
@@ -279,7 +279,7 @@ struct Excerpt {
     labels: Vec<ExcerptLabel>,
 }
 
-/// A label in the bytes of the excerpt.
+/// A label as a byte range of the excerpt.
 #[derive(Debug)]
 struct ExcerptLabel {
     start: usize,
@@ -290,7 +290,7 @@ struct ExcerptLabel {
 }
 
 impl Excerpt {
-    /// Of labels that lie in one file; none if there are none or the file is not known.
+    /// The excerpt for labels in one file; none if there are none or the file is unknown.
     fn new(files: &[SourceFile], labels: &[&Label]) -> Option<Excerpt> {
         let file = files.get(labels.first()?.span.file.0 as usize)?;
         let text: &str = &file.text;
@@ -324,11 +324,11 @@ impl Excerpt {
         Some(excerpt)
     }
 
-    /// Adds a line that begins at `offset` of the original text, and places the labels' ends that lie in it.
+    /// Adds a line that begins at `offset` of the original text, and maps the ends of labels in it.
     fn add_line(&mut self, line: &str, offset: usize, spans: &[(usize, usize)]) {
         let body = line.strip_suffix('\r').unwrap_or(line);
         let start = self.text.len();
-        // Where the characters went: (original offset, offset in the excerpt), ascending in both.
+        // Maps characters: (original offset, offset in the excerpt), ascending in both.
         let mut moved: Vec<(usize, usize)> = Vec::with_capacity(body.len() + 1);
         let keep = kept_columns(body, offset, spans);
         let mut column = 0;
@@ -365,18 +365,18 @@ impl Excerpt {
         self.text.push('\n');
     }
 
-    /// Line of a byte of the excerpt, counted within it.
+    /// Line number of a byte offset, within the excerpt.
     fn line_of(&self, offset: usize) -> usize {
         self.text[..offset].bytes().filter(|byte| *byte == b'\n').count()
     }
 }
 
-/// The part of a label that is marked: inside the text, at boundaries of characters, not over many lines.
+/// The marked part of a label: inside the text, at character boundaries, not over many lines.
 fn shown_span(text: &str, label: &Label) -> (usize, usize) {
     let start = floor_boundary(text, label.span.start as usize);
     let end = floor_boundary(text, label.span.end as usize).max(start);
     let marked = &text[start..end];
-    // A mark that ends with its line does not reach into the next one.
+    // A mark up to the end of a line does not extend into the next one.
     let marked = marked.trim_end_matches(['\n', '\r']);
     if marked.bytes().filter(|byte| *byte == b'\n').count() >= MOST_LINES {
         let first = marked.split('\n').next().unwrap_or_default();
@@ -385,7 +385,7 @@ fn shown_span(text: &str, label: &Label) -> (usize, usize) {
     (start, start + marked.len())
 }
 
-/// Which characters of a line are shown: all, or those around the first label that stands in it.
+/// The characters of a line that are shown: all, or those around the first label in it.
 fn kept_columns(line: &str, offset: usize, spans: &[(usize, usize)]) -> std::ops::Range<usize> {
     let count = line.chars().count();
     if count <= LONGEST_LINE {
@@ -398,7 +398,7 @@ fn kept_columns(line: &str, offset: usize, spans: &[(usize, usize)]) -> std::ops
 }
 
 impl SourceCode for Excerpt {
-    /// Whole lines, whatever context is asked for.
+    /// Always whole lines, whatever context miette requests.
     fn read_span<'a>(
         &'a self,
         span: &SourceSpan,

@@ -1,4 +1,4 @@
-//! What became of a run, in words and as JSON.
+//! Formats the results of a run as text and as JSON.
 
 use crate::compile::Stages;
 use crate::quantity::{count, duration, show, significant, uncertain};
@@ -11,23 +11,23 @@ use runtime::record::Recording;
 use runtime::run::verdict::{Margin, Reading, Verdict};
 use serde_json::{Value, json};
 
-/// One run and all that is told of it.
+/// One run with everything that is reported about it.
 pub struct Ran<'a> {
-    /// The text.
+    /// The name of the file.
     pub file: &'a str,
     /// The experiment.
     pub experiment: &'a Experiment,
-    /// What sets the case apart in a sweep; else empty.
+    /// The label of the case in a sweep; else empty.
     pub label: &'a str,
     /// The instance before the run.
     pub instance: &'a Instance,
-    /// Remarks of the compiler.
+    /// Notes of the compiler.
     pub notes: &'a [String],
     /// How it ended.
     pub result: &'a Result<Outcome, Failure>,
-    /// Seconds that all cases of the experiment took.
+    /// Seconds that all cases of the experiment took together.
     pub wall: f64,
-    /// Seconds from text to code.
+    /// Compile time by stage.
     pub stages: &'a Stages,
 }
 
@@ -37,7 +37,7 @@ impl Ran<'_> {
         self.result.as_ref().is_ok_and(Outcome::passed)
     }
 
-    /// The object of `--json`. Values are in the unit beside them; what is not finite is a string.
+    /// The object of `--json`. Each value is in the unit beside it; a value that is not finite is a string.
     pub fn json(&self) -> Value {
         let description = self.instance.description();
         let adaptive = self.experiment.solver.method == Method::Adaptive;
@@ -86,7 +86,7 @@ pub fn states(description: &Description) -> usize {
     description.quantities.iter().filter(|quantity| matches!(quantity.kind, Kind::State | Kind::SampledState)).count()
 }
 
-/// Number of parts: different paths before a last dot.
+/// Number of parts: distinct paths before the last dot.
 pub fn parts(description: &Description) -> usize {
     use abi::description::Kind;
     let own = description.quantities.iter().filter(|quantity| quantity.kind != Kind::Observed);
@@ -96,7 +96,7 @@ pub fn parts(description: &Description) -> usize {
     paths.len()
 }
 
-/// A number of JSON, or `"inf"`, `"-inf"`, `"nan"`.
+/// A JSON number, or `"inf"`, `"-inf"`, `"nan"`.
 pub fn number(value: f64) -> Value {
     match serde_json::Number::from_f64(value) {
         Some(number) => Value::Number(number),
@@ -109,7 +109,7 @@ fn shown(si: f64, unit: &Unit, boolean: bool) -> (Value, Value) {
     if boolean { (json!(si > 0.5), Value::Null) } else { (number(unit.from_si(si)), json!(unit.text)) }
 }
 
-/// Final values of all outputs, and of what was plotted besides, by path.
+/// Final values of all outputs, and of other plotted quantities, by path.
 fn finals(outcome: &Outcome) -> Value {
     let mut finals = serde_json::Map::new();
     for end in &outcome.finals {
@@ -130,7 +130,7 @@ fn plotted(recording: &Recording) -> Vec<(&str, f64, &Unit, bool)> {
     columns.map(|(column, value)| (column.label.as_str(), *value, &column.unit, column.boolean)).collect()
 }
 
-/// How errors were found: what kind of error, companions, and what would decide.
+/// How errors were estimated: the kind of error, the companions, and a solver that would decide.
 fn estimate_json(estimate: &Estimate) -> Value {
     json!({
         "companions": estimate.companions.iter().map(solver).collect::<Vec<_>>(),
@@ -139,7 +139,7 @@ fn estimate_json(estimate: &Estimate) -> Value {
     })
 }
 
-/// A difference of two values in a unit.
+/// A difference of two values in a unit (without the offset of the unit).
 fn width(unit: &Unit, si: f64) -> Value {
     number(unit.from_si(si) - unit.from_si(0.0))
 }
@@ -172,8 +172,8 @@ fn verdict_json(verdict: &Verdict) -> Value {
     })
 }
 
-/// One line each: mark, text, value with its error, margin. `estimate`: how the errors were found; `digits`: how many are shown
-/// at most.
+/// One line for each verdict: mark, text, value with its error, margin. `estimate`: how the errors were estimated;
+/// `digits`: the most that are shown.
 pub fn verdicts(
     terminal: &Terminal,
     verdicts: &[Verdict],
@@ -198,7 +198,7 @@ pub fn verdicts(
     out
 }
 
-/// The value with its error, how far from the limit, and when.
+/// The value with its error, the distance to the limit, and the time.
 fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> String {
     if let Some(problem) = &verdict.problem {
         return problem.clone();
@@ -230,7 +230,7 @@ fn words(verdict: &Verdict, estimate: Option<&Estimate>, digits: Option<u8>) -> 
             false => format!("{}, {}", readings(), open("finer runs disagree".into())),
         };
     };
-    // One measure against a limit speaks for itself; arithmetic over several shows what went in.
+    // A single measure against a limit needs no details; for arithmetic over several, the measures are shown.
     let value = match verdict.readings.as_slice() {
         [reading] if reading.value == margin.value => shown(margin.value, margin.error, &margin.unit),
         _ => format!("{} ({})", shown(margin.value, margin.error, &margin.unit), readings()),
@@ -262,7 +262,7 @@ pub fn solver(solver: &Solver) -> String {
     }
 }
 
-/// What was compiled and how long it took, on two lines.
+/// The size of the compiled model and the compile time, on two lines.
 pub fn compiled(description: &Description, experiment: &Experiment, stages: &Stages, cases: usize) -> String {
     let counted = |n: usize, one: &str| format!("{n} {one}{}", if n == 1 { "" } else { "s" });
     let mut facts = vec![counted(states(description), "state")];
@@ -285,7 +285,7 @@ pub fn compiled(description: &Description, experiment: &Experiment, stages: &Sta
     )
 }
 
-/// How much work the runs of an experiment were, and what their errors were found with in how many s besides.
+/// The number of steps of the runs of an experiment, and the companions of the error estimate with their time in s.
 pub fn work(experiment: &Experiment, outcomes: &[&Outcome], wall: f64, judging: f64) -> String {
     let steps: u64 = outcomes.iter().map(|outcome| outcome.work.steps).sum();
     let simulated: f64 = outcomes.iter().map(|outcome| outcome.time).sum();

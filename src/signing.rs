@@ -1,16 +1,16 @@
-//! Keys and signatures in the format of minisign. The only file that knows `minisign` and `ct_codecs`.
+//! Keys and signatures in the format of minisign. The only file that uses `minisign` and `ct_codecs`.
 //!
-//! In: files of keys, bytes. Out: a pair of keys as texts, a signature as text. The signer mixes chance into each signature,
-//! so that its key does not leak by faults: two signatures of equal bytes differ, and both hold.
+//! In: key files, bytes. Out: a key pair as texts, a signature as text. The signer mixes randomness into each
+//! signature, so that fault attacks do not reveal its key: two signatures of equal bytes differ, and both are valid.
 
 use ct_codecs::{Base64, Decoder};
 use minisign::{KeyPair, PublicKey, SecretKey, SecretKeyBox};
 use std::path::Path;
 
-/// A new pair: the secret key without a password, as `minisign -G -W` makes it, and the public key.
+/// Generates a key pair: the secret key without a password, as by `minisign -G -W`, and the public key.
 ///
 /// # Errors
-/// Why there is none.
+/// Why the system has none.
 pub fn new_pair() -> Result<(String, String), String> {
     let KeyPair { pk, sk } = KeyPair::generate_unencrypted_keypair().map_err(|error| error.to_string())?;
     let secret = sk.to_box(Some("fric secret key")).map_err(|error| error.to_string())?;
@@ -18,17 +18,17 @@ pub fn new_pair() -> Result<(String, String), String> {
     Ok((secret.into_string(), public.into_string()))
 }
 
-/// A secret key with its public one.
+/// A secret key with its public key.
 pub struct Signing {
     secret: SecretKey,
     public: PublicKey,
 }
 
 impl Signing {
-    /// The secret key in a file. One with a password asks for it on the terminal.
+    /// Reads the secret key in a file. If it has a password, prompts for it on the terminal.
     ///
     /// # Errors
-    /// Why it cannot be had, in words.
+    /// Why it cannot be used, in words.
     pub fn open(key: &Path) -> Result<Signing, String> {
         let text = std::fs::read_to_string(key).map_err(|error| format!("cannot read {}: {error}", key.display()))?;
         let about = |error: minisign::PError| format!("{} is no secret key of minisign: {error}", key.display());
@@ -41,12 +41,12 @@ impl Signing {
         Ok(Signing { secret, public })
     }
 
-    /// The public key in base64, as the last line of its file has it.
+    /// The public key in base64, as in the last line of its file.
     pub fn public(&self) -> String {
         self.public.to_base64()
     }
 
-    /// A signature of bytes. `comment` is signed with them.
+    /// Signs bytes. The signature also covers `comment`.
     ///
     /// # Errors
     /// Why not, in words.
@@ -57,9 +57,9 @@ impl Signing {
     }
 }
 
-/// A key without a password as the stock tool writes it: with zeros where its checksum would be.
+/// A key without a password in the format of the stock tool: with zeros in place of its checksum.
 fn unchecked(text: &str) -> Option<SecretKey> {
-    // Where the way from a password to a key stands, and how long the checksum at the end is.
+    // Position of the key derivation function, and length of the checksum at the end.
     const KDF: std::ops::Range<usize> = 2..4;
     const CHECKSUM: usize = 32;
     let bytes = Base64::decode_to_vec(text.lines().nth(1)?, None).ok()?;
@@ -90,7 +90,7 @@ mod tests {
         let anna = |at_s| Ok(Some(Signer { name: "anna".into(), signed_s: Some(at_s) }));
         assert_eq!(keys.signer(bytes, Some(&signed)), anna(1_764_000_000));
         assert_eq!(keys.signer(bytes, Some(&sign(1_764_000_001).unwrap())), anna(1_764_000_001));
-        // The time is part of what is signed.
+        // The signature covers the time.
         let forged = signed.replace("timestamp:1764000000", "timestamp:1964000000");
         assert!(forged != signed && keys.signer(bytes, Some(&forged)).is_err());
         let why = keys.signer(bytes, None).unwrap_err().to_string();
@@ -100,7 +100,7 @@ mod tests {
             changed[at] ^= 1;
             assert!(keys.signer(&changed, Some(&signed)).is_err(), "byte {at}");
         }
-        // Any flipped bit of what the signature consists of; the first line is a comment that nothing depends on.
+        // Any flipped bit of the signature proper; the first line is a comment and not covered.
         let begin = signed.find('\n').unwrap() + 1;
         for at in begin..signed.len() {
             let mut changed = signed.clone().into_bytes();

@@ -1,28 +1,28 @@
-//! Texts as a log keeps them: what was asked for while a rig was compiled, and the same answers again.
+//! Snapshots of source texts in a log: the texts that were read while a rig was compiled, for replay.
 //!
-//! In: the [`Sources`] of a compilation. Out: sections of a log, and sources made of them, so that a replay compiles what
-//! ran, whatever has become of the files since.
+//! In: the [`Sources`] of a compilation. Out: sections of a log, and sources reconstructed from them, so that a replay
+//! compiles the texts that ran even if the files have changed since.
 
 use crate::compile::Sources;
 use runtime::record::log::Sections;
 use std::cell::RefCell;
 
-/// Answers as another source gives them, kept.
+/// Forwards to other sources and records their answers.
 pub struct Keeping<'a> {
     inner: &'a dyn Sources,
     kept: RefCell<Sections>,
 }
 
-/// Between the parts of a section's name and of its text: stands in no text of the language.
+/// Separator within the name and the text of a section: occurs in no text of the language.
 const GAP: char = '\0';
 
 impl<'a> Keeping<'a> {
-    /// Keeps what another source answers.
+    /// Records the answers of other sources.
     pub fn new(inner: &'a dyn Sources) -> Keeping<'a> {
         Keeping { inner, kept: RefCell::default() }
     }
 
-    /// What was kept, added to the head of a log.
+    /// Adds the recorded answers to the head of a log.
     pub fn into(self, mut head: Sections) -> Sections {
         head.0.extend(self.kept.into_inner().0);
         head
@@ -57,7 +57,7 @@ impl Sources for Keeping<'_> {
     }
 }
 
-/// Answers from the head of a log.
+/// Sources that answer from the head of a log.
 pub struct Kept<'a>(pub &'a Sections);
 
 impl Kept<'_> {

@@ -1,29 +1,29 @@
-//! Another computer, through the system's own ssh and scp: its keys, its agent, its configuration.
+//! Runs commands on another computer through the system's ssh and scp, with the user's keys, agent and configuration.
 //!
-//! In: a host and options, commands, files. Out: what the command printed, or why it failed. What another computer says is
-//! not to be trusted with a terminal: what would act on one arrives as an escape. Knows no packages.
+//! In: a host and options, commands, files. Out: what the command printed, or why it failed. Output of another computer
+//! is not trusted with a terminal: control characters are escaped. Knows nothing of packages.
 
 use abi::foreign::shown;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-/// A computer that ssh reaches.
+/// A computer that is reached by ssh.
 pub struct Remote {
     host: String,
     options: Vec<String>,
 }
 
-/// Why a command on another computer failed.
+/// Why a remote command failed.
 pub enum Failed {
-    /// It could not be reached, or the command is not there.
+    /// The host could not be reached, or the command is missing there.
     Unreachable(String),
-    /// The command ran and failed: its exit code and what it reported.
+    /// The command ran and failed: its exit code and its error output.
     Exit(i32, String),
 }
 
 impl Failed {
-    /// In words.
+    /// The failure in words.
     pub fn words(&self) -> String {
         match self {
             Failed::Unreachable(why) => why.clone(),
@@ -36,7 +36,7 @@ impl Failed {
 }
 
 impl Remote {
-    /// `host`: as ssh takes it. `options`: as behind `-o`, such as `Port=2222`.
+    /// `host`: as ssh accepts it. `options`: as after `-o`, such as `Port=2222`.
     pub fn new(host: &str, options: &[String]) -> Remote {
         Remote { host: host.into(), options: options.iter().flat_map(|one| ["-o".into(), one.clone()]).collect() }
     }
@@ -46,7 +46,7 @@ impl Remote {
         &self.host
     }
 
-    /// Runs a command there; gives what it printed.
+    /// Runs a command there; returns its output.
     ///
     /// # Errors
     /// Why it failed.
@@ -54,7 +54,7 @@ impl Remote {
         done("ssh", &mut self.command(words))
     }
 
-    /// Runs a command there that goes on for a while; `told` gets each line as it comes. Ctrl-C ends ssh too.
+    /// Runs a long command there; passes each line of output to `told`. Ctrl-C also ends ssh.
     ///
     /// # Errors
     /// Why it failed.
@@ -71,12 +71,12 @@ impl Remote {
     fn command(&self, words: &[&str]) -> Command {
         let line = words.iter().map(|word| quoted(word)).collect::<Vec<_>>().join(" ");
         let mut command = Command::new("ssh");
-        // Nobody answers questions here: without a key that works, it fails and says so.
+        // No interactive questions: without a working key, ssh fails with a message.
         command.args(["-o", "BatchMode=yes"]).args(&self.options).arg("--").arg(&self.host).arg(line);
         command
     }
 
-    /// Copies files there, into a folder that exists.
+    /// Copies files to a folder that exists there.
     ///
     /// # Errors
     /// Why it failed.
@@ -107,19 +107,19 @@ fn done(what: &str, command: &mut Command) -> Result<String, Failed> {
     ended(what, output)
 }
 
-/// What a command printed that has ended.
+/// The output of a command that has ended, or its failure.
 fn ended(what: &str, output: Output) -> Result<String, Failed> {
     let said = shown(String::from_utf8_lossy(&output.stderr).trim()).into_owned();
     match output.status.code() {
         Some(0) => Ok(shown(&String::from_utf8_lossy(&output.stdout)).into_owned()),
-        // ssh's own failures.
+        // Exit code of ssh's own failures.
         Some(255) => Err(Failed::Unreachable(said)),
         Some(code) => Err(Failed::Exit(code, said)),
         None => Err(Failed::Unreachable(format!("{what} was ended: {}", output.status))),
     }
 }
 
-/// A word that the shell there takes as it is.
+/// A word quoted for the remote shell.
 fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.' | '/' | '=' | ':' | ',' | '+');
     if !word.is_empty() && word.chars().all(plain) { word.into() } else { format!("'{}'", word.replace('\'', "'\\''")) }

@@ -1,33 +1,33 @@
-//! Standard output and standard error: colour, width, and readers that went away.
+//! Standard output and standard error: colour, width, and closed pipes.
 
 use std::io::{self, ErrorKind, IsTerminal, Write};
 
-/// Columns where nothing better is known.
+/// Columns if the width is unknown.
 const WIDTH: usize = 80;
 
-/// What is printed goes through here.
+/// All output goes through here.
 ///
-/// When the reader of a pipe has gone, the rest is dropped without a word; the work goes on, so that files are written
-/// and the exit code tells the truth.
+/// If the reader of a pipe has gone, further output is dropped silently and the work continues, so that files are
+/// written and the exit code is correct.
 pub struct Terminal {
     closed: bool,
     colour: bool,
     error_colour: bool,
 }
 
-/// How words are set off.
+/// How words are highlighted.
 #[derive(Clone, Copy)]
 pub enum Style {
     /// Headings.
     Bold,
-    /// What went well.
+    /// Success.
     Good,
-    /// What did not.
+    /// Failure.
     Bad,
 }
 
 impl Terminal {
-    /// The process's own.
+    /// The terminal of the process.
     pub fn new() -> Terminal {
         let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
             && std::env::var_os("TERM").is_none_or(|term| term != "dumb");
@@ -38,17 +38,17 @@ impl Terminal {
         }
     }
 
-    /// Whether what is printed may have colour.
+    /// Whether standard output may have colour.
     pub fn colour(&self) -> bool {
         self.colour
     }
 
-    /// Whether what is reported may have colour.
+    /// Whether standard error may have colour.
     pub fn error_colour(&self) -> bool {
         self.error_colour
     }
 
-    /// Columns for plots: of the terminal, at most 100.
+    /// Columns for plots: those of the terminal, at most 100.
     pub fn width(&self) -> usize {
         match terminal_size::terminal_size_of(io::stdout()) {
             Some((terminal_size::Width(width), _)) => usize::from(width).min(100),
@@ -56,7 +56,7 @@ impl Terminal {
         }
     }
 
-    /// Words in a style, if what is printed may have colour.
+    /// Words in a style, if standard output may have colour.
     pub fn styled(&self, style: Style, words: &str) -> String {
         styled(self.colour, style, words)
     }
@@ -69,7 +69,7 @@ impl Terminal {
         let mut out = io::stdout().lock();
         if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
             self.closed = true;
-            // A full disk is worth a word, a closed pipe is not.
+            // A full disk is reported, a closed pipe is not.
             if error.kind() != ErrorKind::BrokenPipe {
                 self.report(&format!("cannot print: {error}\n"));
             }
@@ -81,12 +81,12 @@ impl Terminal {
         self.print(&format!("{text}\n"));
     }
 
-    /// Prints to the standard error. If that is gone too, nobody is left to be told.
+    /// Prints to the standard error. If that is closed too, the text is lost.
     pub fn report(&self, text: &str) {
         let _ = io::stderr().lock().write_all(text.as_bytes());
     }
 
-    /// Reports a failure that has no place in a text.
+    /// Reports a failure that has no position in a text.
     pub fn error(&self, message: &str) {
         self.report(&format!("{} {message}\n", styled(self.error_colour, Style::Bad, "error:")));
     }

@@ -1,24 +1,24 @@
-//! A table that is not finished: who writes it, what was asked for, and which of its rows are as they were written.
+//! Resumable tables: exclusive write access, the request, and which rows are intact.
 //!
-//! In: the path of a table, what a sweep is asked for, its rows as they are appended. Out: the right to write it, for one
-//! process at a time, and where to go on after an interruption. A neighbour of the table, `.NAME.unfinished`, is locked by
-//! the writing process; it holds the request, an empty line, and marks: rows, bytes and a hash of all bytes until there. The
-//! system lets go of the lock however the process ends. Knows nothing of what rows mean.
+//! In: the path of a table, the request of a sweep, and its rows as they are appended. Out: exclusive write access
+//! across processes, and where to resume after an interruption. The writing process locks a file beside the table,
+//! `.NAME.unfinished`, with the request, an empty line, and checkpoints: rows, bytes and a hash of all bytes so far.
+//! The operating system releases the lock however the process ends. Knows nothing of the meaning of rows.
 
 use runtime::record::claim::open_alone;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// FNV-1a.
+/// An FNV-1a hash.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Hash(u64);
 
 impl Hash {
-    /// Of nothing.
+    /// The hash of no bytes.
     pub const EMPTY: Hash = Hash(0xcbf2_9ce4_8422_2325);
 
-    /// Of all before and these bytes.
+    /// The hash after these further bytes.
     pub fn and(self, bytes: &[u8]) -> Hash {
         Hash(bytes.iter().fold(self.0, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)))
     }
@@ -30,42 +30,42 @@ impl std::fmt::LowerHex for Hash {
     }
 }
 
-/// A point of a table: so many rows, so many bytes with the header, and their hash.
+/// A checkpoint of a table: number of rows, number of bytes including the header, and their hash.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Mark {
     /// Rows without the header.
     pub rows: u64,
     /// Bytes with the header.
     pub bytes: u64,
-    /// Of these bytes.
+    /// Hash of these bytes.
     pub hash: Hash,
 }
 
-/// The right to write a table.
+/// Exclusive write access to a table.
 pub struct Unfinished {
     path: PathBuf,
     file: File,
-    /// What an earlier writer was asked for; empty if there was none.
+    /// The request of an earlier writer; empty if there was none.
     asked: String,
     marks: Vec<Mark>,
-    /// It stays when this goes: there is something to go on with.
+    /// Whether the lock file stays when this is dropped, so that the table can be resumed.
     begun: bool,
 }
 
-/// Where a table can be gone on with.
+/// Where a table can be resumed.
 #[derive(Debug)]
 pub struct Sound {
-    /// The end of what is as it was written; the rest has been cut off.
+    /// The end of the intact part; the rest has been cut off.
     pub mark: Mark,
-    /// What was found behind it that is not, if it is more than a row that was being written: in words.
+    /// A description of damage found after it, if it is more than a row that was being written.
     pub fault: Option<String>,
 }
 
 impl Unfinished {
-    /// Takes the right to write a table.
+    /// Acquires exclusive write access to a table.
     ///
     /// # Errors
-    /// If somebody else has it, or why the neighbour cannot be used.
+    /// If another process has it, or why the lock file cannot be used.
     pub fn claim(table: &Path) -> Result<Unfinished, String> {
         let name = table.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let path = table.with_file_name(format!(".{name}.unfinished"));
@@ -77,7 +77,7 @@ impl Unfinished {
             ));
         };
         let mut text = String::new();
-        // What is no text was not written here, and is gone on with by nobody.
+        // A file that is not text was not written here, and cannot be resumed.
         let _ = (&file).read_to_string(&mut text);
         let (asked, marks) = text.split_once("\n\n").unwrap_or((&text, ""));
         let marks = marks.lines().map_while(mark).collect();
@@ -85,12 +85,12 @@ impl Unfinished {
         Ok(Unfinished { path, file, begun: !asked.is_empty(), asked, marks })
     }
 
-    /// What an earlier writer was asked for, who did not come to an end.
+    /// The request of an earlier writer that did not finish.
     pub fn before(&self) -> Option<&str> {
         (!self.asked.is_empty()).then_some(self.asked.as_str())
     }
 
-    /// Begins anew, with nothing written.
+    /// Starts over, with an empty table.
     ///
     /// # Errors
     /// Those of the file.
@@ -102,18 +102,18 @@ impl Unfinished {
         write!(self.file, "{}\n\n", self.asked)
     }
 
-    /// Notes how far the table is written.
+    /// Appends a checkpoint.
     ///
     /// # Errors
     /// Those of the file.
     pub fn note(&mut self, mark: Mark) -> io::Result<()> {
         let Mark { rows, bytes, hash } = mark;
-        // One write for one line: whatever ends the process leaves whole lines, or one without its end.
+        // One write call per line: a killed process leaves complete lines, or a last one without a line end.
         self.file.seek(SeekFrom::End(0))?;
         self.file.write_all(format!("{rows} {bytes} {hash:016x}\n").as_bytes())
     }
 
-    /// Finds how far a table is as it was written, and cuts off what is not. `fits` says whether a line can be that row.
+    /// Finds the intact part of a table, and cuts off the rest. `fits` returns whether a line can be that row.
     ///
     /// # Errors
     /// Those of the table.
@@ -133,7 +133,7 @@ impl Unfinished {
         loop {
             line.clear();
             reader.read_until(b'\n', &mut line)?;
-            // The row that was being written has no end.
+            // The row that was being written has no line end.
             let Some((b'\n', row)) = line.split_last() else { break };
             if !std::str::from_utf8(row).is_ok_and(|row| fits(at.rows, row)) {
                 fault = Some(format!("row {}", at.rows));
@@ -149,12 +149,12 @@ impl Unfinished {
                 _ => {}
             }
         }
-        // Rows behind the last mark are taken by their form alone, unless something is wrong with one of them.
+        // Rows after the last checkpoint are accepted by their form alone, unless one of them is damaged.
         let mark = if fault.is_some() { good } else { at };
         let file = reader.into_inner();
         file.set_len(mark.bytes)?;
         self.marks.retain(|known| known.bytes <= mark.bytes);
-        // Marks of what was cut off say nothing any more.
+        // Checkpoints of the part that was cut off are invalid.
         let (asked, marks) = (self.asked.clone(), std::mem::take(&mut self.marks));
         self.begin(&asked)?;
         marks.iter().try_for_each(|mark| self.note(*mark))?;
@@ -168,7 +168,7 @@ impl Unfinished {
     }
 }
 
-/// One that was never begun, or is finished, leaves no neighbour: taken away before the lock goes.
+/// If the table was never begun or is finished, removes the lock file before the lock is released.
 impl Drop for Unfinished {
     fn drop(&mut self) {
         if !self.begun {
@@ -177,7 +177,7 @@ impl Drop for Unfinished {
     }
 }
 
-/// `rows bytes hash`
+/// Parses `rows bytes hash`.
 fn mark(line: &str) -> Option<Mark> {
     let mut words = line.split(' ');
     let (rows, bytes, hash) = (words.next()?, words.next()?, words.next()?);
@@ -199,7 +199,7 @@ mod tests {
         row.split_once(',').is_some_and(|(run, x)| run == k.to_string() && x.parse::<u64>().is_ok())
     }
 
-    /// A table of 100 rows that was interrupted, with marks at 40 and 80.
+    /// A table of 100 rows that was interrupted, with checkpoints at 40 and 80.
     fn interrupted(table: &Path) -> Vec<u8> {
         let mut unfinished = Unfinished::claim(table).unwrap();
         unfinished.begin("so many\nof that\n").unwrap();
@@ -234,8 +234,8 @@ mod tests {
         assert_eq!(Unfinished::claim(&table).unwrap().before(), None);
     }
 
-    /// Any byte changed, taken away or added, any row taken away or doubled, any end: what is gone on with is a beginning
-    /// of what was written, unless the change lies behind the last mark and leaves a row of right form.
+    /// Any byte changed, removed or added, any row removed or doubled, any truncation: the part that is resumed is a
+    /// prefix of what was written, unless the change lies after the last checkpoint and leaves a row of valid form.
     #[test]
     fn what_is_gone_on_with_is_as_it_was_written() {
         let folder = tempfile::tempdir().unwrap();
@@ -273,7 +273,7 @@ mod tests {
             assert_eq!(kept.iter().filter(|byte| **byte == b'\n').count() as u64, sound.mark.rows + 1);
             let until = kept.len().min(last_mark);
             assert_eq!(kept[..until], whole[..until], "{:?}", sound.fault);
-            // What went in is what goes on.
+            // Resuming twice gives the same result.
             let again = Unfinished::claim(&table).unwrap().sound(&table, HEADER, &fits).unwrap();
             assert_eq!((again.mark, again.fault), (sound.mark, None));
         }

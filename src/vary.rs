@@ -1,7 +1,8 @@
-//! What `--vary` says: a grid of values, or a distribution.
+//! Parses `--vary`: a grid of values, or a distribution.
 //!
-//! In: text such as `fr.Fs = 1 N .. 2 N by 0.1 N` or `fr.vs ~ lognormal(1 mm/s, 0.2)`. Out: the value of each run, from
-//! its number alone. Random numbers are drawn by counter, so that a run has the same ones on every machine, in any order.
+//! In: text such as `fr.Fs = 1 N .. 2 N by 0.1 N` or `fr.vs ~ lognormal(1 mm/s, 0.2)`. Out: the value for each run, as
+//! a function of its number alone. Random numbers come from a counter-based generator, so a run has the same ones on
+//! every machine and in any order.
 
 use crate::compile::Alone;
 use crate::quantity;
@@ -10,31 +11,31 @@ use abi::unit::Unit;
 /// Most values of a grid.
 const MOST_VALUES: usize = 10_000_000;
 
-/// One parameter that changes.
+/// One varied parameter.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Vary {
     /// Its path.
     pub path: String,
     /// The unit of its values as written.
     pub unit: Unit,
-    /// What it becomes.
+    /// Its grid or distribution.
     pub how: How,
 }
 
 /// Values in SI.
 #[derive(Clone, PartialEq, Debug)]
 pub enum How {
-    /// One after the other.
+    /// A list of values.
     Values(Vec<f64>),
-    /// Of this mean and standard deviation.
+    /// Normal distribution: mean and standard deviation.
     Normal(f64, f64),
-    /// Of this median; the second is the standard deviation of its logarithm.
+    /// Log-normal distribution: median, and standard deviation of the logarithm.
     Lognormal(f64, f64),
-    /// Between two bounds.
+    /// Uniform distribution between two bounds.
     Uniform(f64, f64),
 }
 
-/// Reads one `--vary`.
+/// Parses one `--vary`.
 ///
 /// # Errors
 /// What is wrong with it, and how to write it.
@@ -65,7 +66,7 @@ fn listed(text: &str, examples: &str) -> Result<(Unit, How), String> {
     if count > MOST_VALUES as f64 {
         return Err(format!("{count} values are too many; {MOST_VALUES} are possible"));
     }
-    // Twelve digits in the unit as written: without the noise of a sum.
+    // Rounded to twelve digits in the unit as written, without the rounding noise of a sum.
     let value = |k: usize| {
         let shown: f64 = format!("{:.11e}", unit.from_si(first + k as f64 * step)).parse().unwrap_or(f64::NAN);
         quantity::si(shown, &unit)
@@ -102,7 +103,7 @@ fn drawn(text: &str, examples: &str) -> Result<(Unit, How), String> {
     }
 }
 
-/// Values of one kind; the unit is that of the first.
+/// Values of one dimension; the unit is that of the first.
 fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
     let read: Vec<(f64, Unit)> = texts.iter().map(|text| quantity::parse(text)).collect::<Result<_, _>>()?;
     let unit = read[0].1.clone();
@@ -116,7 +117,7 @@ fn of_one_kind(texts: &[&str]) -> Result<(Vec<f64>, Unit), String> {
 }
 
 impl Vary {
-    /// Number of values of a grid; none of a distribution.
+    /// Number of values of a grid; none for a distribution.
     pub fn len(&self) -> Option<usize> {
         match &self.how {
             How::Values(values) => Some(values.len()),
@@ -124,7 +125,7 @@ impl Vary {
         }
     }
 
-    /// One value that is typical: to see whether the text can be compiled with it.
+    /// A typical value, to check whether the text compiles with it.
     pub fn typical(&self) -> f64 {
         match &self.how {
             How::Values(values) => values[values.len() / 2],
@@ -135,7 +136,7 @@ impl Vary {
     }
 }
 
-/// Draws values.
+/// A counter-based random generator.
 pub struct Dice {
     seed: u64,
     exp: Alone,
@@ -143,12 +144,12 @@ pub struct Dice {
 }
 
 impl Dice {
-    /// All that is drawn follows from the seed.
+    /// Everything drawn depends on the seed alone.
     pub fn new(seed: u64) -> Dice {
         Dice { seed, exp: Alone::exp(), log: Alone::log() }
     }
 
-    /// The value in SI of a distribution in this draw; `k`: which of the distributions it is.
+    /// The value in SI of a distribution in this draw; `k`: number of the distribution.
     pub fn value(&self, how: &How, draw: u64, k: u64) -> f64 {
         // Never 0 nor 1.
         let bits = word(word(self.seed, draw), k) >> 11;
@@ -161,8 +162,8 @@ impl Dice {
         }
     }
 
-    /// The value that a standard normal variable is below with probability `p`; to 16 digits.
-    /// Source: Wichura, Appl. Statist. 37 (1988), algorithm AS 241, PPND16.
+    /// Quantile function of the standard normal distribution, to 16 digits. Source: Wichura, Appl. Statist. 37 (1988),
+    /// algorithm AS 241, PPND16.
     fn normal(&self, p: f64) -> f64 {
         let ratio = |x: f64, above: &[f64; 8], below: &[f64; 8]| {
             let sum = |c: &[f64; 8]| c.iter().rev().fold(0.0, |sum, c| sum * x + c);
@@ -178,7 +179,7 @@ impl Dice {
     }
 }
 
-/// SplitMix64's finaliser of seed · 0x9E37… + k: what the language's `random` is made of.
+/// SplitMix64's finaliser of seed · 0x9E37… + k, as in the language's `random`.
 fn word(seed: u64, k: u64) -> u64 {
     let mut z = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15).wrapping_add(k);
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -1,26 +1,26 @@
-//! The battery as text: experiments over the benches of the library, with the slot filled by the model under test.
+//! The battery as text: experiments with the benches of the library and the model under test.
 //!
-//! In: a [`Subject`] and the [`Scales`] measured so far. Out: a text. Numbers in it are in SI and have four digits at
-//! most, so that it can be read and changed.
+//! In: a [`Subject`] and the [`Scales`] measured so far. Out: a text. Numbers in it are in SI with at most four digits,
+//! so that users can read and change it.
 
 use super::subject::{External, Subject};
 use crate::quantity::significant;
 use std::fmt::Write;
 
-/// What is measured before the battery is laid out. SI; straight or rotary.
+/// Scales that are measured before the battery is generated. SI; translational or rotary.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Scales {
     /// Force at a fast steady speed.
     pub f_ref: f64,
-    /// Mass on the benches that have one: a power of ten that makes forces move it at about 1 m/s².
+    /// Mass on the benches that have one: a power of ten for which these forces cause about 1 m/s².
     pub mass: f64,
-    /// Break-away force of a slow ramp.
+    /// Break-away force under a slow ramp.
     pub f_b: f64,
-    /// Travel at the break-away.
+    /// Displacement at break-away.
     pub x_b: f64,
-    /// Least force of sliding after the peak.
+    /// Least sliding friction after the peak.
     pub f_c: f64,
-    /// Speed at which the excess over `f_c` has fallen to 1/e; else a hundredth of the greatest speed.
+    /// Speed at which the excess over `f_c` has decayed to 1/e; else a hundredth of the greatest speed.
     pub v_s: f64,
     /// Speed that counts as sliding.
     pub v_slip: f64,
@@ -64,7 +64,7 @@ const ROTARY: Units = Units {
 };
 
 impl Units {
-    /// Those of straight or rotary motion.
+    /// Those of translational or rotary motion.
     pub fn of(rotary: bool) -> Units {
         if rotary { ROTARY } else { STRAIGHT }
     }
@@ -83,7 +83,7 @@ pub struct Entry {
     sweep: Option<String>,
     plots: Vec<String>,
     expects: Vec<String>,
-    /// Greatest fixed step in s of a model that chatters, and how many steps are wanted.
+    /// Greatest fixed step in s for a model that chatters, and the number of steps wanted.
     longest: f64,
     fine: f64,
 }
@@ -104,12 +104,12 @@ impl Entry {
         }
     }
 
-    /// Moved at one speed, so that nothing depends on the step but how far the contact goes in it.
+    /// Moved at constant speed: the step affects only how far the contact moves within it.
     fn steady(self) -> Entry {
         Entry { longest: f64::INFINITY, fine: 2.5e4, ..self }
     }
 
-    /// With as many steps as may be, if it must be run with fixed ones: what others are compared with.
+    /// With the most steps possible, if it must run with fixed ones: a reference for others.
     fn finest(self) -> Entry {
         Entry { fine: 3e5, ..self }
     }
@@ -129,8 +129,9 @@ impl Entry {
         self
     }
 
-    /// Runs with a fixed step from now on: an adaptive run finds no end of turns in it. Never more than 300,000 steps, unless
-    /// the model itself computes something oftener; `period` in s is how often, and a whole number of steps.
+    /// Switches to a fixed step, because an adaptive run finds an endless sequence of events in it. At most 300,000
+    /// steps, unless the model itself samples faster; `period` in s is its sampling period, and becomes a whole number
+    /// of steps.
     pub fn step_fixed(&mut self, period: Option<f64>) {
         const STEPS: [f64; 15] =
             [0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5];
@@ -143,17 +144,17 @@ impl Entry {
             None => STEPS.into_iter().find(|step| *step <= wanted * 1.000001).unwrap_or(1e-5),
         };
         self.solver = Some(format!("expo step {} s", n(step)));
-        // Whole steps.
+        // A whole number of steps.
         self.duration = (self.duration / step).ceil() * step;
     }
 
-    /// The length of its steps in s, where that is fixed.
+    /// The length of its steps in s, if fixed.
     pub fn step(&self) -> Option<f64> {
         let text = self.solver.as_ref()?.strip_prefix("expo step ")?;
         text.strip_suffix(" s")?.parse().ok()
     }
 
-    /// Whether it steps adaptively.
+    /// Whether the solver is adaptive.
     pub fn adaptive(&self) -> bool {
         self.solver.as_ref().is_none_or(|solver| solver.starts_with("adaptive"))
     }
@@ -188,17 +189,17 @@ pub fn text(imports: &str, head: &str, entries: &[Entry]) -> String {
     format!("{imports}\n{head}\n{}", entries.join("\n"))
 }
 
-/// Four digits are enough for a number that was measured only to lay out an experiment.
+/// Formats with four digits, enough for a number that only sizes an experiment.
 pub fn n(x: f64) -> String {
     significant(x, 6)
 }
 
-/// Rounded to two digits.
+/// Rounds to two digits.
 pub fn round(x: f64) -> f64 {
     significant(x, 2).parse().expect("a printed number reads back")
 }
 
-/// The text of a model under test, and what to fill slots with.
+/// Generates the experiments for a model under test.
 pub struct Layout<'a> {
     subject: &'a Subject,
     /// Units of the model.
@@ -207,18 +208,18 @@ pub struct Layout<'a> {
 }
 
 impl<'a> Layout<'a> {
-    /// With the scales known so far.
+    /// A generator with the scales known so far.
     pub fn new(subject: &'a Subject, scales: Scales) -> Layout<'a> {
         Layout { subject, units: Units::of(subject.rotary), scales }
     }
 
-    /// Regimes of the model's own.
+    /// The model's own regimes.
     pub fn own_regimes(&self) -> &[String] {
         &self.subject.own_regimes
     }
 
-    /// What fills the slot of a bench that has no force of its own but moves the contact at a speed. A drive that does so
-    /// pushes as hard as it takes, so a contact that asks for the force is told of more than it can hold.
+    /// The argument for a bench that prescribes the speed and has no force of its own. A speed drive pushes as hard as
+    /// needed, so a contact with an input for the external force receives more than it can hold.
     fn moved(&self, v: &str) -> String {
         let push = format!("{} {} * sign({v})", n(100.0 * power_near(self.scales.f_ref)), self.units.force);
         match self.subject.external {
@@ -227,7 +228,7 @@ impl<'a> Layout<'a> {
         }
     }
 
-    /// What fills the slot of a bench with a mass.
+    /// The argument for a bench with a mass.
     fn pushed(&self) -> String {
         self.subject.instance.to_string()
     }
@@ -269,7 +270,7 @@ impl<'a> Layout<'a> {
         format!("F [{}]", self.units.force)
     }
 
-    /// How hard the contact resists a fast speed: to know what size of force to push with.
+    /// Measures the friction at a fast speed, to scale applied forces.
     pub fn scale_sliding(&self) -> Entry {
         let run = format!("Sliding(speed = {} {})", n(0.1 * self.scales.v_max), self.units.speed);
         Entry::new("scale_sliding", "The size of the force, from sliding fast.", run, 20.0)
@@ -277,7 +278,7 @@ impl<'a> Layout<'a> {
             .steady()
     }
 
-    /// The force and the travel at which it lets go, for a ramp of `f_ref` a second.
+    /// Measures force and displacement at break-away, for a ramp of `f_ref` per second.
     pub fn scale_break_away(&self, times: f64) -> Entry {
         let Units { force, rate, length, speed, .. } = self.units;
         let rate_ref = round(self.scales.f_ref * times);
@@ -293,7 +294,7 @@ impl<'a> Layout<'a> {
         .plot(format!("v [{speed}]"))
     }
 
-    /// Steady friction against velocity: a sweep for each decade, both directions.
+    /// Steady friction against velocity: a sweep for each decade, in both directions.
     pub fn steady(&self) -> Vec<Entry> {
         const GRID: [f64; 8] = [1.0, 1.3, 1.8, 2.4, 3.2, 4.2, 5.6, 7.5];
         let Units { speed, .. } = self.units;
@@ -302,7 +303,7 @@ impl<'a> Layout<'a> {
             let grid = if k == 0 { &GRID[..1] } else { &GRID[..] };
             let speeds = grid.iter().flat_map(|g| [g * low, -g * low]).map(|v| format!("{} {speed}", n(v)));
             let speeds: Vec<String> = speeds.collect();
-            // e^−30 of the start, 1e-13, is left of what settles along the path.
+            // The transient along the path decays to e^−30, 1e-13 of its start.
             let travel = (30.0 * self.scales.x_b).max(1e-3 * self.scales.v_max);
             let mut entry = Entry::new(
                 format!("steady_{}", 7 - k),
@@ -342,7 +343,7 @@ impl<'a> Layout<'a> {
         [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0].map(|x| x * unit).to_vec()
     }
 
-    /// A path on which memory of the path shows.
+    /// A path that shows whether friction depends on the path's history.
     pub fn path(&self) -> f64 {
         round(self.scales.x_b.max(1e-3 * self.scales.v_s))
     }
@@ -367,7 +368,7 @@ impl<'a> Layout<'a> {
             entry.plot(format!("F [{force}]")).plot(format!("x [{length}]")).plot(format!("v [{speed}]"))
         };
 
-        // Where a model has regimes, what is drawn over time is shaded by them.
+        // For a model with regimes, plots over time are shaded by regime.
         let shaded = |entry: Entry, slot: &str| {
             let regimes = self.subject.own_regimes.iter();
             regimes.fold(entry, |entry, regime| entry.plot(format!("{slot}.{regime}")))
@@ -466,7 +467,7 @@ impl<'a> Layout<'a> {
 
         for seed in 0..6_u32 {
             let part = |k: u32| {
-                // A spread of speeds over two decades from a fixed rule: the same motions everywhere.
+                // Speeds over two decades by a fixed rule: the same motions everywhere.
                 let turn = f64::from((seed * 7 + k * 5 + 3) % 11) / 10.0;
                 round(0.3 * s.v_s * (1.0 + 99.0 * turn * turn * turn))
             };
@@ -519,7 +520,7 @@ impl<'a> Layout<'a> {
         ));
         entries.push(shaded(thrown, "fr"));
 
-        // A load that the contact carries, if it can carry any.
+        // A load that the contact can hold, if it can hold any.
         let load = if s.f_c > 0.01 * f_b { s.f_c } else { f_b };
         entries.push(shaded(
             motion(Entry::new(
@@ -580,7 +581,7 @@ impl<'a> Layout<'a> {
     }
 }
 
-/// A force that goes from stop to stop at a constant rate, and how long that takes.
+/// A force that passes through `stops` at a constant rate, and the duration.
 fn triangle(stops: &[f64], rate: f64, force: &str, per_second: &str) -> (String, f64) {
     let (mut text, mut at, mut slope) = (String::new(), 0.0, 0.0);
     for pair in stops.windows(2) {
@@ -604,7 +605,7 @@ fn power(k: i32) -> f64 {
     format!("1e{k}").parse().expect("a power of ten")
 }
 
-/// The power of ten nearest to a positive number, seen on a logarithmic axis.
+/// The power of ten nearest to a positive number on a logarithmic scale.
 pub fn power_near(x: f64) -> f64 {
     let text = format!("{x:e}");
     let (digits, exponent) = text.split_once('e').expect("written with an exponent");
@@ -612,12 +613,12 @@ pub fn power_near(x: f64) -> f64 {
     power(if digits > 3.162 { exponent + 1 } else { exponent })
 }
 
-/// Square root: exact in every back end, so allowed here too.
+/// Square root: correctly rounded on every machine, so allowed here.
 fn root(x: f64) -> f64 {
     x.sqrt()
 }
 
-/// Two digits, not above x.
+/// Rounded down to two digits.
 fn round_down(x: f64) -> f64 {
     let rounded = round(x);
     if rounded > x { round(x * 0.99) } else { rounded }

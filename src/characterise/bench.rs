@@ -1,7 +1,7 @@
-//! Compiles and runs the experiments of a text, all at once.
+//! Compiles and runs the experiments of a text, in parallel.
 //!
-//! In: a text. Out: for each experiment what its cases recorded, or why not. A model that chatters at rest is run again
-//! with a fixed step, and the text then says so.
+//! In: a text. Out: for each experiment the recordings of its cases, or why there are none. A model that chatters at
+//! rest is run again with a fixed step, and the text then contains that step.
 
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::report;
@@ -10,11 +10,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-/// An adaptive run of a small model is given up after 64 times as many tries of a step: twenty times what any test should
-/// need. Of a model with more than eight states a step costs more, and there are fewer of them.
+/// An adaptive run of a small model is abandoned after 64 times this many step attempts: twenty times what any test
+/// should need. For a model with more than eight states a step costs more, and the limit is lower.
 const MOST_LOOKS: usize = 1000;
 
-/// What became of one case of an experiment.
+/// The result of one case of an experiment.
 pub struct Ran {
     /// `speed = 1 mm/s`; empty without a sweep.
     pub label: String,
@@ -23,7 +23,7 @@ pub struct Ran {
 }
 
 impl Ran {
-    /// Rows of time and columns, SI; why there are none if the run failed.
+    /// Rows of time and columns, SI; the reason if the run failed.
     pub fn rows(&self) -> Result<Vec<Vec<f64>>, String> {
         match &self.result {
             Ok(outcome) => Ok(outcome.recording.rows().map(<[f64]>::to_vec).collect()),
@@ -41,10 +41,10 @@ impl Ran {
     }
 }
 
-/// Results by the name of the experiment; a message where it could not be compiled.
+/// Results by the name of the experiment; a message if it could not be compiled.
 pub type Results = BTreeMap<String, Result<Vec<Ran>, String>>;
 
-/// Loads a text that this program made.
+/// Loads a generated text.
 ///
 /// # Errors
 /// What is wrong with it, as a report.
@@ -56,8 +56,8 @@ pub fn load(name: &str, text: &str, sources: &(dyn compile::Sources + Sync)) -> 
     }
 }
 
-/// Compiles and runs experiments of a loaded text. Where the first case of a sweep comes to no end the others are left out,
-/// for the experiment will be run otherwise.
+/// Compiles and runs experiments of a loaded text. If the first case of a sweep does not finish, the others are
+/// skipped, because the experiment will be repeated with another solver.
 pub fn run(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + Sync)) -> Results {
     let compiled = compiled(loaded, names, sources);
     let mut cases: Vec<(usize, &compile::Case)> = Vec::new();
@@ -89,13 +89,13 @@ pub fn run(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + 
         .collect()
 }
 
-/// Runs cases on all cores; the results are in their order, and the same for any number of threads.
+/// Runs cases on all cores; the results are in order, and the same for any number of threads.
 fn outcomes(cases: &[&compile::Case]) -> Vec<Result<Outcome, Failure>> {
     let next = AtomicUsize::new(0);
     let work = || {
         let mut done = Vec::new();
         while let Some(case) = cases.get(next.fetch_add(1, Ordering::Relaxed)).copied() {
-            // Counted, not timed, so that what is given up does not depend on the machine.
+            // Counted, not timed, so that the limit does not depend on the machine.
             let states = case.instance.description().layout.states.len as usize;
             let most = (MOST_LOOKS * 8 / states.max(8)).max(50);
             let mut looks = 0;
@@ -117,16 +117,16 @@ fn outcomes(cases: &[&compile::Case]) -> Vec<Result<Outcome, Failure>> {
     done.into_iter().map(|(_, result)| result).collect()
 }
 
-/// Why an adaptive run came to no end that a run with fixed steps would come to.
+/// Why an adaptive run did not finish where a fixed-step run would.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Endless {
-    /// The model turns to and fro.
+    /// The model switches back and forth.
     Chatters,
-    /// It takes more steps than are worth waiting for.
+    /// It needs too many steps.
     Slow,
 }
 
-/// Whether a case came to no such end, and why.
+/// Why a case did not finish, if any did not.
 pub fn endless(results: &Result<Vec<Ran>, String>) -> Option<Endless> {
     results.as_ref().ok()?.iter().find_map(|ran| why(&ran.result))
 }
@@ -141,7 +141,7 @@ fn why(result: &Result<Outcome, Failure>) -> Option<Endless> {
 
 type Compiled = (String, Result<Vec<compile::Case>, String>);
 
-/// Compiles experiments on all cores; the order is theirs.
+/// Compiles experiments on all cores; the results are in order.
 fn compiled(loaded: &Loaded, names: &[String], sources: &(dyn compile::Sources + Sync)) -> Vec<Compiled> {
     let one = |loaded: &mut Loaded, name: &String| {
         let options = Options { changes: Changes::default(), interpret: false };

@@ -1,4 +1,4 @@
-//! What a test of the battery leaves: curves and numbers, and how they are shown.
+//! Results of a test of the battery: curves and numbers, and their display.
 
 use crate::plot::{Band, raised};
 use crate::quantity::{show, significant};
@@ -7,13 +7,13 @@ use abi::unit::Unit;
 /// One test of the battery.
 #[derive(Clone, Debug)]
 pub struct Test {
-    /// For files: `break_away`.
+    /// Identifier for files: `break_away`.
     pub key: &'static str,
-    /// Heading.
+    /// Title in the report.
     pub title: &'static str,
     /// What was done, in a sentence.
     pub how: String,
-    /// Curves, or the reason why there are none.
+    /// Graphs, or the reason why there are none.
     pub result: Result<Vec<Graph>, String>,
     /// What was measured.
     pub numbers: Vec<Number>,
@@ -22,20 +22,20 @@ pub struct Test {
 /// A measured number.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Number {
-    /// For programs: `break_away_force`.
+    /// Identifier for programs: `break_away_force`.
     pub key: &'static str,
-    /// For people.
+    /// Name in the report.
     pub name: String,
     /// SI.
     pub value: f64,
     /// Coherent SI unit, empty for a pure number.
     pub unit: String,
-    /// What is smaller than this is shown as 0: what rounding and the control of errors leave of nothing.
+    /// A smaller magnitude is shown as 0: the error level of rounding and error control.
     pub nothing: f64,
 }
 
 impl Number {
-    /// With a unit that suits its size.
+    /// With a unit of suitable size.
     pub fn shown(&self) -> String {
         match (self.key, self.value) {
             (_, f64::INFINITY) => "more than was tried".into(),
@@ -46,11 +46,11 @@ impl Number {
     }
 }
 
-/// Numbers that are parts of something, and so are shown in percent.
+/// Numbers that are ratios, shown in percent.
 const PARTS: [&str; 4] = ["break_away_change", "loop_area", "memory_error", "rate_difference_part"];
 
-/// A measured value in SI for people: four digits, and a prefix that leaves a number one can grasp. What is too short or
-/// too slow to be more than rounding is 0, in the least unit that would have been shown.
+/// A measured value in SI for people: four digits, and a suitable prefix. A value at the level of rounding errors is
+/// shown as 0, in the smallest unit that would have been used.
 pub fn shown(value: f64, base: &str) -> String {
     let least = match base {
         "m" | "rad" | "m/s" | "rad/s" => 1e-12,
@@ -63,12 +63,12 @@ pub fn shown(value: f64, base: &str) -> String {
         let small = if least > 0.0 { 1e-9 } else { 0.0 };
         return format!("0 {}", prefixed(base, small).0).trim_end().to_string();
     }
-    // Below the least prefix there are no four digits to tell.
+    // Below the smallest prefix, four digits are not significant.
     let digits = if (1e-12..1e-10).contains(&value.abs()) { 2 } else { 4 };
     show(value, &prefixed(base, value.abs()).0, digits)
 }
 
-/// A part as so many percent, with as many digits as tell something.
+/// A ratio in percent, with the significant digits.
 pub fn percent(part: f64) -> String {
     let percent = 100.0 * part;
     match percent.abs() {
@@ -78,47 +78,47 @@ pub fn percent(part: f64) -> String {
     }
 }
 
-/// A small number as people write it: `4.5·10⁻⁶`.
+/// A small number in mathematical notation: `4.5·10⁻⁶`.
 fn power_of_ten(x: f64) -> String {
     let text = format!("{x:.1e}");
     let (digits, exponent) = text.split_once('e').expect("written with an exponent");
     format!("{digits}·10{}", raised(exponent.parse().expect("an exponent")))
 }
 
-/// Curves over common axes; values in SI.
+/// Curves with common axes; values in SI.
 #[derive(Clone, Debug)]
 pub struct Graph {
-    /// For files: `energy`.
+    /// Identifier for files: `energy`.
     pub key: &'static str,
-    /// Name and coherent unit of what is drawn to the right.
+    /// Name and coherent unit of the horizontal axis.
     pub x: (String, String),
-    /// The same upwards.
+    /// The same for the vertical axis.
     pub y: (String, String),
-    /// Whether in powers of ten.
+    /// Whether the axes are logarithmic.
     pub logarithmic: (bool, bool),
     /// The curves.
     pub lines: Vec<Line>,
-    /// In which regime the model is, over time.
+    /// The regime of the model over time.
     pub bands: Vec<Band>,
-    /// Why it is no use beside the graphs of other models, whose curves it would hide.
+    /// Why it is not shown together with the graphs of other models: it would hide their curves.
     pub alone: Option<String>,
 }
 
 /// One curve of a graph.
 #[derive(Clone, Debug)]
 pub struct Line {
-    /// For the legend; may be empty.
+    /// Name in the legend; may be empty.
     pub name: String,
     /// SI.
     pub points: Vec<(f64, f64)>,
-    /// Measured points rather than a course.
+    /// Whether these are measured points rather than a continuous curve.
     pub marks: bool,
-    /// Shown when several models share the axes.
+    /// Whether it is shown when several models share the axes.
     pub main: bool,
 }
 
 impl Line {
-    /// A course.
+    /// A continuous curve.
     pub fn course(name: impl Into<String>, points: Vec<(f64, f64)>) -> Line {
         Line { name: name.into(), points, marks: false, main: true }
     }
@@ -128,13 +128,13 @@ impl Line {
         Line { name: name.into(), points, marks: true, main: true }
     }
 
-    /// The same, left out where several models share the axes.
+    /// The same curve, omitted when several models share the axes.
     pub fn aside(self) -> Line {
         Line { main: false, ..self }
     }
 }
 
-/// A unit with the prefix that suits a size, and what one of it is in SI.
+/// A unit with a prefix for a magnitude, and its scale in SI.
 pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
     const PREFIXES: [(&str, f64); 6] = [("G", 1e9), ("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("u", 1e-6)];
     let plain = || (Unit::parse(base).unwrap_or_else(|_| Unit::none()), 1.0);
@@ -144,7 +144,7 @@ pub fn prefixed(base: &str, size: f64) -> (Unit, f64) {
     if (0.1..1e4).contains(&size) || base == "s" && size >= 0.1 {
         return plain();
     }
-    // A little below one of the next: 0.997 mm rather than 997 µm.
+    // Slightly below the next prefix: 0.997 mm rather than 997 µm.
     let fitting = PREFIXES.into_iter().find(|(_, scale)| size >= 0.9 * scale).unwrap_or(("n", 1e-9));
     match Unit::parse(&format!("{}{base}", fitting.0)) {
         Ok(unit) => (unit, fitting.1),

@@ -1,8 +1,8 @@
-//! Puts a friction model through the standard battery.
+//! Characterises a friction model with the standard battery of experiments.
 //!
-//! In: a model as a user writes it, `LuGre(vd = 10 mm/s)`. Out: a [`Study`]: what was asked of it, what it was seen to
-//! do, and which phenomena that shows. The battery is text that is compiled and run like any other, so that a user can
-//! read it, change it and run it again. Knows no files and no terminal.
+//! In: a model as a user writes it, `LuGre(vd = 10 mm/s)`. Out: a [`Study`]: the experiments, the measured behaviour,
+//! and the phenomena that it shows. The battery is text that is compiled and run like any other, so a user can read it,
+//! change it and run it again. Knows no files and no terminal.
 
 pub mod subject;
 

@@ -1,6 +1,6 @@
-//! The report: one page of HTML that needs nothing but itself.
+//! The report: one self-contained HTML page.
 //!
-//! In: one [`Study`] or several. Out: a page. Figures are SVG in the page, nothing is fetched, nothing is run.
+//! In: one or more [`Study`] values. Out: a page. Figures are inline SVG; the page loads nothing and runs no script.
 
 use super::measured::{Graph, Test, shown};
 use super::phenomena::Seen;
@@ -10,7 +10,7 @@ use crate::plot;
 use crate::quantity::{show, significant};
 use std::fmt::Write;
 
-/// Width of a figure in px: two fit beside each other on a laptop.
+/// Width of a figure in px: two fit side by side on a laptop.
 const WIDE: f64 = 560.0;
 
 const STYLE: &str = "
@@ -50,7 +50,7 @@ details > summary { cursor: pointer; color: #0072b2; }
 @media print { body { max-width: none; padding: 0; } h2 { break-after: avoid; } details { display: none; } }
 ";
 
-/// The page of one model.
+/// The page for one model.
 pub fn report(study: &Study) -> String {
     let mut body = String::new();
     let subject = &study.subject;
@@ -171,7 +171,7 @@ fn page(title: &str, body: &str) -> String {
     )
 }
 
-/// One test: figures, and its numbers where it is of one model only.
+/// One test: its figures, and its numbers if the page is for one model only.
 fn section(test: &Test, studies: &[&Study]) -> String {
     let found: Vec<(&Study, &Test)> = studies
         .iter()
@@ -275,12 +275,12 @@ fn scales(study: &Study) -> String {
     out
 }
 
-/// A parameter's value; what has no bound is ∞.
+/// A parameter's value; infinity as ∞.
 fn value(si: f64, unit: &abi::unit::Unit) -> String {
     if si == f64::INFINITY { "∞".into() } else { show(si, unit, 6) }
 }
 
-/// A doc comment: paragraphs, and lines that are set in as they stand.
+/// A doc comment: paragraphs, and indented lines verbatim.
 fn prose(doc: &str) -> String {
     let mut out = String::new();
     for block in doc.trim_matches('\n').split("\n\n") {
@@ -303,7 +303,7 @@ fn prose(doc: &str) -> String {
     out
 }
 
-/// A line of words, with what stands between backticks as code.
+/// A line of text, with backticks as code.
 fn words(text: &str) -> String {
     let parts = text.split('`').enumerate();
     let part = |(i, part): (usize, &str)| match i % 2 {

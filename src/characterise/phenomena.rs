@@ -1,7 +1,7 @@
-//! Which phenomena a model was seen to show.
+//! Decides which friction phenomena a model shows.
 //!
-//! In: the numbers that the tests read from the curves. Out: a verdict for each phenomenon with the numbers behind it.
-//! Nothing here asks what a model says of itself.
+//! In: the numbers that the tests extracted from the curves. Out: a verdict for each phenomenon with its evidence.
+//! Documentation of the model is not used.
 
 use super::battery::Scales;
 use super::measured::{Number, Test, plain};
@@ -10,13 +10,13 @@ use super::subject::{External, Subject};
 /// A phenomenon and whether the model shows it.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Finding {
-    /// For programs: `return_point_memory`.
+    /// Identifier for programs: `return_point_memory`.
     pub key: &'static str,
-    /// For people.
+    /// Name in the report.
     pub name: &'static str,
     /// The verdict.
     pub seen: Seen,
-    /// The numbers behind it, or the reason.
+    /// The evidence, or the reason.
     pub why: String,
 }
 
@@ -25,14 +25,14 @@ pub struct Finding {
 pub enum Seen {
     /// It was seen.
     Shown,
-    /// It was looked for and not seen.
+    /// It was tested for and not seen.
     NotShown,
-    /// The question has no meaning for this model.
+    /// It does not apply to this model.
     NotApplicable,
 }
 
 impl Seen {
-    /// In words.
+    /// The verdict in words.
     pub fn words(self) -> &'static str {
         match self {
             Seen::Shown => "shown",
@@ -41,7 +41,7 @@ impl Seen {
         }
     }
 
-    /// In JSON.
+    /// The verdict in JSON.
     pub fn key(self) -> &'static str {
         match self {
             Seen::Shown => "shown",
@@ -51,7 +51,7 @@ impl Seen {
     }
 }
 
-/// All of them, in the order of the table.
+/// All findings, in the order of the table.
 pub fn findings(subject: &Subject, scales: &Scales, tests: &[Test], chatter: Option<&str>) -> Vec<Finding> {
     let look = Look { subject, scales, tests, chatter };
     vec![
@@ -107,7 +107,7 @@ impl Look<'_> {
         test.numbers.iter().find(|number| number.key == key)
     }
 
-    /// A memoryless map: questions about memory have no meaning for it.
+    /// A static map without memory: memory phenomena do not apply to it.
     fn is_static(&self) -> bool {
         self.subject.states == 0 && self.subject.regimes.is_empty()
     }
@@ -161,7 +161,7 @@ impl Look<'_> {
         }
         let sliding = Number { value: self.scales.f_c, ..highest.clone() };
         let why = format!("lets go at up to {}, slides with {}", highest.shown(), sliding.shown());
-        // What is viscous at the speed that counts as sliding is no stiction.
+        // The viscous part at the sliding speed does not count as stiction.
         let viscous =
             self.test("steady").ok().and_then(|test| Self::number(test, "viscous_slope")).map_or(0.0, |n| n.value);
         when(highest.value > 1.02 * self.scales.f_c + viscous.abs() * self.scales.v_slip && self.scales.f_c > 0.0, why)
@@ -338,7 +338,7 @@ impl Look<'_> {
         if let (Some(v), Some(force)) = (Self::number(test, "pushes_at"), Self::number(test, "pushes_with")) {
             return when(false, format!("can push: at v = {} with F = {}", v.shown(), force.shown()));
         }
-        // Less is what the sum over the steps of a run leaves.
+        // Smaller values are rounding errors of the sum over the steps of a run.
         let greatest = Self::number(test, "greatest_work").map_or(0.0, |number| number.value);
         if least.value < -1e-9 * greatest {
             return when(false, format!("gives out {} on a closed path", least.shown()));

@@ -1,7 +1,7 @@
-//! Lays the battery out, runs it, and reads from the curves what the model did.
+//! Generates the battery, runs it, and extracts the behaviour of the model from the curves.
 //!
-//! In: a [`Subject`]. Out: a [`Study`]. Scales come first: the force of fast sliding, then break-away and presliding
-//! travel, then the steady curve; the rest is laid out with them.
+//! In: a [`Subject`]. Out: a [`Study`]. Scales are measured first: the force of fast sliding, then break-away and
+//! presliding displacement, then the steady curve; the remaining experiments are sized with them.
 
 use super::battery::{self, Entry, Layout, Scales, Units, n};
 use super::bench::{self, Endless, Ran, Results};
@@ -13,7 +13,7 @@ use crate::plot::{Axis, Band, Curve, Figure, Panel};
 use abi::unit::Unit;
 use runtime::engine::Cause;
 
-/// What was done with a model and what came of it.
+/// The results for a model.
 #[derive(Clone, Debug)]
 pub struct Study {
     /// The model.
@@ -28,9 +28,9 @@ pub struct Study {
     pub scales: Scales,
     /// In the order of the report.
     pub tests: Vec<Test>,
-    /// What it shows.
+    /// The phenomena that it shows.
     pub findings: Vec<Finding>,
-    /// Remarks on the whole, such as that it chatters.
+    /// General remarks, such as that it chatters.
     pub notes: Vec<String>,
 }
 
@@ -39,11 +39,11 @@ pub struct Study {
 pub enum Extent {
     /// All of it.
     Whole,
-    /// The steady curve and the presliding loops: what a page of many models shows.
+    /// The steady curve and the presliding loops: for a page on many models.
     Sketch,
 }
 
-/// A graph as a figure: the curves of several models, each by its number, or all curves of one. A model has the same
+/// A graph as a figure: the curves of several models, each with its number, or all curves of one. A model has the same
 /// colour in every figure.
 pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
     let Some((_, _, first)) = graphs.first() else { return Figure::default() };
@@ -71,7 +71,7 @@ pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
         name: match (alone, graphs.iter().map(|(_, _, graph)| graph.lines.iter().filter(shown).count()).max() > Some(1))
         {
             (true, _) if among == 1 => line.name.clone(),
-            // A comparison of one that has it draws that one by its name.
+            // In a comparison with one curve, use the name of the model.
             (true, _) => format!("{model}{}{}", if line.name.is_empty() { "" } else { ", " }, line.name),
             (false, true) => format!("{model}, {}", line.name),
             (false, false) => model.into(),
@@ -90,26 +90,26 @@ pub fn figure(graphs: &[(usize, &str, &Graph)], among: usize) -> Figure {
         x: axis(&first.x, x_unit, first.logarithmic.0),
         y: axis(&first.y, y_unit, first.logarithmic.1),
         curves: curves.collect(),
-        // Several models would shade over each other.
+        // Shades of several models would overlap.
         bands: if alone { first.bands.clone() } else { Vec::new() },
     };
     Figure { title: String::new(), subtitle: String::new(), panels: vec![panel] }
 }
 
-/// The figure of one graph of a study, if it has it.
+/// The figure of one graph of a study, if it exists.
 pub fn drawn(study: &Study, key: &str) -> Option<Figure> {
     let graphs = study.tests.iter().filter_map(|test| test.result.as_ref().ok()).flatten();
-    // A force that jumps at every step is no picture of anything.
+    // A force that jumps at every step makes no useful picture.
     let graph = graphs.into_iter().find(|graph| graph.key == key && graph.alone.as_deref() != Some(JUMPS))?;
-    // What did not move is no curve.
+    // Without motion there is no curve.
     let moved = graph.lines.iter().any(|line| line.points.iter().any(|point| point.0.abs() > 1e-12));
     moved.then(|| figure(&[(0, &study.label, graph)], 1))
 }
 
-/// Puts a model through the battery.
+/// Characterises a model.
 ///
 /// # Errors
-/// Why nothing at all can be said, as a message or a report.
+/// Why nothing can be measured, as a message or a report.
 pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), extent: Extent) -> Result<Study, String> {
     let rotary = subject.rotary;
     let mut runner = Runner {
@@ -121,7 +121,7 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
         chatter: None,
         slow: false,
     };
-    // Twins of straight models keep their numbers; what is written for shafts turns faster.
+    // Rotary twins of translational models keep their numbers; models written for shafts run faster.
     let v_max = if rotary && !subject.instance.is_rotary() { 10.0 } else { 1.0 };
     let mut scales =
         Scales { f_ref: 0.0, mass: 1.0, f_b: 0.0, x_b: 0.0, f_c: 0.0, v_s: 0.01 * v_max, v_slip: 0.01 * v_max, v_max };
@@ -153,8 +153,8 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
     let units = Units::of(rotary);
     let steady = Steady::of(&runner.results)?;
     (scales.f_c, scales.v_s) = (steady.f_c, steady.v_s.unwrap_or(scales.v_s / 10.0));
-    // Ten times the Stribeck speed is sliding; it is 10 mm/s for the textbook's 1 mm/s. A mass that swings on a contact which
-    // still holds does not slide: under a ramp of rate r it swings with up to 2 r/k.
+    // Sliding is ten times the Stribeck speed: 10 mm/s for the textbook's 1 mm/s. A mass that oscillates on a contact
+    // which still holds does not slide: under a ramp of rate r it oscillates with up to 2 r/k.
     let fastest = Layout::new(&subject, scales.clone()).rates().into_iter().fold(0.0, f64::max);
     scales.v_slip = battery::round((10.0 * scales.v_s).max(4.0 * fastest / stiffness));
 
@@ -201,7 +201,7 @@ pub fn study(subject: Subject, name: &str, sources: &(dyn Sources + Sync), exten
     Ok(Study { label, units, battery: text, scales, tests, findings, notes, subject })
 }
 
-/// Collects the experiments and what became of them.
+/// Collects the experiments and their results.
 struct Runner<'a> {
     subject: &'a Subject,
     name: &'a str,
@@ -218,7 +218,7 @@ impl Runner<'_> {
         let layout = Layout::new(self.subject, scales.clone());
         let first = self.entries.len();
         self.entries.extend(entries(&layout));
-        // What was slow once will be again.
+        // An experiment that was slow once will be slow again.
         let (slow, period) = (self.slow, self.subject.period);
         let again = self.entries[first..].iter_mut().filter(|entry| slow && entry.adaptive());
         again.for_each(|entry| entry.step_fixed(period));
@@ -264,7 +264,7 @@ impl Runner<'_> {
     }
 }
 
-/// `abs(v)` and `sign(v)` turn.
+/// A clause that names the switching conditions: ``"`abs(v)` and `sign(v)` turn"``.
 fn what_turns(conditions: &[String]) -> String {
     let conditions: Vec<String> = conditions.iter().map(|text| format!("`{text}`")).collect();
     match &conditions[..] {
@@ -282,22 +282,22 @@ fn one<'a>(results: &'a Results, name: &str) -> Result<&'a Ran, String> {
     }
 }
 
-/// Largest force before the speed first reaches `v_slip`, and the travel at it. Rows hold t, F, x, v.
+/// Largest force before the speed first reaches `v_slip`, and the displacement there. Rows hold t, F, x, v.
 fn break_away(rows: &[Vec<f64>], v_slip: f64) -> Option<(f64, f64)> {
     let end = rows.iter().position(|row| row[3].abs() >= v_slip)?;
     let best = rows[..=end].iter().max_by(|a, b| a[1].total_cmp(&b[1]))?;
     Some((best[1], best[2]))
 }
 
-/// Force over travel at a tenth of the break-away force. Rows hold t, F, x, v.
+/// Force per displacement at a tenth of the break-away force. Rows hold t, F, x, v.
 fn early_stiffness(rows: &[Vec<f64>], f_b: f64) -> Option<f64> {
     let early = rows.iter().find(|row| row[1] >= 0.1 * f_b)?;
     let stiffness = early[1] / early[2];
     (stiffness.is_finite() && stiffness > 0.0).then_some(stiffness)
 }
 
-/// The force at the end of a run at one speed; its mean over the last half where it goes on to change, and by how much it
-/// does.
+/// The force at the end of a constant-speed run; if it is still changing, its mean over the last half, and the amount
+/// of change.
 fn settled(rows: &[Vec<f64>]) -> (f64, f64) {
     let Some(last) = rows.last() else { return (f64::NAN, 0.0) };
     let half = rows.partition_point(|row| row[0] < 0.5 * last[0]);
@@ -317,7 +317,7 @@ struct Steady {
     backward: Vec<(f64, f64)>,
     f_c: f64,
     v_s: Option<f64>,
-    /// Speed and height of the peak, and how many steps of the grid the force falls behind it.
+    /// Speed and height of the peak, and for how many points of the grid the force falls after it.
     peak: (f64, f64),
     falls: usize,
     viscous: f64,
@@ -350,7 +350,7 @@ impl Steady {
             return Err(failures.into_iter().next().unwrap_or_else(|| "it has no steady curve".into()));
         };
         let viscous = (last.1 - before.1) / (last.0 - before.0);
-        // The first speed from which on the force falls, and where it has stopped falling.
+        // The first speed at which the force begins to fall, and where it stops falling.
         let top = (0..forward.len() - 1).find(|i| forward[i + 1].1 < forward[*i].1 * (1.0 - 5e-4));
         let (mut falls, mut v_s, mut peak) = (0, None, forward[0]);
         let intercept = last.1 - viscous * last.0;
@@ -364,7 +364,7 @@ impl Steady {
             let level = f_c + (peak.1 - f_c) / std::f64::consts::E;
             let below = (top..=foot).find(|i| forward[*i].1 <= level).unwrap_or(foot);
             let (a, b) = (forward[below - 1], forward[below]);
-            // A jump, or the noise of a force that never settles, has no speed of its own.
+            // A jump, or the noise of a force that never settles, defines no Stribeck speed.
             v_s = (falls >= 3 && peak.1 - f_c > noise)
                 .then_some(a.0 + (b.0 - a.0) * ((a.1 - level) / (a.1 - b.1)).clamp(0.0, 1.0));
         }
@@ -373,20 +373,20 @@ impl Steady {
     }
 }
 
-/// Reads tests from results.
+/// Extracts tests from results.
 struct Reader<'a> {
     results: &'a Results,
     layout: &'a Layout<'a>,
     units: Units,
     scales: &'a Scales,
     steady: &'a Steady,
-    /// Whether the force jumps to and fro at rest.
+    /// Whether the force jumps back and forth at rest.
     chatters: bool,
-    /// The step in s of the reference of the step-size sweep, where it could not be run adaptively.
+    /// The step in s of the reference of the step-size sweep, if it could not run adaptively.
     reference: Option<f64>,
 }
 
-/// Why a curve of a model that chatters is not drawn beside others.
+/// Why a curve of a model that chatters is not drawn together with others.
 const JUMPS: &str = "at rest its force jumps to and fro";
 
 type Read = Result<(Vec<Graph>, Vec<Number>), String>;
@@ -507,7 +507,7 @@ impl Reader<'_> {
     }
 
     fn number(&self, key: &'static str, name: impl Into<String>, value: f64, unit: &str) -> Number {
-        // Work and power are of the size of the force at the speeds and paths of the battery.
+        // Work and power have the magnitude of the force at the speeds and paths of the battery.
         let of_force = ["N", "N·m", "J", "W"].contains(&unit) || unit == self.units.damping;
         let nothing = if of_force { 1e-8 * self.scales.f_ref } else { 0.0 };
         let nothing = if ["J", "W"].contains(&unit) { 1e-6 * nothing } else { nothing };
@@ -518,7 +518,7 @@ impl Reader<'_> {
         one(self.results, name)?.rows()
     }
 
-    /// When the model is in which regime; rows hold t, F, x, v, and then its regimes.
+    /// The regime of the model over time; rows hold t, F, x, v, and then its regimes.
     fn regimes(&self, rows: &[Vec<f64>]) -> Vec<Band> {
         let band = |(k, name): (usize, &String)| {
             let course: Vec<(f64, f64)> = rows.iter().map(|row| (row[0], row[4 + k])).collect();
@@ -640,10 +640,10 @@ impl Reader<'_> {
         };
         let small_travel = peak_to_peak(&small, 2);
         let large_travel = peak_to_peak(&large, 2);
-        // u: 0, a, −a, a/2, 0, a. Times of the stops follow from the constant rate.
+        // u: 0, a, −a, a/2, 0, a. The times of the stops follow from the constant rate.
         let a = large.iter().map(|row| row[1]).fold(0.0, f64::max);
         let end = large.last().map_or(0.0, |row| row[0]);
-        // Of the whole path of 6 a: first at a/2 on the way up after 4.5 a, back there after 5.5 a.
+        // On the total path of 6 a: first at a/2 on the way up after 4.5 a, back there after 5.5 a.
         let at = |part: f64| value_at(&large, end * part / 6.0, 2);
         let (left, turned, back) = (at(4.5), at(5.0), at(5.5));
         let inner = (left - turned).abs();
@@ -681,7 +681,7 @@ impl Reader<'_> {
         for (i, f) in self.layout.lag_frequencies().into_iter().enumerate() {
             let rows = self.rows(&format!("lag_{}", i + 1))?;
             let end = rows.last().map_or(0.0, |row| row[0]);
-            // From the row before on, so that the loop closes.
+            // From the previous row on, so that the loop closes.
             let first = rows.partition_point(|row| row[0] < end - 1.0 / f).saturating_sub(1);
             let last: Vec<(f64, f64)> = rows[first..].iter().map(|row| (row[2], row[1])).collect();
             let width = lag(&last);
@@ -711,14 +711,14 @@ impl Reader<'_> {
         let rows = self.rows("reversal")?;
         let turn = rows.iter().map(|row| row[2]).fold(0.0, f64::max);
         let half = rows.last().map_or(0.0, |row| row[0]) / 2.0;
-        // The row at the turn itself is there twice: before and after it.
+        // The row at the reversal exists twice: before and after it.
         let turned = rows.partition_point(|row| row[0] <= half).saturating_sub(1);
         let forth: Vec<(f64, f64)> = rows[..turned].iter().map(|row| (row[2], row[1])).collect();
         let back: Vec<(f64, f64)> = rows[turned..].iter().map(|row| (turn - row[2], -row[1])).collect();
         let top = |points: &[(f64, f64)]| points.iter().map(|point| point.1).fold(f64::NEG_INFINITY, f64::max);
         let settled = forth.last().map_or(f64::NAN, |point| point.1);
         let (first, second) = (top(&forth) - settled, top(&back) - settled);
-        // Where both have settled there is nothing more to see.
+        // After both have settled there is no more difference to measure.
         let size = settled.abs().max(1e-300);
         let moving = |points: &[(f64, f64)]| {
             let last = points.iter().rev().find(|point| (point.1 - settled).abs() > 0.01 * size);
@@ -937,7 +937,8 @@ impl Reader<'_> {
             for row in &mut rows {
                 row[0] /= end;
             }
-            // The second of two cycles, over a path of length 1: what the rounding of the frequency changes is left out.
+            // The second of two cycles, over a path normalised to length 1, which removes the rounding of the
+            // frequency.
             let whole = peak_to_peak(&rows, 2).max(1e-300);
             let cycle: Vec<(f64, f64)> =
                 rows.iter().filter(|row| row[0] >= 0.5).map(|row| (row[2] / whole, row[1])).collect();
@@ -948,7 +949,7 @@ impl Reader<'_> {
         let mut difference = 0.0_f64;
         for i in 0..=400 {
             let t = 0.5 + 0.5 * f64::from(i) / 400.0;
-            // At the turn itself the force may jump.
+            // The force may jump at the reversal itself.
             if !((i % 200) < 3 || (i % 200) > 197) {
                 let forces: Vec<f64> = courses.iter().map(|rows| value_at(rows, t, 1)).collect();
                 for a in &forces {
@@ -1054,14 +1055,14 @@ impl Reader<'_> {
     }
 }
 
-/// Greatest minus least of a column.
+/// Maximum minus minimum of a column.
 fn peak_to_peak(rows: &[Vec<f64>], column: usize) -> f64 {
     let values = rows.iter().map(|row| row[column]);
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), x| (low.min(x), high.max(x)));
     high - low
 }
 
-/// A column at a time, straight lines between rows.
+/// The value of a column at a time, interpolated linearly.
 fn value_at(rows: &[Vec<f64>], t: f64, column: usize) -> f64 {
     let next = rows.partition_point(|row| row[0] < t);
     match (rows.get(next.wrapping_sub(1)), rows.get(next)) {
@@ -1077,7 +1078,7 @@ fn area(rows: &[Vec<f64>], from: f64, to: f64) -> f64 {
     inside.windows(2).map(|pair| 0.5 * (pair[0][1] + pair[1][1]) * (pair[1][2] - pair[0][2])).sum::<f64>().abs()
 }
 
-/// Force at a rising speed minus force at the same falling speed, where that is greatest in size.
+/// Force at increasing speed minus force at the same decreasing speed, where that difference is largest.
 fn lag(cycle: &[(f64, f64)]) -> f64 {
     let (mut rising, mut falling): (Vec<Vec<f64>>, Vec<Vec<f64>>) = (Vec::new(), Vec::new());
     for pair in cycle.windows(2) {
@@ -1093,14 +1094,14 @@ fn lag(cycle: &[(f64, f64)]) -> f64 {
     let (Some(first), Some(last)) = (rising.first(), rising.last()) else { return f64::NAN };
     let (low, high) = (first[0], last[0]);
     let gap = |i: u32| {
-        // The ends of the loop are where it turns: nothing to compare.
+        // Skip the ends of the loop, where it reverses.
         let v = low + (high - low) * (0.05 + 0.9 * f64::from(i) / 100.0);
         value_at(&rising, v, 1) - value_at(&falling, v, 1)
     };
     (0..=100).map(gap).fold(0.0, |widest: f64, gap| if gap.abs() > widest.abs() { gap } else { widest })
 }
 
-/// Instants at which a pulled mass begins to slip after it was at rest, without the first.
+/// Instants at which a pulled mass begins to slip after rest, without the first.
 fn slips(rows: &[Vec<f64>], vp: f64) -> Vec<f64> {
     let (mut resting, mut starts) = (true, Vec::new());
     for row in rows {
@@ -1114,9 +1115,10 @@ fn slips(rows: &[Vec<f64>], vp: f64) -> Vec<f64> {
     starts.split_off(1.min(starts.len()))
 }
 
-/// Whether a pulled mass that slips at these instants also comes to rest each time: for a twenty-fifth of the period it goes
-/// less than a thousandth of what the far end does. One that swings about a steady slide without loss only touches zero speed:
-/// in so short a time it goes 2.6 thousandths. A contact without damping rings while it holds, by far less.
+/// Whether a pulled mass that slips at these instants also comes to rest each time: for a twenty-fifth of the period it
+/// moves less than a thousandth of the distance of the pulled end. A mass that oscillates about steady sliding without
+/// loss only touches zero speed, and moves 2.6 thousandths in that time. A contact without damping rings while it
+/// holds, but by far less.
 fn sticks(rows: &[Vec<f64>], slips: &[f64], vp: f64) -> bool {
     let [first, .., last] = slips[..] else { return false };
     let period = (last - first) / (slips.len() - 1) as f64;
@@ -1129,8 +1131,8 @@ fn sticks(rows: &[Vec<f64>], slips: &[f64], vp: f64) -> bool {
     slips.len() >= 3 && slips.windows(2).all(rests)
 }
 
-/// The course of the position, drawn on between rows that lie far apart: the cubic that has their speeds. Rows hold t, F, x,
-/// v.
+/// The position with additional points between distant rows, from the cubic Hermite interpolation with their speeds.
+/// Rows hold t, F, x, v.
 fn smooth(rows: &[Vec<f64>]) -> Vec<(f64, f64)> {
     let fine = rows.last().map_or(0.0, |row| row[0]) / 500.0;
     let mut points = Vec::with_capacity(rows.len());

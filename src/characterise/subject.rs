@@ -1,4 +1,4 @@
-//! The model under test: where its text is, how it is written, what its ports are.
+//! The model under test: its source, its instance, its ports.
 //!
 //! In: a model's name with arguments and where to look for it. Out: a [`Subject`], or why it cannot be tested.
 
@@ -15,37 +15,37 @@ use grammar::span::FileId;
 pub enum Origin {
     /// The library.
     Library,
-    /// A text of the user's: its path as the battery imports it.
+    /// A user's file: its path as the battery imports it.
     File(String),
 }
 
-/// A model as it is put to the test.
+/// A model under test.
 #[derive(Clone, Debug)]
 pub struct Subject {
     /// The model's name: `LuGre`.
     pub model: String,
-    /// What a slot is filled with: `LuGre(vd = 10 mm/s)`, with `rotary` where the user wrote it.
+    /// The argument for a bench's slot: `LuGre(vd = 10 mm/s)`, with `rotary` if the user wrote it.
     pub instance: Written,
-    /// Where its text is.
+    /// The source of its text.
     pub origin: Origin,
-    /// Lines before the first experiment of the battery.
+    /// The lines before the first experiment of the battery.
     pub imports: String,
     /// Doc comment.
     pub doc: Option<String>,
-    /// Equations, in the symbols of the text.
+    /// Equations, in symbols.
     pub equations: Vec<(String, String)>,
     /// Whether velocities are angular.
     pub rotary: bool,
-    /// Whether it asks for the external force, and whether it insists on it.
+    /// Whether it has an input for the external force, and whether it requires it.
     pub external: External,
     /// Its parameters with the values of this instance.
     pub params: Vec<Param>,
-    /// Continuous states, and whether it has regimes or sampled code.
+    /// Number of continuous states.
     pub states: usize,
     pub regimes: Vec<String>,
-    /// Regimes of its own, not of its parts.
+    /// Regimes of its own, without those of its parts.
     pub own_regimes: Vec<String>,
-    /// How often its sampled code runs, in s: the shortest period.
+    /// The shortest period of its sampled code, in s.
     pub period: Option<f64>,
 }
 
@@ -63,19 +63,19 @@ pub enum External {
 /// A parameter and its value.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Param {
-    /// Such as `Fc` or `law.Fc`.
+    /// Path, such as `Fc` or `law.Fc`.
     pub path: String,
     /// In SI.
     pub value: f64,
-    /// In which it is declared.
+    /// The declared unit.
     pub unit: Unit,
-    /// Where it may lie, as in the text: `> 0`; may be empty.
+    /// The declared range, as in the text: `> 0`; may be empty.
     pub range: String,
     /// Doc comment.
     pub doc: Option<String>,
 }
 
-/// An instance as text, whose arguments can be changed.
+/// An instance as text, with replaceable arguments.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Written {
     rotary: bool,
@@ -90,7 +90,7 @@ enum Argument {
 }
 
 impl Written {
-    /// Reads `LuGre`, `LuGre(vd = 10 mm/s)`, `rotary LuGre()`.
+    /// Parses `LuGre`, `LuGre(vd = 10 mm/s)`, `rotary LuGre()`.
     ///
     /// # Errors
     /// What is wrong with it, in words.
@@ -122,7 +122,7 @@ impl Written {
         }
     }
 
-    /// Whether it is written as the rotary twin of a straight model.
+    /// Whether it is written as the rotary twin of a translational model.
     pub fn is_rotary(&self) -> bool {
         self.rotary
     }
@@ -132,10 +132,10 @@ impl Written {
         &self.model
     }
 
-    /// Gives an argument another value: `Fs`, or `law.Fs` of a part that is an argument itself.
+    /// Sets an argument to another value: `Fs`, or `law.Fs` of a part that is an argument itself.
     ///
     /// # Errors
-    /// Where the path does not lead, in words.
+    /// Why the path is wrong, in words.
     pub fn set(&mut self, path: &str, value: &str) -> Result<(), String> {
         match path.split_once('.') {
             None => {
@@ -159,7 +159,7 @@ impl Written {
         }
     }
 
-    /// The text with further arguments where it does not give them itself.
+    /// The text with further arguments, unless it has them itself.
     pub fn with(&self, more: &[(&str, &str)]) -> String {
         let mut written = self.clone();
         for (name, value) in more {
@@ -170,7 +170,7 @@ impl Written {
         written.to_string()
     }
 
-    /// The model that was put into a slot.
+    /// The model that was passed for a slot.
     fn slot(&self, part: &str) -> Option<&str> {
         self.args.iter().find_map(|(name, argument)| match argument {
             Argument::Model(model) if name == part => Some(model.model.as_str()),
@@ -178,7 +178,7 @@ impl Written {
         })
     }
 
-    /// Short, for legends: without empty parentheses.
+    /// A short form for legends: without empty parentheses.
     pub fn label(&self) -> String {
         let text = self.to_string();
         text.strip_suffix("()").map_or(text.clone(), str::to_string)
@@ -199,7 +199,7 @@ impl std::fmt::Display for Written {
     }
 }
 
-/// A model's tree, wherever it is visible from the asked-for file.
+/// A model's syntax tree, if it is visible from the file.
 pub fn model<'a>(loaded: &'a Loaded, name: &str) -> Option<(FileId, &'a ast::Model)> {
     match loaded.find(loaded.root(), Space::Type, name) {
         Lookup::Found(item, Item::Model(model)) => Some((item.file, model)),
@@ -226,13 +226,13 @@ fn declarations(model: &ast::Model) -> impl Iterator<Item = &ast::Declaration> {
     })
 }
 
-/// Whether a model has an input `v` and an output `F`: what it takes to be a friction model, but for units.
+/// Whether a model has an input `v` and an output `F`: the ports of a friction model, without a check of units.
 pub fn looks_like_friction(model: &ast::Model) -> bool {
     inputs(model).any(|(name, _)| name == "v")
         && declarations(model).any(|d| d.kind == DeclarationKind::Output && d.name.text == "F")
 }
 
-/// The equations of a model, and behind them those of its parts, each kind of part once.
+/// The equations of a model, followed by those of its parts, each kind of part once.
 pub fn equations(loaded: &Loaded, found: &ast::Model, written: &Written) -> Vec<(String, String)> {
     let mut lines = equations::equations(found);
     let mut told: Vec<&str> = Vec::new();
@@ -240,7 +240,7 @@ pub fn equations(loaded: &Loaded, found: &ast::Model, written: &Written) -> Vec<
         let Statement::Part(part) = statement else { continue };
         let (slot, own) = (equations::symbol(&part.name.text), &part.instance.model.text);
         let name = written.slot(&part.name.text).unwrap_or(own);
-        // What was put into a slot stands there, not what the model has by itself.
+        // A slot shows the model that was passed for it, not the default.
         if let Some((_, right)) = lines.iter_mut().find(|(left, right)| *left == slot && right == own) {
             *right = name.to_string();
         }
@@ -254,7 +254,7 @@ pub fn equations(loaded: &Loaded, found: &ast::Model, written: &Written) -> Vec<
     lines
 }
 
-/// How a model treats the external force.
+/// How a model uses the external force.
 pub fn external(model: &ast::Model) -> External {
     match inputs(model).find(|(name, _)| *name == "F_ext") {
         None => External::Absent,
@@ -263,12 +263,12 @@ pub fn external(model: &ast::Model) -> External {
     }
 }
 
-/// Whether the ports of a model are those of a friction model, and then whether of a rotary one.
+/// Checks that the ports of a model are those of a friction model; returns whether it is rotary.
 ///
 /// # Errors
-/// Which port does not fit, in words.
+/// Which port does not match, in words.
 pub fn rotary(model: &ast::Model, written: &Written, instance: &Instance) -> Result<bool, String> {
-    // A bound input is no quantity of its own any more, so its unit is read where it is declared.
+    // A connected input is no longer a separate quantity, so its unit is read from the declaration.
     let declared = declarations(model).find(|declaration| declaration.name.text == "v");
     let v = declared.and_then(|v| Unit::parse(&v.unit.as_ref()?.text).ok()).map(|unit| unit.dimension);
     let force = instance.description().quantity("F").map(|quantity| quantity.unit.dimension);
@@ -285,7 +285,7 @@ pub fn rotary(model: &ast::Model, written: &Written, instance: &Instance) -> Res
     }
 }
 
-/// What stands behind `in`, with symbols: `> 0`, `0.01 … 0.99`.
+/// The range after `in`, in symbols: `> 0`, `0.01 … 0.99`.
 pub fn range(range: &ast::Range) -> String {
     match range {
         ast::Range::Between(low, high) => format!("{} … {}", expression(low), expression(high)),
@@ -300,7 +300,7 @@ pub fn range(range: &ast::Range) -> String {
     }
 }
 
-/// The parameters of a compiled model, those of its parts too.
+/// The parameters of a compiled model and of its parts.
 pub fn params(model: &ast::Model, instance: &Instance) -> Vec<Param> {
     let stated = |path: &str| {
         let declaration = declarations(model).find(|declaration| declaration.name.text == path)?;

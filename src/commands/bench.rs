@@ -1,4 +1,4 @@
-//! `fric bench`: what a step of an experiment costs, alone, in lanes and on all cores, and what compiling it took.
+//! `fric bench`: the cost of a step of an experiment, alone, in lanes and on all cores, and the compile time.
 
 use super::{End, compiled, has_experiment, load, reported};
 use crate::args::Bench;
@@ -11,9 +11,9 @@ use abi::{Instance, Slot};
 use serde_json::json;
 use std::time::{Duration, Instant};
 
-/// Most steps between two looks at the clock.
+/// Most steps between two readings of the clock.
 const STEPS: u64 = 20_000;
-/// How long each figure is measured.
+/// Duration of each measurement.
 const MEASURED: Duration = Duration::from_millis(400);
 
 pub fn bench(args: &Bench, terminal: &mut Terminal) -> End {
@@ -132,7 +132,7 @@ fn tell(
     terminal.line(&format!("  compiled in {}: {}", duration(stages.total()), parts.join(", ")));
 }
 
-/// The median over rounds of what `round` says, in seconds a step of one instance.
+/// The median over rounds of the result of `round`, in seconds per step of one instance.
 fn measured(mut round: impl FnMut() -> f64) -> f64 {
     let begin = Instant::now();
     let mut times = vec![round()];

@@ -1,4 +1,4 @@
-//! `fric bench-rt`: a loop as a rig has it, how late it woke, and what that means.
+//! `fric bench-rt`: measures the wake-up latency of a periodic loop like a rig's, and interprets it.
 
 use super::{End, chosen_rig, load, reported};
 use crate::args::BenchRt as Args;
@@ -16,10 +16,10 @@ use runtime::realtime::threads::{self, Wishes};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Ctrl-C: ends the run, and what it has shown so far is told.
+/// Ctrl-C: ends the run and prints the results so far.
 static STOP: AtomicBool = AtomicBool::new(false);
 
-/// Widest bar of the histogram.
+/// Width of the longest bar of the histogram.
 const BAR: f64 = 40.0;
 
 pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
@@ -43,7 +43,7 @@ pub fn bench_rt(args: &Args, terminal: &mut Terminal) -> End {
     tell(&report, args, terminal)
 }
 
-/// The cycle of a rig with its model, its drives simulated in this process at the pace of the wall.
+/// The cycle of a rig with its model; its drives are simulated in this process in real time.
 fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
     let Some(mut loaded) = load(file, terminal, &mut Stopwatch::start("read")) else { return End::Failed };
     let name = match chosen_rig(file, args.rig.as_deref(), &loaded) {
@@ -58,7 +58,7 @@ fn of_rig(file: &Path, args: &Args, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    // What is late is to be counted: neither the drives nor the watchdog stop it.
+    // Lateness is only counted here: neither the drives nor the watchdog stop the run because of it.
     ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(60_000_000_000);
     let mut options = Options { arms_itself: true, ..Options::default() };
     (options.control.count_overruns, options.start.simulated, options.start.missed) = (true, true, 1.0);
@@ -113,7 +113,7 @@ fn judged(fit: Fit, rate: &str) -> (String, Style, End) {
     }
 }
 
-/// A bar an octave: the bins in between are for quantiles.
+/// A bar for each octave; the bins in between serve the quantiles.
 fn histogram(lateness: &Histogram) -> String {
     let mut octaves: Vec<(u64, u64)> = Vec::new();
     for (_, upper_ns, count) in lateness.bins() {
@@ -125,7 +125,7 @@ fn histogram(lateness: &Histogram) -> String {
     }
     let most = octaves.iter().map(|(_, count)| *count).max().unwrap_or(1) as f64;
     let line = |(upper_ns, count): &(u64, u64)| {
-        // One cycle in a million is still one to see.
+        // A single cycle in a million is still visible.
         let bar = "━".repeat((BAR * *count as f64 / most).ceil() as usize);
         let upper = format!("≤ {}", quantity::duration(*upper_ns as f64 * 1e-9));
         format!("{upper:>10}  {bar:<40}  {}\n", quantity::count(*count))

@@ -1,4 +1,4 @@
-//! `fric build`: a model as something to take away: C, a machine-code image, or what the compiler makes on the way.
+//! `fric build`: writes a model as C, as a machine-code image, or as an intermediate form of the compiler.
 
 use super::{End, load, reported};
 use crate::args::Build;

@@ -1,4 +1,4 @@
-//! `fric bus`: joins buses of any kind, opens doors to them, and prints what goes over them.
+//! `fric bus`: bridges buses of any kind, opens doors to them, and prints their traffic.
 
 use super::{End, load, reported};
 use crate::args::Bus as Args;
@@ -22,10 +22,10 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Ctrl-C.
+/// Set by Ctrl-C.
 static STOP: AtomicBool = AtomicBool::new(false);
 
-/// How soon Ctrl-C is heard on a silent bus.
+/// How often Ctrl-C is checked on a silent bus.
 const LOOK_NS: u64 = 50_000_000;
 
 pub fn bus(args: &Args, terminal: &mut Terminal) -> End {
@@ -56,7 +56,7 @@ fn run(args: &Args, known: &Known, terminal: &mut Terminal) -> Result<(), Cannot
         let name = name.strip_prefix("socketcan:").unwrap_or(&name);
         hub.join(name, can::open(address, &options, &world, name)?);
         if matches!(address, Address::Sim(_)) {
-            // Somebody must acknowledge what comes through a door, or it would be sent again for ever.
+            // Frames that come through a door must be acknowledged, or they would be repeated for ever.
             let deaf = Options { filter: Filter::Only(Vec::new()), ..options.clone() };
             listeners.push(can::open(address, &deaf, &world, "listener")?);
         }
@@ -70,7 +70,7 @@ fn run(args: &Args, known: &Known, terminal: &mut Terminal) -> Result<(), Cannot
     joined.extend(server.as_ref().map(|server| format!("TCP port {}", server.port())));
     terminal.report(&format!("joined: {}\n", joined.join(", ")));
 
-    // Logs count from 1970, pages for people from the start.
+    // Times in logs count from 1970, on the screen from the start.
     let day_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |day| day.as_nanos() as u64);
     let origin_ns = day_ns.saturating_sub(clock.now_ns());
     let until_ns = args.duration.map_or(u64::MAX, |seconds| clock.now_ns().saturating_add((seconds * 1e9) as u64));
@@ -108,7 +108,7 @@ fn run(args: &Args, known: &Known, terminal: &mut Terminal) -> Result<(), Cannot
     Ok(())
 }
 
-/// As candump prints it, and what CANopen calls it.
+/// A frame in the format of candump, with its CANopen meaning.
 fn traffic_line(page: &mut String, from: &str, received: &Received, known: &Known) {
     let seconds = |ns: u64| format!("({:03}.{:06})", ns / 1_000_000_000, ns / 1000 % 1_000_000);
     match received {
@@ -128,14 +128,14 @@ fn traffic_line(page: &mut String, from: &str, received: &Received, known: &Know
     }
 }
 
-/// What rigs and DBC files say of frames.
+/// The names that rigs and DBC files give to frames.
 #[derive(Default)]
 struct Known {
-    /// By identifier, and whether it has 29 bits: who sends or takes it, and what it carries.
+    /// By identifier, and whether it has 29 bits: the sender or receiver, and the message.
     messages: BTreeMap<(u32, bool), (String, Message)>,
-    /// Drives by their number.
+    /// Names of drives by their node number.
     drives: BTreeMap<u32, String>,
-    /// Objects of a data sheet, by index and sub-index as they are shown.
+    /// Names of objects in a data sheet, by index and sub-index as shown.
     objects: BTreeMap<String, String>,
 }
 
@@ -189,7 +189,7 @@ impl Known {
         Ok(())
     }
 
-    /// Who a frame is of, and what it carries: by rig and DBC file, else by CANopen.
+    /// The node and content of a frame: by rig and DBC file, else by CANopen.
     fn name(&self, frame: &Frame) -> String {
         if let Some((who, message)) = self.messages.get(&(frame.id(), frame.is_extended()))
             && !frame.is_remote()
@@ -215,7 +215,7 @@ impl Known {
 
 fn log_line(page: &mut String, from: &str, received: &Received, origin_ns: u64) {
     if let Received::Frame(frame, at_ns) = received {
-        // A reader of logs takes white space for the end of a name.
+        // Readers of logs end a name at white space.
         let interface = from.replace(char::is_whitespace, "_");
         let _ = writeln!(page, "{}", Entry { time_ns: origin_ns + at_ns, interface, frame: *frame });
     }

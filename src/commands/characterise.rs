@@ -1,4 +1,4 @@
-//! `fric characterise` and `fric compare`: a friction model, or several, through the standard battery.
+//! `fric characterise` and `fric compare`: run friction models through the standard battery.
 
 use super::End;
 use crate::args::{Characterise, Compare};
@@ -90,7 +90,7 @@ fn battery_in(folder: &Path) -> String {
     folder.join("battery.fric").display().to_string()
 }
 
-/// The models that are meant, each with the folder its report goes to.
+/// The requested models, each with the folder for its report.
 fn subjects(
     what: &str,
     models: &[String],
@@ -144,7 +144,7 @@ pub(super) fn fitted(written: Written, file: Option<&Path>, folder: &Path) -> Re
         }
     };
     let name = battery_in(folder);
-    // A text that brings its own models need not have the library's, unless an argument is one of those.
+    // A text with its own models does not need the library's, unless an argument is one of those.
     let imports = [format!("{own}import std.bench\n"), format!("{own}import std.friction\nimport std.bench\n")];
     let imports = match file {
         None => imports[1].clone(),
@@ -230,7 +230,7 @@ fn relative(file: &Path, folder: &Path) -> String {
     up.chain(down).collect::<Vec<_>>().join("/")
 }
 
-/// Writes the report, the battery, and a table for each graph; gives the number of tables.
+/// Writes the report, the battery, and a table for each graph; returns the number of tables.
 fn write(study: &Study, folder: &Path) -> Result<usize, String> {
     let mut files: Vec<(String, String)> =
         vec![("report.html".into(), page::report(study)), ("battery.fric".into(), study.battery.clone())];
@@ -252,7 +252,7 @@ fn write(study: &Study, folder: &Path) -> Result<usize, String> {
     Ok(tables)
 }
 
-/// The summary of one model.
+/// Prints the summary of one model.
 fn tell(study: &Study, terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &study.label));
     let scales = &study.scales;
@@ -304,7 +304,7 @@ fn table(studies: &[Study], terminal: &Terminal) -> String {
     out
 }
 
-/// What `--json` prints.
+/// The output of `--json`.
 fn json(study: &Study) -> Value {
     let number = |value: f64| serde_json::Number::from_f64(value).map_or(Value::Null, Value::Number);
     let tests = study.tests.iter().map(|test| {

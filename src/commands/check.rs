@@ -1,4 +1,4 @@
-//! `fric check`: says what is wrong without running anything.
+//! `fric check`: reports problems without running anything.
 
 use super::End;
 use crate::args::Check;
@@ -50,7 +50,7 @@ pub fn check(args: &Check, terminal: &mut Terminal) -> End {
     if errors + unread == 0 { End::Fine } else { End::Failed }
 }
 
-/// All that is wrong with a text, each thing once; none if it cannot be read.
+/// All diagnostics of a text, without duplicates; none if it cannot be read.
 fn found_in(path: &Path, terminal: &Terminal) -> Option<(Loaded, Vec<Diagnostic>)> {
     let name = path.display().to_string();
     match project::read(path) {

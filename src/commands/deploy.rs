@@ -1,8 +1,8 @@
-//! `fric deploy`, `fric fetch-log`: a rig onto the computer that runs it, and its recordings back.
+//! `fric deploy`, `fric fetch-log`: installs a rig on the computer that runs it, and fetches its recordings.
 //!
-//! Everything that can be refused is refused before anything changes there: the package is built for that computer,
-//! copied beside what is installed, checked by the computer itself, and made current in one step. Interrupted at any
-//! point, the rig keeps running what it ran.
+//! All checks happen before anything changes on that computer: the package is built for its processor, copied beside
+//! the installed one, verified by the computer itself, and activated in one step. If interrupted at any point, the rig
+//! keeps running its old package.
 
 use super::End;
 use crate::args::{Deploy, FetchLog, Host};
@@ -47,7 +47,7 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     if let Some(key) = &key {
         register(args, &remote, key, &trusted, simulated, terminal)?;
     }
-    // Beside what is installed, in a folder of its own that nobody else can have made or can write to.
+    // In a new folder beside the installed packages that nobody else can write to.
     let name = format!("{}-{}.{}", package.rig, &hash(&bytes)[..12], runtime::package::EXTENSION);
     let staging = Staging::new(&name, &bytes, signature.as_deref())?;
     let failed = |what: &str| {
@@ -76,7 +76,7 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     install.extend(args.allow_older.then(|| "--allow-older".into()));
     let installed = run(&install).map_err(failed("it could not be installed"))?;
     terminal.print(&installed);
-    // What has been installed is kept under its hash; the copy has done its work.
+    // The installed package is kept under its hash; the copy is no longer needed.
     drop(arrived);
     if args.start {
         let mut words = with(&[rig, "start", "--hash", &hash(&bytes), "--dir", dir]);
@@ -88,7 +88,7 @@ fn deployed(args: &Deploy, terminal: &mut Terminal) -> Result<(), String> {
     Ok(())
 }
 
-/// A folder on the other computer, removed when it goes.
+/// A folder on the other computer, removed on drop.
 struct There<'a> {
     remote: &'a Remote,
     folder: String,
@@ -100,8 +100,8 @@ impl Drop for There<'_> {
     }
 }
 
-/// The key to sign with: the one that is named, else one of whoever deploys, made on first use. None where nothing is to be
-/// signed.
+/// The signing key: the one named on the command line, else the user's own, created on first use. None if nothing is to
+/// be signed.
 fn signing(args: &Deploy, terminal: &mut Terminal) -> Result<Option<Named>, String> {
     let signed = is_package(&args.file) && beside(&args.file).exists();
     if let Some(path) = &args.sign {
@@ -123,20 +123,20 @@ fn signing(args: &Deploy, terminal: &mut Terminal) -> Result<Option<Named>, Stri
         terminal.line(&format!("made a key to sign packages with: {}, keep it to yourself", path.display()));
     }
     let key = Signing::open(&path)?;
-    // Two people may have one name: a piece of the key tells theirs apart.
+    // Two people may have the same name: a part of the key makes the name unique.
     let letters = |text: &str| text.chars().filter(char::is_ascii_alphanumeric).take(32).collect::<String>();
     let user = variable("USER").map(|user| letters(&user.to_string_lossy())).filter(|user| !user.is_empty());
     let name = format!("{}-{}", user.unwrap_or("fric".into()), &hash(key.public().as_bytes())[..8]);
     Ok(Some(Named { name, key }))
 }
 
-/// A key and the name under which a rig's computer knows it.
+/// A key and the name under which the rig's computer knows it.
 struct Named {
     name: String,
     key: Signing,
 }
 
-/// Has the rig's computer trust a key, if it trusts none yet; says so.
+/// Registers a key with the rig's computer if that trusts no key yet; reports it.
 fn register(
     args: &Deploy,
     remote: &Remote,
@@ -180,14 +180,15 @@ fn register(
     }
 }
 
-/// Starts what has been installed, and tells its state; if it refuses, the computer itself goes back to what was there.
+/// Starts the installed package and reports its state. If it fails to start, the computer itself returns to the
+/// previous package.
 fn start(args: &Deploy, remote: &Remote, words: &[String], terminal: &mut Terminal) -> Result<(), String> {
     let Host { host, rig, dir, .. } = &args.host;
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     let said = remote.run(&words).map_err(|why| format!("{host}: {}", why.words()))?;
     terminal.print(&said);
     if args.follow || std::io::stdout().is_terminal() {
-        // Whoever has seen enough presses Ctrl-C: what was asked for is done.
+        // Ctrl-C ends only the display: the deployment is done.
         crate::interrupt::on_interrupt(|| ENOUGH.store(true, Ordering::Relaxed));
         let followed = remote.follow(&[rig, "status", "--follow", "--dir", dir], &mut |line| terminal.line(line));
         return match followed {
@@ -198,7 +199,7 @@ fn start(args: &Deploy, remote: &Remote, words: &[String], terminal: &mut Termin
     Ok(())
 }
 
-/// Ctrl-C, once the rig runs.
+/// Set by Ctrl-C once the rig runs.
 static ENOUGH: AtomicBool = AtomicBool::new(false);
 
 fn no_rig(remote: &Remote, rig: &str, why: &Failed) -> String {
@@ -221,7 +222,7 @@ fn is_package(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == runtime::package::EXTENSION)
 }
 
-/// The package and its signature: read, or built for the computer.
+/// The package and its signature: read from a file, or built for the computer.
 fn packed(args: &Deploy, target: &str, key: Option<&Named>, terminal: &mut Terminal) -> Result<Packed, String> {
     let path = &args.file;
     let key = key.map(|named| &named.key);
@@ -253,7 +254,7 @@ fn packed(args: &Deploy, target: &str, key: Option<&Named>, terminal: &mut Termi
     Ok(Packed { bytes, signature })
 }
 
-/// A folder of this computer with the files to send: new, open to nobody else, removed when it goes.
+/// A local folder with the files to send: new, readable only by its owner, removed on drop.
 struct Staging {
     _folder: tempfile::TempDir,
     paths: Vec<PathBuf>,
@@ -291,13 +292,13 @@ pub fn fetch_log(args: &FetchLog, terminal: &mut Terminal) -> End {
             return End::Failed;
         }
     };
-    // A name that leaves its folder, here or there, or is more than a name is none of a log.
+    // Reject names that are paths, because they could leave the folder on either computer.
     let (all, odd): (Vec<&str>, Vec<&str>) =
         listed.lines().filter(|name| name.ends_with(".friclog")).partition(|name| is_component(name));
     for name in odd {
         terminal.error(&format!("{host} says that it has a log `{name}`: that is no name of one, it stays there"));
     }
-    // A long log lies in several files, of which the newest comes first.
+    // A long log consists of several files; the newest comes first.
     let whole = |name: &str| all.iter().rev().copied().filter(|other| of_log(other) == of_log(name)).collect();
     let wanted: Vec<&str> = match &args.log {
         Some(name) if all.contains(&name.as_str()) => whole(name),
@@ -323,7 +324,7 @@ pub fn fetch_log(args: &FetchLog, terminal: &mut Terminal) -> End {
     End::Fine
 }
 
-/// The log that a file is a part of: `rtfs` for `rtfs.friclog` and for `rtfs.2.friclog`.
+/// The log that a file belongs to: `rtfs` for `rtfs.friclog` and for `rtfs.2.friclog`.
 fn of_log(name: &str) -> &str {
     let stem = name.strip_suffix(".friclog").unwrap_or(name);
     match stem.rsplit_once('.') {
@@ -332,7 +333,7 @@ fn of_log(name: &str) -> &str {
     }
 }
 
-/// Copies a file here: whole or not at all.
+/// Copies a file here, atomically.
 fn fetched(remote: &Remote, from: &str, to: &Path) -> Result<(), String> {
     let about = |error: std::io::Error| error.to_string();
     project::make_folder_of(to).map_err(about)?;

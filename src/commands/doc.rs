@@ -1,7 +1,7 @@
-//! `fric doc`: a page of all models of the library, made from the library's own text.
+//! `fric doc`: a page on all models of the library, generated from the library's text.
 //!
 //! In: the embedded library. Out: `docs/models.md`, and characteristic plots in a folder of the same name beside it.
-//! The page shows those plots that are there, so it can be compared without running anything.
+//! The page includes the plots that exist, so it can be compared without running anything.
 
 use super::End;
 use super::characterise::fitted;
@@ -13,7 +13,7 @@ use crate::{compile, equations, plot, project};
 use grammar::ast::{Declaration, DeclarationKind, Function, Interface, Item, Model, Statement};
 use std::path::Path;
 
-/// Graphs that a model's section shows.
+/// Graphs in a model's section.
 const SHOWN: [(&str, &str); 2] = [("steady", "steady friction against velocity"), ("presliding", "presliding loops")];
 
 pub fn doc(args: &Doc, terminal: &mut Terminal) -> End {
@@ -40,7 +40,7 @@ pub fn doc(args: &Doc, terminal: &mut Terminal) -> End {
     End::Fine
 }
 
-/// Draws what the friction models do, as far as they do it with their own parameters.
+/// Draws the characteristic plots of the friction models, where they have them with their default parameters.
 fn plots(folder: &Path, terminal: &mut Terminal) -> Result<(), String> {
     for (_, items) in library().into_iter().filter(|(module, _)| module.starts_with("std.friction.")) {
         for model in items.iter().filter_map(|item| match item {
@@ -81,7 +81,7 @@ fn library() -> Vec<(String, Vec<Item>)> {
     project::library().iter().map(items).collect()
 }
 
-/// The page. `folder` is asked only which plots there are.
+/// The page. `folder` is read only for the list of existing plots.
 fn page(folder: &Path) -> String {
     let mut out = String::from(
         "# The library\n\n\
@@ -130,7 +130,7 @@ fn page(folder: &Path) -> String {
     out.trim_end().to_string() + "\n"
 }
 
-/// What a doc comment says first.
+/// The first sentence of a doc comment.
 fn first_sentence(doc: &str) -> String {
     let paragraph = doc.trim().split("\n\n").next().unwrap_or_default();
     let words: Vec<&str> = paragraph.split_whitespace().collect();
@@ -138,7 +138,7 @@ fn first_sentence(doc: &str) -> String {
     words[..last].join(" ").trim_end_matches('.').to_string()
 }
 
-/// A doc comment as Markdown: what is set in stays as it stands.
+/// A doc comment as Markdown: indented lines stay verbatim.
 fn prose(doc: Option<&String>) -> String {
     let Some(doc) = doc else { return String::new() };
     let (mut out, mut set_in) = (String::new(), false);
@@ -146,7 +146,7 @@ fn prose(doc: Option<&String>) -> String {
         let inside = line.starts_with("  ") || (set_in && line.trim().is_empty());
         if inside != set_in {
             if !inside {
-                // The blank line behind what is set in stands outside.
+                // The blank line after an indented part belongs outside.
                 out = out.trim_end().to_string() + "\n";
             }
             out += if inside { "```text\n" } else { "```\n" };
@@ -158,7 +158,7 @@ fn prose(doc: Option<&String>) -> String {
     if set_in {
         out = out.trim_end().to_string() + "\n```\n";
     }
-    // A fence stands by itself.
+    // A code fence needs lines of its own.
     let mut text = String::new();
     let mut open = false;
     for line in out.lines() {

@@ -1,4 +1,4 @@
-//! `fric doctor`: what this machine and its buses lack for a rig, with the line that mends each.
+//! `fric doctor`: what this machine and its buses lack for a rig, with a command to fix each.
 
 use super::{End, load, reported};
 use crate::args::{Doctor as Args, LookedAt};
@@ -12,7 +12,7 @@ use runtime::realtime::clock::Clock;
 use runtime::realtime::host_check::{Finding, Host, Verdict};
 use std::path::Path;
 
-/// How long a bus is listened to for another master.
+/// How long a bus is observed for another master.
 const LISTEN_NS: u64 = 1_000_000_000;
 
 pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
@@ -34,12 +34,12 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
             let of_it = interface(name, *bit_rate);
             let forbids = of_it.iter().any(|finding| matches!(finding.verdict, Verdict::Forbids(_)));
             found.extend(of_it);
-            // What cannot be listened to has been told.
+            // A bus that cannot be opened has been reported.
             if forbids {
                 continue;
             }
         }
-        // Nobody else can be on a bus in this process.
+        // A simulated bus in this process has no other participants.
         if !matches!(address, Address::Sim(_)) {
             found.push(traffic(address, *bit_rate));
         }
@@ -59,7 +59,7 @@ pub fn doctor(args: &Args, terminal: &mut Terminal) -> End {
     if forbidden { End::Failed } else { End::Fine }
 }
 
-/// The buses of all rigs in a text; what is wrong with it is reported.
+/// The buses of all rigs in a text; reports problems in it.
 fn of_rigs(path: &Path, terminal: &Terminal) -> Result<Vec<(Address, Option<u32>)>, End> {
     let mut loaded = load(path, terminal, &mut Stopwatch::start("read")).ok_or(End::Failed)?;
     let rigs: Vec<String> = loaded.rigs().iter().map(|rig| rig.name.text.clone()).collect();
@@ -88,7 +88,7 @@ fn of_rigs(path: &Path, terminal: &Terminal) -> Result<Vec<(Address, Option<u32>
     Ok(buses)
 }
 
-/// What the kernel says of an interface.
+/// What the kernel reports about an interface.
 fn interface(name: &str, wanted: Option<u32>) -> Vec<Finding> {
     let up = format!("ip link set {name} up type can bitrate {} restart-ms 0", wanted.unwrap_or(1_000_000));
     let found = match socketcan::inspect(name) {
@@ -131,7 +131,7 @@ fn interface(name: &str, wanted: Option<u32>) -> Vec<Finding> {
     all
 }
 
-/// Whether somebody else masters the bus: SYNC, NMT, requests or heartbeats before we have said anything.
+/// Whether there is another master on the bus: SYNC, NMT, requests or heartbeats before we have sent anything.
 fn traffic(address: &Address, bit_rate: Option<u32>) -> Finding {
     let topic = address.to_string();
     let world = Simulation::real_time();

@@ -1,4 +1,4 @@
-//! `fric drives`: the drives and devices of a rig, simulated, on a bus that other programs can reach.
+//! `fric drives`: simulates the drives and devices of a rig on a bus that other programs can reach.
 
 use super::{End, chosen_rig, load, reported};
 use crate::args::Drives as Args;
@@ -8,7 +8,7 @@ use crate::terminal::Terminal;
 use runtime::drive::serve::{Doors, Refused, Served, Sheet};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Ctrl-C.
+/// Set by Ctrl-C.
 static STOP: AtomicBool = AtomicBool::new(false);
 
 pub fn drives(args: &Args, terminal: &mut Terminal) -> End {

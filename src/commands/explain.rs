@@ -1,4 +1,4 @@
-//! `fric explain`: the page of an error or a warning, or what the compiler knows of a model.
+//! `fric explain`: the page on an error or a warning, or the compiler's analysis of a model.
 
 use super::End;
 use crate::args::Explain;
@@ -30,7 +30,7 @@ pub(super) fn page_of(subject: &str) -> Option<&'static str> {
     page(&named.map_or_else(|| subject.trim().to_uppercase(), |(_, code)| code.to_string()))
 }
 
-/// That there is no such page, and what was probably meant.
+/// The message that there is no such page, with a suggestion.
 pub(super) fn no_page(subject: &str) -> String {
     let subject = subject.trim();
     let lints = compile::LINTS.iter().map(|(lint, _)| *lint);
@@ -47,10 +47,10 @@ pub(super) fn no_page(subject: &str) -> String {
     format!("there is no page about `{subject}`; {help}")
 }
 
-/// Models that a message names at most.
+/// Most models listed in a message.
 const MOST_NAMED: usize = 8;
 
-/// Explains models of a file, or models that it imports.
+/// Explains the models of a file, or models that it imports.
 fn models(args: &Explain, terminal: &mut Terminal) -> End {
     let mut watch = Stopwatch::start("read");
     let Some(loaded) = super::load(Path::new(&args.subject), terminal, &mut watch) else { return End::Failed };
@@ -97,7 +97,7 @@ fn models(args: &Explain, terminal: &mut Terminal) -> End {
     end
 }
 
-/// Everything about a model, and how long its steps take where that was asked for.
+/// Prints everything about a model, with the time of its steps if requested.
 pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut Terminal) {
     terminal.line(&terminal.styled(Style::Bold, &explanation.model));
     let width = |of: &mut dyn Iterator<Item = usize>| of.max().unwrap_or(0);
@@ -166,7 +166,7 @@ pub(super) fn tell(explanation: &Explanation, bounds: &[Bound], terminal: &mut T
     terminal.line("");
 }
 
-/// `euler 20 us, rk4 28 us, expo any, implicit any`; none where nothing is stepped.
+/// `euler 20 us, rk4 28 us, expo any, implicit any`; none for a model without states to integrate.
 fn stable_steps(explanation: &Explanation) -> Option<String> {
     let one = |step: &compile::StepCost| {
         let most = step.stable?;
@@ -221,23 +221,23 @@ fn as_json(explanation: &Explanation, bounds: &[Bound]) -> serde_json::Value {
     })
 }
 
-/// Calls that are timed.
+/// Number of timed calls.
 const CALLS: usize = 1_000_000;
-/// What another million may bring: other programs, other states, a colder cache.
+/// Factor for conditions beyond the measurement: other programs, other states, a colder cache.
 const MARGIN: f64 = 2.0;
-/// The step that is timed, in s. Its length changes no instruction.
+/// Length of the timed step, in s. It changes no instruction.
 const STEP: f64 = 1e-3;
 
-/// How long one call took, in ns.
+/// The measured time of one call, in ns.
 pub(super) struct Bound {
     method: Method,
     median: f64,
-    /// All but a hundred are below this.
+    /// An upper bound for all calls but a hundred.
     most: f64,
     worst: f64,
 }
 
-/// Times the fixed steps of a model; of methods without machine code nothing.
+/// Times the fixed steps of a model; nothing for methods without machine code.
 fn bounds(loaded: &compile::Loaded, explanation: &Explanation) -> Vec<Bound> {
     let timed = explanation.steps.iter().filter(|step| step.code.is_some());
     let bound = |method: Method| {
@@ -255,7 +255,7 @@ fn bounds(loaded: &compile::Loaded, explanation: &Explanation) -> Vec<Bound> {
     timed.filter_map(|step| bound(step.method)).collect()
 }
 
-/// A short time in words.
+/// Formats a short time.
 fn nanoseconds(ns: f64) -> String {
     match ns {
         ns if ns < 1e3 => format!("{ns:.0} ns"),
@@ -271,7 +271,7 @@ pub(super) fn page(code: &str) -> Option<&'static str> {
     Some(&PAGES[start..end])
 }
 
-/// Where headings of the second level begin, outside blocks of code.
+/// Offsets of second-level headings, outside code blocks.
 fn headings() -> impl Iterator<Item = usize> {
     let mut at = 0;
     let mut inside = false;

@@ -1,4 +1,4 @@
-//! `fric fmt`: rewrites texts in the one canonical layout.
+//! `fric fmt`: rewrites texts in the canonical layout.
 
 use super::End;
 use crate::args::Fmt;
@@ -26,7 +26,7 @@ pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
             formatted.map(|formatted| (formatted != text, formatted))
         });
         let done = match formatted {
-            // What is wrong with it has been reported.
+            // Its problems have been reported.
             Ok(None) => Err(None),
             Ok(Some((changed, _))) if args.check => {
                 if changed {
@@ -55,7 +55,7 @@ pub fn fmt(args: &Fmt, terminal: &mut Terminal) -> End {
     end
 }
 
-/// The text in its canonical layout; none if it cannot be read as a tree, which is reported.
+/// The text in its canonical layout; none if it does not parse, which is reported.
 fn formatted(name: &str, text: &str, width: u16, terminal: &Terminal) -> Option<String> {
     match grammar::format::format(text, usize::from(width)) {
         Ok(formatted) => Some(formatted),

@@ -1,4 +1,4 @@
-//! `fric hil`: runs a rig against drives on its buses, real or simulated.
+//! `fric hil`: runs a rig with drives on its buses, real or simulated.
 
 use super::prompt::{Rehearsal, prompt};
 use super::{End, chosen_rig, load_from};
@@ -29,9 +29,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Cycles whose loss a killed process may cost, as a time.
+/// Most time of a recording that is lost when the process is killed.
 const BLOCK_NS: u64 = 100_000_000;
-/// What a black box holds.
+/// Length of the black box.
 const BLACK_BOX_NS: u64 = 10_000_000_000;
 
 pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
@@ -68,7 +68,8 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
         return End::Misused;
     }
     if args.count_overruns {
-        // Neither the drives nor the watchdog stop what is only to be counted, unless there is no cycle for so long.
+        // If overruns are only counted, neither the drives nor the watchdog stop the rig, unless no cycle runs for this
+        // long.
         ready.rig.watchdog_ns = ready.rig.watchdog_ns.max(PATIENT_NS);
     }
     let root = loaded.files.get(loaded.root());
@@ -103,13 +104,13 @@ pub fn hil(args: &Args, terminal: &mut Terminal) -> End {
     if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
 }
 
-/// Whether a rig may run: whether it is stable only while it looks ahead; none if it must not.
+/// Whether the rig is stable only with the predictor; none if it must not run.
 fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool> {
     let (mut against, needs_look) = loop_stability::objections(ready);
     if args.accept_unstable {
         against.clear();
     }
-    // Simulated time stands still meanwhile.
+    // Simulated time does not advance during a step, so a slow step does not matter.
     if !args.fast {
         against.extend(watches::too_slow(&ready.rig, &ready.control));
     }
@@ -125,7 +126,7 @@ fn bearable(args: &Args, ready: &Ready, terminal: &mut Terminal) -> Option<bool>
     None
 }
 
-/// What cannot be asked for together.
+/// Rejects combinations of options that exclude each other.
 fn usage(args: &Args, ready: &Ready, simulated: bool) -> Result<(), String> {
     if simulated && args.fast && args.duration.is_none() && !args.check && !args.identify {
         return Err("--fast needs --for TIME: simulated time has no operator who would end the run".into());
@@ -145,7 +146,7 @@ fn usage(args: &Args, ready: &Ready, simulated: bool) -> Result<(), String> {
     Ok(())
 }
 
-/// Options that only simulated drives bear.
+/// Options that are allowed with simulated drives only.
 fn daring(args: &Args) -> Option<&'static str> {
     let all = [
         (args.arm, "--arm"),
@@ -156,7 +157,7 @@ fn daring(args: &Args) -> Option<&'static str> {
     all.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
 }
 
-/// When the run was started, for the log; nothing where two equal runs leave equal logs.
+/// The start time for the log; empty for a repeatable run, so that equal runs have equal logs.
 fn started(repeatable: bool) -> String {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     if repeatable { String::new() } else { format!("{}.{:09} s since 1970", now.as_secs(), now.subsec_nanos()) }
@@ -172,7 +173,7 @@ fn log_settings(args: &Args, name: &str, ready: &Ready, simulated: bool) -> Sett
         Sink::File(path, Limits { part: args.roll, keep: args.keep, ..Limits::default() })
     };
     let cycles_per_block = cycles(BLOCK_NS);
-    // Where time stands meanwhile, the log may take its time.
+    // With frozen time, the log may block the cycle.
     Settings { sink, cycles_per_block, patient: simulated && args.fast }
 }
 
@@ -180,17 +181,17 @@ fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     let mut options = HilOptions::default();
     options.control.count_overruns = args.count_overruns;
     options.start.simulated = simulated;
-    // What is late between this process and itself says nothing of the drives.
+    // Delays inside this process are no evidence about drives.
     options.start.missed = match (simulated, args.count_overruns) {
         (_, true) => 1.0,
         (true, false) => 0.05,
-        // Where a host gives no real time, drives that are programs on it answer when they can.
+        // On a host without real-time scheduling, drives that are programs on it answer late.
         (false, false) if args.accept_jitter => 0.9,
         (false, false) => 0.0,
     };
     options.start.timeout_test = !args.count_overruns;
     if simulated && holds_and_pushes(rig) {
-        // A drive that holds its speed would not let another one push the shaft.
+        // A drive that holds its speed would prevent another one from turning the shaft.
         options.start.sign_test = SignTest::Skip;
     }
     options.arms_itself = args.sim || simulated || args.arm;
@@ -199,7 +200,7 @@ fn hil_options(args: &Args, rig: &Rig, simulated: bool) -> HilOptions {
     options
 }
 
-/// Torque pulses in place of the model.
+/// Runs torque pulses in place of the model.
 fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Terminal) -> End {
     let asked = match Identification::new(&ready.rig) {
         Ok(asked) => asked,
@@ -215,7 +216,7 @@ fn identified(args: &Args, mut ready: Ready, simulated: bool, terminal: &mut Ter
     if simulated { in_process(args, ready, asked, terminal) } else { on_buses(args, ready, asked, terminal) }
 }
 
-/// Says what was measured, as text to paste.
+/// Prints the measured parameters as text to paste.
 fn measured(asked: &Identification, rows: &[identify::Row], terminal: &mut Terminal) {
     let milli = |seconds: f64| quantity::significant(seconds * 1e3, 3);
     for found in asked.evaluate(rows) {
@@ -232,17 +233,17 @@ fn measured(asked: &Identification, rows: &[identify::Row], terminal: &mut Termi
     }
 }
 
-/// What a run is to do besides running.
+/// What a run does besides the control cycle.
 #[derive(Default)]
 struct Asked<'a> {
     log: Option<(Settings, Sections)>,
     /// Torque pulses in place of the model.
     pulses: Option<&'a Identification>,
-    /// What judges sets of parameters.
+    /// Validates new sets of parameters.
     rehearsal: Option<Rehearsal>,
 }
 
-/// Buses, drives and devices in this process.
+/// Runs with buses, drives and devices in this process.
 fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
     let pace = if args.fast { Pace::Fast } else { Pace::Wall };
     let world = World::new(&ready.rig, Some(ready.plant.clone()), pace, args.seed);
@@ -266,7 +267,7 @@ fn in_process(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) 
     run(args, ready, clock, masters, true, asked, terminal)
 }
 
-/// Buses of this machine.
+/// Runs on the buses of this machine.
 fn on_buses(args: &Args, ready: Ready, asked: Asked, terminal: &mut Terminal) -> End {
     let world = Simulation::real_time();
     let mut buses: Vec<Box<dyn Bus>> = Vec::new();
@@ -382,7 +383,7 @@ fn run(
     finish(args, hil, end, log_path, terminal)
 }
 
-/// What `--check` found of each drive, and that nothing was wrong.
+/// Prints what `--check` found for each drive, and that there were no problems.
 fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
     for (at, node) in rig.nodes.iter().enumerate() {
         let Some(status) = hil.fieldbus().status(at) else { continue };
@@ -409,7 +410,7 @@ fn checked(rig: &Rig, hil: &Hil, terminal: &mut Terminal) {
     terminal.line("  checks passed: nothing was armed");
 }
 
-/// What the host refused, and the remedy.
+/// The request that the host refused, and the remedy.
 fn said(refusal: &threads::Refusal) -> String {
     format!("{:?}: {}; {}", refusal.what, refusal.reason, refusal.remedy)
 }
@@ -438,15 +439,15 @@ fn begin(rig: &Rig, simulated: bool, fast: bool, refusals: &[String], notes: &[S
     }
 }
 
-/// Where the log goes, and the space that is free there.
+/// The destination of the log, and the free space there.
 fn room(log: &Path) -> String {
-    // The folder is made when the log begins.
+    // The folder is created when the log begins.
     let there = log.ancestors().skip(1).find(|folder| folder.is_dir()).unwrap_or(Path::new("."));
     let free = parts::free(there).map_or(String::new(), |free| format!(", {} free on its disk", parts::size(free)));
     format!("  log {}{free}", log.display())
 }
 
-/// Tells how it ended, after the log was closed.
+/// Reports how the run ended, after the log was closed.
 fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal: &mut Terminal) -> End {
     let counts = words::counts(hil.counts());
     let missed = hil.counts().missed;
@@ -494,7 +495,7 @@ fn finish(args: &Args, hil: Hil, end: cycle::End, log: Option<PathBuf>, terminal
     code
 }
 
-/// Shows the gauges, some times a second, until it is over.
+/// Displays the gauges, several times a second, until the run ends.
 fn view(gauges: &Gauges, rig: &Rig, over: &AtomicBool) {
     let mut terminal = Terminal::new();
     let names: Vec<String> = (rig.outputs.iter())

@@ -1,4 +1,4 @@
-//! `fric inspect`: everything in a package, verified.
+//! `fric inspect`: the contents of a package, verified.
 
 use super::End;
 use crate::args::Inspect;
@@ -89,7 +89,7 @@ fn words(args: &Inspect, terminal: &Terminal) -> Result<String, String> {
     Ok(out)
 }
 
-/// Which parameters may change while the rig runs.
+/// The parameters that may change during a run.
 fn settable(live: &Live) -> String {
     let (mut may, mut start) = (String::new(), String::new());
     for param in &live.params {
@@ -103,7 +103,7 @@ fn settable(live: &Live) -> String {
     format!("\n  may be set while it runs:{may}\n  only a start reads:{start}\n")
 }
 
-/// The plan of a rig: how often, on which buses, who is there.
+/// The plan of a rig: period, buses, nodes.
 fn planned(rig: &Rig) -> String {
     let mut out = format!("rig: {} Hz", significant(1e9 / rig.period_ns as f64, 6));
     for (at, bus) in rig.buses.iter().enumerate() {
@@ -113,7 +113,7 @@ fn planned(rig: &Rig) -> String {
     out
 }
 
-/// A program in a line.
+/// A summary of a program in one line.
 fn program(image: &Image) -> String {
     let Description { name, layout, .. } = &image.description;
     let functions: Vec<&str> = Function::ALL
@@ -134,7 +134,7 @@ fn program(image: &Image) -> String {
     )
 }
 
-/// The name of a section as one inside a folder, whatever it says.
+/// The name of a section as a file name that cannot leave its folder.
 fn safe(name: &str) -> std::path::PathBuf {
     name.split('/').filter(|part| !matches!(*part, "" | "." | "..")).collect()
 }

@@ -1,4 +1,4 @@
-//! `fric key new`: a pair of keys to sign packages with.
+//! `fric key new`: generates a key pair to sign packages with.
 
 use super::End;
 use crate::args::KeyNew;

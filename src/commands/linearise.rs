@@ -1,4 +1,5 @@
-//! `fric linearise`: A, B, C, D at a point, and the modes of A; P and Q, how rates and outputs depend on parameters.
+//! `fric linearise`: the matrices A, B, C, D at an operating point and the modes of A; P and Q, the derivatives of
+//! rates and outputs by parameters.
 
 use super::{End, load, reported};
 use crate::args::Linearise;
@@ -73,7 +74,8 @@ pub fn linearise(args: &Linearise, terminal: &mut Terminal) -> End {
     End::Fine
 }
 
-/// Puts the instance to the point: where the run is at that time, if an experiment was asked for; then what is given.
+/// Moves the instance to the operating point: the state of an experiment at a given time, if requested; then the given
+/// values.
 fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
     let mut later = Vec::new();
     for (path, text) in &args.at {
@@ -91,7 +93,7 @@ fn go_to_point(linear: &mut Linear, args: &Linearise) -> Result<(), String> {
         };
         let value = given(quantity, text)?;
         match quantity.kind {
-            // What initial values may follow from comes before the start.
+            // Parameters and inputs are set before the start, because initial values may depend on them.
             Kind::Param | Kind::Input => linear.instance.set(quantity.slot, value),
             _ => later.push((quantity.slot, value)),
         }
@@ -134,7 +136,7 @@ fn regime(linear: &Linear, path: &str, text: &str) -> Option<(Slot, Result<f64, 
     Some((automaton.slot, number))
 }
 
-/// A value in SI of the kind of a quantity.
+/// Parses a value in SI with the dimension of a quantity.
 fn given(quantity: &Quantity, text: &str) -> Result<f64, String> {
     let (value, unit) = parse(text).map_err(|reason| format!("{}: {reason}", quantity.path))?;
     let fits = unit.dimension == quantity.unit.dimension || value == 0.0 && unit.text.is_empty();
@@ -152,7 +154,7 @@ fn given(quantity: &Quantity, text: &str) -> Result<f64, String> {
     }
 }
 
-/// P and Q only if parameters were named.
+/// The matrices with their names; P and Q only if parameters were named.
 fn named<'a>(linear: &Linear, found: &'a Matrices) -> Vec<Matrix<'a>> {
     let (n, m, p, q) = (linear.states.len(), linear.inputs.len(), linear.outputs.len(), linear.params.len());
     let matrix = |name, rows, columns, values| Matrix { name, rows, columns, values };
@@ -267,7 +269,7 @@ fn words(linear: &Linear, found: &Matrices, modes: &[Mode], terminal: &Terminal)
     out
 }
 
-/// A matrix with the names of its rows and columns.
+/// Formats a matrix with the names of its rows and columns.
 fn table(matrix: &Matrix, rows: &[&str], columns: &[&str]) -> String {
     let entry = |i: usize, j: usize| significant(matrix.values[i * matrix.columns + j], 6);
     let first = rows.iter().map(|name| name.chars().count()).max().unwrap_or(0);

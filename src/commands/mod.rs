@@ -1,4 +1,4 @@
-//! The commands, one file each. A command prints what it has to say and returns how it ended.
+//! The commands, one file each. A command prints its results and returns how it ended.
 
 mod bench;
 mod bench_rt;
@@ -46,13 +46,13 @@ pub enum End {
     Fine,
     /// The input or an expectation failed: exit code 1.
     Failed,
-    /// Wrong usage that only the input shows, such as one plot file for two experiments: exit code 2.
+    /// Wrong usage that is detected only with the input, such as one plot file for two experiments: exit code 2.
     Misused,
-    /// A rig was stopped by safety or by a condition of its own: exit code 3.
+    /// A rig was stopped by the safety supervisor or by a `stop` condition: exit code 3.
     Stopped,
 }
 
-/// Does what was asked for.
+/// Runs the command of the arguments.
 pub fn run(args: &Args, terminal: &mut Terminal) -> End {
     let Some(command) = &args.command else { return repl::repl(&Repl::default(), terminal) };
     match command {
@@ -91,7 +91,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
         Command::Man { command } => {
             let mut out = Vec::new();
             let mut tree = Args::command();
-            // Only a built tree knows that a command's name is `fric run`.
+            // Only a built command tree knows the full name `fric run`.
             tree.build();
             let page = command.as_ref().and_then(|name| tree.find_subcommand(name)).unwrap_or(&tree).clone();
             let name = command.as_ref().map_or("fric".into(), |name| format!("fric-{name}"));
@@ -103,7 +103,7 @@ pub fn run(args: &Args, terminal: &mut Terminal) -> End {
     }
 }
 
-/// Says if there is no experiment of this name among all of a file, and which one may be meant.
+/// An error, with a suggestion, if no experiment of a file has this name.
 fn has_experiment(file: &Path, name: &str, all: &[String]) -> Result<(), String> {
     if all.iter().any(|one| one == name) {
         return Ok(());
@@ -116,12 +116,12 @@ fn has_experiment(file: &Path, name: &str, all: &[String]) -> Result<(), String>
     Err(format!("{} has no experiment `{name}`; {help}", file.display()))
 }
 
-/// Reads and loads a text; reports what is wrong with it. None if it cannot be used.
+/// Reads and loads a text; reports problems in it. None if it cannot be used.
 fn load(path: &Path, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
     load_from(path, &project::Disk, terminal, watch)
 }
 
-/// The same with imports from elsewhere.
+/// The same with imports from other sources.
 fn load_from(path: &Path, sources: &dyn Sources, terminal: &Terminal, watch: &mut Stopwatch) -> Option<Loaded> {
     let name = path.display().to_string();
     let text = match project::read(path) {
@@ -134,7 +134,7 @@ fn load_from(path: &Path, sources: &dyn Sources, terminal: &Terminal, watch: &mu
     load_text(&name, &text, sources, terminal, watch)
 }
 
-/// Loads a text that has been read; reports what is wrong with it. None if it cannot be used.
+/// Loads a text that has been read; reports problems in it. None if it cannot be used.
 fn load_text(
     name: &str,
     text: &str,
@@ -152,10 +152,10 @@ fn load_text(
     Some(loaded)
 }
 
-/// The rig that is meant: the one named, or the only one.
+/// The requested rig: the one named, or the only one.
 ///
 /// # Errors
-/// What there is instead, in words.
+/// The rigs that exist instead, in words.
 fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String, String> {
     let file = file.display();
     let rigs: Vec<&str> = loaded.rigs().iter().map(|rig| rig.name.text.as_str()).collect();
@@ -172,7 +172,7 @@ fn chosen_rig(file: &Path, name: Option<&str>, loaded: &Loaded) -> Result<String
     }
 }
 
-/// Refuses what `fric check` refuses in the models of a text, and reports it; counts its warnings in one line.
+/// Refuses and reports errors of `fric check` in the models of a text; prints the number of warnings in one line.
 fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatch) -> Result<(), Vec<Diagnostic>> {
     watch.stage("models");
     let found = compile::check_models(loaded, &project::Disk);
@@ -195,13 +195,13 @@ fn sound(loaded: &Loaded, quiet: bool, terminal: &Terminal, watch: &mut Stopwatc
 struct Done {
     cases: Vec<Case>,
     results: Vec<Result<Outcome, Failure>>,
-    /// Seconds that all cases took, and that the estimate of their errors took besides.
+    /// Time in s of all cases, and of the estimate of their errors.
     wall: f64,
     judging: f64,
     stages: Stages,
 }
 
-/// Compiles an experiment; reports what is wrong with it, and with `warn` also what deserves a look.
+/// Compiles an experiment; reports errors in it, and with `warn` also warnings.
 fn compiled(
     loaded: &mut Loaded,
     experiment: &str,
@@ -226,13 +226,13 @@ fn compiled(
     Ok((cases?, stages))
 }
 
-/// Reports what is wrong with a text.
+/// Reports the diagnostics of a text.
 fn reported(loaded: &Loaded, diagnostics: &[Diagnostic], terminal: &Terminal) {
     terminal.report(&report::full(&loaded.files.0, diagnostics, terminal.error_colour()));
 }
 
-/// Runs the cases of an experiment, with a bar on a terminal if it takes a while.
-/// Estimates their numerical errors besides, if `errors` are wanted.
+/// Runs the cases of an experiment, with a progress bar on a terminal if it takes a while. With `errors`, also
+/// estimates their numerical errors.
 fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
     let bar = ProgressBar::with_draw_target(
         Some(1000),
@@ -243,7 +243,7 @@ fn done(cases: Vec<Case>, stages: Stages, quiet: bool, errors: bool) -> Done {
     }
     let begin = Instant::now();
     let watch = |fraction: f64| {
-        // A short run needs no bar, and a bar costs more than a batch of steps.
+        // A short run needs no bar, and drawing one costs more than a batch of steps.
         if begin.elapsed().as_millis() > 400 {
             bar.set_position((1000.0 * fraction) as u64);
         }

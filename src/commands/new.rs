@@ -1,4 +1,4 @@
-//! `fric new`: a folder with a first model and its experiment.
+//! `fric new`: creates a folder with a first model and its experiment.
 
 use super::End;
 use crate::args::New;

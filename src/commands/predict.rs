@@ -1,6 +1,7 @@
-//! `fric predict`: says before anything moves whether an emulated contact is stable, and what is too coarse for it.
+//! `fric predict`: reports, before anything moves, whether an emulated contact is stable, and which resolutions are too
+//! coarse for it.
 //!
-//! The loops come from `stability`, judged by runtime::coupling::loop_stability. Advice comes as numbers.
+//! The loops come from `loop_stability`, analysed by runtime::coupling::loop_stability. Advice consists of numbers.
 
 use super::{End, chosen_rig, load};
 use crate::args::Predict as Args;
@@ -77,7 +78,7 @@ pub fn predict(args: &Args, terminal: &mut Terminal) -> End {
     if stable { End::Fine } else { End::Failed }
 }
 
-/// The rig that is meant: the one named, the one that the experiment runs, or the only one.
+/// The requested rig: the one named, the one that the experiment runs, or the only one.
 fn chosen(args: &Args, loaded: &Loaded) -> Result<String, String> {
     let run = args.experiment.as_ref().map(|name| run_by(name, args, loaded)).transpose()?;
     chosen_rig(&args.file, args.rig.as_deref().or(run.as_deref()), loaded)
@@ -99,7 +100,7 @@ fn run_by(name: &str, args: &Args, loaded: &Loaded) -> Result<String, String> {
     run.filter(of_a_rig).ok_or(format!("experiment `{name}` runs no rig of {file}"))
 }
 
-/// Stability of one contact at rest, at the Stribeck speed and while sliding, and what would help.
+/// Stability of one contact at rest, at the Stribeck speed and while sliding, with remedies.
 fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
     let period = ready.rig.period_ns as f64 * 1e-9;
     let tau = 0.5 * period + contact.late.dead + contact.late.lag;
@@ -117,7 +118,8 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
     for (regime, speed) in points {
         let near = contact.at(ready, &[], speed);
         let radius = near.radius();
-        // A falling characteristic grows by itself, on the shaft as on the rig: only rest is judged.
+        // A falling characteristic is unstable by itself, on the real shaft as well as on the rig, so the verdict is
+        // only on rest.
         let limit = (regime == "presliding").then(|| near.limit(0)).flatten();
         words += &format!("{regime:<11} {}  radius {}", contact.drive, significant(radius, 4));
         if regime == "presliding" {
@@ -163,11 +165,11 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
     (words, object, stable)
 }
 
-/// Poles of the look ahead's observer at a period of 1 ms, and how far above them, in units of (1 − θ)/T, a resonance of the
-/// shaft must lie for it to be taken as rigid.
+/// How far above the poles of the predictor's observer (at a period of 1 ms), in units of (1 − θ)/T, a resonance of the
+/// shaft must lie for the shaft to count as rigid.
 const RIGID: f64 = 6.0 * (1.0 - 0.9) / 1e-3;
 
-/// Where the shaft by itself swings.
+/// The resonances of the shaft alone.
 fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
     let (states, a) = contact.shaft();
     let (mut words, mut out) = (String::new(), Vec::new());
@@ -187,7 +189,7 @@ fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
     (words, Value::Array(out))
 }
 
-/// The stiffness and the damping of the contact: params, and how far each may go.
+/// The parameters that set the stiffness and the damping of the contact, with the range of each that is stable.
 fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
     let here = contact.at(ready, &[], 0.0);
     let own = contact.stiffness(&here);
@@ -265,7 +267,7 @@ fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
     (words, Value::Object(out))
 }
 
-/// Parameters whose unit reads so, with their values.
+/// Parameters whose unit satisfies a condition, with their values.
 fn params(ready: &Ready, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
     let all = ready.control.description().quantities.iter();
     all.filter(|q| q.kind == QuantityKind::Param && unit(&q.unit.text))
@@ -273,7 +275,7 @@ fn params(ready: &Ready, unit: impl Fn(&str) -> bool) -> Vec<(Quantity, f64)> {
         .collect()
 }
 
-/// Counts in presliding, steps of torque, and how full the buses are.
+/// Resolution in presliding in counts, steps of torque, and bus load.
 fn resolution(ready: &Ready) -> (String, Value) {
     let rig = &ready.rig;
     let (mut words, mut out) = (String::new(), Vec::new());
@@ -311,7 +313,7 @@ fn resolution(ready: &Ready) -> (String, Value) {
     (words, json!({"drives": out, "buses": buses}))
 }
 
-/// What a step takes on this machine, and of its period.
+/// The time of a step on this machine, also as a fraction of its period.
 fn step_time(ready: &Ready) -> (String, Value) {
     let (median, greatest) = watches::step_time(&ready.rig, &ready.control);
     let period = ready.rig.period_ns as f64 * 1e-9;
@@ -324,7 +326,7 @@ fn step_time(ready: &Ready) -> (String, Value) {
     (words, json!({"median": median, "greatest": greatest, "period": period}))
 }
 
-/// Each contact by itself beside the one that the rig plays, in a standard set of motions.
+/// Each contact alone compared with the emulated one, in a standard set of motions.
 fn standard(ready: &Ready) -> (String, Value) {
     let (mut words, mut out) = (String::new(), Vec::new());
     for found in standard::standard(&ready.rig, &ready.control, &ready.plant) {
@@ -357,7 +359,7 @@ fn standard(ready: &Ready) -> (String, Value) {
     (words, Value::Array(out))
 }
 
-/// The dry run beside one whose drives act at once: how far what is drawn differs.
+/// The SIL run compared with one whose drives act without delay: the differences of the plotted quantities.
 fn twins(
     loaded: &mut Loaded,
     ready: &Ready,

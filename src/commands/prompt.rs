@@ -1,7 +1,7 @@
-//! What an operator types while `fric hil` runs: one thread reads, another one carries out.
+//! The operator's prompt of `fric hil`: one thread reads, another executes.
 //!
-//! In: lines. Out: commands, and what became of each. The thread that reads hands `stop` over itself: a stop never waits for a
-//! set that is being judged.
+//! In: lines. Out: commands, and the result of each. The reading thread sends `stop` itself, so a stop never waits for
+//! a set of parameters that is being validated.
 
 use crate::compile::{self, Changes, Loaded, Options};
 use crate::loop_stability;
@@ -15,31 +15,32 @@ use runtime::record::log::Sections;
 use std::io::BufRead;
 use std::sync::mpsc::{Receiver, channel};
 
-/// Judges sets of parameters before the cycle gets them.
+/// Validates sets of parameters before the cycle receives them.
 ///
-/// The cycle's judge knows the conditions of a start. The stability of the fixed step and of the contacts takes a compiler:
-/// the rig is compiled once more with the values of the set, from the texts of the run, whatever has become of the files.
+/// The cycle checks the constraints of the start. The stability of the fixed step and of the contacts needs a compiler:
+/// the rig is compiled once more with the values of the set, from the texts of the run, even if the files have changed
+/// since.
 pub struct Rehearsal {
-    /// The conditions.
+    /// The constraints.
     pub judge: Judge,
-    /// The control program with the values that act.
+    /// The control program with the active values.
     pub control: Instance,
     /// The texts as they were read.
     pub loaded: Loaded,
-    /// What they import: the head of the log.
+    /// Their imports: the head of the log.
     pub kept: Sections,
     /// The rig.
     pub name: String,
-    /// `--set` of the start, then the sets that act: path and value.
+    /// `--set` of the start, then the sets in effect: path and value.
     pub set: Vec<(String, String)>,
-    /// Contacts may be unstable.
+    /// Whether contacts may be unstable.
     pub accept_unstable: bool,
-    /// This run stops when its commands cannot look ahead.
+    /// Whether this run stops if its predictor fails.
     pub needs_look: bool,
 }
 
 impl Rehearsal {
-    /// The values of a start, with those of `set PATH = VALUE, …` in place of theirs.
+    /// The values of a start, with those of `set PATH = VALUE, …` replaced.
     fn with(&self, set: &str) -> Vec<(String, String)> {
         let mut all = self.set.clone();
         for (path, value) in set.split(',').filter_map(|one| one.split_once('=')) {
@@ -49,7 +50,7 @@ impl Rehearsal {
         all
     }
 
-    /// Judges a set; `all`: the values of a start that would lead to it.
+    /// Validates a set; `all`: the values of a start that would lead to it.
     ///
     /// # Errors
     /// What a start would refuse, in words.
@@ -78,7 +79,7 @@ impl Rehearsal {
         Ok(())
     }
 
-    /// Hands a set over if a start would take it.
+    /// Sends a set to the cycle if a start would accept it.
     fn change(&mut self, operator: &mut Operator, text: &str) -> Result<(), String> {
         let set = self.judge.read(text)?;
         let all = self.with(text);
@@ -94,7 +95,7 @@ impl Rehearsal {
     }
 }
 
-/// Reads what the operator types, a line at a time. Without a rehearsal no parameter may change.
+/// Reads the operator's input line by line. Without a rehearsal, no parameter may change.
 pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>) {
     let stopper = operator.stopper();
     let (lines, typed) = channel::<String>();
@@ -112,7 +113,7 @@ pub fn prompt(operator: Operator, rehearsal: Option<Rehearsal>) {
     let _ = carrying.join();
 }
 
-/// Carries lines out in their order, and says what became of each.
+/// Executes lines in order, and reports the result of each.
 fn carry_out(mut operator: Operator, mut rehearsal: Option<Rehearsal>, typed: &Receiver<String>) {
     let mut terminal = Terminal::new();
     for line in typed {

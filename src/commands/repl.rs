@@ -1,4 +1,4 @@
-//! `fric`, `fric repl`: a session at the prompt.
+//! `fric`, `fric repl`: an interactive session.
 
 use super::End;
 use crate::args::{Characterise, Repl};
@@ -51,7 +51,7 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
         let text = match editor.read() {
             Ok(Input::Text(text)) => text,
             Ok(Input::Interrupted) => continue,
-            // What was wrong in a session that somebody typed has been seen.
+            // In an interactive session, errors have been seen, so the exit code is 0.
             Ok(Input::End) => return if typed { End::Fine } else { end },
             Err(why) => {
                 terminal.error(&format!("cannot read on: {why}"));
@@ -74,7 +74,7 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
                     end = End::Failed;
                 }
             }
-            // What was pasted behind a mistake may build on it.
+            // Pasted lines after an error may depend on the failed one.
             if rest.any(|line| !line.trim().is_empty()) {
                 terminal.error("the lines behind it were not done");
             }
@@ -86,7 +86,7 @@ pub fn repl(args: &Repl, terminal: &mut Terminal) -> End {
     }
 }
 
-/// What comes after a line.
+/// What follows a line.
 enum Next {
     Line,
     /// An expectation did not hold.
@@ -94,7 +94,7 @@ enum Next {
     Quit,
 }
 
-/// Does lines.
+/// Executes lines.
 struct Prompt<'a> {
     session: &'a mut Session,
     terminal: &'a mut Terminal,
@@ -144,7 +144,7 @@ impl Prompt<'_> {
         Ok(Next::Line)
     }
 
-    /// Two words one behind the other are no expression: a command was meant.
+    /// Two words in sequence are no expression: suggest a command.
     fn misspelt(&self, text: &str) -> Option<String> {
         let mut words = text.split_whitespace();
         let (first, second) = (words.next()?, words.next());
@@ -244,7 +244,7 @@ impl Prompt<'_> {
         Ok(if held { Next::Line } else { Next::Missed })
     }
 
-    /// A positive time, as typed.
+    /// Parses a positive time.
     fn time(&mut self, text: &str, example: &str) -> Result<f64, Fault> {
         let value = self.session.value(text)?;
         let second = Unit::parse("s").expect("the second is known");
@@ -334,7 +334,7 @@ impl Prompt<'_> {
             return Err("explain what? `explain f.z`, `explain LuGre`, `why E0401`".into());
         }
         let (explanation, path) = match self.session.explained(rest) {
-            // Codes and lints are explained on the command line; so they are here.
+            // `explain` of codes and lints works as on the command line.
             Err(Fault::Words(words)) => match super::explain::page_of(rest) {
                 Some(page) => {
                     self.terminal.print(page);
@@ -351,7 +351,7 @@ impl Prompt<'_> {
         Ok(())
     }
 
-    /// One quantity: what it is, where its value comes from, how it is stepped.
+    /// Explains a quantity: what it is, where its value comes from, how it is integrated.
     fn quantity(&mut self, explanation: &Explanation, path: &str) {
         let Some(q) = explanation.quantities.iter().find(|q| q.path == path) else { return };
         let unit = if q.unit.is_empty() { String::new() } else { format!(" [{}]", q.unit) };
@@ -427,7 +427,7 @@ impl Prompt<'_> {
         Ok(())
     }
 
-    /// A quantity and, indented below it, what it needs; each is opened once.
+    /// Prints a quantity and, indented below it, its dependencies; each is expanded once.
     fn needs(&mut self, explanation: &Explanation, path: &str, depth: usize, shown: &mut Vec<String>) {
         let q = explanation.quantities.iter().find(|q| q.path == path);
         let (kind, unit) = q.map_or(("", ""), |q| (q.kind, q.unit.as_str()));
@@ -530,7 +530,7 @@ impl Prompt<'_> {
     }
 }
 
-/// File and what follows it, quoted or not.
+/// Splits a file name, quoted or not, from what follows it.
 fn split_file(rest: &str) -> (String, String) {
     let cut = match rest.strip_prefix('"') {
         Some(rest) => rest.split_once('"'),
@@ -540,7 +540,7 @@ fn split_file(rest: &str) -> (String, String) {
     (file.trim().into(), name.trim().into())
 }
 
-/// `EXPR against PATH = A .. B [steady]`: its pieces, if a line is one.
+/// Splits `EXPR against PATH = A .. B [steady]`, if a line has this form.
 fn over(text: &str) -> Option<(&str, String, &str, &str, bool)> {
     let tokens: Vec<_> = grammar::tokens::tokens(text).into_iter().filter(|token| !token.is_trivia()).collect();
     let at = |word: &str, from: usize| (from..tokens.len()).find(|k| tokens[*k].text(text) == word);
@@ -555,7 +555,7 @@ fn over(text: &str) -> Option<(&str, String, &str, &str, bool)> {
     Some((text[..tokens[against].start].trim(), path, from, text[tokens[dots].end..end].trim(), steady))
 }
 
-/// A failed run as a fault; stopping it is none.
+/// A failed run as a fault; an interrupted one is not a fault.
 fn stopped(ran: &Ran) -> Result<(), Fault> {
     match ran.results.iter().find_map(|result| result.as_ref().err()) {
         Some(failure) if failure.cause == Cause::Stopped => {

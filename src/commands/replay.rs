@@ -1,4 +1,4 @@
-//! `fric replay`: a rig's log computed again, and its exports.
+//! `fric replay`: recomputes a rig's log, and exports it.
 
 use super::{End, load_text};
 use crate::args::Replay as Args;
@@ -71,7 +71,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     if let Err(why) = exports.write(args, terminal) {
         return fail(terminal, &why);
     }
-    // A log goes on in further files; the last one that was read is the one of whose end there is something to say.
+    // A log may continue in further files; the end to report is that of the last file read.
     let last = if reader.path() == args.log { "it".into() } else { reader.path().display().to_string() };
     let ends = match reader.end() {
         Some(LogEnd::Cut { at }) => format!("{last} is cut off at byte {at}: the writer was killed"),
@@ -115,7 +115,7 @@ pub fn replay(args: &Args, terminal: &mut Terminal) -> End {
     }
 }
 
-/// A number of a cycle in words.
+/// Describes a number of a cycle that differs.
 fn differing(rig: &Rig, what: What) -> String {
     let output = |i: usize| words::signal(rig, rig.outputs[i].signal);
     match what {
@@ -133,7 +133,7 @@ struct Exports {
     rig: Rig,
     shape: Shape,
     columns: Vec<(String, Holds)>,
-    /// Its cycles, where a table of them is wanted.
+    /// Its cycles, if a table of them is requested.
     cycles: Option<String>,
     candump: Option<String>,
 }

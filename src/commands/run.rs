@@ -1,4 +1,4 @@
-//! `fric run`: compiles experiments, runs them, shows and writes what they did.
+//! `fric run`: compiles experiments, runs them, and shows and writes their results.
 
 use super::{Done, End, compiled, done, has_experiment, load, sound};
 use crate::args::Run;
@@ -54,7 +54,7 @@ pub fn run(args: &Run, terminal: &mut Terminal) -> End {
     end
 }
 
-/// What `--json` says of an experiment that does not run.
+/// The `--json` output for an experiment that does not compile.
 fn refused(args: &Run, loaded: &Loaded, name: &str, diagnostics: &[Diagnostic], terminal: &mut Terminal) {
     let (file, found) = (args.file.display().to_string(), report::json(&loaded.files.0, diagnostics));
     terminal.line(&json!({ "file": file, "experiment": name, "passed": false, "diagnostics": found }).to_string());
@@ -131,7 +131,7 @@ fn experiment(
     let mut passed = crossed.as_ref().is_some_and(|all| all.iter().all(Crossed::passed));
     let crossed = crossed.unwrap_or_default();
     let drawn = drawn(name, &done);
-    // Files come first: when the reader of our words has gone, they are there all the same.
+    // Files are written first: they exist even if the reader of our output has gone.
     let written = write(args, name, &done, &grids, drawn.as_ref());
     for (k, (case, result)) in done.cases.iter().zip(&done.results).enumerate() {
         let ran = Ran {
@@ -183,14 +183,14 @@ fn experiment(
     }
 }
 
-/// Where an experiment stands.
+/// The position of an experiment in its file.
 fn place(loaded: &Loaded, name: &str) -> String {
     let all = loaded.experiments();
     let found = all.iter().find(|experiment| experiment.name == name);
     found.map_or(String::new(), |experiment| report::place(&loaded.files.0, experiment.span))
 }
 
-/// All that was recorded in one figure; none if the experiment plots nothing.
+/// All recordings in one figure; none if the experiment plots nothing.
 fn drawn(name: &str, done: &Done) -> Option<Figure> {
     let first = done.cases.first()?;
     if first.experiment.plots.is_empty() {
@@ -201,8 +201,8 @@ fn drawn(name: &str, done: &Done) -> Option<Figure> {
     Some(figure::figure(name, &subtitle, &first.experiment.plots, &cases))
 }
 
-/// Writes what was asked for; gives the paths, or the one that failed and why. `grids`: the instants of each case in s, if
-/// rows are to lie on a grid.
+/// Writes the requested files; returns their paths, or the one that failed and why. `grids`: the instants of each case
+/// in s, if rows are requested on a time grid.
 fn write(
     args: &Run,
     name: &str,
@@ -222,7 +222,7 @@ fn write(
             let mut bytes = Vec::new();
             let evenly = grids.get(k).map(|grid| {
                 let case = &done.cases[k];
-                // How the run ends has been said of the first one.
+                // How the run ends has been reported for the first one.
                 even_grid::record(case.instance.clone(), &case.experiment, grid, &mut |_| Continue::Continue(())).0
             });
             csv::write(evenly.as_ref().unwrap_or(recording), &mut bytes).expect("writing to memory does not fail");
@@ -251,7 +251,7 @@ fn for_case(path: &Path, label: &str) -> PathBuf {
     path.with_file_name(format!("{stem}-{}.{extension}", words.join("-")))
 }
 
-/// Work, plot and verdicts in full.
+/// Prints work, plot and verdicts in full.
 fn tell(done: &Done, drawn: Option<&Figure>, digits: Option<u8>, terminal: &mut Terminal) {
     let outcomes: Vec<_> = done.results.iter().filter_map(|result| result.as_ref().ok()).collect();
     if let Some(case) = done.cases.first().filter(|_| !outcomes.is_empty()) {
@@ -275,7 +275,7 @@ fn tell(done: &Done, drawn: Option<&Figure>, digits: Option<u8>, terminal: &mut 
     }
 }
 
-/// What did not hold, on the standard error.
+/// Prints failed and undecided expectations to the standard error.
 fn complain(name: &str, done: &Done, digits: Option<u8>, terminal: &Terminal) {
     for (case, result) in done.cases.iter().zip(&done.results) {
         let Ok(outcome) = result else { continue };

@@ -1,9 +1,9 @@
-//! `fric sweep`: many runs of one experiment under other parameters, one row each.
+//! `fric sweep`: many runs of one experiment with other parameters, one row each.
 //!
-//! Rows are appended in the order of the runs as they are done, so a file that was interrupted is the beginning of the
-//! whole one, and shards written one behind the other are the whole. Until it is complete, [`Unfinished`] keeps others from
-//! writing it and knows what was asked for: nobody goes on with another sweep, or with rows that are not as they were.
-//! Once it is complete, [`errors`] estimates the numerical errors of a sample of its runs.
+//! Rows are appended in the order of the runs as they complete, so an interrupted file is a prefix of the complete one,
+//! and the concatenation of shards is the whole. Until the table is complete, [`Unfinished`] locks it and records the
+//! request, so that it cannot be resumed with another sweep or from damaged rows. After completion, [`errors`]
+//! estimates the numerical errors of a sample of its runs.
 
 mod errors;
 mod summary;
@@ -33,7 +33,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Draws of distributions where nobody says how many.
+/// Draws of distributions if no number is given.
 const DEFAULT_RUNS: u64 = 100;
 
 pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
@@ -70,7 +70,8 @@ pub fn sweep(args: &Sweep, terminal: &mut Terminal) -> End {
     }
 }
 
-/// The experiment with its parameters open; a parameter that follows from others, or has no value, is given one first.
+/// The experiment with its parameters variable; a parameter that is computed from others, or has no value, is assigned
+/// one first.
 fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Vec<Varying>> {
     let mut options = Options {
         changes: Changes { vary: args.vary.iter().map(|vary| vary.path.clone()).collect(), ..args.changed.changes() },
@@ -102,7 +103,7 @@ fn compiled(args: &Sweep, loaded: &mut Loaded, terminal: &Terminal) -> Option<Ve
     }
 }
 
-/// Where rows are appended: the table itself, or a neighbour of one that cannot grow row by row.
+/// The file to which rows are appended: the table itself, or one beside it if the format cannot grow row by row.
 fn rows_of(out: &Path) -> PathBuf {
     match out.extension().is_some_and(|extension| extension == "parquet") {
         true => out.with_file_name(format!(".{}.csv", name_of(out))),
@@ -110,20 +111,20 @@ fn rows_of(out: &Path) -> PathBuf {
     }
 }
 
-/// All runs of a sweep and what is written of them.
+/// All runs of a sweep and the columns of its table.
 struct Table {
     cases: Vec<Varying>,
     vary: Vec<Vary>,
     /// For each case the slots of the parameters.
     slots: Vec<Vec<Slot>>,
-    /// Combinations of the grids, and draws of each.
+    /// Combinations of the grids, and draws for each.
     grid: u64,
     draws: u64,
     seed: u64,
     columns: Vec<Column>,
 }
 
-/// What rows are appended to, and how far it is written.
+/// The file to which rows are appended, and its checkpoint.
 struct Writing<'a> {
     file: &'a mut File,
     unfinished: &'a mut Unfinished,
@@ -135,7 +136,7 @@ struct Run {
     number: u64,
     /// Number of its case.
     at: usize,
-    /// What is varied, SI.
+    /// The varied values, SI.
     values: Vec<f64>,
     description: Arc<Description>,
 }
@@ -143,7 +144,7 @@ struct Run {
 /// A column of the file.
 struct Column {
     title: String,
-    /// For a figure.
+    /// Its axis in a figure.
     axis: Axis,
     kind: ColumnKind,
 }
@@ -195,7 +196,7 @@ impl Table {
         self.cases.len() as u64 * self.grid * self.draws
     }
 
-    /// The case of a run and its values in SI: the last grid changes fastest, draws within it.
+    /// The case of a run and its values in SI: the last grid varies fastest, with the draws inside it.
     fn values(&self, run: u64, dice: &Dice) -> (usize, Vec<f64>) {
         let (point, draw) = (run / self.draws, run % self.draws);
         let (case, mut left) = ((point / self.grid) as usize, point % self.grid);
@@ -210,7 +211,8 @@ impl Table {
                     left %= stride;
                 }
                 how => {
-                    // The same draws at each point of a grid: points differ by what was changed, not by chance.
+                    // The same draws at each point of a grid (common random numbers): points differ by what was
+                    // changed, not by chance.
                     *value = dice.value(how, draw, k);
                     k += 1;
                 }
@@ -224,13 +226,13 @@ impl Table {
         (run / self.draws / self.grid) as usize
     }
 
-    /// Makes runs and hands in their rows: in lanes where there are some and runs enough to fill them.
+    /// Executes runs and hands in their rows: in lanes if available and if there are enough runs to fill them.
     fn work(&self, desk: &Desk<Vec<u8>>, dice: &Dice, stopped: &AtomicBool, each: u64) {
         let watch = &mut |_| match stopped.load(Ordering::Relaxed) {
             true => Continue::Break(()),
             false => Continue::Continue(()),
         };
-        // A run that was taken and is of the next case.
+        // A run that was taken already but belongs to the next case.
         let mut first = None;
         loop {
             let number = match first.take() {
@@ -276,7 +278,7 @@ impl Table {
         }
     }
 
-    /// A run with its values; the row of one that they do not let run.
+    /// A run with its values; or the row of a run that its values do not allow.
     fn fitted(&self, number: u64, dice: &Dice) -> Result<(Run, Fitted), Vec<u8>> {
         let (at, values) = self.values(number, dice);
         let given: Vec<(Slot, f64)> = self.slots[at].iter().copied().zip(values.iter().copied()).collect();
@@ -287,7 +289,7 @@ impl Table {
         }
     }
 
-    /// What became of a run as a row; none if it was stopped.
+    /// The outcome of a run as a row; none if it was stopped.
     fn row(&self, run: Run, result: Result<Outcome, Failure>) -> Option<Vec<u8>> {
         let Run { number, at, values, description } = run;
         let case = &self.cases[at];
@@ -334,7 +336,7 @@ impl Table {
                 runtime::format::plain(self.vary[k].unit.from_si(values[k]))
             }
             ColumnKind::Measure(k, j) => {
-                // Of an expectation that could not be evaluated some measures may be missing.
+                // For an expectation that could not be evaluated, some measures may be missing.
                 let text = &case.experiment.expects[k].measures[j].text;
                 let found = readings.get(k).and_then(|read| read.iter().find(|(known, _)| known == text));
                 found.map_or(String::new(), |(_, value)| runtime::format::plain(*value))
@@ -351,7 +353,7 @@ impl Table {
         let (shard, shards) = args.shard.unwrap_or((1, 1));
         let part = |i: u64| (u128::from(total) * u128::from(i) / u128::from(shards)) as u64;
         let range = part(shard - 1)..part(shard);
-        // Only the first shard has a header: so that all of them one behind the other are the whole.
+        // Only the first shard has a header, so that the concatenation of all is the whole.
         let header = if shard == 1 { line(self.columns.iter().map(|column| column.title.clone())) } else { Vec::new() };
         let asked = self.asked(args, loaded, &range);
         let out = &args.out;
@@ -466,15 +468,15 @@ impl Table {
         Ok(End::Fine)
     }
 
-    /// Whether a line of the table can be the row of a run: its number, what was varied, and as many cells as there are
-    /// columns, numbers where measures stand.
+    /// Whether a line of the table can be the row of a run: its number, the varied values, the number of columns, and
+    /// numbers in the columns of measures.
     fn is_row(&self, run: u64, row: &str, dice: &Dice) -> bool {
         let mut reader = csv::ReaderBuilder::new().has_headers(false).flexible(true).from_reader(row.as_bytes());
         let mut record = csv::StringRecord::new();
         if !reader.read_record(&mut record).is_ok_and(|found| found) || record.len() != self.columns.len() {
             return false;
         }
-        // A reader of CSV forgives quotes that are missing; readers of the whole table do not.
+        // The CSV reader accepts missing quotes; readers of the whole table do not.
         if line(record.iter().map(str::to_string)).strip_suffix(b"\n") != Some(row.as_bytes()) {
             return false;
         }
@@ -534,7 +536,7 @@ impl Table {
                 }
                 Err(error) => {
                     failed = Some(error);
-                    // Runs under way need not come to their ends.
+                    // Runs in progress need not finish.
                     stopped.store(true, Ordering::Relaxed);
                     Continue::Break(())
                 }
@@ -547,7 +549,7 @@ impl Table {
         }
     }
 
-    /// What a sweep must have in common with one that it goes on with.
+    /// The request that a sweep must share with one that it resumes.
     fn asked(&self, args: &Sweep, loaded: &Loaded, range: &Range<u64>) -> String {
         let texts = loaded.files.0.iter().filter(|file| !file.name.starts_with("--"));
         let texts = texts.fold(Hash::EMPTY, |hash, file| hash.and(file.text.as_bytes()));
@@ -569,7 +571,7 @@ impl Table {
         asked + &format!("--seed {}, runs {}..{} of {}\n", self.seed, range.start, range.end, self.total())
     }
 
-    /// The rows as a Parquet file; they themselves are no longer needed then.
+    /// Converts the rows to a Parquet file, after which they are no longer needed.
     fn convert(&self, rows: &Path, header: bool, out: &Path) -> io::Result<()> {
         let holds = |column: &Column| match column.kind {
             ColumnKind::Run => Holds::Integers,
@@ -591,8 +593,8 @@ impl Table {
     }
 }
 
-/// A flag that Ctrl-C sets. A second Ctrl-C ends the process at once: the table then holds whole rows but for the last, which
-/// --resume drops.
+/// A flag that Ctrl-C sets. A second Ctrl-C ends the process at once: the table then holds complete rows except for the
+/// last, which --resume drops.
 fn stopped_by_ctrl_c() -> Arc<AtomicBool> {
     let stopped = Arc::new(AtomicBool::new(false));
     let flag = stopped.clone();
@@ -604,7 +606,7 @@ fn stopped_by_ctrl_c() -> Arc<AtomicBool> {
     stopped
 }
 
-/// Least and greatest value of a range that is watched.
+/// Least and greatest value of a guarded range.
 fn extremes(watched: &Verdict) -> (f64, f64) {
     let value = |k: usize| watched.readings.get(k).map_or(f64::NAN, |reading| reading.value);
     (value(0), value(1))

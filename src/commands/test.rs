@@ -1,4 +1,4 @@
-//! `fric test`: runs every experiment that expects something.
+//! `fric test`: runs every experiment that has expectations.
 
 use super::{End, compiled, done, load};
 use crate::args::Test;
@@ -65,7 +65,7 @@ impl Tally {
     }
 }
 
-/// Runs one experiment; whether all that it expects holds in every case.
+/// Runs one experiment; returns whether its expectations hold in every case.
 fn experiment(args: &Test, loaded: &mut Loaded, name: &str, before: &Stages, terminal: &mut Terminal) -> bool {
     let options = Options { interpret: args.interpret, ..Options::default() };
     let Ok((cases, stages)) = compiled(loaded, name, &options, before, false, terminal) else {

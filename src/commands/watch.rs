@@ -1,4 +1,4 @@
-//! `fric watch`: runs an experiment again whenever its text is saved. States go on by name and unit.
+//! `fric watch`: runs an experiment again whenever its file is saved. States continue, matched by name and unit.
 
 use super::{End, has_experiment};
 use crate::args::Watch;
@@ -13,7 +13,7 @@ use std::fs;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
 
-/// How often files are looked at: short against the time a hand takes, long against the work of looking.
+/// Polling interval for changed files: short compared with a user's reaction, long compared with the cost of a check.
 const LOOK: Duration = Duration::from_millis(50);
 
 pub fn watch(args: &Watch, terminal: &mut Terminal) -> End {
@@ -66,7 +66,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                 let took = crate::quantity::duration(begun.elapsed().as_secs_f64());
                 terminal.line(&format!("  {took} from text to plot; waiting for {file} (Ctrl-C ends)"));
             }
-            // What ran before stays as it is: the next save may be better.
+            // The last successful run stays: the next save may be correct.
             Err(fault) => tell_fault(&fault, terminal),
         }
         loop {
@@ -82,7 +82,7 @@ pub(super) fn follow(file: &str, name: &str, restart: bool, session: &mut Sessio
                 Ok(()) => break,
                 Err(fault) => tell_fault(&fault, terminal),
             }
-            // Wait until the file that is wrong changes.
+            // Wait until the erroneous file changes.
             while self::stamps(&files) == now {
                 if interrupted() {
                     return End::Fine;
@@ -118,7 +118,7 @@ fn told(carried: &abi::instance::Carried) -> String {
     words
 }
 
-/// When each file was written last, and how long it is.
+/// Modification time and length of each file.
 fn stamps(files: &[String]) -> Vec<Option<(SystemTime, u64)>> {
     let of = |file: &String| {
         let metadata = fs::metadata(Path::new(file)).ok()?;

@@ -1,11 +1,11 @@
-//! A figure in characters: eight dots a cell, axes with numbers, names beside the curves.
+//! Renders a figure as text: Braille characters with eight dots per cell, axes with numbers, names beside the curves.
 
 use super::scale::{Scale, padded};
 use super::{Figure, Panel, decimate};
 
-/// Rows of a panel that stands alone, and of one among several.
+/// Rows of a single panel, and of one among several.
 const ROWS: (usize, usize) = (14, 9);
-/// Colours of the curves, as for text on a terminal: like those of the palette of the SVG.
+/// ANSI colours of the curves, similar to the palette of the SVG.
 const COLOURS: [u8; 6] = [34, 31, 32, 35, 36, 33];
 /// Most columns for the names beside the curves.
 const NAME: usize = 20;
@@ -50,7 +50,7 @@ fn draw(panel: &Panel, width: usize, rows: usize, colour: bool) -> String {
             if !(x.is_finite() && y.is_finite()) {
                 return (f64::NAN, f64::NAN);
             }
-            // Far outside is as good as further outside.
+            // Clamp points far outside, so that lines to them stay short.
             let near = |position: f64| position.clamp(-4.0, 4.0);
             (near(x_axis.position(x)) * (dots_x - 1.0), near(1.0 - y_axis.position(y)) * (dots_y - 1.0))
         };
@@ -125,7 +125,7 @@ fn truncate_blanks(out: &mut String) {
     out.truncate(out.trim_end_matches([' ', '\u{2800}']).len());
 }
 
-/// For each row the curve whose name stands beside it: the row of the curve's end, or the nearest free one.
+/// For each row the curve whose name is shown there: the row of the curve's end, or the nearest free one.
 fn placed(ends: &[Option<usize>], rows: usize) -> Vec<Option<usize>> {
     let mut beside: Vec<Option<usize>> = vec![None; rows];
     for (i, end) in ends.iter().enumerate() {
@@ -137,7 +137,7 @@ fn placed(ends: &[Option<usize>], rows: usize) -> Vec<Option<usize>> {
     beside
 }
 
-/// Dots, eight to a cell, and the curve that was drawn in each cell first.
+/// Dots, eight per cell, and the first curve drawn in each cell.
 struct Canvas {
     columns: usize,
     rows: usize,
@@ -150,7 +150,7 @@ impl Canvas {
     }
 
     fn dot(&mut self, x: i64, y: i64, curve: usize) {
-        /// Bits of a cell by row and column, as Braille numbers its dots.
+        /// Bits of a cell by row and column, in the Unicode numbering of Braille dots.
         const BITS: [[u8; 2]; 4] = [[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]];
         if x < 0 || y < 0 || x >= 2 * self.columns as i64 || y >= 4 * self.rows as i64 {
             return;
@@ -163,7 +163,7 @@ impl Canvas {
         cell.0 |= BITS[y % 4][x % 2];
     }
 
-    /// Joins the points, given in dots.
+    /// Connects the points, given in dots.
     fn line(&mut self, points: &[(f64, f64)], curve: usize) {
         let round = |(x, y): (f64, f64)| (x.round() as i64, y.round() as i64);
         if let Some(first) = points.first() {

@@ -1,11 +1,11 @@
-//! Fewer points that draw the same picture.
+//! Reduces the points of a curve without changing its picture.
 
-/// Points of one unbroken line.
+/// Points of one uninterrupted line.
 pub type Line = Vec<(f64, f64)>;
 
-/// The lines of a curve in a picture of `width` × `height` pixels, given as pixel coordinates; a gap where a point
-/// is not finite. Of a curve that runs to the right only, each pixel column keeps its first, lowest, highest and last
-/// point; of any other, points that stand apart.
+/// The lines of a curve in a picture of `width` × `height` pixels, in pixel coordinates, with a gap where a point is
+/// not finite. If x only increases, each pixel column keeps its first, lowest, highest and last point; otherwise,
+/// points with a minimum distance are kept.
 pub fn lines(points: &[(f64, f64)], width: f64, height: f64) -> Vec<Line> {
     points
         .split(|(x, y)| !(x.is_finite() && y.is_finite()))
@@ -22,7 +22,7 @@ pub fn lines(points: &[(f64, f64)], width: f64, height: f64) -> Vec<Line> {
         .collect()
 }
 
-/// First, least, greatest and last of each pixel column, in the order of the line.
+/// First, least, greatest and last point of each pixel column, in the order of the line.
 fn columns(line: &[(f64, f64)]) -> Line {
     let mut kept = Line::new();
     for column in line.chunk_by(|a, b| a.0.floor() == b.0.floor()) {
@@ -48,8 +48,8 @@ fn columns(line: &[(f64, f64)]) -> Line {
     kept
 }
 
-/// Points at least a fraction of a pixel from the one kept before. A line that covers the picture again and again is
-/// thinned further until its number of points has a bound.
+/// Points at least a fraction of a pixel from the previous one kept. A line that covers the picture repeatedly is
+/// thinned further, so that the number of points is bounded.
 fn apart(line: &[(f64, f64)], area: f64) -> Line {
     let most = (area / 10.0).clamp(1_000.0, 30_000.0) as usize;
     let mut distance = 0.4;
@@ -68,7 +68,7 @@ fn apart(line: &[(f64, f64)], area: f64) -> Line {
         }
         distance *= 1.5;
         if distance > 4.0 {
-            // Jumps to and fro all over the picture: no thinning by distance helps.
+            // Jumps all over the picture: thinning by distance does not help.
             let stride = kept.len().div_ceil(most);
             return kept.into_iter().step_by(stride).collect();
         }

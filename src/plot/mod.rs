@@ -1,6 +1,6 @@
-//! Figures of curves: one model, three renderers.
+//! Figures with curves: one data model, three renderers.
 //!
-//! In: numbers in the units they are shown in. Out: text for a terminal, an SVG, a PNG. Knows no runs and no files.
+//! In: numbers in the units shown. Out: text for a terminal, an SVG, a PNG. Knows no runs and no files.
 
 mod decimate;
 mod scale;
@@ -27,51 +27,51 @@ pub struct Figure {
     pub panels: Vec<Panel>,
 }
 
-/// Curves over common axes.
+/// Curves with common axes.
 #[derive(Clone, Debug, Default)]
 pub struct Panel {
-    /// To the right.
+    /// The horizontal axis.
     pub x: Axis,
-    /// Upwards.
+    /// The vertical axis.
     pub y: Axis,
     /// In the order of the legend.
     pub curves: Vec<Curve>,
-    /// Shaded stretches of x, behind the curves.
+    /// Shaded intervals of x, behind the curves.
     pub bands: Vec<Band>,
 }
 
-/// What is drawn along an axis.
+/// The quantity along an axis.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Axis {
     /// Such as `body.v`; may be empty.
     pub name: String,
     /// Such as `mm/s`; empty for a pure number.
     pub unit: String,
-    /// In powers of ten; what is not positive leaves a gap.
+    /// Whether the scale is logarithmic; a value that is not positive leaves a gap.
     pub logarithmic: bool,
 }
 
-/// Points joined by straight lines, in the order given; a point that is not finite leaves a gap.
+/// Points connected by straight lines, in the order given; a point that is not finite leaves a gap.
 #[derive(Clone, Debug, Default)]
 pub struct Curve {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
     /// (x, y) in the units of the axes.
     pub points: Vec<(f64, f64)>,
-    /// Only the values 0 and 1, held between points.
+    /// Whether the values are only 0 and 1, held between points.
     pub boolean: bool,
-    /// Each point is a measured one and gets a mark.
+    /// Whether each point was measured and is marked.
     pub marks: bool,
-    /// Numbers of its colour and of its dashes; by its place among the curves if there are none.
+    /// Numbers of its colour and of its dash pattern; by default from its position among the curves.
     pub style: Option<(usize, usize)>,
 }
 
-/// Where something is true.
+/// Intervals in which a condition is true.
 #[derive(Clone, Debug)]
 pub struct Band {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
-    /// Stretches of x, ascending.
+    /// Intervals of x, ascending.
     pub stretches: Vec<(f64, f64)>,
 }
 
@@ -81,7 +81,7 @@ impl Axis {
         if self.logarithmic { Scale::decades(from, to, count) } else { Scale::new(from, to, count) }
     }
 
-    /// Where a value is drawn: at its exponent on a logarithmic axis.
+    /// The coordinate of a value: its exponent on a logarithmic axis.
     #[expect(clippy::disallowed_methods, reason = "a picture, not a result")]
     fn place(&self, value: f64) -> f64 {
         match self.logarithmic {
@@ -102,7 +102,7 @@ impl Axis {
 }
 
 impl Band {
-    /// The stretches of a curve of zeros and ones in which it is one.
+    /// The intervals in which a curve of zeros and ones is one.
     pub fn of(name: &str, points: &[(f64, f64)]) -> Band {
         let mut stretches: Vec<(f64, f64)> = Vec::new();
         let mut since = None;
@@ -124,7 +124,7 @@ impl Band {
 }
 
 impl Curve {
-    /// The points to join: those of a truth value with the corners between them.
+    /// The points to connect: for a truth value with the corners between them.
     fn corners(&self) -> Cow<'_, [(f64, f64)]> {
         if !self.boolean {
             return Cow::Borrowed(&self.points);
@@ -143,7 +143,7 @@ impl Curve {
 }
 
 impl Panel {
-    /// The panel with the points of its curves where they are drawn.
+    /// The panel with the points of its curves in axis coordinates.
     fn placed(&self) -> Cow<'_, Panel> {
         if !self.x.logarithmic && !self.y.logarithmic {
             return Cow::Borrowed(self);

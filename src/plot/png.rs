@@ -1,12 +1,12 @@
-//! A figure as a PNG: its SVG, drawn with the letters that travel with the program, so that it looks the same on a
-//! machine without any fonts.
+//! Renders a figure as PNG: its SVG, rasterised with embedded fonts, so that it looks the same on a machine without
+//! fonts.
 
 use super::{Figure, svg};
 use resvg::tiny_skia::{Pixmap, Transform};
 use resvg::usvg::{Options, Tree, fontdb};
 use std::sync::Arc;
 
-/// Pixels per px of the SVG: sharp on paper and on fine screens.
+/// Pixels per px of the SVG: sharp on paper and on high-resolution screens.
 const SCALE: f32 = 2.0;
 
 /// The figure as the bytes of a PNG.

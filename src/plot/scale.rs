@@ -1,6 +1,6 @@
-//! Where the ticks of an axis lie and what stands beside them.
+//! Positions and labels of the ticks of an axis.
 //!
-//! Works with decimal exponents read from printed numbers, so that no logarithm is off by one at a power of ten.
+//! Uses decimal exponents parsed from printed numbers, so that no logarithm is off by one at a power of ten.
 
 /// An axis with its ticks.
 #[derive(Clone, PartialEq, Debug)]
@@ -9,18 +9,18 @@ pub struct Scale {
     pub from: f64,
     /// Upper end.
     pub to: f64,
-    /// Ascending, inside the ends.
+    /// Ascending, between the ends.
     pub ticks: Vec<Tick>,
-    /// What the labels leave out: `×10⁻⁶`, `+3.3068`; mostly empty.
+    /// The factor or offset omitted from the labels: `×10⁻⁶`, `+3.3068`; often empty.
     pub note: String,
 }
 
-/// A mark on an axis.
+/// A tick of an axis.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Tick {
-    /// Its place.
+    /// Its value.
     pub at: f64,
-    /// Its number.
+    /// Its label.
     pub label: String,
 }
 
@@ -35,11 +35,11 @@ impl Scale {
             .collect();
         let largest = from.abs().max(to.abs());
 
-        // More than six digits: labels count from a round number near the lower end.
+        // More than six digits: labels are relative to a round number near the lower end.
         let round = ten_to(exponent(to - from) + 1);
         let base = if largest > 1e5 * step { (from / round).floor() * round } else { 0.0 };
         let largest = if base == 0.0 { largest } else { to - base };
-        // Very large or small: labels leave out a power of ten.
+        // Very large or small: labels omit a power of ten.
         let power = match exponent(largest) {
             0..5 => 0,
             -3..0 => 0,
@@ -98,14 +98,14 @@ impl Scale {
         Scale { from, to, ticks, note: String::new() }
     }
 
-    /// Position of a value, 0 at the lower end and 1 at the upper one.
+    /// Relative position of a value, 0 at the lower end and 1 at the upper one.
     pub fn position(&self, value: f64) -> f64 {
         // Halved, so that the difference of huge ends stays finite.
         (value / 2.0 - self.from / 2.0) / (self.to / 2.0 - self.from / 2.0)
     }
 }
 
-/// A little more than the values need, so that no curve runs along the frame.
+/// Slightly more than the range of the values, so that no curve runs along the frame.
 pub fn padded((min, max): (f64, f64), part: f64) -> (f64, f64) {
     let (from, to) = opened(min, max);
     let pad = (to / 2.0 - from / 2.0) * 2.0 * part;
@@ -113,7 +113,7 @@ pub fn padded((min, max): (f64, f64), part: f64) -> (f64, f64) {
     if lower.is_finite() && upper.is_finite() { (lower, upper) } else { (from, to) }
 }
 
-/// An interval that has a width worth drawing.
+/// Widens an interval to a width that can be drawn.
 fn opened(from: f64, to: f64) -> (f64, f64) {
     // Beyond this, differences overflow.
     let (from, to) = (from.clamp(-1e300, 1e300), to.clamp(-1e300, 1e300));
@@ -125,12 +125,12 @@ fn opened(from: f64, to: f64) -> (f64, f64) {
     (from - half, to + half)
 }
 
-/// 1, 2 or 5 times a power of ten that cuts the interval into a number of parts near `count`.
+/// 1, 2 or 5 times a power of ten that divides the interval into about `count` parts.
 fn step(from: f64, to: f64, count: usize) -> f64 {
     let wanted = count.max(1) as f64;
     let power = exponent((to - from) / wanted);
     let steps = [power - 1, power, power + 1].into_iter().flat_map(|e| [1.0, 2.0, 5.0].map(|m| m * ten_to(e)));
-    // Parts too many crowd an axis sooner than parts too few leave it bare.
+    // Too many parts are worse than too few.
     let badness = |step: f64| {
         let parts = (to - from) / step;
         if parts > wanted { 1.3 * (parts / wanted - 1.0) } else { wanted / parts - 1.0 }
@@ -149,7 +149,7 @@ pub fn ten_to(exponent: i32) -> f64 {
     format!("1e{exponent}").parse().expect("a power of ten is a number")
 }
 
-/// An exponent in raised digits.
+/// An exponent in superscript digits.
 pub fn raised(exponent: i32) -> String {
     let raise = |c: char| match c {
         '-' => '⁻',

@@ -1,4 +1,4 @@
-//! A figure as a self-contained SVG: no script, no external request, readable in any viewer and in print.
+//! Renders a figure as a self-contained SVG: no script, no external request, readable in any viewer and in print.
 
 use super::scale::{Scale, padded};
 use super::{Curve, Figure, PALETTE, Panel, SHADES, decimate};
@@ -6,17 +6,17 @@ use std::fmt::Write;
 
 /// Width of a figure in px.
 const WIDTH: f64 = 860.0;
-/// Left of the axes: numbers and the title of y.
+/// Space left of the axes: numbers and the title of y.
 const LEFT: f64 = 84.0;
-/// Right of the axes: half of the last number.
+/// Space right of the axes: half of the last number.
 const RIGHT: f64 = 28.0;
-/// Below the axes: numbers and the title of x.
+/// Space below the axes: numbers and the title of x.
 const BELOW: f64 = 50.0;
-/// Between panels, and below the last one.
+/// Space between panels, and below the last one.
 const GAP: f64 = 14.0;
 /// Height of a row of the legend.
 const ROW: f64 = 22.0;
-/// Height of the words.
+/// Font size.
 const TEXT: f64 = 13.0;
 
 const INK: &str = "#1f2328";
@@ -24,12 +24,12 @@ const FAINT: &str = "#59636e";
 const GRID: &str = "#e4e7eb";
 const DASHES: [&str; 3] = ["", "7 4", "2 3"];
 
-/// The figure as text.
+/// The figure as SVG text.
 pub fn svg(figure: &Figure) -> String {
     inline(figure, WIDTH, "axes")
 }
 
-/// The figure as text, `wide` px wide, for a page that holds several: `id` sets its names apart from theirs.
+/// The figure as SVG text, `wide` px wide, for a page with several figures: `id` makes its identifiers unique.
 pub fn inline(figure: &Figure, wide: f64, id: &str) -> String {
     let mut body = String::new();
     let mut y = 18.0;
@@ -81,7 +81,7 @@ fn is_boolean(panel: &Panel) -> bool {
     !panel.curves.is_empty() && panel.curves.iter().all(|curve| curve.boolean)
 }
 
-/// Draws a panel whose top is at `top`; returns its bottom. Its size is the width of the figure and the height of its
+/// Draws a panel whose top is at `top`; returns its bottom. The size is the width of the figure and the height of the
 /// axes.
 fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height): (f64, f64)) -> f64 {
     let top = legend(out, panel, top, wide) + 8.0;
@@ -89,7 +89,7 @@ fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height
     let bounds = panel.bounds();
     let (xs, ys) = bounds.unwrap_or(((0.0, 1.0), (0.0, 1.0)));
     let running = panel.curves.iter().all(|curve| curve.points.windows(2).all(|pair| pair[0].0 <= pair[1].0));
-    // Time fills the width; a loop in the plane keeps clear of the frame.
+    // Time fills the width; a loop in the plane keeps a distance from the frame.
     let marked = panel.curves.iter().any(|curve| curve.marks);
     let xs = if running && !marked { xs } else { padded(xs, 0.04) };
     let x_axis = panel.x.scale(xs.0, xs.1, (width / 90.0) as usize);
@@ -191,7 +191,7 @@ fn draw_panel(out: &mut String, panel: &Panel, id: &str, top: f64, (wide, height
     bottom + BELOW
 }
 
-/// Names of curves and bands, where there are several; returns the bottom.
+/// Names of curves and bands, if there are several; returns the bottom.
 fn legend(out: &mut String, panel: &Panel, top: f64, wide: f64) -> f64 {
     if panel.curves.len() + panel.bands.len() < 2 {
         return top + 4.0;
@@ -230,13 +230,13 @@ fn legend(out: &mut String, panel: &Panel, top: f64, wide: f64) -> f64 {
     y + 4.0
 }
 
-/// Numbers of colour and dashes of the `i`-th curve: more colours than there are come again with other dashes.
+/// Numbers of colour and dash pattern of the `i`-th curve: colours repeat with other dash patterns.
 fn style(panel: &Panel, i: usize) -> (usize, usize) {
     let (colour, dashes) = panel.curves[i].style.unwrap_or((i, 0));
     (colour, dashes + colour / PALETTE.len())
 }
 
-/// Colour and dashes of the `i`-th curve.
+/// Colour and dash pattern of the `i`-th curve.
 fn stroke(panel: &Panel, i: usize) -> String {
     let (colour, dashes) = style(panel, i);
     let colour = PALETTE[colour % PALETTE.len()];
@@ -246,7 +246,7 @@ fn stroke(panel: &Panel, i: usize) -> String {
     }
 }
 
-/// A curve as the data of a path.
+/// A curve as the data of an SVG path.
 fn path(curve: &Curve, px: impl Fn(f64) -> f64, py: impl Fn(f64) -> f64, width: f64, height: f64) -> String {
     let place =
         |&(x, y): &(f64, f64)| if x.is_finite() && y.is_finite() { (px(x), py(y)) } else { (f64::NAN, f64::NAN) };
@@ -257,14 +257,14 @@ fn path(curve: &Curve, px: impl Fn(f64) -> f64, py: impl Fn(f64) -> f64, width: 
             let _ = write!(path, "{}{} {}", if i == 0 { 'M' } else { 'L' }, tenth(*x), tenth(*y));
         }
         if let [(x, y)] = line[..] {
-            // A point by itself: a dot.
+            // An isolated point: a dot.
             let _ = write!(path, "L{} {}", tenth(x + 0.1), tenth(y));
         }
     }
     path
 }
 
-/// Stretches with those joined that lie closer than a picture shows.
+/// Merges intervals that are closer than a picture can show.
 fn merged(stretches: &[(f64, f64)], least: f64) -> Vec<(f64, f64)> {
     let mut joined: Vec<(f64, f64)> = Vec::new();
     for &(from, to) in stretches {
@@ -276,7 +276,7 @@ fn merged(stretches: &[(f64, f64)], least: f64) -> Vec<(f64, f64)> {
     joined
 }
 
-/// One decimal, without a needless `.0`.
+/// One decimal, without a trailing `.0`.
 fn tenth(x: f64) -> String {
     let text = format!("{x:.1}");
     text.strip_suffix(".0").map_or(text.clone(), str::to_string)
@@ -302,7 +302,7 @@ fn escaped(text: &str) -> String {
             '<' => out.push_str("&lt;"),
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
-            // XML knows no control characters, not even as references.
+            // XML does not allow control characters, not even as references.
             c if c.is_control() => out.push(' '),
             c => out.push(c),
         }
@@ -310,7 +310,7 @@ fn escaped(text: &str) -> String {
     out
 }
 
-/// About the width of a text in px: near enough to lay out a legend.
+/// Approximate width of a text in px, accurate enough to lay out a legend.
 fn text_width(text: &str, size: f64) -> f64 {
     let em = |c: char| match c {
         'i' | 'j' | 'l' | '.' | ',' | ':' | ';' | '|' | '\'' | 'I' | ' ' | '·' => 0.27,
@@ -322,7 +322,7 @@ fn text_width(text: &str, size: f64) -> f64 {
     text.chars().map(em).sum::<f64>() * size
 }
 
-/// The text, cut to a width.
+/// The text, truncated to a width.
 fn fitted(text: &str, width: f64, size: f64) -> String {
     if text_width(text, size) <= width {
         return text.into();

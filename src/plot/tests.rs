@@ -93,7 +93,7 @@ fn odd_figures_are_drawn_without_complaint() {
     png(&Figure::default());
 }
 
-/// Leaves a picture to look at: `FRIC_PICTURES=out cargo test --bin fric picture`.
+/// Writes a picture to look at: `FRIC_PICTURES=out cargo test --bin fric picture`.
 #[test]
 fn a_picture_has_letters_without_any_system_font() {
     let blank = png(&Figure { panels: vec![Panel::default()], ..Figure::default() });

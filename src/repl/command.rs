@@ -1,10 +1,10 @@
-//! What a line is: a command, an item of the language, an instance, a setting or an expression.
+//! Classifies a line: a command, an item of the language, an instance, a setting or an expression.
 //!
-//! In: a line. Out: a [`Line`]. Knows no session: whether names mean anything is not asked here.
+//! In: a line. Out: a [`Line`]. Knows no session: names are not resolved here.
 
 use grammar::tokens::{TokenKind, tokens};
 
-/// Commands: name, how it is used, what it does.
+/// Commands: name, usage, effect.
 pub const COMMANDS: &[(&str, &str, &str)] = &[
     ("use", "use \"FILE.fric\" | use std.friction", "brings in the models and experiments of a file or the library"),
     ("run", "run NAME [for 20 s]", "runs an experiment, an instance, or Model(…) from its start"),
@@ -31,7 +31,7 @@ pub const COMMANDS: &[(&str, &str, &str)] = &[
     ("quit", "quit", "ends the session; so does Ctrl-D"),
 ];
 
-/// Words that begin an item.
+/// Keywords that begin an item.
 const ITEMS: &[&str] = &["import", "const", "fn", "table", "interface", "model", "experiment", "fit", "device", "rig"];
 
 /// A command.
@@ -84,24 +84,24 @@ impl Command {
     }
 }
 
-/// What a line is.
+/// The kind of a line.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Line {
     /// Blanks and comments.
     Nothing,
-    /// A command, and what stands behind its name.
+    /// A command, and the text after its name.
     Command(Command, String),
     /// `model M { … }`, `const k = 2 N/m`.
     Item,
-    /// `f = LuGre(vd = 10 mm/s)`: the name, and where the instance begins.
+    /// `f = LuGre(vd = 10 mm/s)`: the name, and the offset of the instance.
     Instance(String, usize),
-    /// `f.Fs = 1 N`: the path, and where the value begins.
+    /// `f.Fs = 1 N`: the path, and the offset of the value.
     Setting(String, usize),
     /// `10 mm * 2 N/m`
     Expression,
 }
 
-/// Says what a line is.
+/// Classifies a line.
 pub fn read(line: &str) -> Line {
     let words: Vec<_> = tokens(line).into_iter().filter(|token| !token.is_trivia()).collect();
     let Some(first) = words.first() else { return Line::Nothing };
@@ -141,7 +141,7 @@ pub fn read(line: &str) -> Line {
     }
 }
 
-/// Whether more lines must follow: a bracket is open, or an operator waits for its right side.
+/// Whether more lines must follow: a bracket is open, or an operator lacks its right operand.
 pub fn incomplete(text: &str) -> bool {
     let mut depth = 0i64;
     let mut last = "";
@@ -162,7 +162,8 @@ pub fn incomplete(text: &str) -> bool {
     depth > 0 || (depth == 0 && waits && !text.ends_with("\n\n"))
 }
 
-/// The inputs of a text of several lines, as a terminal hands over what is pasted: each goes as far as it must.
+/// Splits a text of several lines, as a terminal delivers pasted text, into inputs; each continues until it is
+/// complete.
 pub fn inputs(text: &str) -> Vec<&str> {
     let mut found = Vec::new();
     let (mut begin, mut end) = (0, 0);
@@ -179,7 +180,7 @@ pub fn inputs(text: &str) -> Vec<&str> {
     found
 }
 
-/// Splits `… to FILE.svg` off the end of a command: what stands before, and the file.
+/// Splits `… to FILE.svg` off the end of a command: returns the text before it, and the file.
 ///
 /// # Errors
 /// What is wrong with the name of the file.

@@ -1,6 +1,6 @@
-//! What can stand at the cursor.
+//! Completion at the cursor.
 //!
-//! In: a session, a line, the cursor. Out: candidates, those whose unit fits first. Knows no terminal.
+//! In: a session, a line, the cursor. Out: candidates, those with a matching unit first. Knows no terminal.
 
 use super::command::{COMMANDS, Line, read};
 use super::session::{Session, library_models};
@@ -8,15 +8,15 @@ use crate::compile::nearest;
 use abi::unit::{Dimension, Unit};
 use grammar::ast::{DeclarationKind, Statement};
 
-/// Most candidates that are shown.
+/// Most candidates shown.
 const MOST: usize = 100;
 
-/// What could stand at the cursor.
+/// A candidate for the word at the cursor.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Candidate {
-    /// What is put in place of the word.
+    /// The replacement of the word.
     pub text: String,
-    /// The text and what it is: `f.F [N]`.
+    /// The replacement with a description: `f.F [N]`.
     pub shown: String,
 }
 
@@ -33,23 +33,23 @@ impl Candidate {
     }
 }
 
-/// Where the word at the cursor begins.
+/// The start of the word at the cursor.
 fn word_start(line: &str, cursor: usize) -> usize {
     let before = &line[..cursor];
     let of_word = |c: char| c.is_alphanumeric() || matches!(c, '_' | '.' | '[' | ']');
     let start = before.trim_end_matches(of_word).len();
-    // Digits begin a number, not a name.
+    // A digit begins a number, not a name.
     if before[start..].starts_with(|c: char| c.is_ascii_digit()) { cursor } else { start }
 }
 
-/// Whether a file name stands at the cursor: behind `use`, `save`, `watch`, `to`.
+/// Whether a file name is expected at the cursor: after `use`, `save`, `watch`, `to`.
 pub fn wants_file(line: &str, cursor: usize) -> bool {
     let before = line[..cursor].trim_start();
     let file = |word: &str| before.strip_prefix(word).is_some_and(|rest| rest.starts_with([' ', '"']));
     ["use", "save", "watch"].into_iter().any(file) && !before.contains("std") || before.contains(" to ")
 }
 
-/// Candidates for the word at the cursor, and where it begins.
+/// Candidates for the word at the cursor, and the start of that word.
 pub fn candidates(session: &Session, line: &str, cursor: usize) -> (usize, Vec<Candidate>) {
     let start = word_start(line, cursor);
     if line[..cursor].ends_with(|c: char| c.is_ascii_digit()) && start == cursor {
@@ -105,14 +105,14 @@ fn models(session: &Session) -> impl Iterator<Item = Candidate> + use<> {
     names.into_iter().map(Candidate::plain)
 }
 
-/// Whether a model is due: `f =`, `f = rotary`.
+/// Whether a model is expected: `f =`, `f = rotary`.
 fn model_follows(before: &str) -> bool {
     let before = before.strip_suffix("rotary").unwrap_or(before).trim_end();
     let Some(name) = before.strip_suffix('=') else { return false };
     matches!(read(&format!("{name}= M()")), Line::Instance(..)) && !name.contains('.')
 }
 
-/// The model whose argument is named next: `LuGre(` or `LuGre(Fs = 2 N, `.
+/// The model whose argument name is expected: `LuGre(` or `LuGre(Fs = 2 N, `.
 fn argument_of(before: &str) -> Option<String> {
     let mut depth = 0;
     for (at, c) in before.char_indices().rev() {
@@ -130,7 +130,7 @@ fn argument_of(before: &str) -> Option<String> {
     None
 }
 
-/// Parameters, inputs, states (their start values) and slots of a model, ready to be given.
+/// Parameters, inputs, states (their initial values) and slots of a model, with ` = `.
 fn arguments(session: &Session, model: &str) -> Vec<Candidate> {
     let mut with_library = session.clone();
     with_library.bring_in(model);
@@ -150,7 +150,7 @@ fn arguments(session: &Session, model: &str) -> Vec<Candidate> {
     model.body.iter().filter_map(argument).collect()
 }
 
-/// What a unit as it is shown measures; none for what is true or false.
+/// The dimension of a unit as shown; none for truth values.
 fn dimension(unit: &str) -> Option<Dimension> {
     Unit::parse(if unit.is_empty() { "1" } else { unit }).ok().map(|unit| unit.dimension)
 }
@@ -174,7 +174,7 @@ fn paths(session: &Session, wanted: Option<Dimension>, word: &str) -> impl Itera
     all.into_iter().map(|(_, candidate)| candidate)
 }
 
-/// What kind of quantity is due in place of the word at the cursor.
+/// The dimension expected for the word at the cursor.
 fn wanted(session: &Session, line: &str, start: usize, cursor: usize) -> Option<Dimension> {
     if let Line::Setting(path, begin) = read(&line[..start]) {
         let set = session.quantities().find(|q| q.path == path).and_then(|q| dimension(&q.unit));
@@ -193,7 +193,7 @@ fn wanted(session: &Session, line: &str, start: usize, cursor: usize) -> Option<
     session.wanted(&line)
 }
 
-/// What is shown in grey behind the cursor: how a command is used, or what a quantity is.
+/// The hint shown in grey after the cursor: the usage of a command, or a description of a quantity.
 pub fn hint(session: &Session, line: &str) -> Option<String> {
     let word = line.trim();
     if word.is_empty() {
@@ -213,7 +213,7 @@ pub fn hint(session: &Session, line: &str) -> Option<String> {
     Some(format!(" {unit}{doc}")).filter(|hint| !hint.trim().is_empty())
 }
 
-/// The command that was meant.
+/// The closest command name.
 pub fn meant(word: &str) -> Option<&'static str> {
     nearest(word, COMMANDS.iter().map(|(name, ..)| *name).filter(|name| !name.is_empty()))
 }

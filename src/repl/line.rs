@@ -1,7 +1,7 @@
-//! Where lines come from: a terminal with an editor, or a file or pipe. The only file that knows rustyline.
+//! Input lines: from a terminal with an editor, or from a file or pipe. The only file that uses rustyline.
 //!
-//! In: a session to complete from. Out: whole inputs, over several lines where a bracket is open. Knows no commands
-//! beyond their names.
+//! In: a session for completion. Out: complete inputs, over several lines where a bracket is open. Knows only the names
+//! of commands.
 
 use super::command::{COMMANDS, incomplete};
 use super::complete::{candidates, hint, wants_file};
@@ -21,19 +21,19 @@ use std::io::{BufRead, Stdin};
 use std::path::PathBuf;
 use std::rc::Rc;
 
-/// What stands before a line, and before one that goes on.
+/// The prompts before a first line and before a continuation line.
 pub const PROMPT: &str = "fric> ";
 const MORE: &str = "  ... ";
-/// Most lines of history that are kept.
+/// Longest history.
 const MOST_HISTORY: usize = 10_000;
 
-/// What was read.
+/// The result of reading.
 pub enum Input {
-    /// One input, perhaps of several lines.
+    /// One input, possibly of several lines.
     Text(String),
     /// Ctrl-C at the prompt.
     Interrupted,
-    /// The end.
+    /// End of the input.
     End,
 }
 
@@ -46,7 +46,7 @@ pub enum Editor {
 }
 
 impl Editor {
-    /// For a terminal: with history, completion, highlighting and hints.
+    /// An editor for a terminal: with history, completion, highlighting and hints.
     pub fn terminal(session: Rc<RefCell<Session>>, colour: bool) -> Result<Editor, String> {
         let config = Config::builder()
             .max_history_size(MOST_HISTORY)
@@ -60,13 +60,13 @@ impl Editor {
         editor.set_helper(Some(Help { session, colour, files: FilenameCompleter::new() }));
         let history = history_file();
         if let Some(path) = &history {
-            // The first session has none yet.
+            // The first session has no history yet.
             let _ = editor.load_history(path);
         }
         Ok(Editor::Terminal(Box::new(editor), history))
     }
 
-    /// For what is piped in.
+    /// An editor for piped input.
     pub fn piped() -> Editor {
         Editor::Piped(std::io::stdin())
     }
@@ -82,7 +82,7 @@ impl Editor {
                     if !text.trim().is_empty() {
                         let _ = editor.add_history_entry(text.as_str());
                         if let Some(path) = history {
-                            // A history that cannot be written is no reason to stop working.
+                            // Failing to write the history is no reason to stop.
                             let _ = make_folder(path).and_then(|()| editor.append_history(path).map_err(|_| ()));
                         }
                     }
@@ -100,7 +100,7 @@ impl Editor {
                     if read == 0 {
                         return Ok(if text.trim().is_empty() { Input::End } else { Input::Text(text) });
                     }
-                    // Indented lines of a transcript go on where the prompt of the terminal says so.
+                    // Indented lines of a transcript are continuation lines, as in the terminal.
                     if text[before..].trim().is_empty() && before > 0 || !incomplete(&text) {
                         return Ok(Input::Text(text));
                     }
@@ -127,7 +127,7 @@ pub fn as_typed(text: &str) -> String {
     lines.map(|(k, line)| format!("{}{line}\n", if k == 0 { PROMPT } else { MORE })).collect()
 }
 
-/// Completion, hints, highlighting and the rule when an input is whole.
+/// Completion, hints, highlighting, and the check whether an input is complete.
 pub struct Help {
     session: Rc<RefCell<Session>>,
     colour: bool,
@@ -149,7 +149,7 @@ impl Completer for Help {
     }
 }
 
-/// Words behind the cursor that are only shown: no key takes them over into the line.
+/// A hint after the cursor that is only displayed: no key inserts it.
 pub struct Note(String);
 
 impl rustyline::hint::Hint for Note {
@@ -166,7 +166,7 @@ impl Hinter for Help {
     type Hint = Note;
 
     fn hint(&self, line: &str, cursor: usize, _: &Context<'_>) -> Option<Note> {
-        // Without colour it could not be told from what was typed.
+        // Without colour a hint could not be distinguished from the input.
         if cursor < line.len() || !self.colour { None } else { hint(&self.session.borrow(), line).map(Note) }
     }
 }

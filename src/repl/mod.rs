@@ -1,7 +1,7 @@
-//! A session at the prompt: what a line is, what the session knows, how a line is edited and completed.
+//! An interactive session: classification of lines, state of the session, editing and completion.
 //!
-//! In: lines. Out: values, figures, diagnostics. A session is a text under construction: its items and instances are
-//! laid out as a file, and every line is read, checked and compiled as part of that file. Prints nothing.
+//! In: lines. Out: values, figures, diagnostics. A session is a text under construction: its items and instances form a
+//! file, and every line is parsed, checked and compiled as part of that file. Prints nothing.
 
 mod command;
 

@@ -1,7 +1,7 @@
-//! `--cross`: repeats an experiment with another solver, and says how far the two are apart.
+//! `--cross`: repeats an experiment with another solver, and reports the differences.
 //!
-//! The partner of an adaptive run is `expo step 0.1 ms`, that of a fixed step `adaptive tol 1e-8`. Both are read at the
-//! same instants. What is said besides, which fixed step would do, has been tried.
+//! An adaptive run is compared with `expo step 0.1 ms`, a fixed step with `adaptive tol 1e-8`. Both are sampled at the
+//! same instants. The advice on a sufficient fixed step has been verified by a run.
 
 use crate::commands::reported;
 use crate::compile::{self, Case, Changes, Loaded, Options};
@@ -17,13 +17,13 @@ use runtime::engine::{self, Continue, Failure, Outcome};
 use runtime::run::verdict::Verdict;
 use serde_json::{Value, json};
 
-/// Intervals between the instants that are compared.
+/// Number of intervals between the compared instants.
 const INTERVALS: usize = 2000;
 
-/// What a recommended step keeps to: root of the mean square of the difference, as a part of the range.
+/// Accuracy of a recommended step: root mean square of the difference, relative to the range.
 const GOAL: f64 = 1e-4;
 
-/// Most steps of a run that is made only to try a step.
+/// Most steps of a run that only verifies a step.
 const MOST_STEPS: f64 = 2e6;
 
 /// One quantity under two solvers.
@@ -31,12 +31,12 @@ pub struct Row {
     label: String,
     unit: Unit,
     boolean: bool,
-    /// Largest difference and when; of a truth value the part of the time in which the two disagree.
+    /// Largest difference and when; for a truth value the fraction of time in which the two disagree.
     largest: f64,
     time: f64,
-    /// Root of the mean square of the difference.
+    /// Root mean square of the difference.
     rms: f64,
-    /// Largest less least value of the reference, which is the adaptive run.
+    /// Maximum minus minimum of the reference, which is the adaptive run.
     range: f64,
     finals: [f64; 2],
 }
@@ -46,18 +46,18 @@ pub struct Crossed {
     label: String,
     solvers: [Solver; 2],
     rows: Vec<Row>,
-    /// The expectations under the partner, or why it stopped.
+    /// The expectations with the other solver, or why it stopped.
     partner: Result<Vec<Verdict>, Failure>,
     advice: Option<String>,
 }
 
 impl Crossed {
-    /// Whether the partner came to its end and every expectation held there too.
+    /// Whether the run with the other solver reached its end and every expectation held there too.
     pub fn passed(&self) -> bool {
         self.partner.as_ref().is_ok_and(|verdicts| verdicts.iter().all(|verdict| verdict.holds))
     }
 
-    /// The table and what follows from it.
+    /// The table and its conclusions.
     pub fn words(&self, terminal: &Terminal, indent: &str) -> String {
         let mut out = String::new();
         let case = if self.label.is_empty() { String::new() } else { format!("{}: ", self.label) };
@@ -104,7 +104,7 @@ impl Crossed {
         out
     }
 
-    /// For `--json`.
+    /// The object for `--json`.
     pub fn json(&self) -> Value {
         let row = |row: &Row| {
             let shown = |si: f64| if row.boolean { si } else { row.unit.from_si(si) };
@@ -128,8 +128,7 @@ impl Crossed {
     }
 }
 
-/// Repeats all cases of an experiment with the partner of their solver; none if it cannot be compiled, which is
-/// reported.
+/// Repeats all cases of an experiment with the other solver; none if it cannot be compiled, which is reported.
 pub fn cross(
     loaded: &mut Loaded,
     name: &str,
@@ -157,7 +156,7 @@ pub fn cross(
             return None;
         }
     };
-    // What is said of steps is measured against a run whose own error does not count.
+    // Steps are judged against a run whose own error is negligible.
     let sharp = match own.method {
         Method::Adaptive => {
             let mut sharp = options.clone();
@@ -197,7 +196,7 @@ pub fn cross(
     Some(all)
 }
 
-/// One case under its own solver and under the partner.
+/// One case with its own solver and with the other.
 fn compared(case: &Case, other: &Case) -> Crossed {
     let solvers = [case.experiment.solver, other.experiment.solver];
     let go_on = &mut |_| Continue::Continue(());
@@ -242,7 +241,7 @@ fn compared(case: &Case, other: &Case) -> Crossed {
     crossed(rows.collect(), partner)
 }
 
-/// Outputs and what is plotted; states where there is neither.
+/// Outputs and plotted quantities; states if there are neither.
 fn wanted(instance: &Instance, experiment: &Experiment) -> Vec<(String, Slot, Unit, bool)> {
     let of = |kind: Kind| {
         let quantities = instance.description().quantities.iter().filter(move |quantity| quantity.kind == kind);
@@ -260,7 +259,7 @@ fn wanted(instance: &Instance, experiment: &Experiment) -> Vec<(String, Slot, Un
     wanted
 }
 
-/// Instants over the run at which a fixed step of either ends.
+/// Instants over the run at which fixed steps of both solvers end.
 fn instants(duration: f64, solvers: [Solver; 2]) -> Vec<f64> {
     let step = solvers.iter().map(|solver| solver.step).fold(0.0, f64::max);
     let all = (0..=INTERVALS).map(|k| {
@@ -272,7 +271,7 @@ fn instants(duration: f64, solvers: [Solver; 2]) -> Vec<f64> {
     instants
 }
 
-/// The largest of the mean differences, as a part of its range.
+/// The largest root mean square difference, relative to its range.
 fn worst(rows: &[Row]) -> f64 {
     let counted = rows.iter().filter(|row| !row.boolean && row.range > 0.0);
     counted
@@ -280,7 +279,7 @@ fn worst(rows: &[Row]) -> f64 {
         .fold(0.0, |worst, part| if part > worst || part.is_nan() { part } else { worst })
 }
 
-/// Which fixed step would do: what the order of the method foretells, tried, and halved until it does.
+/// A sufficient fixed step: extrapolated by the order of the method, verified, and halved until it is accurate enough.
 fn advice(fixed: &Experiment, error: f64, tried: &mut dyn FnMut(f64) -> Option<f64>) -> String {
     let Solver { method, step, .. } = fixed.solver;
     let roots = match method {

@@ -1,4 +1,4 @@
-//! What several commands do: a session of texts under change, the comparison of two models, packages for rigs.
+//! Code shared by several commands: sessions with files under change, the comparison of two solvers, packages of rigs.
 
 pub mod cross_check;
 pub mod package;

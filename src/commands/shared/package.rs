@@ -1,4 +1,4 @@
-//! A rig as a package: built for a processor, with the texts it was made from, signed if asked for.
+//! Builds a rig as a package: compiled for a processor, with its source texts, optionally signed.
 
 use crate::args::{Build, Set};
 use crate::commands::{End, chosen_rig, load_from};
@@ -44,7 +44,7 @@ pub(in crate::commands) fn build(args: &Build, terminal: &mut Terminal) -> End {
     let beside = beside(out);
     let written = match &signature {
         Some(text) => project::write(&beside, text.as_bytes()),
-        // A signature of what was there before would be a wrong one.
+        // A signature of an earlier package would be invalid.
         None if beside.exists() => std::fs::remove_file(&beside),
         None => Ok(()),
     };
@@ -63,9 +63,9 @@ pub(in crate::commands) fn build(args: &Build, terminal: &mut Terminal) -> End {
 pub(in crate::commands) struct Wanted<'a> {
     /// The rig; the only one of the text if none is named.
     pub name: Option<&'a str>,
-    /// Such as `aarch64-linux`.
+    /// The target, such as `aarch64-linux`.
     pub target: &'a str,
-    /// What its code may use there besides.
+    /// Instruction set extensions that its code may use.
     pub features: &'a [Feature],
     /// Parameters and slots that are changed.
     pub set: &'a Set,
@@ -76,7 +76,7 @@ pub(in crate::commands) struct Wanted<'a> {
 /// The bytes of a package and its signature.
 ///
 /// # Errors
-/// Why there is none; diagnostics are reported, and an empty text is left.
+/// Why there is none; diagnostics are reported directly, and the message is then empty.
 pub(in crate::commands) fn packed(
     file: &Path,
     wanted: &Wanted,
@@ -95,7 +95,7 @@ pub(in crate::commands) fn packed(
     let built = built.map_err(|why| why.unwrap_or_else(reported))?;
     let mut package =
         Package { fric: env!("CARGO_PKG_VERSION").into(), target: target.into(), rig: name, sections: Vec::new() };
-    // The rig's computer has no compiler to judge it with.
+    // The rig's computer has no compiler to analyse stability with.
     let (against, needs_look) = loop_stability::objections(&built.ready);
     if !against.is_empty() {
         return Err(format!("refused: {}; `fric predict` says what would help", against.join("; ")));
@@ -106,7 +106,7 @@ pub(in crate::commands) fn packed(
     package.add("plant", built.plant);
     package.add("live", built.live);
     package.add("judge", built.judge);
-    // The head of every log of it, so that a recording can be computed again wherever it is brought.
+    // The head of each of its logs, so that a recording can be replayed anywhere.
     let root = loaded.files.get(loaded.root());
     let head = Sections::default()
         .with("fric", package.fric.as_str())
@@ -123,7 +123,7 @@ pub(in crate::commands) fn packed(
         }
     }
     let bytes = package.to_bytes();
-    // What is refused where it is to run is not handed out.
+    // A package that its target would refuse is not written.
     Package::read(&bytes)
         .and_then(|package| package.contents())
         .map_err(|why| format!("the package would be refused, which is a mistake of fric: {why}"))?;
@@ -141,7 +141,7 @@ pub(in crate::commands) fn signed(key: &Signing, package: &Package, bytes: &[u8]
     key.sign(bytes, &comment(&what, now.as_secs()))
 }
 
-/// The name of a text without what depends on where it lay: the same rig packs to the same bytes anywhere.
+/// The name of a text without its folder, so that a rig packs to the same bytes wherever its files are.
 fn tidy(name: &str) -> String {
     Path::new(name).file_name().map_or_else(|| name.to_string(), |name| name.to_string_lossy().into_owned())
 }

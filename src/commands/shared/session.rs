@@ -1,4 +1,4 @@
-//! What a session at the prompt and a text that is watched share: Ctrl-C, and what is said of a run.
+//! Code shared by the interactive session and by `watch`: Ctrl-C, and the display of a run.
 
 use crate::plot::{self, Figure};
 use crate::repl::{Fault, Ran, Value, plain};
@@ -9,7 +9,7 @@ use abi::unit::Unit;
 use runtime::engine::Continue;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Set by Ctrl-C, taken back before each line.
+/// Set by Ctrl-C, reset before each line.
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
 /// Whether Ctrl-C was pressed since the line began.
@@ -17,24 +17,24 @@ pub(in crate::commands) fn interrupted() -> bool {
     INTERRUPTED.load(Ordering::Relaxed)
 }
 
-/// Takes back what was pressed before.
+/// Resets the flag.
 pub(in crate::commands) fn forget_interrupt() {
     INTERRUPTED.store(false, Ordering::Relaxed);
 }
 
-/// Lets Ctrl-C stop what runs instead of the process.
+/// Lets Ctrl-C stop the current run instead of the process.
 pub(in crate::commands) fn catch_interrupts() {
     forget_interrupt();
-    // Set once for the process; a second call has nothing to add.
+    // Set once for the process; a second call has no effect.
     crate::interrupt::on_interrupt(|| INTERRUPTED.store(true, Ordering::Relaxed));
 }
 
-/// Stops a run once Ctrl-C was pressed.
+/// Stops a run after Ctrl-C.
 pub(in crate::commands) fn stop_on_interrupt(_: f64) -> Continue {
     if interrupted() { Continue::Break(()) } else { Continue::Continue(()) }
 }
 
-/// Says what is wrong.
+/// Prints a fault.
 pub(in crate::commands) fn tell_fault(fault: &Fault, terminal: &Terminal) {
     match fault {
         Fault::Found(files, diagnostics) => {
@@ -45,7 +45,7 @@ pub(in crate::commands) fn tell_fault(fault: &Fault, terminal: &Terminal) {
     }
 }
 
-/// Says what a run did, draws its plots, judges its expectations; returns whether they hold.
+/// Prints the results of a run, draws its plots, judges its expectations; returns whether they hold.
 pub(in crate::commands) fn show_run(ran: &Ran, draw: bool, terminal: &mut Terminal) -> bool {
     if let Some(warnings) = &ran.warnings {
         tell_fault(warnings, terminal);
@@ -100,7 +100,7 @@ pub(in crate::commands) fn run_figure(ran: &Ran, last: bool) -> Option<Figure> {
     Some(figure::figure(&ran.name, &subtitle, plots, &cases))
 }
 
-/// Time of an instance, for those who go on from it.
+/// The time of an instance, from which a run continues.
 pub(in crate::commands) fn time_of(instance: &abi::Instance) -> f64 {
     instance.get(Slot::TIME)
 }

@@ -1,8 +1,8 @@
-//! The numerical errors of a sample of the runs of a sweep.
+//! Numerical errors of a sample of the runs of a sweep.
 //!
-//! In: a sweep whose table is complete. Out: for each measure the largest error in the sample and the run that has it, and how
-//! many verdicts of the sample are open. The sample follows from the size of the table alone; each run of it is repeated with
-//! its companions, so the table itself is not touched.
+//! In: a sweep whose table is complete. Out: for each measure the largest error in the sample and its run, and how many
+//! verdicts of the sample are undecided. The sample depends only on the size of the table; each of its runs is repeated
+//! with its companions, so the table itself is not changed.
 
 use super::{Table, extremes};
 use crate::compile::Fitted;
@@ -29,12 +29,12 @@ fn sample(total: u64) -> Vec<u64> {
     numbers
 }
 
-/// An error, and in which run.
+/// An error and its run.
 type Worst = (f64, u64);
 
 /// Errors of a sample.
 pub(super) struct Errors {
-    /// Runs sampled in this table or shard, those of them that came to their end, and all rows.
+    /// Runs sampled in this table or shard, those of them that reached their end, and all rows.
     sampled: u64,
     ended: u64,
     total: u64,
@@ -42,16 +42,16 @@ pub(super) struct Errors {
     experiment: Experiment,
     /// Solvers of the companions.
     companions: Vec<Solver>,
-    /// For each measure its text, its unit, and the largest error; none where it could be taken in no run.
+    /// For each measure its text, its unit, and the largest error; none if no run has a value of it.
     measures: Vec<(String, Unit, Option<Worst>)>,
-    /// Verdicts of the sample, and those that are open: text and run.
+    /// Verdicts of the sample, and the undecided ones: text and run.
     verdicts: u64,
     open: Vec<(String, u64)>,
 }
 
 impl Table {
-    /// Estimates the errors of those sampled runs that lie in `range`; none where the experiment measures nothing or where
-    /// `stopped` was set before the end. The result does not depend on the number of threads.
+    /// Estimates the errors of the sampled runs in `range`; none if the experiment has no measures or if `stopped` was
+    /// set before the end. The result does not depend on the number of threads.
     pub(super) fn errors(
         &self,
         range: &Range<u64>,
@@ -86,15 +86,15 @@ impl Table {
         (!stopped.load(Ordering::Relaxed)).then_some(errors)
     }
 
-    /// The verdicts of a run with their errors, and its companions; nothing inside where the run does not come to its end, and
-    /// nothing at all where `stopped` was set.
+    /// The verdicts of a run with their errors, and its companions; `Some(None)` if the run does not reach its end, and
+    /// `None` if `stopped` was set.
     fn judged(&self, number: u64, dice: &Dice, stopped: &AtomicBool) -> Option<Option<Judged>> {
         let watch = &mut |_: f64| match stopped.load(Ordering::Relaxed) {
             true => Continue::Break(()),
             false => Continue::Continue(()),
         };
         let Ok((run, Fitted { instance, experiment })) = self.fitted(number, dice) else { return Some(None) };
-        // With the watches on ranges, as the row was made: a row whose run left one has no error either.
+        // With guards on ranges, as for the row: a run that left a range has no error either.
         let (case, description) = (&self.cases[run.at], run.description);
         let ended = engine::run(instance.clone(), &experiment, watch).ok().filter(|outcome| {
             let watched = &outcome.verdicts[case.expects()..];
@@ -129,7 +129,7 @@ impl Errors {
                 let (_, _, worst) = measures.next().expect("all cases have the same measures");
                 let read = verdict.readings.iter().find(|reading| reading.text == measure.text);
                 let Some(error) = read.and_then(|reading| reading.error) else { continue };
-                // The first of several that are equally large.
+                // If several are equally large, keep the first.
                 if worst.is_none_or(|(most, _)| error > most) {
                     *worst = Some((error, number));
                 }
@@ -143,7 +143,7 @@ impl Errors {
         }
     }
 
-    /// A heading, a line a measure, and a line on verdicts.
+    /// A heading, a line for each measure, and a line on verdicts.
     pub(super) fn words(&self) -> String {
         let runs =
             |n: u64| format!("{} of {} run{}", count(n), count(self.total), if self.total == 1 { "" } else { "s" });
@@ -169,7 +169,7 @@ impl Errors {
                 None => "not measured in any of them".into(),
                 Some((error, number)) if error.is_infinite() => format!("not known (run {number})"),
                 Some((error, number)) => {
-                    // An error is a difference: of a temperature in °C, of kelvins.
+                    // An error is a difference: for a temperature in °C, in kelvin.
                     let error = significant(unit.from_si(*error) - unit.from_si(0.0), 2);
                     let unit = if unit.text.is_empty() { String::new() } else { format!(" {unit}") };
                     format!("at most {error}{unit} (run {number})")

@@ -1,7 +1,8 @@
-//! What a complete table says, in words and as a figure.
+//! Summary of a complete table, as text and as a figure.
 //!
-//! In: a file of rows and its columns. Out: mean, spread and quantiles of each column of numbers, how often each verdict holds, why
-//! runs did not end well, and curves of measures over a parameter. The file is read once, in bounded memory.
+//! In: a file of rows and its columns. Out: mean, standard deviation and quantiles of each numeric column, how often
+//! each verdict holds, why runs failed, and curves of measures over a parameter. The file is read once, in bounded
+//! memory.
 
 use super::{Column, ColumnKind, Table};
 use crate::args::Sweep;
@@ -11,7 +12,7 @@ use crate::results;
 use std::io;
 use std::path::Path;
 
-/// Most values of a column that are kept to find its quantiles and to draw it.
+/// Most values of a column that are kept for its quantiles and figures.
 const SAMPLE: usize = 1 << 16;
 
 impl Table {
@@ -27,7 +28,7 @@ impl Table {
         Ok(summary)
     }
 
-    /// A measure over a parameter: those named, else the first parameter and every measure.
+    /// A measure over a parameter: the named ones, else the first parameter and every measure.
     pub(super) fn figure(&self, args: &Sweep, summary: &Summary) -> Result<Figure, String> {
         let (show, against) = (args.show.as_deref(), args.against.as_deref());
         let is_measure = |column: &&Column| matches!(column.kind, ColumnKind::Measure(..));
@@ -53,7 +54,7 @@ impl Table {
             });
         }
         let panel = |y: usize| {
-            // Each point by itself: a gap before the next.
+            // Isolated points: a gap before each.
             let points = summary.kept.iter().flat_map(|row| [(row[x], row[y]), (f64::NAN, f64::NAN)]).collect();
             Panel {
                 x: self.columns[x].axis.clone(),
@@ -70,18 +71,18 @@ impl Table {
     }
 }
 
-/// What a file holds, column by column.
+/// Statistics of a file, column by column.
 pub(super) struct Summary {
     tallies: Vec<Tally>,
-    /// Every so many-th row as numbers: for quantiles and figures, in bounded memory.
+    /// Every k-th row as numbers: for quantiles and figures, in bounded memory.
     kept: Vec<Vec<f64>>,
     every: u64,
     rows: u64,
-    /// How runs ended that did not end well.
+    /// Runs that failed, by reason.
     ended: Vec<Ended>,
 }
 
-/// Runs that ended for the same reason.
+/// Runs that failed for the same reason.
 struct Ended {
     /// The reason without its numbers.
     kind: String,
@@ -91,7 +92,7 @@ struct Ended {
     first: String,
 }
 
-/// A reason without numbers and their units, for these differ from run to run. What is in backticks is a name and stays.
+/// A reason without numbers and their units, because these differ from run to run. Names in backticks stay.
 fn kind(status: &str) -> String {
     let mut kept = Vec::new();
     for (k, part) in status.split('`').enumerate() {
@@ -119,11 +120,11 @@ struct Tally {
     kind: ColumnKind,
     number: u64,
     mean: f64,
-    /// Sum of squares of distances to the mean.
+    /// Sum of squared distances to the mean.
     square: f64,
     least: f64,
     most: f64,
-    /// Verdicts that hold.
+    /// Number of verdicts that hold.
     held: u64,
 }
 
@@ -145,7 +146,7 @@ impl Tally {
         };
         if f64::is_finite(value) {
             self.number += 1;
-            // Welford's recurrence.
+            // Welford's algorithm.
             let distance = value - self.mean;
             self.mean += distance / self.number as f64;
             self.square += distance * (value - self.mean);

@@ -1,6 +1,6 @@
-//! What is asked of a session without running it: values, what there is, what a name stands for.
+//! Queries that do not run the session: values, quantities, meanings of names.
 //!
-//! In: expressions, names, paths. Out: values, trees, explanations. Nothing changes.
+//! In: expressions, names, paths. Out: values, trees, explanations. Changes nothing.
 
 use super::words::{Value, literal, model_of};
 use super::{Fault, Session, Setup, TEXT, Used, What, begin, found};
@@ -14,7 +14,7 @@ use runtime::engine::{self, Continue};
 use std::sync::Arc;
 
 impl Session {
-    /// The value of an expression, now.
+    /// The present value of an expression.
     pub fn value(&mut self, text: &str) -> Result<Value, Fault> {
         let text = self.with_answer(text)?;
         let what = self.meant(&text).unwrap_or(What::Session);
@@ -31,10 +31,10 @@ impl Session {
         Ok(Value { si, unit: series.unit.clone(), boolean: series.boolean })
     }
 
-    /// The first case of what is meant, where it is now.
+    /// The first case of `what`, in its present state.
     pub(super) fn now(&self, what: &What, also: &[String], typed: &str) -> Result<Case, Fault> {
         let (mut loaded, name) = self.loaded(what, "");
-        // One question needs no expectations, and no long run.
+        // A query needs no expectations, and no long run.
         let setup = Setup { also: Vec::new(), duration: Some(1.0), ..self.setup(what).clone() };
         let (cases, _) = self
             .compiled_in(&mut loaded, &name, &setup, also, true)
@@ -72,12 +72,12 @@ impl Session {
         Some(Ok(Value { si: value.0, unit: value.1, boolean: false }))
     }
 
-    /// Keeps a value for `ans`.
+    /// Stores a value for `ans`.
     pub fn answer(&mut self, value: &Value) {
         self.ans = Some(value.clone());
     }
 
-    /// The text with the last value in place of `ans`.
+    /// The text with `ans` replaced by the last value.
     pub(super) fn with_answer(&self, text: &str) -> Result<String, Fault> {
         let mut out = String::new();
         let mut after_dot = false;
@@ -94,7 +94,7 @@ impl Session {
         Ok(out)
     }
 
-    /// What kind of quantity fits in place of `?` in a line.
+    /// The dimension that fits in place of `?` in a line.
     pub fn wanted(&self, line: &str) -> Option<Dimension> {
         let what = self.meant(line).unwrap_or(What::Session);
         let (mut loaded, name) = self.loaded(&what, "");
@@ -104,21 +104,22 @@ impl Session {
         Unit::parse(&hole.labels.first()?.text).ok().map(|unit| unit.dimension)
     }
 
-    /// What can stand where: quantities of the instances, then those of what was run last.
+    /// Quantities for completion: those of the instances, then those of the last run.
     pub fn quantities(&self) -> impl Iterator<Item = &Listed> {
         let staged = self.stage.as_ref().map_or(&[][..], |(_, setup)| &setup.known);
         self.bench.known.iter().chain(staged)
     }
 
-    /// Every quantity of what is meant; none if it cannot be compiled as it stands.
+    /// Every quantity of `what`; empty if it does not compile in its present form.
     pub(super) fn listed(&self, what: &What, setup: &Setup) -> Arc<[Listed]> {
         let (mut loaded, name) = self.loaded(what, "");
         let changes = Changes { set: setup.set.clone(), unjudged: true, ..Changes::default() };
         compile::quantities(&mut loaded, &project::Disk, &name, &changes).unwrap_or_default().into()
     }
 
-    /// What is known of a quantity, a part, an experiment or a model: its explanation, and the path within it; none for a
-    /// model, empty for another whole. What was run last and the instances come before models of the same name.
+    /// Explains a quantity, a part, an experiment or a model: the explanation, and the path within it; no path for a
+    /// model, an empty one for another whole. The last run and the instances take precedence over models of the same
+    /// name.
     pub fn explained(&mut self, name: &str) -> Result<(Explanation, Option<String>), Fault> {
         let what = self.meant(name).unwrap_or_else(|| self.current());
         let known = self.setup(&what).known.clone();
@@ -165,7 +166,7 @@ impl Session {
 
     fn explained_run(&self, what: &What, typed: &str) -> Result<Explanation, Fault> {
         let (mut loaded, experiment) = self.loaded(what, "");
-        // Settings belong to what was run last, or to the instances.
+        // Settings belong to the last run, or to the instances.
         let set = match &self.stage {
             Some((staged, setup)) if staged == what => setup.set.clone(),
             _ if *what == What::Session => self.bench.set.clone(),
@@ -176,7 +177,7 @@ impl Session {
             .map_err(|errors| found(&loaded, &errors, typed, None))
     }
 
-    /// That there is no model of this name, and what there is instead.
+    /// The message that there is no model of this name, with suggestions.
     pub fn no_model(&self, name: &str) -> Fault {
         let known = self.quantities().any(|q| q.path == name || q.path.starts_with(&format!("{name}.")));
         Fault::Words(if self.experiments().iter().any(|experiment| experiment == name) {
@@ -192,7 +193,7 @@ impl Session {
         })
     }
 
-    /// The tree of a model that is visible, in the session or in a file in use.
+    /// The syntax tree of a visible model, from the session or from a file in use.
     pub fn model(&self, name: &str) -> Option<ast::Model> {
         let name = self.parts.iter().find(|part| part.name == name).map_or(name, |part| &part.instance);
         let name = &model_of(name);
@@ -204,18 +205,18 @@ impl Session {
         })
     }
 
-    /// Models and interfaces that are visible.
+    /// Visible models and interfaces.
     pub fn models(&self) -> Vec<String> {
         let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
         own.visible(own.root(), Space::Type).into_iter().map(str::to_string).collect()
     }
 
-    /// Names of instances, each with what it is.
+    /// Names of instances, each with its definition.
     pub fn instances(&self) -> Vec<(String, String)> {
         self.parts.iter().map(|part| (part.name.clone(), part.instance.clone())).collect()
     }
 
-    /// Where an experiment of this name stands: among the session's own, or in the file used last that has it.
+    /// The place of an experiment with this name: among the session's own, or in the file in use, last first.
     pub(super) fn experiment(&self, name: &str) -> Result<What, Fault> {
         let own = compile::load(TEXT, &self.items.join("\n"), &project::Disk);
         if own.experiments().iter().any(|experiment| experiment.name == name) {
@@ -235,7 +236,7 @@ impl Session {
         Err(Fault::Words(format!("there is no experiment or instance `{name}`; {help}")))
     }
 
-    /// What was run last besides the instances: its name, and its quantities that are no parameters.
+    /// The last run besides the instances: its name, and its quantities without parameters.
     pub fn staged(&self) -> Option<(String, Vec<String>)> {
         let (what, setup) = self.stage.as_ref()?;
         let name = match what {
@@ -265,7 +266,7 @@ impl Session {
         self.used.iter().rev().find(has).map(|used| used.path.clone())
     }
 
-    /// The files that a file in use consists of, on disk.
+    /// The files on disk that a file in use consists of.
     pub fn files_of(&self, path: &str) -> Vec<String> {
         let used = self.used.iter().find(|used| used.path == path);
         let files = used.map_or(Vec::new(), |used| used.loaded.files.0.clone());
@@ -296,7 +297,7 @@ impl<'a, I: Iterator<Item = &'a Used>> Experiments for I {
     }
 }
 
-/// An expression was handed over as `plot EXPR`: the report shows the expression alone.
+/// The expression was compiled as `plot EXPR`: the report shows only the expression.
 pub(super) fn unplot(mut files: Vec<SourceFile>, text: &str) -> Vec<SourceFile> {
     for file in files.iter_mut().filter(|file| file.text.strip_prefix("plot ") == Some(text)) {
         file.text = text.into();
@@ -304,7 +305,7 @@ pub(super) fn unplot(mut files: Vec<SourceFile>, text: &str) -> Vec<SourceFile> 
     files
 }
 
-/// Places in `plot EXPR` as places in the expression.
+/// Maps positions in `plot EXPR` to positions in the expression.
 pub(super) fn unplotted(errors: Vec<Diagnostic>) -> Vec<Diagnostic> {
     let moved = |mut error: Diagnostic| {
         for label in &mut error.labels {

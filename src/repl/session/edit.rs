@@ -1,7 +1,6 @@
-//! What changes a session: items, files in use, instances, settings.
+//! Changes to a session: items, files in use, instances, settings.
 //!
-//! In: lines as typed. Out: the session with what they say, or as it was if something is wrong with them. What changed is
-//! told in words.
+//! In: lines as typed. Out: the changed session, or the old one if a line has errors. Changes are described in words.
 
 use super::words::{counted, with_inputs};
 use super::{EXPERIMENT, Fault, MODEL, Part, Session, TEXT, Used, What, found, run};
@@ -14,7 +13,8 @@ use grammar::tokens::{TokenKind, tokens};
 use std::path::Path;
 
 impl Session {
-    /// Brings in the modules of the library that define what a line names and nothing here does; gives their names.
+    /// Imports the modules of the library that define the names of a line which are undefined here; returns their
+    /// names.
     pub fn bring_in(&mut self, line: &str) -> Vec<String> {
         let mut brought = Vec::new();
         for token in tokens(line).into_iter().filter(|token| token.kind == TokenKind::Word) {
@@ -39,7 +39,7 @@ impl Session {
         !matches!(loaded.find(loaded.root(), Space::Type, name), Lookup::Missing)
     }
 
-    /// Adds an item as typed; an earlier one of that name gives way. Gives what deserves a look.
+    /// Adds an item as typed; replaces an earlier one of the same name. Returns warnings.
     pub fn add_item(&mut self, item: &str) -> Result<Option<Fault>, Fault> {
         let mut next = self.clone();
         let head = |text: &str| -> Vec<String> {
@@ -64,7 +64,7 @@ impl Session {
         Ok((!warnings.is_empty()).then(|| found(&loaded, &warnings, item, Some(at))))
     }
 
-    /// Uses a file, or a module of the library: what it has, in words.
+    /// Uses a file, or a module of the library; describes its contents.
     pub fn add_file(&mut self, name: &str) -> Result<String, Fault> {
         let name = name.trim();
         let bare = name.trim_matches('"');
@@ -104,7 +104,7 @@ impl Session {
         Ok(words)
     }
 
-    /// Makes an instance, or puts another in its place: states go on by name and unit. Gives a line about it.
+    /// Creates an instance, or replaces one: states continue, matched by name and unit. Returns a line about it.
     pub fn add_part(&mut self, name: &str, instance: &str) -> Result<String, Fault> {
         let instance =
             if instance.contains('(') { instance.trim().to_string() } else { format!("{}()", instance.trim()) };
@@ -141,7 +141,7 @@ impl Session {
         let mut loaded = compile::load(TEXT, &text, &project::Disk);
         let case = next.compiled_in(&mut loaded, EXPERIMENT, &next.bench, &[], true);
         let (case, _) = case.map_err(|mut errors| {
-            // The library is as near as what is in use.
+            // Suggest models of the library as well as those in use.
             for error in errors.iter_mut().filter(|error| error.code == "E0201") {
                 if let Some(near) = compile::nearest(&model, library_models()) {
                     error.help = Some(format!("did you mean `{near}`?"));
@@ -166,7 +166,7 @@ impl Session {
         Ok(words)
     }
 
-    /// Sets a parameter, an input or a slot of an instance or of what was run last.
+    /// Sets a parameter, an input or a slot of an instance or of the last run.
     pub fn set(&mut self, path: &str, setting: &str) -> Result<(), Fault> {
         let what = self.meant(path);
         let Some(what) = what else {
@@ -199,7 +199,7 @@ impl Session {
         Ok(())
     }
 
-    /// Reads the files in use again.
+    /// Reloads the files in use.
     pub fn reload(&mut self) -> Result<(), Fault> {
         let mut next = self.clone();
         for used in &mut next.used {
@@ -216,14 +216,14 @@ impl Session {
     }
 }
 
-/// Whether something that was found is about the session's text, not about its model that is put together here.
+/// Whether a diagnostic is about the session's text, not about the model that is composed here.
 pub(super) fn concerns(loaded: &Loaded, found: &Diagnostic) -> bool {
     let text = &loaded.files.get(loaded.root()).text;
     let own = text.find(&format!("model {MODEL} {{")).unwrap_or(text.len());
     found.is_error() || (found.span().file == loaded.root() && (found.span().start as usize) < own)
 }
 
-/// Inputs of a model that must be given.
+/// Inputs of a model without a default.
 pub(super) fn open_inputs(model: &ast::Model) -> Vec<&str> {
     let inputs = model.body.iter().filter_map(|statement| match statement {
         Statement::Declaration(d) if d.kind == DeclarationKind::Input && d.value.is_none() => {

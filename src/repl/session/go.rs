@@ -1,7 +1,7 @@
-//! What runs: experiments and instances, single steps, curves over an input or a parameter.
+//! Execution: experiments and instances, single steps, curves over an input or a parameter.
 //!
-//! In: what to run, for how long, and who watches. Out: cases with what became of them, values after a step, curves.
-//! Where a run ends, the next step goes on.
+//! In: what to run, the duration, and a callback. Out: cases with their results, values after a step, curves. A step
+//! continues from the end of the last run.
 
 use super::words::{Value, rewired, unit_as_typed};
 use super::{Fault, Session, Setup, What, begin, found};
@@ -13,53 +13,53 @@ use abi::{Function, Instance, Slot};
 use runtime::engine::{self, Cause, Continue, Failure, Outcome};
 use runtime::engine::{equilibrium, sweep};
 
-/// The parameter over which a curve is drawn.
+/// The parameter along the horizontal axis of a curve.
 const SWEPT: &str = "swept";
 /// Points of a curve over a parameter or an input: odd, so that the middle is one.
 const POINTS: usize = 241;
-/// Most outputs that a run of instances draws by itself.
+/// Most outputs plotted by default for a run of instances.
 const MOST_DRAWN: usize = 6;
-/// Relative tolerance with which a model is brought to rest.
+/// Relative tolerance of the search for equilibrium.
 const STEADY_TOL: f64 = 1e-8;
 
-/// What was run: cases of the sweeps and what became of them.
+/// A run: the cases of its sweeps and their results.
 pub struct Ran {
     /// Its name in headings.
     pub name: String,
     /// Compiled cases.
     pub cases: Vec<Case>,
-    /// What became of each.
+    /// The result of each.
     pub results: Vec<Result<Outcome, Failure>>,
-    /// What deserves a look.
+    /// Warnings.
     pub warnings: Option<Fault>,
-    /// What was taken over from an earlier run.
+    /// What was carried over from an earlier run.
     pub carried: Option<abi::instance::Carried>,
 }
 
 /// A curve over an input or a parameter.
 pub struct Cut {
-    /// What was drawn, with labels and units.
+    /// The plotted series, with labels and units.
     pub series: Vec<Series>,
-    /// Over what, and its unit.
+    /// The horizontal quantity and its unit.
     pub over: (String, Unit),
     /// For each series its points in SI.
     pub curves: Vec<Vec<(f64, f64)>>,
 }
 
-/// One quantity after a step.
+/// A quantity after a step.
 pub struct Shown {
     /// Dotted path.
     pub path: String,
     /// `state`, `output`, …
     pub kind: &'static str,
-    /// Before, if it was another.
+    /// The value before, if it was different.
     pub before: Option<Value>,
     /// Now.
     pub now: Value,
 }
 
 impl Session {
-    /// Runs an experiment, an instance, `Model(…)`, or the last once more. `duration`: in s.
+    /// Runs an experiment, an instance, `Model(…)`, or repeats the last run. `duration`: in s.
     pub fn run(
         &mut self,
         name: &str,
@@ -87,7 +87,7 @@ impl Session {
         if setup.known.is_empty() {
             setup.known = self.listed(&what, &setup);
         }
-        // Instances have no plots of their own: their outputs are shown.
+        // Instances have no plots of their own: plot their outputs.
         let outputs: Vec<&str> =
             setup.known.iter().filter(|q| q.kind == "output").map(|q| q.path.as_str()).take(MOST_DRAWN).collect();
         let shows = match &what {
@@ -106,7 +106,7 @@ impl Session {
         Ok(ran.0)
     }
 
-    /// Runs with further statements, for their plots or expectations; they are kept if `keep` says so.
+    /// Repeats the run with further statements, for their plots or expectations; `keep`: they stay.
     pub fn again(
         &mut self,
         statement: &str,
@@ -126,7 +126,7 @@ impl Session {
         Ok(ran)
     }
 
-    /// Runs on from where an earlier run ended, after files have changed: `from` is where it was.
+    /// Continues after files have changed, from the state `from` where an earlier run ended.
     pub fn run_on(
         &mut self,
         name: &str,
@@ -193,7 +193,7 @@ impl Session {
         Ok((Ran { name, cases, results, warnings, carried }, live))
     }
 
-    /// One fixed step of `h` seconds by hand; gives the time and every quantity.
+    /// One fixed step of `h` seconds; returns the time and every quantity.
     pub fn step(&mut self, h: f64) -> Result<(f64, Vec<Shown>), Fault> {
         let what = self.current();
         if what == What::Session && self.parts.is_empty() {
@@ -244,7 +244,8 @@ impl Session {
         Ok((time, all))
     }
 
-    /// Draws expressions over an input or a parameter: with the states as they are, or `steady`, each point at rest.
+    /// Plots expressions over an input or a parameter: with the present states, or, if `steady`, at equilibrium for
+    /// each point.
     pub fn cut(
         &mut self,
         shows: &str,
@@ -280,7 +281,7 @@ impl Session {
                 (loaded, name, path.to_string(), setup)
             }
             ("input", Some((part, input))) if what == What::Session && !input.contains('.') => {
-                // The input is wired to a parameter of the session's own.
+                // The input is connected to a parameter of the session itself.
                 let mut wired = self.clone();
                 let part = wired.parts.iter_mut().find(|one| one.name == part).expect("it has this quantity");
                 part.instance = rewired(&part.instance, input, SWEPT);

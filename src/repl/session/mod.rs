@@ -1,8 +1,8 @@
-//! What a session knows, and what its lines mean to the compiler.
+//! The state of a session, and the compilation of its lines.
 //!
 //! In: lines, files in use. Out: values, runs, curves, or a [`Fault`]. The session is a text under construction:
-//! imports and items as typed, instances as parts of one model. Every question is an experiment on that text, or on a
-//! file in use, with further statements; so parser, checks and code are those of files.
+//! imports and items as typed, and instances as parts of one model. Every query is an experiment on that text, or on a
+//! file in use, with further statements; so parser, checks and code are the same as for files.
 
 mod words;
 
@@ -33,13 +33,13 @@ const TEXT: &str = "session";
 const MODEL: &str = "Session";
 const EXPERIMENT: &str = "session";
 
-/// Why a line cannot be done.
+/// Why a line failed.
 pub enum Fault {
-    /// Something is wrong with a text.
+    /// Diagnostics of a text.
     Found(Vec<SourceFile>, Vec<Diagnostic>),
     /// In words.
     Words(String),
-    /// A run that stopped before its end.
+    /// A run stopped before its end.
     Stopped(Box<Failure>),
 }
 
@@ -55,27 +55,27 @@ impl From<&str> for Fault {
     }
 }
 
-/// What is being run, stepped and changed.
+/// The subject of runs, steps and changes.
 #[derive(Clone, PartialEq, Debug)]
 enum What {
     /// The instances of the session.
     Session,
-    /// An experiment: the file in use it stands in, or none for the session's own items.
+    /// An experiment: the file in use that contains it, or none for the session's own items.
     Experiment(Option<usize>, String),
     /// `run Pull(k = 2 N/m) for 40 s`: the instance as typed.
     Typed(String),
 }
 
-/// What has been done to it.
+/// Changes made to it.
 #[derive(Clone, Default)]
 struct Setup {
     /// `fr.Fs = 2 N`, as typed.
     set: Vec<String>,
     /// `expect …`, as typed.
     also: Vec<String>,
-    /// How long it was run, in s.
+    /// Duration of its last run, in s.
     duration: Option<f64>,
-    /// Where it is now.
+    /// Its present state.
     live: Option<Instance>,
     /// Its quantities.
     known: Arc<[Listed]>,
@@ -87,7 +87,7 @@ struct Part {
     name: String,
     /// As typed.
     instance: String,
-    /// Inputs that nobody gave: they are 0.
+    /// Inputs without a value: they are 0.
     open: Vec<String>,
 }
 
@@ -107,19 +107,19 @@ pub struct Session {
     used: Vec<Used>,
     /// The instances.
     bench: Setup,
-    /// What was run last besides them, and what has been done to it.
+    /// The last run besides the instances, and its changes.
     stage: Option<(What, Setup)>,
-    /// Whether the line before spoke of the instances.
+    /// Whether the previous line was about the instances.
     at_bench: bool,
     ans: Option<Value>,
 }
 
-/// Texts that stand for what was typed, whatever the compiler calls them.
+/// Names that the compiler uses for typed texts.
 const TYPED: [&str; 2] = ["--set", "--also"];
-/// What is typed is called in reports.
+/// Name of typed text in reports.
 const INPUT: &str = "input";
 
-/// A fault that speaks of the line as typed. `at`: where the line stands in the session's text.
+/// A fault with positions in the line as typed. `at`: the offset of the line in the session's text.
 fn found(loaded: &Loaded, diagnostics: &[Diagnostic], typed: &str, at: Option<usize>) -> Fault {
     let mut files = loaded.files.0.clone();
     for file in files.iter_mut().filter(|file| TYPED.contains(&file.name.as_str())) {
@@ -142,7 +142,7 @@ fn found(loaded: &Loaded, diagnostics: &[Diagnostic], typed: &str, at: Option<us
     };
     let moved = diagnostics.iter().map(|diagnostic| {
         let labels = diagnostic.labels.iter().map(&moved).collect();
-        // The model that holds the instances is nobody's but ours.
+        // The model that holds the instances is internal: hide its name.
         let message = diagnostic.message.replace(&format!(" in {MODEL}"), " here");
         Diagnostic { labels, message, ..diagnostic.clone() }
     });
@@ -150,8 +150,8 @@ fn found(loaded: &Loaded, diagnostics: &[Diagnostic], typed: &str, at: Option<us
 }
 
 impl Session {
-    /// The text so far, with further lines in its model and another experiment; and where the last item and the last
-    /// part begin.
+    /// The text so far, with further lines in its model and another experiment; and the offsets of the last item and
+    /// the last part.
     fn text(&self, more: &str, experiment: &str) -> (String, usize, usize) {
         let mut text = String::new();
         let (mut item_at, mut part_at) = (0, 0);
@@ -171,7 +171,7 @@ impl Session {
         (text, item_at, part_at)
     }
 
-    /// What a line speaks of: instances if it names one, else what was run last.
+    /// The subject of a line: the instances if it names one, else the last run.
     fn meant(&self, text: &str) -> Option<What> {
         let mut after_dot = false;
         let mut words = false;
@@ -199,7 +199,7 @@ impl Session {
         })
     }
 
-    /// What a command without names speaks of.
+    /// The subject of a command without names.
     fn current(&self) -> What {
         match &self.stage {
             Some((what, _)) if !self.at_bench => what.clone(),
@@ -221,7 +221,7 @@ impl Session {
         }
     }
 
-    /// The text in which something stands, and the name of its experiment.
+    /// The text that contains the subject, and the name of its experiment.
     fn loaded(&self, what: &What, more: &str) -> (Loaded, String) {
         match what {
             What::Experiment(Some(file), name) => (self.used[*file].loaded.clone(), name.clone()),
@@ -237,8 +237,8 @@ impl Session {
         }
     }
 
-    /// Compiles an experiment with what has been done to it and further statements. A question is interpreted, and the
-    /// experiment's own expectations are left out of it.
+    /// Compiles an experiment with its changes and further statements. A query is interpreted, and the experiment's own
+    /// expectations are omitted.
     fn compiled_in(
         &self,
         loaded: &mut Loaded,
@@ -267,7 +267,7 @@ fn run(model: &str, duration: f64) -> String {
     format!("experiment {EXPERIMENT} {{\n  run {model}() for {duration} s\n}}")
 }
 
-/// Puts an instance where another is, or at its start, for steps of `h` seconds.
+/// Moves an instance to the state of another, or to its start, for steps of `h` seconds.
 fn begin(instance: &mut Instance, live: Option<&Instance>, h: f64) {
     instance.start(h);
     if let Some(live) = live {

@@ -1,6 +1,6 @@
-//! A session as a file that runs: what was run, what was set, what was expected.
+//! Saves a session as a runnable file: runs, settings, expectations.
 //!
-//! In: a session. Out: the text of an experiment, checked and laid out.
+//! In: a session. Out: the text of an experiment, checked and formatted.
 
 use super::{Fault, MODEL, Session, What, found};
 use crate::compile::{self, Loaded};
@@ -9,7 +9,7 @@ use grammar::ast::{self, Item};
 use grammar::diagnostic::Diagnostic;
 
 impl Session {
-    /// The session as a file: an experiment of this name that one can run and paste.
+    /// The session as a file: an experiment of this name.
     pub fn written(&self, name: &str) -> Result<String, Fault> {
         let what = self.current();
         let setup = self.setup(&what);
@@ -36,7 +36,7 @@ impl Session {
                 lines.extend(statements(&loaded, experiment, setup.duration));
             }
         }
-        // One value is a sweep of one.
+        // A setting becomes a sweep over one value.
         lines.extend(setup.set.iter().map(|set| format!("sweep {}", set.trim())));
         lines.extend(setup.also.iter().map(|also| also.trim().to_string()));
         text += &format!("\nexperiment {name} {{\n");
@@ -53,7 +53,7 @@ impl Session {
     }
 }
 
-/// Statements of an experiment as written, with another duration if there is one.
+/// Statements of an experiment as written, with the duration replaced if one is given.
 pub(super) fn statements(loaded: &Loaded, name: &str, duration: Option<f64>) -> Vec<String> {
     let file = loaded.files.get(loaded.root());
     let found = file.ast.items.iter().find_map(|item| match item {

@@ -1,4 +1,4 @@
-//! Values and instances as texts: as shown, and as they are put into a text again.
+//! Values and instances as texts: for display, and for insertion into a program.
 //!
 //! In: values, instances as typed. Out: texts. Knows no session.
 
@@ -6,24 +6,24 @@ use crate::quantity;
 use abi::unit::Unit;
 use grammar::span::FileId;
 
-/// A quantity, or whether something is true.
+/// A quantity or a truth value.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Value {
     /// In SI; 1 and 0 for true and false.
     pub si: f64,
-    /// The unit it is declared in, or that of SI.
+    /// The declared unit, or that of SI.
     pub unit: Unit,
-    /// Whether it is true or false.
+    /// Whether it is a truth value.
     pub boolean: bool,
 }
 
-/// A value in the unit that suits: `20 mN`, `1.5 µm`, `true`.
+/// A value in a suitable unit: `20 mN`, `1.5 µm`, `true`.
 pub fn plain(value: &Value) -> String {
     if value.boolean {
         return if value.si > 0.5 { "true".into() } else { "false".into() };
     }
     let unit = &value.unit;
-    // A unit that somebody chose stays; one of SI gets a prefix that makes the number handy.
+    // A declared unit stays; an SI unit gets a prefix of suitable size.
     if unit.scale == 1.0 && !unit.text.is_empty() && value.si != 0.0 && value.si.is_finite() {
         let size = value.si.abs();
         let prefixes = [("", 1.0), ("m", 1e-3), ("u", 1e-6), ("n", 1e-9), ("k", 1e3), ("M", 1e6), ("G", 1e9)];
@@ -39,7 +39,7 @@ pub fn plain(value: &Value) -> String {
     quantity::show(value.si, unit, 6)
 }
 
-/// A value as a text that reads as exactly that value.
+/// A value as a text that parses to exactly that value.
 pub(super) fn literal(value: &Value) -> String {
     if value.boolean {
         return if value.si > 0.5 { "true".into() } else { "false".into() };
@@ -51,7 +51,7 @@ pub(super) fn literal(value: &Value) -> String {
     if value.si < 0.0 { format!("(-{number}{space})") } else { format!("({number}{space})") }
 }
 
-/// The unit behind the number that a text begins with.
+/// The unit after the number at the beginning of a text.
 pub(super) fn unit_as_typed(text: &str) -> Option<Unit> {
     let text = text.trim().trim_start_matches('-').trim_start();
     quantity::parse(text).ok().map(|(_, unit)| unit).filter(|unit| !unit.text.is_empty())
@@ -70,7 +70,7 @@ pub(super) fn with_inputs<'a>(instance: &str, more: impl Iterator<Item = (&'a st
     format!("{before}{comma}{}{}", more.join(", "), &instance[close..])
 }
 
-/// An instance with another value for one argument.
+/// An instance with one argument replaced.
 pub(super) fn rewired(instance: &str, name: &str, value: &str) -> String {
     let (read, _) = grammar::parse::parse_instance(FileId(0), instance);
     let bound = read.and_then(|read| read.args.into_iter().find(|arg| arg.name.text == name));
@@ -82,7 +82,7 @@ pub(super) fn rewired(instance: &str, name: &str, value: &str) -> String {
     }
 }
 
-/// The model of an instance as written.
+/// The model name of an instance.
 pub(super) fn model_of(instance: &str) -> String {
     let written = instance.trim();
     let written = written.strip_prefix("rotary ").unwrap_or(written);
