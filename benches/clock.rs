@@ -1,6 +1,6 @@
-//! The clock of the benches.
+//! The clock of the benchmarks.
 
-/// Seconds this thread has had the processor: other programs count little.
+/// Processor time of this thread in s, which other programs affect little.
 pub fn processor_time() -> f64 {
     let now = nix::time::clock_gettime(nix::time::ClockId::CLOCK_THREAD_CPUTIME_ID).expect("a clock of this system");
     now.tv_sec() as f64 + 1e-9 * now.tv_nsec() as f64

@@ -1,6 +1,6 @@
-//! How long a text takes from its first character to its first step, by stage, in a warm process; and how long the whole
-//! library takes to be checked and compiled; and how both grow with the size of a program. Medians over some rounds of
-//! processor time; run with `cargo bench --bench compile`.
+//! Compile time of a text, from its first character to its first step, by stage, in a warm process; the time to check
+//! and compile the whole library; and how both grow with the size of a program. Medians of processor time over several
+//! rounds; run with `cargo bench --bench compile`.
 
 mod clock;
 
@@ -21,7 +21,7 @@ use std::sync::Arc;
 
 const ROUNDS: usize = 60;
 
-/// The PID servo with LuGre friction, as the library has it.
+/// The PID servo with LuGre friction from the library.
 const SERVO: &str = "import std.interfaces
 import std.friction
 import std.control
@@ -42,7 +42,7 @@ fn main() {
     elements();
 }
 
-/// Milliseconds of each stage, in the order in which they ran.
+/// Milliseconds of each stage, in order of execution.
 fn stages() {
     let mut all: Vec<(&'static str, Vec<f64>)> = Vec::new();
     for _ in 0..ROUNDS {
@@ -76,7 +76,7 @@ fn stages() {
     println!("  {:<12} {sum:8.3} ms", "together");
 }
 
-/// The whole library as one text, by what is done with it.
+/// The whole library as one text, by operation.
 fn library() {
     let modules = project::Disk.modules();
     let texts: Vec<(String, String)> =
@@ -105,7 +105,7 @@ fn library() {
     let built = |mut loaded: compiler::Loaded, work: &dyn Fn(&compiler::ir::program::Program)| {
         for model in &names {
             let (changes, mut warnings) = (Changes::default(), Vec::new());
-            // A model with an open slot cannot be run on its own.
+            // A model with an open slot cannot run alone.
             if let Ok(mut built) = compiler::build(&mut loaded, &NoSources, model, &changes, &mut warnings) {
                 built.program.size_rings(1e-3);
                 work(&built.program);
@@ -175,7 +175,7 @@ fn lines() {
     println!("checking a text of 1,000 equations: {:.1} ms", median(&mut times));
 }
 
-/// A chain of parts: checked, and made ready to run interpreted, which leaves out what code takes to be made.
+/// A chain of parts: checked, and prepared for the interpreter, which excludes code generation.
 fn parts() {
     println!("a chain of so many parts: checked, compiled for `expo` but for its machine code");
     for n in [10, 100, 1_000, 10_000] {
@@ -206,7 +206,7 @@ fn parts() {
     }
 }
 
-/// A model of so many LuGre elements side by side: its machine code and its steps, each by the element.
+/// A model of many parallel LuGre elements: time of its machine code and of its steps, per element.
 fn elements() {
     println!(
         "so many LuGre elements in one model: machine code of an `expo` step, a step of many in a call, one step a call"
@@ -234,7 +234,7 @@ fn elements() {
             let begin = processor_time();
             assert_eq!(instance.advance(steps), 0);
             stepped.push(1e9 * (processor_time() - begin) / (steps as f64 * f64::from(n)));
-            // As a rig does it: an input for each step, so that nothing is computed once for many.
+            // As in a rig: a new input for each step, so that nothing is computed once for many.
             let begin = processor_time();
             for _ in 0..steps {
                 assert_eq!(instance.advance(1), 0);

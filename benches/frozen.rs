@@ -1,7 +1,7 @@
-//! Hashes of everything that the back ends make of the library: what a change that only moves or renames must leave as it is.
+//! Hashes of everything that the back ends generate from the library: a refactoring must not change them.
 //!
-//! One line for each model and method: images for both processors, C, lanes of each width, as the first twelve digits of SHA-256.
-//! `cargo bench --bench frozen > before.txt`, and `diff` with the same after the change.
+//! One line for each model and method: images for both processors, C, and lanes of each width, as the first twelve
+//! digits of SHA-256. Run `cargo bench --bench frozen > before.txt`, and compare with `diff` after the change.
 
 #[path = "../src/project.rs"]
 #[allow(dead_code, unused_imports, reason = "the command uses more of it")]
@@ -38,7 +38,7 @@ fn main() {
     }
 }
 
-/// What each back end makes of a model, or the code of the first mistake, as of a model with an open slot.
+/// The output of each back end for a model; or the code of the first error, as for a model with an open slot.
 fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u8>>, String> {
     let mut loaded = load(name, text, &project::Disk);
     let changes =
@@ -71,7 +71,7 @@ fn made(name: &str, text: &str, model: &str, method: Method) -> Result<Vec<Vec<u
     Ok(all)
 }
 
-/// The beginning of a hash.
+/// The first digits of a hash.
 fn short(bytes: &[u8]) -> String {
     sha256(bytes).iter().take(6).map(|byte| format!("{byte:02x}")).collect()
 }

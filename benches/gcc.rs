@@ -1,4 +1,4 @@
-//! C written by hand, as a library: what generated code is measured against.
+//! Hand-written C as a shared library: the reference for generated code.
 
 use libloading::Library;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ pub fn built(source: &str) -> Library {
     library
 }
 
-/// The same in several places: behind so many bytes.
+/// The same at several offsets in bytes.
 pub fn built_at<const N: usize>(source: &str, leads: [usize; N]) -> [Library; N] {
     let object = room(source, "o");
     gcc("-c", &object, &["-O3", "-march=native", "-fPIC", "-Wall", "-Wextra", "-pedantic"], &[&in_benches(source)]);
@@ -30,7 +30,7 @@ fn in_benches(source: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(source)
 }
 
-/// What becomes of a source, by its ending.
+/// The path of a product of a source, by extension.
 fn room(source: &str, ending: &str) -> PathBuf {
     let name = in_benches(source).with_extension(ending);
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(name.file_name().expect("a source has a name"))

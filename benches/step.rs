@@ -1,5 +1,5 @@
-//! Time of one step of the PID servo with LuGre friction, at 10 µs: generated code, the interpreter, and C written by
-//! hand with `gcc -O3 -march=native`, side by side in one run. Ratios are medians over interleaved rounds.
+//! Time of one step of the PID servo with LuGre friction, at 10 µs: generated code, the interpreter, and hand-written C
+//! with `gcc -O3 -march=native`, interleaved in one run. Ratios are medians over rounds.
 
 mod gcc;
 
@@ -27,7 +27,7 @@ const PARAMS: [f64; 14] = [1.0, 1.0, 1e5, 316.0, 0.4, 1.0, 1.5, 1e-3, 3.0, 0.75,
 /// Step in s.
 const H: f64 = 1e-5;
 
-/// The servo; `watched`: with the guards that a model read from text has.
+/// The servo; `watched`: with the guards of a model compiled from text.
 fn servo(watched: bool) -> Program {
     let layout = Layout::new([14, 0, 5, 0, 0, 1, 5, 0, 30, 0]);
     let func = |name: &str| {
@@ -124,7 +124,7 @@ fn main() {
     contact(*unsafe { library.get::<Hand>(b"contact") }.expect("the function is in the source"));
 }
 
-/// The contact alone under a speed that is a function of time: only its state waits for itself.
+/// The contact alone with its speed as a function of time: only its state has a loop-carried dependency.
 fn contact(hand: Hand) {
     const TEXT: &str = "model Contact {
   param sigma0 = 1e5 N/m  param Fc = 1 N  param Fs = 1.5 N  param vs = 1 mm/s
@@ -161,7 +161,7 @@ fn contact(hand: Hand) {
     println!("  deflection at the end {z:.12e} m, of gcc {:.12e} m", state[0]);
 }
 
-/// Many instances, each with its own parameters, on one core: the code for lanes against C that runs one after the other.
+/// Many instances, each with its own parameters, on one core: code for lanes against C that runs one after the other.
 fn lanes(method: Method, name: &str, hand: Hand) {
     println!("{name}, many instances with their own parameters, on one core:");
     let program = servo(true);
@@ -176,7 +176,7 @@ fn lanes(method: Method, name: &str, hand: Hand) {
         }
     }
     let count = 2_000 / if method == Method::Rk4 { 4 } else { 1 };
-    // Parameters within 10 % of their own; the same for every code.
+    // Parameters within 10 % of the nominal ones; the same for every code.
     let varied = |instance: usize| {
         let mut params = PARAMS;
         for (k, param) in params.iter_mut().enumerate() {

@@ -1,4 +1,4 @@
-//! A compiled model as a file: what is loaded runs to the bit as what was compiled in memory, and what does not fit is
+//! Compiled models as files: a loaded model runs bit-identical to one compiled in memory, and an unsuitable file is
 //! refused.
 
 mod support;
@@ -23,7 +23,7 @@ experiment hunting {
 }
 ";
 
-/// The servo as an image for a target, and as it runs in memory.
+/// The servo as an image for a target, and as an instance in memory.
 fn servo(target: Target) -> (Image, Instance) {
     let sources = Texts::default();
     let mut loaded = compiler::load("servo.fric", SERVO, &sources);

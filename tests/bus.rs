@@ -1,4 +1,4 @@
-//! `fric bus`, `fric doctor` and `fric bench-rt` as a user meets them.
+//! `fric bus`, `fric doctor` and `fric bench-rt` from the user's view.
 
 use runtime::can::slcan::Slcan;
 use runtime::can::socketcand::Client;
@@ -12,7 +12,7 @@ fn fric(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_fric")).args(arguments).output().expect("fric starts")
 }
 
-/// A path of this run's own.
+/// A path unique to this run.
 fn scratch(name: &str) -> PathBuf {
     Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("bus-{name}-{}", std::process::id()))
 }
@@ -21,7 +21,7 @@ fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-/// Waits for a frame; the bus may say other things first.
+/// Waits for a frame; other frames may come first.
 fn expect(bus: &mut dyn Bus, clock: &Monotonic, frame: Frame) {
     let until_ns = clock.now_ns() + 20_000_000_000;
     while bus.wait(until_ns) {
@@ -55,7 +55,7 @@ fn two_doors_to_one_bus() {
     let mut serial = Slcan::open(&link, &options, clock).expect("the door is open");
     let mut tcp = Client::open("127.0.0.1", port, "can0", &options, clock).expect("the door is open");
     let (sync, answer) = (Frame::new(0x080, &[]), Frame::new(0x181, &[0x27, 6]));
-    // Behind the greetings there is a pause in which a client hears nothing.
+    // After the greetings there is a pause in which a client receives nothing.
     clock.sleep_until(clock.now_ns() + 200_000_000);
     serial.send(sync).expect("sent");
     expect(&mut tcp, &clock, sync);
@@ -124,7 +124,7 @@ fn the_machine_is_looked_at_and_measured() {
         assert!(page.lines().any(|line| line.starts_with(topic)), "{topic}: {page}");
     }
 
-    // What it measures is this machine's business; that it measures all cycles is ours.
+    // The results depend on this machine; only the number of cycles is checked.
     let measured = fric(&["bench-rt", "--rate", "100Hz", "--seconds", "1"]);
     let page = text(&measured.stdout);
     assert!(page.contains("100 cycles at 100 Hz: ") && page.contains("verdict: "), "{page}");

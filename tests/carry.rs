@@ -1,4 +1,4 @@
-//! One model takes the place of another while it runs: states, what is delayed and what is sampled go on.
+//! Replacing a model by another one during a run: states, delayed and sampled quantities continue.
 
 mod support;
 
@@ -25,7 +25,7 @@ experiment echo {
 }
 ";
 
-/// The model in fixed steps of `h` s with something set, at its start.
+/// The model in fixed steps of `h` s with some settings, at its start.
 fn echo(h: f64, set: &[&str]) -> Instance {
     let sources = Texts::default();
     let mut loaded = compiler::load("echo.fric", ECHO, &sources);
@@ -73,7 +73,7 @@ fn another_step_and_another_dead_time_read_the_same_past() {
     assert_eq!(old.advance(100), 0);
     for h in [0.5e-3, 2e-3] {
         let mut new = at_its_time(echo(h, &["T = 30 ms"]), &old, h);
-        // The dead time and the past are there at once: x moves 1 m in a second.
+        // Dead time and history take effect at once: x moves 1 m in a second.
         for k in 1..=40 {
             assert_eq!(new.advance(1), 0);
             close(value(&new, "y"), 0.1 + f64::from(k) * h - 0.03);
@@ -91,7 +91,7 @@ fn a_period_that_was_changed_counts() {
     assert_eq!(value(&new, "n") - before, 10.0);
 }
 
-/// Where time begins anew, there is no past: that is told.
+/// If time starts anew, there is no history: that is reported.
 #[test]
 fn a_past_behind_the_start_is_told_to_be_lost() {
     let mut old = echo(1e-3, &[]);

@@ -1,11 +1,11 @@
-//! The battery on models whose answers are known: published break-away forces, and the table of phenomena.
+//! The battery on models with known results: published break-away forces, and the table of phenomena.
 
 use serde_json::Value;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A folder of its own for one test, empty at its start.
+/// A folder for one test, empty at its start.
 fn folder(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
     let _ = fs::remove_dir_all(&path);
@@ -20,7 +20,7 @@ fn fric(folder: &Path, args: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What `--json` says of a model.
+/// The `--json` output for a model.
 fn answers(name: &str, model: &str) -> Value {
     let folder = folder(name);
     serde_json::from_str(&fric(&folder, &["characterise", model, "--json"])).unwrap()
@@ -34,7 +34,7 @@ fn number(answers: &Value, test: &str, name: &str) -> f64 {
     found.unwrap_or_else(|| panic!("no {name} in {test}"))["value"].as_f64().unwrap()
 }
 
-/// Verdicts in the order asked for: `+` shown, `-` not shown, `.` not applicable.
+/// Verdicts in the order of `keys`: `+` shown, `-` not shown, `.` not applicable.
 fn verdicts(answers: &Value, keys: &[&str]) -> String {
     let phenomena = answers["phenomena"].as_array().unwrap();
     let mark = |key: &&str| match phenomena.iter().find(|one| one["key"] == *key).unwrap()["seen"].as_str().unwrap() {
@@ -60,7 +60,7 @@ const TABLE: [&str; 8] = [
 #[test]
 fn lugre_breaks_away_as_published_and_drifts() {
     let lugre = answers("lugre", "LuGre");
-    // The published set; computed once with other code to four decimals.
+    // The published values; verified once with other code to four decimals.
     for (rate, force) in [("at 1 N/s", 1.4324), ("at 50 N/s", 1.0075)] {
         let seen = number(&lugre, "break_away", rate);
         assert!((seen - force).abs() < 1e-4, "{rate}: {seen}");
@@ -86,7 +86,7 @@ fn the_table_of_phenomena_is_what_the_catalogue_says() {
     assert_eq!(verdicts(&bliman_sorine, &TABLE), "++-+--++");
     let overshoot = |key| number(&bliman_sorine, "reversal", key);
     assert!((overshoot("reversal_overshoot") / overshoot("virgin_overshoot") - 2.0).abs() < 1e-3);
-    // Tustin's law as the paper uses it holds; the bare map jumps at rest and cannot.
+    // Tustin's law as used in the paper can hold; the bare map jumps at rest and cannot.
     assert_eq!(verdicts(&answers("tustin_held", "Sticking(law = Tustin())"), &TABLE), "+++-.--.");
     assert_eq!(verdicts(&answers("tustin", "Tustin"), &TABLE), "-++-.--.");
 }
@@ -94,7 +94,7 @@ fn the_table_of_phenomena_is_what_the_catalogue_says() {
 /// The models of the table that have presliding.
 #[test]
 fn the_table_of_phenomena_goes_on_with_bristles_and_elements() {
-    // Dahl's break-away force is the same at every rate: a mass that swings on the bristle has not broken away.
+    // Dahl's break-away force is the same at every rate: a mass that oscillates on the bristle has not broken away.
     let dahl = answers("dahl", "Dahl");
     assert_eq!(verdicts(&dahl, &TABLE), "+--+---+");
     // And it does not stick again: without a peak the mass only touches rest.
@@ -136,9 +136,9 @@ model Spring {
 }
 "#;
 
-/// Nothing in a page is fetched.
+/// A page loads nothing from outside.
 fn assert_self_contained(page: &str) {
-    // Names, and clips within the page itself.
+    // Allowed: namespace names, and clip paths within the page itself.
     let outside = page.replace("http://www.w3.org/2000/svg", "").replace("url(#", "");
     for request in ["http:", "https:", "src=", "<script", "<link", "<iframe", "<object", "@import", "url(", "//cdn"] {
         assert!(!outside.contains(request), "{request}");
@@ -155,15 +155,15 @@ fn a_users_model_gets_a_page_a_battery_and_tables() {
     assert!(page.contains("My first contact.") && page.contains("Coulomb friction"));
     assert_self_contained(&page);
     assert!(fs::read_to_string(folder.join("report/steady.csv")).unwrap().starts_with("curve,|v| [m/s],|F| [N]\n"));
-    // The battery is a text like any other.
+    // The battery is an ordinary text.
     let again = fric(&folder, &["run", "report/battery.fric", "hold", "--quiet", "--out", "again"]);
     assert_eq!(again, "");
-    // The same bytes once more.
+    // The same bytes again.
     fric(&folder, &["characterise", "mine.fric", "--set", "Fc=3N", "--out", "report"]);
     assert_eq!(fs::read_to_string(folder.join("report/report.html")).unwrap(), page);
 }
 
-/// A model that computes once a millisecond is stepped so that its ticks fall on whole steps.
+/// A model sampled once a millisecond has steps that divide its period.
 #[test]
 fn a_sampled_model_is_stepped_by_its_period() {
     let clip = answers("clip", "KFMClip");
@@ -195,7 +195,7 @@ fn models_share_axes_on_one_page() {
     assert_self_contained(&page);
 }
 
-/// What jumps to and fro at rest would hide the loops of the others.
+/// A force that jumps back and forth at rest would hide the loops of the others.
 #[test]
 fn a_model_that_chatters_is_not_drawn_over_others() {
     let folder = folder("chatters");
@@ -203,7 +203,7 @@ fn a_model_that_chatters_is_not_drawn_over_others() {
     let page = fs::read_to_string(folder.join("page/compare.html")).unwrap();
     assert!(page.contains("Coulomb is not drawn over x: at rest its force jumps to and fro"));
     assert_self_contained(&page);
-    // Numbers as people write them: no exponents among the verdicts and scales.
+    // Numbers in mathematical notation: no exponents among the verdicts and scales.
     let head = page.split("<h2>Tests</h2>").next().unwrap().split("</style>").nth(1).unwrap();
     let digit = |c: Option<char>| c.is_some_and(|c| c.is_ascii_digit());
     let exponents = head
@@ -212,7 +212,7 @@ fn a_model_that_chatters_is_not_drawn_over_others() {
     assert_eq!(exponents.count(), 0, "{head}");
 }
 
-/// Everything a command leaves behind, byte by byte, twice; a folder of its own for each time.
+/// All output files of a command, byte by byte, twice; in a new folder each time.
 #[test]
 fn two_runs_leave_the_same_bytes() {
     let text = "import std.interfaces\nimport std.friction\nimport std.bench\nimport std.plant\n\

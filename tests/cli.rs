@@ -1,4 +1,4 @@
-//! The command as a person or a script meets it: exit codes, what goes where, odd input, readers that go away.
+//! The command from the view of a user or a script: exit codes, output streams, odd input, closed pipes.
 
 use serde_json::Value;
 use std::fs;
@@ -6,7 +6,7 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-/// A model and three experiments: one that holds, one that does not, one that expects nothing.
+/// A model and three experiments: one that passes, one that fails, one without expectations.
 const PULL: &str = r#"
 model Contact {
   input  v [m/s]
@@ -45,7 +45,7 @@ experiment silent {
 }
 "#;
 
-/// A folder of its own for one test, empty at its start.
+/// A folder for one test, empty at its start.
 struct Folder(PathBuf);
 
 impl Folder {
@@ -71,7 +71,7 @@ impl Folder {
         self.fric(args).output().unwrap()
     }
 
-    /// Runs it and looks at the exit code and for words in what was said; gives both streams.
+    /// Runs the command and checks the exit code and for words in the output; returns both streams.
     #[track_caller]
     fn check(&self, args: &[&str], code: i32, words: &str) -> (String, String) {
         let output = self.run(args);
@@ -82,7 +82,7 @@ impl Folder {
         (out, err)
     }
 
-    /// Names of what lies in a folder below.
+    /// Names of the files in a subfolder.
     fn names(&self, below: &str) -> Vec<String> {
         let Ok(entries) = fs::read_dir(self.0.join(below)) else { return Vec::new() };
         let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
@@ -278,7 +278,7 @@ fn completions_and_the_man_page_are_printed() {
 #[test]
 fn colour_is_for_terminals_and_no_color_turns_it_off() {
     let folder = Folder::new("colour").with("words.fric", "once upon a time");
-    // `script` of util-linux gives a program a terminal; elsewhere there is nothing to see.
+    // `script` of util-linux provides a terminal; without it there is nothing to check.
     let on_terminal = |no_color: &str| {
         let line = format!("{} check words.fric", env!("CARGO_BIN_EXE_fric"));
         let mut command = Command::new("script");
@@ -321,7 +321,7 @@ fn a_sweep_is_one_figure_and_a_file_of_data_each() {
     let cases: Vec<Value> =
         out.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()["case"].take()).collect();
     assert_eq!(cases, ["k = 1 N/m", "k = 2 N/m"]);
-    // What is said from outside takes the place of the sweep.
+    // A setting on the command line replaces the sweep.
     let (out, _) = folder.check(&["run", "pull.fric", "sweeps", "--json", "--set", "k=3 N/m"], 0, "");
     assert_eq!(out.lines().count(), 1, "{out}");
 }
@@ -348,8 +348,8 @@ fn a_model_can_be_taken_away() {
     assert!(!folder.0.join("x").exists());
 }
 
-/// Listings name the places of the block, hold one function after the other, and show the code that runs: expanded, fused,
-/// without a call but of the function itself for more than one iteration.
+/// Listings name the slots of the block, contain one function after the other, and show the code that runs: expanded,
+/// fused, without calls except of the function itself for more than one iteration.
 #[test]
 fn what_is_made_on_the_way_can_be_read() {
     let folder = Folder::new("listings").with("pull.fric", PULL);
@@ -362,7 +362,7 @@ fn what_is_made_on_the_way_can_be_read() {
             let all = ["build", "pull.fric", name, "--emit", emit, "--solver", method];
             folder.check(&[&all[..], more].concat(), 0, "").0
         };
-        // The place of the state x, as the heading tells it.
+        // The address of the state x, from the header.
         let place = |text: &str, what: &str| -> usize {
             let line = text.lines().find(|line| line.starts_with(';') && line.ends_with(what));
             let line = line.unwrap_or_else(|| panic!("no place of {what}: {text}"));
@@ -417,7 +417,7 @@ fn what_is_made_on_the_way_can_be_read() {
             assert!(returns >= functions.len(), "each function ends: {asm}");
         }
     }
-    // A short single step has no frame, and no part of Cranelift's; on 64-bit Arm it has.
+    // On x86-64 a short single step has no frame, and no code of Cranelift; on 64-bit Arm it has.
     let law = "model Law {\n  input  v [m/s]\n  param  Fc = 1 N\n  output F [N] = Fc * sign(v) + 3 N\n}\n";
     let folder = folder.with("law.fric", law);
     let (asm, _) = folder.check(&["build", "law.fric", "--emit", "asm", "--target", "x86_64"], 0, "");
@@ -425,14 +425,14 @@ fn what_is_made_on_the_way_can_be_read() {
     let (single, _) = single.split_once("; any number of iterations\n").expect("and all others");
     let lines: Vec<&str> = single.lines().collect();
     assert_eq!((lines[0], lines[1]), ("  cmp $1, %rdx", "  jne (to any number of iterations)"), "{asm}");
-    // What watches leaves the status behind: 0.
+    // The guards return the status 0.
     let end = ["  test %rax, %rax", "  jne (to any number of iterations)", "  ret"];
     assert!(lines.len() < 25 && lines.ends_with(&end), "{single}");
     assert!(lines.iter().any(|line| line.contains("(%rip)") && line.ends_with("  ; 3.0")), "{single}");
     let clif = |target| folder.check(&["build", "law.fric", "--emit", "clif", "--target", target], 0, "").0;
     assert!(clif("x86_64").contains("; one iteration is not Cranelift's"));
     assert!(clif("aarch64").contains("; one iteration, or go on to more"));
-    // What reads the past is kept in steps.
+    // Delays are stored in steps.
     let late = "model Late {\n  input  u [N]\n  output y [N] = delay(u, 5 ms)\n}\n";
     let folder = folder.with("late.fric", late);
     for emit in ["ir", "c", "asm"] {
@@ -480,7 +480,8 @@ fn files_that_would_hold_nothing_are_refused() {
     folder.check(&["run", "pull.fric", "breaks", "--out", "a"], 1, "nothing to write: the experiment has no `plot`");
 }
 
-/// A text may be a pipe, for somebody writes to it; what a text names must be a file, or everybody waits.
+/// A text on the command line may be a pipe, because another process writes to it; an import must be a file, or the
+/// command would block.
 #[test]
 fn a_text_that_names_a_pipe_is_refused_at_once() {
     let data = "model M { input v [m/s]  output y [m/s] = v }\n\
@@ -524,7 +525,7 @@ experiment fine {
 }
 "#;
     let folder = Folder::new("undecided").with("decay.fric", text);
-    // By ten steps x is 0.349 m, in truth 0.368 m.
+    // With ten steps x is 0.349 m, exactly 0.368 m.
     let (out, _) = folder.check(&["run", "decay.fric", "coarse"], 1, "undecided: the error");
     assert!(out.contains("discretisation by adaptive runs, tol 1e-8 and 1e-10, and steps of 50 ms and 25 ms"), "{out}");
     folder.check(&["run", "decay.fric", "coarse", "--no-error"], 0, "348.678 mm, margin");
@@ -539,7 +540,7 @@ experiment fine {
     assert!((value - truth).abs() < 1.5 * error && error < 3.0 * (value - truth).abs(), "{value} {error}");
     let companions = ["adaptive tol 1e-8", "adaptive tol 1e-10", "euler step 50 ms", "euler step 25 ms"];
     assert_eq!(objects[0]["errors"]["companions"], serde_json::json!(companions));
-    // What decides does.
+    // The solver that is reported to decide does.
     let decides = objects[0]["errors"]["decides"].as_str().map(|s| s.replace("euler step ", "").replace(' ', ""));
     if let Some(step) = decides {
         let (out, _) = folder.check(&["run", "decay.fric", "coarse", "--step", &step], 1, "");
@@ -554,7 +555,8 @@ experiment fine {
     assert!(out.contains("735.758882"), "{out}");
 }
 
-/// Numbers without a unit that a sweep varies: how many parts there are is compiled in, and a state starts from one.
+/// Varied numbers without a unit: one determines the number of parts, which is compiled in, and another an initial
+/// state.
 #[test]
 fn a_sweep_varies_plain_numbers() {
     let text = r#"
@@ -587,7 +589,7 @@ experiment it {
     }
 }
 
-/// A measure made of measures is shown in their unit, an integral of a power as an energy.
+/// A measure composed of measures is shown in their unit, an integral of a power as an energy.
 #[test]
 fn measures_are_shown_in_their_own_units() {
     let text = r#"

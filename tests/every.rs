@@ -1,4 +1,4 @@
-//! Rows on an even grid lie on the course of the run: grids of other distances agree to the bit where they meet, measures
+//! Rows on an even grid agree with the run: grids of different intervals agree to the bit at common instants, measures
 //! at these instants agree, and rows of fixed steps are its steps. `FRIC_SEED`, `FRIC_RUNS` (default 40).
 
 mod support;
@@ -24,8 +24,8 @@ fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
     recording.rows().map(<[f64]>::to_vec).collect()
 }
 
-/// Mutants tried by hand: rows of fixed steps come one step late (red in case 0 of seed 1), rows of adaptive runs are the end of
-/// the step in place of a point of its polynomial (case 2).
+/// Mutants tried by hand: rows of fixed steps come one step late (fails in case 0 of seed 1); rows of adaptive runs are
+/// the end of the step in place of a point of its polynomial (case 2).
 #[test]
 fn rows_lie_on_the_course_of_the_run() {
     let from =

@@ -1,9 +1,9 @@
-//! The library, the examples and the library's own tests: every text checks, is in its canonical layout, and does what
-//! it expects.
+//! The library, the examples and the library's own tests: every text passes `check`, is in canonical layout, and meets
+//! its expectations.
 
 use std::process::Command;
 
-/// Runs `fric` on folders and expects it to be content.
+/// Runs `fric` on folders and expects success.
 fn check(args: &[&str]) {
     let output = Command::new(env!("CARGO_BIN_EXE_fric"))
         .args(args)

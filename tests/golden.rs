@@ -1,10 +1,10 @@
-//! Golden messages: `fric check CODE.fric` prints `CODE.txt` to the letter, and nothing else.
+//! Golden messages: `fric check CODE.fric` prints exactly `CODE.txt`.
 
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
 
-/// What `fric check` says about a text, without the line that counts.
+/// The output of `fric check` for a text, without the summary line.
 fn said(folder: &PathBuf, code: &str) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fric"));
     let output =

@@ -1,4 +1,5 @@
-//! Rigs under way: the example against simulated drives, its log, its replay, kills, and what a cycle must not do.
+//! Rigs in operation: the example with simulated drives, its log, its replay, killed processes, and restrictions on a
+//! cycle.
 
 #![allow(clippy::disallowed_methods, reason = "tests compare with the platform's functions")]
 
@@ -23,12 +24,12 @@ fn ready(set: &[&str]) -> Ready {
     rig_of("rtfs.fric", "rtfs", set)
 }
 
-/// A rig of a text beside the example.
+/// A rig from a text beside the example.
 fn rig_of(file: &str, rig: &str, set: &[&str]) -> Ready {
     rig_in(file, &fs::read_to_string(root().join("examples/rtfs").join(file)).unwrap(), rig, set)
 }
 
-/// A rig of this text, as if it lay there.
+/// A rig from this text, as if it were stored there.
 fn rig_in(file: &str, text: &str, rig: &str, set: &[&str]) -> Ready {
     let dbc = fs::read_to_string(root().join("examples/rtfs/shaft.dbc")).unwrap();
     let sources = Texts(vec![("shaft.dbc".into(), dbc)]);
@@ -50,7 +51,7 @@ fn started(ready: Ready, seconds: f64) -> (Hil, World, Rig) {
     (hil, world, rig)
 }
 
-/// True positions of the servo, one a cycle, while the model runs.
+/// True positions of the servo, one per cycle, while the model runs.
 fn course(mut hil: Hil, world: &World) -> (Vec<f64>, End) {
     let mut all = Vec::new();
     loop {
@@ -72,7 +73,7 @@ fn the_example_hunts_on_simulated_drives_as_it_does_without_them() {
     assert_eq!(x.len(), 60_000);
     let late = &x[40_000..];
     let (least, greatest) = late.iter().fold((f64::MAX, f64::MIN), |(a, b), x| (a.min(*x), b.max(*x)));
-    // The dry run of the example expects some 89 mrad after 40 s.
+    // The SIL run of the example expects about 89 mrad after 40 s.
     assert!(greatest - least > 0.05, "peak to peak {} rad", greatest - least);
     assert!((least + greatest - 2.0).abs() < 0.1, "around 1 rad: {least} .. {greatest}");
 }
@@ -88,7 +89,7 @@ fn another_model_is_put_on_the_shaft() {
     }
 }
 
-/// One row a cycle of what a rig records, and of its readings, while the model runs.
+/// The recorded signals of a rig and its readings, one row per cycle, while the model runs.
 fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Vec<f64>)> {
     let mut world = World::new(&ready.rig, Some(ready.plant), Pace::Fast, 1).unwrap();
     let mut options =
@@ -112,7 +113,7 @@ fn recorded(ready: Ready, seconds: f64, signals: &[Signal]) -> Vec<(Vec<f64>, Ve
     }
 }
 
-/// F(v) as the load drive gives it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow turning.
+/// F(v) as the load drive applies it, against LuGre's own: g(v) sgn(v) + σ1 exp(−(v/vd)²) … + σ2 v for slow rotation.
 #[test]
 fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
     let torque = Signal { node: 0, what: What::Torque };
@@ -122,7 +123,7 @@ fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
     let (mut worst, mut compared) = (0f64, 0);
     for (_, read) in &rows[10_000..] {
         let (v, friction) = (read[0], -read[1]);
-        // Behind a turning point the bristles go from one side to the other within 2 z = 3 mrad: at 0.157 rad/s² that is
+        // After a reversal the bristles move from one side to the other within 2 z = 3 mrad: at 0.157 rad/s² that is
         // over, several times, when 0.05 rad/s is reached.
         if v.abs() < 0.05 {
             continue;
@@ -134,7 +135,8 @@ fn the_characteristic_measured_on_the_rig_is_that_of_the_model() {
     }
     assert!(compared > 20_000, "{compared}");
     assert!(worst < 0.02, "measured and own friction differ by up to {} %", 100.0 * worst);
-    // T_friction against T_ref: what the drive says it applies is what it was told, but for its step of 4 mN·m and its lag.
+    // T_friction against T_ref: the drive reports the commanded torque, except for its resolution of 4 mN·m and its
+    // lag.
     let apart = rows[10_000..].iter().map(|(series, read)| (series[1] + read[1]).powi(2)).sum::<f64>();
     let rms = (apart / 30_000.0).sqrt();
     assert!(rms < 0.02, "{rms} N·m between asked and applied");
@@ -152,8 +154,8 @@ fn an_observer_of_the_friction_makes_the_servo_follow() {
     assert!(with < without / 50.0, "{with} rad with it, {without} without");
 }
 
-/// The rig of `stick_slip.fric` with the contact itself on its shaft: what a drive that plays the contact is measured by.
-/// The servo pulls as there, as late and through the same encoder; the load drive gives nothing.
+/// The rig of `stick_slip.fric` with the contact itself on its shaft: the reference for a drive that emulates the
+/// contact. The servo pulls as in the rig, with the same delay and the same encoder; the load drive applies no torque.
 const UNBROKEN: &str = "
 model Rubbed {
   input  F_motor [N]
@@ -193,8 +195,8 @@ rig unbroken {
 }
 ";
 
-/// Torque of the contact on the shaft once a cycle, from the first of the model on, and how often it slipped. `known`:
-/// whether the look ahead is told of the pull.
+/// Torque of the contact on the shaft once per cycle, from the first cycle of the model on, and how often it slipped.
+/// `known`: whether the predictor knows the pull.
 fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
     let text = fs::read_to_string(root().join("examples/rtfs/stick_slip.fric")).unwrap() + UNBROKEN;
     let made = rig_in("stick_slip.fric", &text, rig, &[&format!("load.delay = {delay_ms} ms")]);
@@ -207,7 +209,7 @@ fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
     let mut options =
         HilOptions { arms_itself: true, duration_ns: Some(20_000_000_000), look, ..HilOptions::default() };
     options.control.ramp_ns = 1;
-    // The push of the sign test would leave the block somewhere else.
+    // The push of the polarity check would move the block.
     options.start.sign_test = runtime::drive::polarity_check::SignTest::Skip;
     let masters = world.masters();
     let (mut hil, _) = Hil::new(&made.rig, made.control, world.clock(), masters, options, None).unwrap();
@@ -229,8 +231,8 @@ fn pulled(rig: &str, delay_ms: f64, known: bool) -> (Vec<f64>, u32) {
     }
 }
 
-/// What a late drive does to stick and slip, and what looking ahead saves: rms error of the friction in % of F_C. 2 ms in
-/// the suite; `FRIC_TABLE=1` prints the table of docs/prediction.md.
+/// The effect of a late drive on stick-slip, and the improvement by the predictor: rms error of the friction in % of
+/// F_C. 2 ms in the test suite; `FRIC_TABLE=1` prints the table of docs/prediction.md.
 #[test]
 fn friction_is_right_at_2_ms_of_delay_when_commands_look_ahead() {
     let (own, slips) = pulled("unbroken", 2.0, true);
@@ -255,7 +257,7 @@ fn friction_is_right_at_2_ms_of_delay_when_commands_look_ahead() {
     }
 }
 
-/// The limit that `fric predict` finds from the compiled step is where the rig begins to chatter, within 5 %.
+/// The limit that `fric predict` computes from the compiled step is where the rig begins to chatter, within 5 %.
 #[test]
 fn the_predicted_limit_is_where_the_simulated_rig_begins_to_chatter() {
     let folder = folder("hil-onset");
@@ -266,7 +268,7 @@ fn the_predicted_limit_is_where_the_simulated_rig_begins_to_chatter() {
         said[from..].split([',', '}']).next().unwrap().parse().unwrap()
     };
     let (tau, margin) = (number("\"tau\":"), number("\"delay_margin\":"));
-    // Total delay of the formula: 2.25 ms; of the discrete loop 2.37.
+    // Total delay by the formula: 2.25 ms; for the discrete loop 2.37.
     assert!((tau + margin - 2.37e-3).abs() < 0.03e-3, "{tau} + {margin}");
     // Ripple of the speed while the spring winds up, 3 to 4 s after the start.
     let ripple = |part: f64| {
@@ -277,7 +279,7 @@ fn the_predicted_limit_is_where_the_simulated_rig_begins_to_chatter() {
         (smooth / held.len() as f64).sqrt()
     };
     let (below, above) = (ripple(0.95), ripple(1.05));
-    // Below, what is left is the noise of the speed's steps.
+    // Below the limit, only the noise of the speed's resolution remains.
     assert!(above > 3.0 * below, "ripple of the torque {below} below, {above} N·m above the limit");
 }
 
@@ -339,7 +341,7 @@ fn a_run_leaves_a_log_that_replays_and_two_equal_runs_leave_equal_logs() {
     assert!(csv.lines().count() > 5000);
     let frames = fs::read_to_string(folder.join("a.log")).unwrap();
     assert!(frames.lines().any(|line| line.ends_with(" can0 080#")), "SYNC");
-    // A flipped bit and a cut are noticed.
+    // A flipped bit and a truncation are detected.
     let mut flipped = a.clone();
     let middle = flipped.len() / 2;
     flipped[middle] ^= 4;
@@ -393,7 +395,7 @@ fn what_the_drives_are_like_is_measured() {
         let rest = &line[line.find(after).unwrap() + after.len()..];
         rest.trim_start().split(' ').next().unwrap().parse().unwrap()
     };
-    // 0.8 and 0.6 ms in the text of the rig; a command is some 0.1 ms on the bus.
+    // 0.8 and 0.6 ms in the text of the rig; a command takes about 0.1 ms on the bus.
     assert!((0.6..1.1).contains(&number("delay =")), "{line}");
     assert!((0.5..0.7).contains(&number("lag =")), "{line}");
     assert!((0.011..0.013).contains(&number("inertia")), "{line}");
@@ -448,7 +450,7 @@ rig bench {
 }
 ";
 
-/// A drive described by frames announces nothing: it cannot prove to be simulated.
+/// A drive described by frames identifies itself by nothing: it cannot prove to be simulated.
 #[test]
 fn options_for_simulated_drives_are_refused_to_a_drive_that_proves_nothing() {
     let folder = folder("hil-permissions");
@@ -473,7 +475,7 @@ fn options_for_simulated_drives_are_refused_to_a_drive_that_proves_nothing() {
     served.wait().unwrap();
 }
 
-/// A run at the pace of the wall that counts what this machine misses, once its log is there.
+/// A real-time run that counts overruns of this machine, once its log exists.
 fn under_way(folder: &Path, log: &str) -> std::process::Child {
     let example = example();
     let mut command = fric(folder, &["hil", "--sim", "--count-overruns", "--roll", "40kB", "--log", log, &example]);
@@ -538,8 +540,8 @@ fn parameters_change_while_it_runs_and_the_log_knows() {
     assert!(said.contains("agree to the bit"), "{said}");
 }
 
-/// The stability of a contact is judged with the values of a set as at a start, and before a package leaves. `FRIC_SEED`
-/// gives other stiffnesses, `FRIC_RUNS` more of them.
+/// The stability of a contact is checked with the values of a set as at a start, and before a package is built.
+/// `FRIC_SEED` selects other stiffnesses, `FRIC_RUNS` more of them.
 #[test]
 fn a_set_is_refused_where_a_start_and_a_package_would_be() {
     let folder = folder("hil-set-stability");
@@ -553,7 +555,7 @@ fn a_set_is_refused_where_a_start_and_a_package_would_be() {
     for stiffness in &stiffnesses {
         writeln!(stdin, "set fr.sigma0 = {stiffness}").unwrap();
     }
-    // Lines are carried out in their order: after this one all sets are answered.
+    // Lines are executed in order: after this one all sets have been answered.
     writeln!(stdin, "set fr.Fz = 1 N·m").unwrap();
     let mut errors = String::new();
     let mut lines = std::io::BufReader::new(child.stderr.take().unwrap()).lines();
@@ -585,12 +587,12 @@ fn a_set_is_refused_where_a_start_and_a_package_would_be() {
     assert!(number("FRIC_SEED", 22) != 22 || counts.iter().all(|count| *count > 0), "{counts:?}");
 }
 
-/// Files of a log, the first one first.
+/// The files of a log, the first one first.
 fn parts_of(first: &Path) -> Vec<PathBuf> {
     (1..).map(|number| runtime::record::parts::path(first, number)).take_while(|path| path.exists()).collect()
 }
 
-/// The words of a message take 8 bytes each, and one more word: what a log held before it was packed.
+/// The words of a message take 8 bytes each, plus one word: the size of an uncompressed log.
 #[test]
 fn a_log_takes_a_quarter_of_its_words_goes_on_in_further_files_and_replays_through_them() {
     let folder = folder("hil-roll");
@@ -609,7 +611,7 @@ fn a_log_takes_a_quarter_of_its_words_goes_on_in_further_files_and_replays_throu
         words += message.words.len() + 1;
     }
     let packed: u64 = a.iter().map(|path| fs::metadata(path).unwrap().len()).sum();
-    // Heads, with the texts of rig and library in each file, are among them.
+    // This includes the heads, with the texts of rig and library in each file.
     assert!(packed * 4 <= 8 * words as u64, "{packed} of {} bytes", 8 * words);
     let cycles = |log: &Path| -> u64 {
         let said = run(&folder, &["replay", log.to_str().unwrap()], 0);
@@ -653,7 +655,7 @@ fn simulated_time_without_an_end_is_wrong_usage() {
     assert!(!folder.join("out").exists(), "nothing was begun");
 }
 
-/// `FRIC_KILLS` says how often; 200 is the full measure.
+/// `FRIC_KILLS`: how often; 200 for the full test.
 #[test]
 fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
     let folder = folder("hil-kill");
@@ -669,7 +671,7 @@ fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
         child.wait().unwrap();
         let said = run(&folder, &["replay", &log, "--csv", "killed.csv"], 0);
         assert!(said.contains("agree to the bit"), "{said}");
-        // When the rig was started, by the wall; and when the last cycle of the log was due, since then.
+        // The wall-clock time of the rig's start, and the time since then at which the last cycle of the log was due.
         let started = runtime::record::log::Reader::open(&path).unwrap().head.text("started").unwrap().to_string();
         let started: f64 = started.split(' ').next().unwrap().parse().unwrap();
         let csv = fs::read_to_string(folder.join("killed.csv")).unwrap();
@@ -680,7 +682,7 @@ fn a_log_of_a_killed_run_lacks_less_than_the_last_second() {
     }
 }
 
-/// `FRIC_SOAK` says how many cycles; 3,600,000 is the full measure.
+/// `FRIC_SOAK`: how many cycles; 3,600,000 for the full test.
 #[test]
 fn a_long_run_misses_nothing_and_its_memory_stays_as_it_is() {
     let cycles = std::env::var("FRIC_SOAK").ok().and_then(|text| text.parse().ok()).unwrap_or(60_000u64);

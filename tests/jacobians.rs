@@ -1,6 +1,6 @@
-//! The compiled Jacobian of every experiment of the library against central differences of its own derivatives, on points
-//! made of chance about where it starts. A kink within reach of a difference shows, since halving it changes much: such an
-//! entry is not compared.
+//! The compiled Jacobian of every experiment of the library against central differences of its own derivatives, at
+//! random points around its start. A kink within the width of a difference is detected, because halving the width
+//! changes the result much: such an entry is not compared.
 
 mod support;
 
@@ -96,7 +96,7 @@ fn compare(name: &str, program: &Program, random: &mut Random, tally: &mut Tally
             let ((wide, f), (narrow, _)) = (difference(by), difference(0.5 * by));
             for row in 0..n {
                 let known = entry(row, column);
-                // Richardson: the two of order two give one of order four.
+                // Richardson extrapolation: two differences of order two give one of order four.
                 let limit = (4.0 * narrow[row] - wide[row]) / 3.0;
                 let rounding = 1e-13 * f[row].abs() / by;
                 let size = limit.abs().max(known.abs());

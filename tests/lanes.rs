@@ -1,5 +1,5 @@
-//! Runs in lanes are those that each would be alone: measures, final values, numbers of steps and reasons to stop, to the
-//! bit, whatever the solver, however often somebody looks, and with whom they share their lanes.
+//! Runs in lanes are bit-identical to single runs: measures, final values, numbers of steps and reasons to stop, for
+//! any solver, any frequency of callbacks, and any runs in the other lanes.
 
 mod support;
 
@@ -47,7 +47,7 @@ experiment held    { run Pull(fr = KFM()) for 10 s  expect final(x) > 0 m }
 experiment sampled { run Sampled() for 2 s  expect final(x) > -10 m }
 "#;
 
-/// The experiment by this solver, with one parameter open.
+/// The experiment with this solver, with one parameter variable.
 fn varying(experiment: &str, path: &str, solver: Option<(Method, f64)>) -> Varying {
     let mut loaded = compiler::load("lanes.fric", TEXT, &Texts::default());
     let (method, step) = solver.unzip();
@@ -67,7 +67,7 @@ fn compare(varying: &Varying, path: &str, runs: usize, low: f64, by: f64) -> usi
     in_lanes_and_alone(varying, path, &values).iter().filter(|outcome| outcome.is_err()).count()
 }
 
-/// A run with each of these values, in SI: together in lanes, and each alone with the same result to the bit.
+/// A run with each of these values, in SI: together in lanes, and each alone; the results must agree to the bit.
 fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Result<Outcome, Failure>> {
     let runs = values.len();
     let slot = varying.param(path).expect("it is a parameter").slot;
@@ -77,7 +77,7 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
     let mut left = 0..runs;
     let mut put_off = false;
     let mut next = |busy: bool| {
-        // Now and then there is nothing to do yet.
+        // Sometimes no run is available yet.
         put_off = busy && !put_off;
         if put_off {
             return Next::Later;
@@ -99,10 +99,11 @@ fn in_lanes_and_alone(varying: &Varying, path: &str, values: &[f64]) -> Vec<Resu
     all
 }
 
-/// A start value that changes from lane to lane is one given with `--set`, to the bit: states of all kinds, all methods.
+/// An initial value that varies from lane to lane equals one given with `--set`, to the bit: states of all kinds, all
+/// methods.
 ///
-/// Mutants tried by hand, each red with seed 1: every run of a sweep starts where the first one does (`fit`); the start value as
-/// written stays although it is varied; sampled states cannot be varied (`starts::open`).
+/// Mutants tried by hand, each fails with seed 1: every run of a sweep starts where the first one does (`fit`); the
+/// initial value stays as written although it is varied; sampled states cannot be varied (`starts::open`).
 #[test]
 fn start_values_share_their_lanes() {
     let from =

@@ -1,17 +1,17 @@
 //! The language, case by case: `tests/lang/*.fric`.
 //!
-//! A file holds many cases, each under its name: `--- symptom check ---` is a text that is only looked at,
-//! `--- symptom run ---` one whose experiments must also hold, on every back end with the same bits. Behind the text
-//! stands what is expected:
+//! A file contains many cases, each with a name: `--- symptom check ---` is a text that is only checked, `--- symptom
+//! run ---` one whose experiments must also pass, with the same bits on every back end. After the text comes the
+//! expected result:
 //!
 //! ```text
-//! //~ ok                                           nothing is wrong, every `expect` holds
-//! //~ 2:18 E0101 cannot add a force and a velocity place, code, message
-//! //~ fails NAME: `F` is not a number at 0 s       an experiment that stops, or what it expects and does not get
+//! //~ ok                                           no diagnostics, every `expect` holds
+//! //~ 2:18 E0101 cannot add a force and a velocity position, code, message
+//! //~ fails NAME: `F` is not a number at 0 s       an experiment that stops, or an expectation that does not hold
 //! ```
 //!
 //! `+++ other.fric` begins a further text of the case, which the first may import. `BLESS=1 cargo test --test lang`
-//! writes what is found over what is expected: read that difference as carefully as code.
+//! replaces the expected results by the actual ones: read that difference as carefully as code.
 
 mod support;
 
@@ -81,7 +81,7 @@ fn cases(text: &str) -> (String, Vec<LangCase>) {
     (intro, cases)
 }
 
-/// What there is to say about a case.
+/// The actual result of a case.
 fn found(case: &LangCase) -> Vec<String> {
     let mut sources = Texts(case.others.clone());
     sources.0.push(("case.fric".into(), case.text.clone()));
@@ -109,7 +109,7 @@ fn found(case: &LangCase) -> Vec<String> {
     out
 }
 
-/// Why a run did not hold; nothing if it did.
+/// Why a run failed; empty if it passed.
 fn failures(result: &Result<runtime::engine::Outcome, runtime::engine::Failure>) -> Vec<String> {
     match result {
         Ok(outcome) => outcome.verdicts.iter().filter(|v| !v.holds).map(|v| v.text.clone()).collect(),
@@ -117,8 +117,8 @@ fn failures(result: &Result<runtime::engine::Outcome, runtime::engine::Failure>)
     }
 }
 
-/// Whether what was found is what is expected. An expectation without a message, or without a column, leaves that
-/// open; so does `…` at its end.
+/// Whether the actual result matches the expected one. An expectation without a message, or without a column, matches
+/// any; so does `…` at its end.
 fn fits(expected: &[String], found: &[String]) -> bool {
     let one = |(expected, found): (&String, &String)| {
         if expected == found {
@@ -191,7 +191,7 @@ macro_rules! files {
 
 files! { rigs steps units derivatives delay sampled regimes parts functions experiments syntax names wrong_units definitions causality values proofs }
 
-/// Cases whose text makes several mistakes, each with a message of its own.
+/// Cases whose text contains several errors, each with a message of its own.
 const SEVERAL: &[&str] = &[
     "a-division-in-a-range",
     "a-mistake-does-not-hide-the-next-model",
@@ -263,12 +263,12 @@ impl Chance {
     }
 }
 
-/// How many of them: as many as the variable says, else `usual`.
+/// Number of cases: the value of the variable, else `usual`.
 fn count(variable: &str, usual: u64) -> u64 {
     std::env::var(variable).ok().and_then(|text| text.parse().ok()).unwrap_or(usual)
 }
 
-/// Texts to begin with: the library, the examples, every case, every golden mistake.
+/// Initial texts: the library, the examples, every case, every golden error.
 fn corpus() -> Vec<String> {
     let mut out = Vec::new();
     for folder in ["stdlib-models", "examples", "tests/errors"] {
@@ -280,7 +280,7 @@ fn corpus() -> Vec<String> {
     out
 }
 
-/// Words that a mutation puts in.
+/// Words that a mutation inserts.
 const WORDS: &[&str] = &[
     "model",
     "param",
@@ -382,7 +382,7 @@ const WORDS: &[&str] = &[
     ";",
 ];
 
-/// A text with one or two changes: something cut out, doubled, moved, replaced or put in.
+/// A text with one or two mutations: a part deleted, doubled, moved, replaced or inserted.
 fn mutated(corpus: &[String], chance: &mut Chance) -> String {
     let mut text = chance.of(corpus).clone();
     for _ in 0..1 + chance.below(2) {
@@ -429,8 +429,8 @@ fn mutated(corpus: &[String], chance: &mut Chance) -> String {
     text
 }
 
-/// Whatever happens to a text: no panic, no endless work, every error with its code and its place, and what can be
-/// formatted stays as it is when formatted again.
+/// For any text: no panic, no endless work, every error with its code and its position, and formatting is idempotent
+/// where it succeeds.
 #[test]
 fn mutated_texts_are_read_formatted_and_checked() {
     let total = count("FRIC_MUTATIONS", 4_000);
@@ -473,7 +473,7 @@ fn mutated_texts_are_read_formatted_and_checked() {
     assert!(total < 100 || clean * 200 > total, "only {clean} of {total} were fine: mutations are too wild");
 }
 
-/// Reads, formats and checks the text of a seed; whether there is nothing to say of it. Panics with the seed.
+/// Parses, formats and checks the text of a seed; returns whether it has no diagnostics. Panics with the seed.
 fn mutation_is_answered(corpus: &[String], seed: u64) -> bool {
     let text = mutated(corpus, &mut Chance(seed));
     let tried = catch_unwind(AssertUnwindSafe(|| {
@@ -487,7 +487,7 @@ fn mutation_is_answered(corpus: &[String], seed: u64) -> bool {
     tried.unwrap_or_else(|_| panic!("seed {seed} (FRIC_SEED={seed} FRIC_MUTATIONS=1):\n{text}"))
 }
 
-/// A pure number over the names, safe to divide by where it is divided by.
+/// A dimensionless expression over the names, safe to divide by where it is a divisor.
 fn expression(chance: &mut Chance, names: &[String], depth: usize) -> String {
     if depth == 0 || chance.below(6) == 0 {
         return match chance.below(4) {
@@ -520,7 +520,7 @@ fn expression(chance: &mut Chance, names: &[String], depth: usize) -> String {
     }
 }
 
-/// A model that means nothing and uses everything, with an experiment.
+/// A meaningless model that uses the whole language, with an experiment.
 fn program(chance: &mut Chance) -> String {
     let mut names: Vec<String> = Vec::new();
     let mut text = String::from("model M {\n");
@@ -563,7 +563,7 @@ fn program(chance: &mut Chance) -> String {
     text + "}\n\nexperiment e {\n  run M() for 0.1 s\n  solver rk4 step 1 ms\n  expect final(y) < inf\n}\n"
 }
 
-/// Programs without meaning, on both back ends with every fixed method.
+/// Meaningless programs, on both back ends with every fixed method.
 #[test]
 fn generated_programs_have_the_same_bits_everywhere() {
     let first = count("FRIC_SEED", 0);
@@ -580,7 +580,7 @@ fn generated_programs_have_the_same_bits_everywhere() {
     }
 }
 
-/// What people and machines do to texts: each is answered, none with a panic.
+/// Typical corruptions of texts by people and machines: each gets a diagnostic, none a panic.
 #[test]
 fn odd_texts_are_answered() {
     let model = |value: &str| format!("model M {{\n  output y [1] = {value}\n}}\n");

@@ -1,8 +1,8 @@
-//! The structure that docs/architecture.md promises: crates know only the crates below them, a module uses only modules that
-//! are declared above it, at every level of folders, and each outside crate has one home.
+//! The structure that docs/architecture.md promises: crates know only the crates below them, a module uses only modules
+//! that are declared above it, at every level of folders, and each outside crate has one home.
 //!
-//! Sources are parsed (syn), so `crate::`, `super::` and `self::` paths count alike, in code and in macros. Only items under
-//! `#[cfg(test)]` are left out.
+//! Sources are parsed (syn), so `crate::`, `super::` and `self::` paths count alike, in code and in macros. Only items
+//! under `#[cfg(test)]` are left out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -13,7 +13,7 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Our crates with their sources, and the crates of ours that each may use.
+/// Our crates with their sources, and those of our crates that each may use.
 const CRATES: [(&str, &str, &[&str]); 6] = [
     ("grammar", "grammar/src/lib.rs", &[]),
     ("abi", "abi/src/lib.rs", &[]),
@@ -65,16 +65,16 @@ const HOMES: &[(&str, &[&str])] = &[
 
 type Module = Vec<String>;
 
-/// What a crate's modules declare and name.
+/// Declarations and paths of a crate's modules.
 #[derive(Default)]
 struct Source {
-    /// For each module its submodules, in the order of their declarations; without those of tests.
+    /// For each module its submodules, in the order of their declarations; without test modules.
     children: BTreeMap<Module, Vec<String>>,
-    /// For each module the paths that it names, without those of tests: resolved inside the crate.
+    /// For each module the paths that it uses, without those in tests: resolved inside the crate.
     inside: BTreeMap<Module, BTreeSet<Module>>,
-    /// For each file the outside crates it may name: the first words of its other paths.
+    /// For each file the outside crates that it may use: the first segments of its other paths.
     outside: BTreeMap<PathBuf, BTreeSet<String>>,
-    /// For each file the names that it imports from its own crate, which may be those of outside crates.
+    /// For each file the names that it imports from its own crate, which may be re-exports of outside crates.
     imported: BTreeMap<PathBuf, BTreeSet<String>>,
 }
 
@@ -85,7 +85,7 @@ fn is_test(attributes: &[syn::Attribute]) -> bool {
     })
 }
 
-/// Reads the paths of one file.
+/// Collects the paths of one file.
 struct Reader<'s> {
     source: &'s mut Source,
     module: Module,
@@ -180,7 +180,7 @@ impl<'a> Visit<'a> for Reader<'_> {
     }
 }
 
-/// Reads a file and, below it, the files of its modules.
+/// Parses a file and, recursively, the files of its modules.
 fn read(source: &mut Source, file: &Path, module: Module) {
     let text = fs::read_to_string(file).unwrap_or_else(|why| panic!("{}: {why}", file.display()));
     let parsed = syn::parse_file(&text).unwrap_or_else(|why| panic!("{}: {why}", file.display()));
@@ -211,7 +211,7 @@ fn source(entry: &str) -> Source {
     source
 }
 
-/// Each use of a module that is declared below the user: at the deepest folder that holds both.
+/// Each use of a module that is declared later than its user, compared at their deepest common folder.
 fn upward(source: &Source) -> Vec<String> {
     let mut found = Vec::new();
     for (user, paths) in &source.inside {

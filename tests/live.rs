@@ -1,6 +1,7 @@
-//! Parameters of a rig that change while it runs, held against a start with the same values: random rigs, random sets.
+//! Changing parameters of a rig during a run, compared with a start with the same values: random rigs, random sets.
 //!
-//! `FRIC_RUNS` says how many rigs, `FRIC_SEED` names one. A failure prints the seed, the text and the smallest set.
+//! `FRIC_RUNS`: how many rigs; `FRIC_SEED`: one of them. A failure prints the seed, the text and the smallest failing
+//! set.
 
 mod support;
 
@@ -10,7 +11,7 @@ use compiler::{Changes, NoSources, Options, Ready};
 use runtime::hil::live::{Judge, Objection, TOLD};
 use runtime::rng::Chance;
 
-/// A rig whose friction has random parameters, of which some follow from others.
+/// A rig whose friction has random parameters, some computed from others.
 fn text(chance: &mut Chance) -> String {
     let mut params = String::new();
     let mut names: Vec<String> = Vec::new();
@@ -112,7 +113,7 @@ fn start(text: &str, set: &[String]) -> Result<Ready, Vec<grammar::diagnostic::D
     compiler::rig(&mut loaded, &NoSources, "bench", &options, &mut Vec::new())
 }
 
-/// `PATH = VALUE`, often at a bound, sometimes of a wrong kind.
+/// `PATH = VALUE`, often at a bound, sometimes of a wrong dimension.
 fn assignment(chance: &mut Chance, path: &str, unit: &str) -> String {
     let number =
         [0.0, 0.0, 0.1, 0.2, 0.25, 0.3, 0.5, 1.0, 2.0, 4.0, -0.5, 0.05, 0.15, 300.0][chance.below(14) as usize];
@@ -127,7 +128,7 @@ fn assignment(chance: &mut Chance, path: &str, unit: &str) -> String {
     format!("{path} = {number} {unit}").trim_end().to_string()
 }
 
-/// What both said of a set, if it is not the same.
+/// The two messages about a set, if they differ.
 fn differ(text: &str, ready: &Ready, set: &[String]) -> Result<Outcome, String> {
     let mut judge = Judge::new(ready.live.clone(), ready.judge.clone(), &ready.control).unwrap();
     let other = start(text, set);
@@ -157,7 +158,7 @@ fn differ(text: &str, ready: &Ready, set: &[String]) -> Result<Outcome, String> 
             let Objection::Broken(_, count) = objection else { return Err(format!("{objection:?}")) };
             let same = live == start || count as usize > TOLD && live.iter().all(|code| start.contains(code));
             let said = judge.words(&objection);
-            // Of each message the words that a start has.
+            // For each message, the words that a start reports.
             let worded = found.iter().filter(|d| d.is_error()).any(|d| said.contains(&d.message));
             match same && worded {
                 true => Ok(Outcome::Refused),
@@ -177,7 +178,7 @@ enum Outcome {
     Start,
 }
 
-/// A rig with a set of parameters is the rig that a start with them makes: its plan, its ranges, each step to the bit.
+/// A rig with a set of parameters equals the rig that starts with them: its plan, its ranges, each step to the bit.
 fn same_rig(ready: &Ready, set: &[(Slot, f64)], other: &Ready) -> Result<(), String> {
     if ready.rig != other.rig {
         return Err("the plans differ".into());
@@ -242,7 +243,7 @@ fn a_set_is_judged_as_a_start_with_the_same_values() {
             match differ(&text, &ready, &set) {
                 Ok(outcome) => *counts.entry(outcome).or_insert(0) += 1,
                 Err(mut why) => {
-                    // Smaller, as long as it still differs.
+                    // Shrink the set as long as it still differs.
                     while let Some((k, less)) = (0..set.len()).filter(|_| set.len() > 1).find_map(|k| {
                         let fewer: Vec<String> =
                             set.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, one)| one.clone()).collect();
@@ -264,7 +265,7 @@ fn a_set_is_judged_as_a_start_with_the_same_values() {
     }
 }
 
-/// Which parameters may change is decided by what reads them.
+/// Whether a parameter may change is decided by where it is used.
 #[test]
 fn parameters_that_only_a_start_reads_say_why() {
     let ready = (0..100).find_map(|seed| start(&text(&mut Chance(seed)), &[]).ok());
@@ -282,7 +283,7 @@ fn parameters_that_only_a_start_reads_say_why() {
     assert_eq!(why("body.x"), "it belongs to `body`, which the drives replace");
 }
 
-/// The start value of a state is set at the start, is checked there, and is refused while the rig runs.
+/// The initial value of a state is set at the start, is checked there, and is refused during the run.
 #[test]
 fn a_start_value_is_set_at_the_start_only() {
     let text =

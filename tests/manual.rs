@@ -1,7 +1,7 @@
-//! The pages in `docs/` say what is true: their blocks of `fric` are checked and run, and every code has its page.
+//! The pages in `docs/` are correct: their `fric` blocks are checked and run, and every code has its page.
 //!
-//! A block marked `fric` has nothing wrong with it and its experiments hold; one marked `fric,error=E0101` gets exactly
-//! that code. On the page of a code `fric wrong` gets that code and no other, and `fric right` none.
+//! A block marked `fric` has no diagnostics and its experiments pass; one marked `fric,error=E0101` gets exactly that
+//! code. On the page of a code, `fric wrong` gets that code and no other, and `fric right` none.
 
 mod support;
 
@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use support::{Texts, checked, line, root, run};
 
-/// A block of code: the words behind its fence, its first line, its text.
+/// A code block: the words after its fence, its first line, its text.
 struct Block {
     words: String,
     line: usize,
@@ -34,7 +34,7 @@ fn blocks(page: &str) -> Vec<Block> {
     blocks
 }
 
-/// What is wrong with a block: lines of diagnostics, and experiments that do not hold.
+/// The failures of a block: lines of diagnostics, and experiments that fail.
 fn wrong(block: &Block) -> Vec<String> {
     let sources = Texts(vec![("shaft.dbc".into(), include_str!("../examples/rtfs/shaft.dbc").into())]);
     let (mut loaded, found) = checked("page.fric", &block.text, &sources);
@@ -50,7 +50,7 @@ fn wrong(block: &Block) -> Vec<String> {
     out
 }
 
-/// Why experiments did not hold.
+/// Why experiments failed.
 fn failures(name: &str, results: &[Result<Outcome, Failure>]) -> Vec<String> {
     let mut out = Vec::new();
     for result in results {
@@ -118,11 +118,11 @@ fn pages(all: &str) -> Vec<(&str, &str)> {
     pages
 }
 
-/// Examples that do not say the truth yet, with the reason. One that comes right must leave this list.
+/// Examples that are not correct yet, with the reason. One that becomes correct must leave this list.
 const WAITING: &[(&str, &str, &str)] = &[];
 
-/// Codes with a page that nothing gives yet, with the reason: an example would show nothing. One that is given must
-/// leave this list and get its examples.
+/// Codes with a page that are never reported yet, with the reason. One that is reported must leave this list and get
+/// its examples.
 const NOT_GIVEN: &[(&str, &str)] = &[("E0904", "fits are not checked yet")];
 
 #[test]
@@ -155,7 +155,8 @@ fn the_examples_of_every_code_are_what_they_claim() {
     assert!(problems.is_empty(), "\n{problems}");
 }
 
-/// Codes in the sources, tests aside; and those among them that a diagnostic is made with, rather than named in a list.
+/// Codes in the sources, without tests; and those among them with which a diagnostic is constructed, rather than only
+/// listed.
 fn codes_in_sources() -> (BTreeSet<String>, BTreeSet<String>) {
     let (mut named, mut given) = (BTreeSet::new(), BTreeSet::new());
     let mut folders: Vec<_> =

@@ -1,6 +1,6 @@
-//! Measures against their definitions, over drawn experiments with printed seeds: `slope` against the difference of
-//! the quantity, `count` and `duration` against a count over the recording, peaks and crossings against the closed form of
-//! what swings. `FRIC_SEED`, `FRIC_RUNS` (default 60).
+//! Measures against their definitions, over random experiments with printed seeds: `slope` against the difference of
+//! the quantity, `count` and `duration` against a count over the recording, peaks and crossings against the closed form
+//! of damped oscillations. `FRIC_SEED`, `FRIC_RUNS` (default 60).
 
 mod support;
 
@@ -21,7 +21,7 @@ fn of_environment(name: &str, otherwise: u64) -> u64 {
     std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise)
 }
 
-/// A smooth expression of pure numbers over the states x and y, the time and a parameter.
+/// A smooth dimensionless expression over the states x and y, the time and a parameter.
 fn expression(random: &mut Random, depth: u32) -> String {
     if depth == 0 {
         let leaves = ["m.x", "m.y", "(t / 1 s)", "m.p", "m.both", "2", "sine(1, 0.7 Hz)"];
@@ -51,8 +51,8 @@ fn expression(random: &mut Random, depth: u32) -> String {
 
 /// ∫ slope(f) dt = f(end) − f(start).
 ///
-/// Mutants tried by hand: a product has the slope of its first factor only (red in case 5 of seed 1), the second term of a
-/// quotient has the wrong sign (case 42).
+/// Mutants tried by hand: a product has the slope of its first factor only (fails in case 5 of seed 1), the second term
+/// of a quotient has the wrong sign (case 42).
 #[test]
 fn a_slope_adds_up_to_the_difference() {
     let (seed, runs) = (of_environment("FRIC_SEED", 1), of_environment("FRIC_RUNS", 60));
@@ -93,8 +93,8 @@ experiment e {{
     assert!(moving * 2 > compared, "{moving} of {compared} change: nothing is tested");
 }
 
-/// Phases and time of a condition, as the rows of a recording show them. A mutant that does not count the phase at the begin
-/// is red in case 13 of seed 1.
+/// Intervals and duration of a condition, compared with the rows of a recording. A mutant that does not count the
+/// interval at the begin fails in case 13 of seed 1.
 #[test]
 fn phases_are_those_of_the_recording() {
     let (seed, runs) = (of_environment("FRIC_SEED", 1), of_environment("FRIC_RUNS", 60) / 3);
@@ -133,7 +133,7 @@ experiment e {{
     assert!(phases > runs, "{phases} phases in {runs} runs: nothing is tested");
 }
 
-/// A sum of damped swings: a, d in 1/s, ω in rad/s, phase in rad of each.
+/// A sum of damped oscillations: a, d in 1/s, ω in rad/s, phase in rad of each.
 struct Swings(Vec<[f64; 4]>);
 
 #[allow(clippy::disallowed_methods, reason = "what a run is compared with has a tolerance")]
@@ -154,7 +154,7 @@ impl Swings {
         self.0.iter().map(one).sum()
     }
 
-    /// Where f falls through 0, or rises, between two times: found between points 1 ms apart.
+    /// Times where f crosses 0 downwards or upwards, between two times: located between points 1 ms apart.
     fn zeros(&self, f: impl Fn(f64) -> f64, falls: bool, from: f64, to: f64) -> Vec<f64> {
         let before = |x: f64| if falls { x > 0.0 } else { x < 0.0 };
         let parts = ((to - from) * 1e3).ceil();
@@ -174,7 +174,7 @@ impl Swings {
         out
     }
 
-    /// As a model whose output is f.
+    /// A model whose output is f.
     fn model(&self) -> String {
         let mut text = String::from("model Swings {\n");
         for (k, [a, d, w, p]) in self.0.iter().enumerate() {
@@ -189,11 +189,11 @@ impl Swings {
     }
 }
 
-/// Number, heights and times of peaks, and how often a level is crossed, as the closed form of the course has them.
+/// Number, heights and times of peaks, and the number of level crossings, compared with the closed form.
 ///
-/// Mutants tried by hand, red from these cases of seed 1 on: every turning point is a peak (0); the last value of a window is a
-/// peak (3); `peak(x, n)` is the one after (0); rises and falls are exchanged (3); a level that is exceeded where the window begins
-/// counts as crossed (1).
+/// Mutants tried by hand, failing from these cases of seed 1 on: every turning point is a peak (0); the last value of a
+/// window is a peak (3); `peak(x, n)` is the one after (0); rises and falls are exchanged (3); a level that is exceeded
+/// where the window begins counts as crossed (1).
 #[test]
 fn peaks_and_crossings_are_those_of_the_closed_form() {
     let (seed, runs) = (of_environment("FRIC_SEED", 1), of_environment("FRIC_RUNS", 60));
@@ -202,7 +202,7 @@ fn peaks_and_crossings_are_those_of_the_closed_form() {
     for case in 0..runs {
         let swings = Swings::of(&mut random);
         let (from, to) = (random.within(0.0, 1.5), random.within(2.0, 3.0));
-        // Height and time of an extreme, by step: where a fixed step has its points.
+        // Tolerances of height and time of an extreme depend on the step: a fixed step has points only at its ends.
         let (solver, step) = [("adaptive tol 1e-9", 0.0), ("rk4 step 0.5 ms", 5e-4)][random.below(2)];
         let level = (random.within(-0.5, 0.5) * 1e3).round() / 1e3;
         let edge = ["rises", "falls", "crosses"][random.below(3)];
@@ -216,7 +216,8 @@ fn peaks_and_crossings_are_those_of_the_closed_form() {
             "falls" => crossed(true),
             _ => crossed(false) + crossed(true),
         };
-        // A swing that barely turns, or barely reaches the level, and an edge of the window that nearly is one of these.
+        // Skip cases in which an oscillation barely turns, or barely reaches the level, or nearly coincides with an
+        // edge of the window.
         let values: Vec<f64> = highs.iter().chain(&lows).map(|t| swings.at(*t)).collect();
         let mut heights: Vec<f64> = highs.iter().chain(&lows).copied().collect();
         heights.sort_by(f64::total_cmp);

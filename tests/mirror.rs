@@ -1,6 +1,6 @@
-//! Mirror symmetry: moved by −v, an odd friction model answers −F, to the bit.
+//! Mirror symmetry: moved by −v, an odd friction model returns −F, to the bit.
 //!
-//! Two runs of one compiled program: its order of evaluation is one, so every rounding has its mirror image.
+//! Two runs of one compiled program: its order of evaluation is fixed, so every rounding has its mirror image.
 
 #[path = "../src/project.rs"]
 #[allow(dead_code, unused_imports, reason = "the command uses more of it")]
@@ -12,8 +12,8 @@ mod compile {
 
 use compiler::{Options, load};
 
-/// Odd models of the library. GearEfficiency is not odd by design (the load drives), PositionDependent not by its ripple,
-/// Bristles not by its random places.
+/// Odd models of the library. GearEfficiency is not odd by design (the load drives), PositionDependent not because of
+/// its ripple, Bristles not because of its random positions.
 const ODD: &str = "Coulomb(), CoulombViscous(), StribeckGauss(), StribeckLorentz(), Tustin(), KFM(), KFMSmooth(), \
     KFMSmooth(soft = AtanSign()), KFMSmooth(soft = RootSign()), KFMSmooth(soft = ClampSign()), KFMDwell(), Karnopp(), BlimanSorine(), LuGre(), LuGre(vd = 10 mm/s), Dahl(), ElastoPlastic(), MaxwellSlip(), GMS(), \
     LeuvenModified(), BoucWen(), BrownMcPhee(), Makkar(), BengisuAkay(), Threlfall(), Ambrosio(), Gonthier(), \
@@ -23,7 +23,7 @@ const ODD: &str = "Coulomb(), CoulombViscous(), StribeckGauss(), StribeckLorentz
     GearM3(F_m = 3 N), GearM4(F_m = 3 N), GearM5(F_m = 3 N), GearM6(F_m = 3 N), MaxwellElement(), Asymmetric(), \
     BittencourtGunnarsson()";
 
-/// Moves every odd model to and fro, and the other way round: one program, its amplitude of the other sign.
+/// Moves every odd model back and forth, and with the opposite sign: one program, its amplitude negated.
 fn mirrored(solver: &str, h: f64, steps: u32) {
     let text = format!(
         "import std.interfaces\nimport std.friction\n\

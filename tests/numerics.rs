@@ -1,5 +1,5 @@
-//! What the solvers must show, with figures computed by other programs or in closed form; and the commands built on
-//! them: sweeps, linearisation, comparison of solvers. Best run as `cargo test --release --test numerics`.
+//! Required results of the solvers, from other programs or in closed form; and the commands based on them: sweeps,
+//! linearisation, comparison of solvers. Best run as `cargo test --release --test numerics`.
 
 #![allow(clippy::disallowed_methods, reason = "closed forms are the platform's")]
 
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// Contacts and loops of the language's manual, section 8.2. `Bristle` declares no range: so that a method may diverge.
+/// Contacts and loops of the language's manual, section 8.2. `Bristle` declares no range, so that a method may diverge.
 const MODELS: &str = r#"
 import std.interfaces
 import std.friction
@@ -168,8 +168,8 @@ fn periods_are_right_at_every_step() {
     }
 }
 
-/// The tables of section 8.2. Of `expo` at 0.5 ms and above, the manual's own formulas, programmed apart from this
-/// project, give the figures here: those of the manual lie up to 1.4e-4 m and 0.006 mm below.
+/// The tables of section 8.2. For `expo` at 0.5 ms and above, the manual's formulas, implemented independently of this
+/// project, give the figures here: those of the manual are up to 1.4e-4 m and 0.006 mm lower.
 #[test]
 fn the_tables_of_the_manual() {
     let folder = Folder::new("tables");
@@ -186,7 +186,8 @@ fn the_tables_of_the_manual() {
         }
     }
     folder.near("pull", "--solver rk4 --step 20us", 3.306792, 0.51e-6);
-    // At 0.1 ms rk4 leaves its region of stability now and then: the last digits are those of rounding. The manual: 3.3978.
+    // At 0.1 ms rk4 leaves its region of stability occasionally: the last digits are rounding errors. The manual:
+    // 3.3978.
     folder.near("pull", "--solver rk4 --step 0.1ms", 3.3978, 0.02);
     let diverged = |experiment: &str, options: &str, bound: f64| {
         let found = folder.readings(experiment, options);
@@ -215,7 +216,7 @@ fn a_throw_keeps_its_travel_and_its_energy() {
     let folder = Folder::new("throw");
     folder.near("coast", "--solver expo --step 1ms", 0.394793, 1e-6);
     folder.near("coast", "--tol 1e-10", 0.394792, 0.51e-6);
-    // ½ m v² + what friction took + … does not change: 0.5 J at the start. The bristle holds part of what it took.
+    // ½ m v² + dissipated energy + … is constant: 0.5 J at the start. The bristle stores part of what it absorbed.
     let found = folder.readings("coast", "--tol 1e-10").unwrap()[1];
     let stored = folder.readings("coast", "--tol 1e-10 --for 3s").unwrap()[1];
     assert_eq!(found, stored);
@@ -225,7 +226,7 @@ fn a_throw_keeps_its_travel_and_its_energy() {
 #[test]
 fn a_bristle_stays_in_bounds_at_ten_metres_a_second() {
     let folder = Folder::new("fast");
-    // The declared range is 15 um; it is watched, with a millionth of slack.
+    // The declared range is 15 um; it is guarded, with a millionth of slack.
     let largest = folder.readings("fast", "").expect("it stays in its range")[0];
     assert!(largest <= 15.0 * (1.0 + 2e-6), "{largest} um");
 }
@@ -251,8 +252,8 @@ fn a_sign_under_a_mass_is_reported_as_chatter_at_once() {
     assert!(err.contains("chatters at") && err.contains("sign(v)"), "{err}");
 }
 
-/// A relaxed sign turns ever faster, and so does a regime that asks when v passes zero: named within a second, however
-/// stiff.
+/// A regularised sign switches ever faster, and so does a regime with a condition on v passing zero: reported within a
+/// second, at any stiffness.
 #[test]
 fn a_relaxed_sign_and_a_regime_that_races_it_are_chatter() {
     let folder = Folder::new("race");
@@ -339,7 +340,7 @@ fn a_sweep_has_the_same_bytes_however_it_is_run() {
         shards.extend(read("shard.csv"));
     }
     assert_eq!(read("one.csv"), shards);
-    // Killed half-way: what is whole is kept.
+    // Killed half-way: complete rows are kept.
     let mut child = folder
         .fric(&with(&[&common[..], &["--out", "cut.csv", "--threads", "1"]].concat()))
         .stdout(Stdio::null())
@@ -367,7 +368,7 @@ fn a_sweep_has_the_same_bytes_however_it_is_run() {
     assert!(!folder.0.join(".cut.csv.unfinished").exists());
 }
 
-/// Two sweeps into one table; one that goes on where rows were lost or changed.
+/// Two sweeps into one table; and resuming after rows were lost or changed.
 #[test]
 fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
     let folder = Folder::new("alone");
@@ -390,7 +391,8 @@ fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
         let (_, err) = folder.run(&[&long("100000", "live.csv")[..], more].concat(), 1);
         assert!(err.contains("another sweep writes live.csv: wait until it has ended"), "{err}");
     }
-    // Killed, the table is free; its rows are those of the shorter sweep, and it is made into one that was interrupted.
+    // After a kill the table is unlocked; its rows are those of the shorter sweep, and it is turned into an interrupted
+    // one.
     child.kill().unwrap();
     child.wait().unwrap();
     let begun = folder.0.join(".live.csv.unfinished");
@@ -451,7 +453,7 @@ fn a_sweep_says_how_far_a_sample_of_its_runs_may_be_off() {
         one.starts_with("  errors of 10 of 31 runs, discretisation by adaptive runs, tol 1e-8 and 1e-10\n"),
         "{one}"
     );
-    // The table itself is the same without, and nothing is said then.
+    // The table itself is the same without, and nothing is reported then.
     let without = sweep(grid, &["--no-error", "--out", "without.csv"]);
     assert!(!without.contains("error") && read("one.csv") == read("without.csv"), "{without}");
     // The largest error of the sample, in its unit, is that of its run, and covers the true one.
@@ -472,18 +474,18 @@ fn a_sweep_says_how_far_a_sample_of_its_runs_may_be_off() {
     let at_run = (0..10).find(|k| 30 * k / 9 == run).expect("it is a run of the sample");
     assert_eq!(errors[at_run], greatest, "{errors:?} and {run}");
     assert!(greatest <= 3.0 * said && said <= 3.0 * greatest, "{greatest} mm is said to be at most {said} mm");
-    // Verdicts that these errors leave open are counted: e^-1 is 367.9 mm, the steps of 20 ms give 364 mm.
+    // Verdicts that these errors leave undecided are counted: e^-1 is 367.9 mm, the steps of 20 ms give 364 mm.
     let open = errors_in(&sweep("T = 1 s, 2 s, 3 s", &["--out", "open.csv"]));
     assert!(
         open.contains("errors of 3 of 3 runs") && open.contains("1 of 6 verdicts undecided, first final(x) > "),
         "{open}"
     );
-    // Shards estimate those of the sample that are theirs.
+    // Each shard estimates its part of the sample.
     let parts: Vec<String> =
         (1..=4).map(|k| errors_in(&sweep(grid, &["--shard", &format!("{k}/4"), "--out", "shard.csv"]))).collect();
     let sampled = |part: &String| part.split_whitespace().nth(2).unwrap().parse::<u64>().unwrap();
     assert_eq!(parts.iter().map(sampled).sum::<u64>(), 10, "{parts:?}");
-    // A run that is not made has no error, and is said.
+    // A run that is not executed has no error, and is reported.
     let text = COARSE.replace("param T = 1 s", "param T = 1 s in 0.1 s .. 1.5 s");
     fs::write(folder.0.join("coarse.fric"), text).unwrap();
     let out = errors_in(&sweep("T = 1 s, 2 s", &["--out", "lost.csv"]));
@@ -522,7 +524,7 @@ fn each_run_is_checked_and_measured_with_its_own_values() {
     assert!(err.contains("`fr.Fs` is both set and varied"), "{err}");
     let (_, err) = folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fx = 1 N, 2 N"], 1);
     assert!(err.contains("Fx"), "{err}");
-    // The same table as Parquet: its rows lie beside it only until it is complete.
+    // The same table as Parquet: its rows are in a file beside it only until it is complete.
     folder.run(&["sweep", "m.fric", "one", "--vary", "fr.Fs = 1 N, 2 N", "--out", "a.parquet"], 0);
     let bytes = fs::read(folder.0.join("a.parquet")).unwrap();
     assert!(bytes.starts_with(b"PAR1") && bytes.ends_with(b"PAR1"), "{} bytes", bytes.len());
@@ -545,7 +547,7 @@ fn a_loop_is_linearised_where_its_run_is() {
     let k = 1e5 * 1e-4 / (1.0 + 0.5 * (-0.01f64).exp());
     assert!((entry("A", 0, 0) + k).abs() < 1e-12 * k && (entry("C", 0, 0) - (1e5 - 316.0 * k)).abs() < 1e-6);
     assert!((entry("D", 0, 0) - (0.4 + 316.0 * entry("B", 0, 0))).abs() < 1e-9);
-    // An input that is given inside the loop is moved; a mass: dv/dt = (u − F)/m.
+    // For an input that is assigned inside the loop; a mass: dv/dt = (u − F)/m.
     let args = ["linearise", "m.fric", "hunt", "--time", "30s", "--inputs", "fr.v", "--outputs", "fr.F,x"];
     let (out, _) = folder.run(&[&args[..], &["--json", "--out", "l.mat"]].concat(), 0);
     let object: Value = serde_json::from_str(out.trim()).unwrap();
@@ -554,7 +556,7 @@ fn a_loop_is_linearised_where_its_run_is() {
     assert!((entry("B", 2, 0) + entry("D", 0, 0)).abs() <= 1e-12 * entry("D", 0, 0).abs(), "{object}");
     assert_eq!((entry("D", 1, 0), entry("C", 1, 1)), (0.0, 1.0));
     assert!(fs::read(folder.0.join("l.mat")).unwrap().starts_with(b"MATLAB 5.0 MAT-file"));
-    // What a parameter does, in closed form: F = sigma1 dz/dt + …, so dF/dsigma1 = dz/dt = v (1 − 1e5 z / g).
+    // The effect of a parameter, in closed form: F = sigma1 dz/dt + …, so dF/dsigma1 = dz/dt = v (1 − 1e5 z / g).
     let point = ["linearise", "m.fric", "Bristle", "--at", "v=0.1mm/s,z=2um", "--params", "sigma1", "--json"];
     let object: Value = serde_json::from_str(folder.run(&point, 0).0.trim()).unwrap();
     let g = 1.0 + 0.5 * (-0.01f64).exp();

@@ -1,5 +1,5 @@
-//! The order of the passes stands in two lists of the compiler. What `fric build --emit passes` prints and the drawing in
-//! docs/machine-code.md name the same passes in the same order.
+//! The order of the passes is defined by two lists of the compiler. The output of `fric build --emit passes` and the
+//! drawing in docs/machine-code.md have the same passes in the same order.
 
 use compiler::codegen::passes::LATE;
 use compiler::opt::PASSES;

@@ -1,7 +1,7 @@
-//! Programs that others have written, against ours: the Python packages python-can, canopen and cantools.
+//! Interoperability with programs of others: the Python packages python-can, canopen and cantools.
 //!
-//! They live in an environment of their own below `target/`, made at the first run with pip. Where that can't be had the
-//! test fails and says so.
+//! They are installed in a virtual environment below `target/`, created at the first run with pip. If that fails, the
+//! test fails and reports it.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
@@ -11,7 +11,7 @@ use std::sync::{Mutex, OnceLock};
 
 const PACKAGES: [&str; 4] = ["python-can==4.6.1", "canopen==2.4.1", "pyserial==3.5", "cantools==45.1.0"];
 
-/// Tests take turns: programs in Python have little time to answer, and a guest takes a processor for itself.
+/// Tests take turns: Python programs have little time to answer, and a virtual machine needs a processor for itself.
 static TURN: Mutex<()> = Mutex::new(());
 
 fn root() -> PathBuf {
@@ -54,7 +54,7 @@ impl Served {
         let command = command.args(["--for", "900s", "--quiet"]).stderr(Stdio::piped()).stdout(Stdio::null());
         let mut child = command.spawn().expect("fric starts");
         let mut told = String::new();
-        // Its first line comes once its doors are open.
+        // Its first line is printed once its doors are open.
         BufReader::new(child.stderr.take().expect("piped")).read_line(&mut told).expect("a line");
         assert!(told.starts_with(begin), "{told}");
         Served { child, told }
@@ -83,13 +83,13 @@ impl Drop for Served {
     }
 }
 
-/// A place for a link to a pseudo-terminal.
+/// A path for a link to a pseudo-terminal.
 fn link(name: &str) -> String {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}-{}", std::process::id()));
     path.to_str().expect("a text").to_string()
 }
 
-/// What a script printed.
+/// The output of a script.
 fn script(name: &str, argument: &str) -> String {
     let output = Command::new(python()).arg(root().join("tests/peers").join(name)).arg(argument).output();
     let output = output.expect("python starts");
@@ -98,7 +98,7 @@ fn script(name: &str, argument: &str) -> String {
     out.into_owned()
 }
 
-/// A line `name value` among what a script said.
+/// The value of a line `name value` in the output of a script.
 fn value<'a>(said: &'a str, name: &str) -> &'a str {
     let line = said.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
     line.unwrap_or_else(|| panic!("no {name} in\n{said}"))
@@ -131,7 +131,7 @@ fn a_foreign_master_leads_our_drives_over_tcp() {
     master_saw(&script("master.py", &format!("127.0.0.1:{}", drives.port())));
 }
 
-/// What the package's drive saw of a rig that began with the whole start-up and ended as asked.
+/// Checks what the package's drive observed of a rig that performed the whole start-up and ended as intended.
 fn node_saw(said: &str, timeout_tested: bool) {
     let states: Vec<&str> = value(said, "states").split(", ").collect();
     let times = states.iter().filter(|state| **state == "enabled").count();
@@ -142,11 +142,11 @@ fn node_saw(said: &str, timeout_tested: bool) {
     assert_eq!(value(said, "nmt"), "OPERATIONAL");
     let number = |name: &str| value(said, name).parse::<u32>().expect("a number");
     assert!(number("syncs") > 100 && number("commands") > 100, "{said}");
-    // The model asks for up to 0.4 N·m, the push of the first motion for less: 0.2 of what 2 N·m are 1000 of.
+    // The model commands up to 0.4 N·m, the push of the polarity check less: 0.2 of 1000 for 2 N·m.
     assert!((150..=300).contains(&number("torque")), "{said}");
 }
 
-/// Our master against the package's drive: the whole start-up, 4 s of a model, the stop, and a log that replays.
+/// Our master with the package's drive: the whole start-up, 4 s of a model, the stop, and a log that replays.
 fn our_master_leads_a_foreign_drive(theirs: &str, ours: &str, name: &str) {
     let script = root().join("tests/peers/node.py");
     let mut node = Command::new(python());
@@ -169,7 +169,7 @@ fn our_master_leads_a_foreign_drive(theirs: &str, ours: &str, name: &str) {
     run(&["hil", rig, "node", "--bus", &bus, "--arm", "--accept-jitter", "--for", "4s", "--quiet", "--log", &log]);
     let told = run(&["replay", &log]);
     assert!(told.contains("agree to the bit; it ended as asked"), "{told}");
-    // The end of its input asks it for what it saw.
+    // The end of its input makes it print what it observed.
     drop(node.stdin.take());
     out.read_to_string(&mut said).expect("text");
     assert!(node.wait().expect("it ends").success(), "{said}");
@@ -196,7 +196,7 @@ fn our_master_leads_a_foreign_drive_over_tcp() {
     );
 }
 
-/// Both roles over a virtual interface of the kernel: here where there is one, else in the guest that has one.
+/// Both roles over a virtual interface of the kernel: here if there is one, else in the virtual machine that has one.
 #[test]
 fn both_roles_over_an_interface_of_the_kernel() {
     let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
@@ -221,7 +221,7 @@ fn both_roles_over_an_interface_of_the_kernel() {
     assert!(said.contains("agree to the bit; it ended as asked"), "{said}");
 }
 
-/// Bytes from hexadecimal digits, with zeros behind.
+/// Bytes from hexadecimal digits, padded with zeros.
 fn bytes(hexadecimal: &str) -> [u8; 8] {
     let mut out = [0; 8];
     for (k, byte) in out.iter_mut().enumerate().take(hexadecimal.len() / 2) {
@@ -241,8 +241,8 @@ fn exactly(text: &str) -> f64 {
     sign * (whole + part) * 2f64.powi(exponent.parse().expect("an exponent"))
 }
 
-/// Big-endian and little-endian signals at odd places, floats, pages and pages of pages: the same values as cantools
-/// reads, and the same bytes as it writes.
+/// Big-endian and little-endian signals at odd positions, floats, multiplexed pages and nested ones: the same values as
+/// cantools decodes, and the same bytes as it encodes.
 #[test]
 fn a_foreign_reader_of_dbc_files_finds_the_same_in_frames() {
     use runtime::drive::frames;
@@ -268,7 +268,7 @@ fn a_foreign_reader_of_dbc_files_finds_the_same_in_frames() {
         let data = bytes(words[2]);
         let data = &data[..message.length.into()];
         if words[3] == "-" {
-            // A page that the file does not describe: whatever hangs on the switch is absent.
+            // A page that the file does not describe: every signal that depends on the multiplexer is absent.
             let switched = |field: &usize| message.fields[*field].multiplexed.is_some();
             let found = (0..message.fields.len()).filter(switched);
             assert!(found.clone().any(|field| frames::read(message, field, data).is_none()), "{line}");
@@ -289,7 +289,7 @@ fn a_foreign_reader_of_dbc_files_finds_the_same_in_frames() {
             absent += usize::from(ours.is_none());
             compared += usize::from(ours.is_some());
             values[k] = ours.unwrap_or_default();
-            // More bits than a double has cannot come back.
+            // More bits than a double has cannot survive the round trip.
             precise &= field.bits <= 53;
         }
         if precise {

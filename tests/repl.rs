@@ -1,5 +1,5 @@
-//! A session as somebody types it, in a pseudo-terminal: prompt, completion, plots, errors, history, Ctrl-C; and as a
-//! script pipes it.
+//! An interactive session in a pseudo-terminal: prompt, completion, plots, errors, history, Ctrl-C; and piped from a
+//! script.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -9,10 +9,10 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-/// The longest that anything may take on a busy machine.
+/// The longest time that anything may take on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A folder of its own for one test, empty at its start.
+/// A folder for one test, empty at its start.
 fn folder(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("repl-{name}"));
     let _ = fs::remove_dir_all(&path);
@@ -32,11 +32,11 @@ struct Terminal {
     child: Child,
     keys: File,
     screen: Receiver<Vec<u8>>,
-    /// All that came, without colours and movements of the cursor.
+    /// All output so far, without colours and movements of the cursor.
     seen: String,
-    /// Up to where it has been looked at.
+    /// Position up to which it has been read.
     at: usize,
-    /// All that came, as it came.
+    /// All output so far, unchanged.
     raw: String,
 }
 
@@ -47,8 +47,8 @@ impl Terminal {
         let inner = || Stdio::from(pair.slave.try_clone().unwrap());
         let mut command = fric(folder);
         command.args(args).stdin(inner()).stdout(inner()).stderr(inner());
-        // SAFETY: only system calls that are allowed between fork and exec: a session of its own with this terminal, so
-        // that Ctrl-C reaches it.
+        // SAFETY: only system calls that are allowed between fork and exec: a new session with this terminal, so that
+        // Ctrl-C reaches it.
         unsafe {
             command.pre_exec(|| {
                 nix::unistd::setsid()?;
@@ -79,7 +79,7 @@ impl Terminal {
         self.keys.write_all(keys.as_bytes()).unwrap();
     }
 
-    /// Waits until a text appears behind what was waited for before; gives what came up to it.
+    /// Waits until a text appears after what was waited for before; returns the output up to it.
     #[track_caller]
     fn wait(&mut self, text: &str) -> String {
         let begun = Instant::now();
@@ -100,7 +100,7 @@ impl Terminal {
         }
     }
 
-    /// Sends keys again and again until they are answered.
+    /// Sends keys repeatedly until the answer appears.
     #[track_caller]
     fn send_until(&mut self, keys: &str, answer: &str) {
         let begun = Instant::now();
@@ -117,7 +117,7 @@ impl Terminal {
         self.wait(answer);
     }
 
-    /// Types a line and waits for the prompt behind what it gives.
+    /// Types a line and waits for the prompt after its output.
     #[track_caller]
     fn line(&mut self, text: &str) -> String {
         self.send(&format!("{text}\r"));
@@ -125,7 +125,7 @@ impl Terminal {
         self.wait("fric> ")
     }
 
-    /// Waits for the end; gives the exit code.
+    /// Waits for the end; returns the exit code.
     fn end(mut self) -> Option<i32> {
         let begun = Instant::now();
         while begun.elapsed() < PATIENCE {
@@ -173,7 +173,7 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     let made = at.line("f = LuGre(vd = 10 mm/s)");
     assert!(made.contains("f: LuGre, 1 state, 7 parameters"), "{made}");
 
-    // Completion: one candidate is put in, several are listed, those whose unit fits first.
+    // Completion: one candidate is inserted, several are listed, those with a matching unit first.
     at.send("expl\t");
     at.wait("explain");
     at.send(" f.z\r");
@@ -182,7 +182,7 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert!(explained.contains("dz/dt = v - sigma0 * abs(v) / g * z"), "{explained}");
     at.send("f.F + f.\t");
     at.wait("Coulomb friction");
-    // The list ends with the line once more.
+    // After the list, the line is shown again.
     at.wait("fric> f.F + f.");
     at.send("\x03");
     at.wait("\n");
@@ -204,7 +204,7 @@ fn a_session_is_typed_completed_plotted_and_goes_on_after_errors() {
     assert_eq!(at.end(), Some(0));
 }
 
-/// What is typed is drawn anew with each key, all lines of it: so answers are waited for, not prompts.
+/// All lines of an input are redrawn at each key, so the test waits for answers, not prompts.
 #[test]
 fn an_item_is_typed_over_several_lines_or_pasted() {
     let folder = folder("lines");
@@ -217,11 +217,11 @@ fn an_item_is_typed_over_several_lines_or_pasted() {
     at.wait("d: Damper, 0 states, 0 parameters");
     at.send("d.F\r");
     at.wait("6 N\n");
-    // An operator at the end waits for its right side.
+    // An operator at the end needs its right operand.
     at.send("d.F +\r");
     at.send("1 N\r");
     at.wait("7 N\n");
-    // As a terminal hands over what is pasted: line ends in it end nothing.
+    // As a terminal delivers pasted text: line ends in it do not submit.
     at.send("\x1b[200~const m = 2 kg\nm / 2\n1 N + 1 m\n5 N\x1b[201~\r");
     at.wait("1 kg\n");
     at.wait("E0101");
@@ -230,7 +230,7 @@ fn an_item_is_typed_over_several_lines_or_pasted() {
     at.send("allow creep \"a damper\"\r}\r");
     at.send("e = Twice(v = 1 m/s)\r");
     at.wait("e: Twice, 0 states, 0 parameters");
-    // It comes back whole from the history.
+    // The history returns it as one entry.
     at.send("\x1b[A");
     at.wait("e = Twice(v = 1 m/s)");
     at.send("\x1b[A");
@@ -254,7 +254,7 @@ fn words_are_coloured_and_what_comes_next_is_hinted() {
     }
     at.send("\r");
     at.wait("f: LuGre, 1 state");
-    // In grey, and not taken over: Enter takes what was typed.
+    // Hints are grey and not inserted: Enter submits what was typed.
     at.send("step");
     at.wait("step 1 ms");
     assert!(at.raw.contains("\x1b[2m 1 ms\x1b[0m"), "{:?}", at.raw);
@@ -307,11 +307,11 @@ fn an_interrupt_stops_a_run_and_keeps_the_session() {
     at.send("run long\r");
     at.wait("\n");
     at.send_until("\x03", "the session goes on");
-    // What is typed ahead of a prompt that is interrupted is lost, as in a shell.
+    // Input typed ahead of an interrupted prompt is lost, as in a shell.
     at.send_until("ans\r", "7 N\n");
 }
 
-/// What a script gives.
+/// The output of a piped script.
 fn piped(folder: &Path, args: &[&str], script: &str) -> Output {
     let mut command = fric(folder);
     let mut child =
@@ -345,7 +345,7 @@ fn a_script_ends_at_its_first_error_unless_told_otherwise() {
     );
 }
 
-/// What is wrong, in one line each: the first line of each report.
+/// The first line of each error report.
 #[track_caller]
 fn says(script: &str, expected: &str) {
     let folder = folder("errors");
@@ -385,7 +385,7 @@ fn mistakes_are_named_with_their_remedy() {
     says("watch", "watch what?");
 }
 
-/// An experiment whose window lies beyond 1 s, and whose quantities have names like models.
+/// An experiment whose window lies after 1 s, and whose quantities have names like models.
 const PULLED: &str = "import std.bench\nimport std.friction\n\nexperiment drawn {\n  run    SpringBench(k = 2 N/m, vp = 0.1 m/s, fr = LuGre()) for 3 s\n  expect max(v) < 9 m/s after 2 s\n}\n";
 
 #[test]
@@ -458,7 +458,7 @@ fn a_saved_file_is_run_again_where_it_was() {
     at.wait("1 m, margin 1 m");
     at.wait("waiting for fill.fric");
     fs::write(folder.join("fill.fric"), model("2 m/s", "")).unwrap();
-    // It goes on from 1 m.
+    // It continues from 1 m.
     at.wait("3 m, margin 3 m");
     at.wait("waiting for fill.fric");
     fs::write(folder.join("fill.fric"), model("2 N", "")).unwrap();
@@ -471,7 +471,7 @@ fn a_saved_file_is_run_again_where_it_was() {
     assert_eq!(at.end(), Some(0));
 }
 
-/// The blocks marked `session` of a page, with the place of each.
+/// The blocks marked `session` of a page, with their positions.
 fn sessions(page: &str) -> Vec<(usize, usize)> {
     let mut found = Vec::new();
     let mut from = 0;
@@ -484,7 +484,7 @@ fn sessions(page: &str) -> Vec<(usize, usize)> {
     found
 }
 
-/// What a session prints that types what a block types.
+/// The output of a session with the inputs of a block.
 fn transcript(block: &str) -> String {
     let typed: String = block
         .lines()
@@ -501,7 +501,7 @@ fn transcript(block: &str) -> String {
     lines.join("\n") + "\n"
 }
 
-/// `BLESS=1 cargo test --test repl` writes what is printed now.
+/// `BLESS=1 cargo test --test repl` writes the actual output.
 #[test]
 fn the_sessions_on_the_pages_print_what_they_show() {
     for name in ["README.md", "docs/repl.md"] {

@@ -1,4 +1,4 @@
-//! Rigs: the two programs that a text becomes, and the plan that joins them.
+//! Rigs: the two programs compiled from a text, and the plan that connects them.
 
 mod support;
 
@@ -8,7 +8,7 @@ use compiler::{Options, Ready};
 use std::fs;
 use support::{Texts, root};
 
-/// The example, with what it names beside it.
+/// The example with its imports.
 fn texts() -> (String, Texts) {
     let folder = root().join("examples/rtfs");
     let read = |name: &str| fs::read_to_string(folder.join(name)).unwrap();
@@ -55,7 +55,7 @@ fn the_example_becomes_two_programs_and_a_plan() {
     let ids: Vec<(u32, bool, u8)> = messages.iter().map(|message| (message.id, message.send, message.length)).collect();
     assert_eq!(ids, [(0x1A0, false, 1), (0x220, true, 1)]);
 
-    // What is read, told and limited.
+    // Inputs, outputs and limits.
     let read: Vec<(String, bool)> = rig.inputs.iter().map(|input| (path(&control, input.slot), input.needed)).collect();
     let expected = [("load.speed", true), ("servo.position", true), ("shaft.torque", false), ("panel.enable", true)];
     assert_eq!(read, expected.map(|(path, needed)| (path.to_string(), needed)));
@@ -75,7 +75,7 @@ fn the_example_becomes_two_programs_and_a_plan() {
         ["body.x", "body.v", "fr.F", "pid.u", "shaft.torque"]
     );
 
-    // The part alone: what drives apply moves what encoders see.
+    // The part alone: the torques that drives apply move the shaft that encoders measure.
     let of = |node: usize, what: What| Signal { node, what };
     let applied: Vec<Signal> = rig.plant.applied.iter().map(|(signal, _)| *signal).collect();
     assert_eq!(applied, [of(1, What::Torque), of(0, What::Torque)]);
@@ -90,7 +90,7 @@ fn the_example_becomes_two_programs_and_a_plan() {
     assert_eq!(plant.advance(50), 0);
     let speed = rig.plant.seen[0].1;
     assert!((plant.get(speed) - 0.06 / 0.012 * 1e-3).abs() < 1e-12, "{}", plant.get(speed));
-    // The control program has no state of the crossed-out part.
+    // The control program has no state of the replaced part.
     let states: Vec<&str> = control
         .description()
         .quantities

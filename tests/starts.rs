@@ -1,8 +1,8 @@
-//! A start value that is given from outside, at a call, with `--set` or with `--vary`, is the same text with that value
-//! in the state's own line, to the bit: over the states of the library's experiments and all methods.
+//! An initial value from outside, in a call, with `--set` or with `--vary`, is equivalent to the same text with that
+//! value in the state's declaration, to the bit: over the states of the library's experiments and all methods.
 //!
-//! Mutants tried by hand, each red with seed 1: a value at the call is ignored, or one of `--set`; one of `--vary` leaves the start
-//! as written, or does so for sampled states.
+//! Mutants tried by hand, each fails with seed 1: a value in the call is ignored, or one of `--set`; one of `--vary`
+//! leaves the initial value as written, or does so for sampled states.
 //!
 //! `FRIC_SEED`, `FRIC_RUNS` (default 60 states).
 
@@ -16,7 +16,7 @@ use grammar::ast::{DeclarationKind, EveryStatement, ExperimentStatement, Item, S
 use runtime::engine::Continue;
 use support::Texts;
 
-/// Every state and output at the end as bits, or why there is none.
+/// Every state and output at the end as bits, or the error.
 type End = Result<Vec<(String, u64)>, String>;
 
 fn loaded(text: &str) -> Loaded {
@@ -33,7 +33,7 @@ fn end_of(instance: abi::Instance, experiment: &abi::plan::Experiment) -> End {
     Ok(quantities.iter().filter(|q| kept(q.kind)).map(bits).collect())
 }
 
-/// The only case of an experiment under changes; an error by its code and message.
+/// The only case of an experiment with changes; an error by its code and message.
 fn case(text: &str, name: &str, changes: Changes) -> Result<compiler::Case, String> {
     let options = Options { changes, interpret: true };
     let cases = compiler::compile(&mut loaded(text), &Texts::default(), name, &options, &mut Vec::new(), &mut |_| ());
@@ -47,7 +47,7 @@ fn compiled(text: &str, name: &str, changes: Changes) -> End {
     end_of(case.instance, &case.experiment)
 }
 
-/// As `fric sweep` does it, which gives a start value that follows from others a number first.
+/// As in `fric sweep`, which first assigns a number to an initial value that is computed from others.
 fn varied(text: &str, name: &str, path: &str, value: f64, typical: &str, method: Method) -> End {
     let changes = Changes { vary: vec![path.into()], set: vec![format!("{path}={typical}")], ..of(method) };
     let options = Options { changes, interpret: true };
@@ -63,7 +63,7 @@ fn of(method: Method) -> Changes {
     Changes { method: Some(method), step, duration: Some(0.02), ..Changes::default() }
 }
 
-/// Where the initial value of a state of a model stands, and where an argument of the experiment's `run` may be put.
+/// The range of a state's initial value in its model, and the offset for an argument of the experiment's `run`.
 fn places(loaded: &Loaded, experiment: &str, state: &str) -> Option<(std::ops::Range<usize>, usize)> {
     let items = &loaded.files.get(loaded.root()).ast.items;
     let instance = items.iter().find_map(|item| match item {
@@ -128,7 +128,7 @@ fn from_outside_as_in_the_text() {
         let mut begun = plain.instance.clone();
         begun.start(1e-3);
         let as_written = begun.get(state.slot);
-        // Mostly inside of the declared range, sometimes beyond it.
+        // Mostly inside the declared range, sometimes outside.
         let (low, high) = state.range;
         let size = if (high - low).is_finite() { 0.6 * (high - low) } else { state.unit.to_si(2.0) };
         let middle = if (high - low).is_finite() { 0.5 * (low + high) } else { 0.0 };
@@ -166,7 +166,7 @@ fn from_outside_as_in_the_text() {
     assert!(moved * 2 > compared, "{moved} of {compared} start values matter: nothing is tested");
 }
 
-/// A part of a part, an element of an array, a slot's new model and a rotary twin.
+/// In a part of a part, an element of an array, a slot's new model and a rotary twin.
 #[test]
 fn wherever_the_state_is() {
     let text = "

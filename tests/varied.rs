@@ -1,5 +1,6 @@
-//! A row of `sweep --vary x=v` is the run of `run --set x=v`, or both are refused: for whatever a parameter may decide,
-//! and for parameters of the library. `FRIC_SEED`, `FRIC_RUNS` (default 40 values of library parameters).
+//! A row of `sweep --vary x=v` equals the run of `run --set x=v`, or both are refused: for everything that a parameter
+//! may determine, and for parameters of the library. `FRIC_SEED`, `FRIC_RUNS` (default 40 values of library
+//! parameters).
 
 mod support;
 
@@ -9,7 +10,7 @@ use compiler::{Changes, Loaded, Options};
 use runtime::engine::{Continue, run};
 use support::Texts;
 
-/// Outputs at the end, or that there are none.
+/// Outputs at the end, or none if it failed.
 type Ends = Option<Vec<(String, u64)>>;
 
 fn ends(instance: abi::Instance, experiment: &Experiment) -> Ends {
@@ -55,7 +56,8 @@ fn set(loaded: &mut Loaded, name: &str, path: &str, value: f64, unit: &str) -> E
     ends(case.instance, &case.experiment)
 }
 
-/// Whether both agree; what a sweep refuses because it is compiled in, `built_in`, a single run may do.
+/// Whether both agree; a sweep may refuse a parameter that is compiled in (`built_in`) although a single run accepts
+/// it.
 fn compare(text: &str, name: &str, path: &str, value: f64, unit: &str, built_in: bool) {
     let load = || compiler::load("a.fric", text, &Texts::default());
     let (by_vary, by_set) = (varied(&mut load(), name, path, value), set(&mut load(), name, path, value, unit));
@@ -65,7 +67,7 @@ fn compare(text: &str, name: &str, path: &str, value: f64, unit: &str, built_in:
     }
 }
 
-/// Texts in which a parameter p decides something that is not in the equations, with its values and unit.
+/// Texts in which a parameter p determines something outside the equations, with its values and unit.
 const DECIDES: &[(&str, &str, &[f64], &str, bool)] = &[
     (
         "how many parts",
@@ -220,7 +222,7 @@ fn parameters_of_the_library() {
         let by_vary = may_vary(&mut fresh(), &name, &param.path, value);
         let by_set = set(&mut fresh(), &name, &param.path, value, if unit == "1" { "" } else { &unit });
         refused += u64::from(by_set.is_none());
-        // A parameter that follows from others is not varied, but given.
+        // A parameter computed from others cannot be varied, only set.
         let Ok(by_vary) = by_vary else { continue };
         assert_eq!(by_vary, by_set, "seed {seed}: {} {name}, {} = {value} {unit}", path.display(), param.path);
     }

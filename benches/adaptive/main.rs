@@ -1,10 +1,11 @@
 //! Adaptive runs at equal error, against hand-written C with the same method: `cargo bench --bench adaptive`.
 //!
-//! Stick-slip to 20 s and hunting to 100 s. For each program the loosest tolerance is taken whose largest error of
-//! position at 201 instants stays below 1e-6 or 1e-8 m; the times are the least of many, of the processor and not of the
-//! wall, taken in turn in one run, and their ratios are what counts. Needs gcc, and CVODE of SUNDIALS to compare with
-//! that; what is missing is said. Then the same runs by hundreds, each with another force at rest, with nothing but their
-//! last position wanted: in lanes on one core, against the program in C that makes one after the other.
+//! Stick-slip to 20 s and hunting to 100 s. For each program the loosest tolerance is used for which the largest error
+//! of position at 201 instants stays below 1e-6 or 1e-8 m. Times are the least of many, in processor time and not
+//! wall-clock time, interleaved in one run; only their ratios are meaningful. Needs gcc, and CVODE of SUNDIALS for that
+//! comparison; missing programs are reported. Then sweeps of hundreds of the same runs, each with another static
+//! friction force, where only the last position is needed: in lanes on one core, against the C program that makes one
+//! run after the other.
 
 #[path = "../clock.rs"]
 mod clock;
@@ -52,7 +53,7 @@ experiment hunting { run Pid() for 100 s  expect final(x) > 0 m }
 
 const INSTANTS: usize = 200;
 const ROUNDS: usize = 15;
-/// Of a sweep.
+/// Number of runs of the sweep.
 const RUNS: usize = 512;
 
 /// Seconds of a run, and positions.
@@ -136,7 +137,7 @@ fn main() {
     }
 }
 
-/// Runs of diffsol at equal error: its best method counts.
+/// Runs of diffsol at equal error; reports its best method.
 fn against_diffsol(name: &str, program: &Path, reference: &[f64], error: f64, ours: f64) {
     let mut best: Option<(f64, &str, f64)> = None;
     for method in ["bdf", "tr_bdf2", "esdirk34"] {
@@ -158,14 +159,14 @@ fn against_diffsol(name: &str, program: &Path, reference: &[f64], error: f64, ou
     }
 }
 
-/// What one of the programs beside prints: seconds of a run, then positions.
+/// Runs another program and parses its output: seconds of a run, then positions.
 fn timed(program: &mut Command) -> Timed {
     let text = String::from_utf8(program.output().expect("it was just built").stdout).expect("it prints numbers");
     let numbers: Vec<f64> = text.lines().map(|line| line.parse().expect("it prints numbers")).collect();
     (numbers[0], numbers[1..].to_vec())
 }
 
-/// Builds the program beside that uses diffsol: a crate of its own with a hundred others, so only if it is asked for.
+/// Builds the diffsol program: a separate crate with a hundred dependencies, so only on request.
 fn diffsol() -> Result<PathBuf, String> {
     if std::env::var_os("FRIC_DIFFSOL").is_none() {
         return Err("set FRIC_DIFFSOL=1 to build it and the hundred crates that it needs".into());
@@ -181,7 +182,7 @@ fn diffsol() -> Result<PathBuf, String> {
     }
 }
 
-/// Many runs in lanes, each with another force at rest; in C one after the other.
+/// Many runs in lanes, each with another static friction force; in C one after the other.
 fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
     let mut loaded = compiler::load("bench", TEXT, &NoSources);
     let changes = Changes { vary: vec!["fr.rise".into()], ..Changes::default() };
@@ -245,7 +246,7 @@ fn sweep(name: &str, rosenbrock: &Path, tolerances: [(f64, f64); 2]) {
     }
 }
 
-/// Builds one of the C programs beside; gives where it is.
+/// Builds one of the C programs; returns its path.
 fn built(name: &str, define: &str, flags: &[String], libraries: &[impl AsRef<str>]) -> Result<PathBuf, String> {
     let program = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}{define}"));
     let source = format!("{}/benches/adaptive/{name}.c", env!("CARGO_MANIFEST_DIR"));
@@ -258,7 +259,7 @@ fn built(name: &str, define: &str, flags: &[String], libraries: &[impl AsRef<str
     }
 }
 
-/// Options for gcc that find SUNDIALS: installed, or unpacked from Debian's package into the folder of builds.
+/// Options with which gcc finds SUNDIALS: installed, or unpacked from Debian's package into the build folder.
 fn sundials() -> Result<(Vec<String>, Vec<String>), String> {
     const LIBRARIES: [&str; 5] = ["cvode", "nvecserial", "sunlinsoldense", "sunmatrixdense", "generic"];
     let mut prefix = PathBuf::from("/usr");
@@ -290,12 +291,12 @@ fn compiled(name: &str) -> Case {
 
 fn distance(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
-    // What is not a number is as far off as can be.
+    // NaN counts as an infinite error.
     let off = |(a, b): (&f64, &f64)| Some((a - b).abs()).filter(|off| !off.is_nan()).unwrap_or(f64::INFINITY);
     a.iter().zip(b).map(off).fold(0.0, f64::max)
 }
 
-/// The loosest tolerance of 1e-3, 1e-3.1, … that keeps the error, and so does the next one.
+/// The loosest tolerance of 1e-3, 1e-3.1, … that keeps the error, as does the next one.
 fn loosest(run: &dyn Fn(f64, usize) -> Timed, reference: &[f64], error: f64) -> f64 {
     loosest_of(run, reference, error).unwrap_or_else(|| panic!("no tolerance keeps an error of {error}"))
 }

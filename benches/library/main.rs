@@ -1,19 +1,21 @@
-//! One step of each model of the library, called once a step as a rig calls it, against C written by hand for that model
+//! One step of each model of the library, with one call per step as in a rig, against C written by hand for that model
 //! and called through a pointer: `cargo bench --bench abi`.
 //!
-//! The C (`models.c`, `gcc -O3 -march=native`) gets the same inputs, new ones at every call, and does the same step: by
-//! `expo`, in the form in which one writes it for one model alone. First both go through the same course, whose states
-//! and outputs must agree; then they are timed in turn, in one process. Ratios of medians; below 1 is faster than C. The bars,
-//! a geometric mean of at most 0.85 and at worst 1.3, are for this C as it stands, which does not watch what it does, against our step as an instance calls it: what hangs on
-//! parameters alone is prepared when one changes. Three columns tell what that is worth: the same C when it watches too, our
-//! step without guards, and our step that prepares nothing, as images have it. The last three are of calls whose inputs wait
-//! for the outputs of the call before, as they do where a loop is closed; in all others many calls are under way at once.
-//! `C to C`, the same C twice and in each round in two places, says what this can tell apart.
-//! A word behind the command takes only models whose names begin with it.
+//! The C (`models.c`, `gcc -O3 -march=native`) receives the same inputs, new ones at every call, and makes the same
+//! step: by `expo`, in the form in which one writes it for one model alone. First both run through the same input
+//! sequence, and their states and outputs must agree; then they are timed interleaved in one process. Reported are
+//! ratios of medians; below 1 is faster than C. The targets, a geometric mean of at most 0.85 and at worst 1.3, compare
+//! this C without guards with our step as an instance calls it: expressions of parameters are hoisted and evaluated
+//! when a parameter changes. Three columns show the effect of these differences: the same C with guards, our step
+//! without guards, and our step without hoisting, as in images. The last three are for calls whose inputs depend on the
+//! outputs of the previous call, as in a closed loop; in all others, many calls overlap in the pipeline. `C to C`, the
+//! same C twice and in each round at two places, shows the noise of the measurement. An argument after the command
+//! selects models whose names begin with it.
 //!
-//! Where numbers lie may cost a step more than all else: a load waits for a store with the same last twelve digits of
-//! its address, and what that hits is a matter of luck; so everything lies elsewhere in each round. As much hangs on where code
-//! lies, since what foresees jumps goes by addresses; so each side has its code in several places, and so has what calls it.
+//! The placement of data may cost a step more than everything else: a load waits for a store whose address has the same
+//! last twelve bits, and where that happens is a matter of luck. So all data moves to another place in each round. The
+//! placement of code matters as much, because branch prediction is indexed by address. So each side has its code at
+//! several places, and so has the calling loop.
 
 #[path = "../../src/project.rs"]
 #[allow(dead_code, unused_imports, reason = "the command uses more of it")]
@@ -39,18 +41,18 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Instants of the course of inputs, which then begins again.
+/// Length of the input sequence, which then repeats.
 const COURSE: usize = 4096;
 /// Steps for which both must agree.
 const COMPARED: usize = 20_000;
-/// Largest difference of a quantity, as a share of the largest value that it has had.
+/// Largest difference of a quantity, relative to its largest value so far.
 const TOLERANCE: f64 = 1e-9;
 const ROUNDS: usize = PLACES * 29;
-/// Places where the code lies in turn.
+/// Number of places of the code, used in turn.
 const PLACES: usize = 12;
 /// Kinds of calls.
 const KINDS: usize = 8;
-/// Calls of a round, and those before the clock runs.
+/// Calls of a round, and warm-up calls before it.
 const CALLS: usize = 1000;
 const WARM: usize = 200;
 
@@ -65,7 +67,7 @@ const LEFT_OUT: &[(&str, &str)] = &[
     ("Hold", "a whole closed loop"),
 ];
 
-/// A model in C: names of its ports, by which numbers find their places, and its step.
+/// A model in C: the names of its ports, which map numbers to slots, and its step.
 #[repr(C)]
 struct Hand {
     name: *const c_char,
@@ -74,9 +76,9 @@ struct Hand {
     states: *const c_char,
     outputs: *const c_char,
     step: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64),
-    /// The same that also watches.
+    /// The same with guards.
     checked: unsafe extern "C" fn(*mut f64, *const f64, *const f64, *mut f64, f64) -> i64,
-    /// Which states it watches, a bit each.
+    /// Which states it guards, as a bit mask.
     watched: u64,
     number_of_outputs: u64,
 }
@@ -87,11 +89,11 @@ fn words(text: *const c_char) -> Vec<String> {
     text.split_whitespace().map(String::from).collect()
 }
 
-/// What a name of a state in C stands for.
+/// The meaning of a name of a state in C.
 enum State {
     /// In the block.
     Slot(Slot),
-    /// C's own, which begins as an input does (`.v`) or as 0 (`.`).
+    /// C's own state, with the initial value of an input (`.v`) or 0 (`.`).
     Own(f64),
 }
 
@@ -166,27 +168,27 @@ fn main() {
 /// The ratios, in the order of the columns.
 const WHAT: [&str; 6] = ["ratio", "to checked", "unguarded", "unprepared", "in turn", "C to C"];
 
-/// Nanoseconds a call, medians.
+/// Nanoseconds per call, medians.
 struct Times {
     c: f64,
-    /// The larger by the smaller of two measurements of it, whose rounds find it in other places.
+    /// Ratio, larger by smaller, of two measurements of the same C at different places.
     c_to_c: f64,
-    /// C that watches too.
+    /// C with guards.
     checked: f64,
     ours: f64,
     /// Without guards.
     bare: f64,
-    /// Nothing is prepared.
+    /// Without hoisting.
     unprepared: f64,
-    /// One call behind the other.
+    /// With inputs that depend on the previous call.
     c_in_turn: f64,
     ours_in_turn: f64,
 }
 
-/// Holds a model's step against its C over the same course, then times both.
+/// Compares a model's step with its C over the same input sequence, then times both.
 fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; PLACES], &[Around; PLACES])) -> Times {
     let hand = hands[0];
-    // A sampled model is called at its own pace.
+    // A sampled model is called at its own rate.
     let h = match name {
         "DriveTorqueSampled" => 0.5e-3,
         _ => 1e-3,
@@ -243,7 +245,7 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; 
         "{name} in C watches all states of its own and all outputs"
     );
 
-    // The same course.
+    // The same input sequence.
     let in_block = states.iter().enumerate().filter_map(|(k, state)| match state {
         State::Slot(slot) => Some((k, *slot)),
         State::Own(_) => None,
@@ -273,7 +275,7 @@ fn compare(name: &str, loaded: &mut compiler::Loaded, (hands, around): ([&Hand; 
     timed((hands, around), ways, &x, &params, (&course, &inputs, &outputs), h)
 }
 
-/// The code in each of its places: behind so many more functions.
+/// The code at each of its places: after a varying number of other functions.
 fn codes(program: &Program, make: impl Fn(&[(Function, Func)]) -> Code) -> [Code; PLACES] {
     let functions = compiler::functions(program, Method::Expo);
     let start = functions.iter().find(|(function, _)| *function == Function::Start).expect("there is a start");
@@ -298,7 +300,7 @@ impl Running {
     }
 }
 
-/// One of our steps, in each of its places, and the numbers it works on.
+/// One variant of our step, at each of its places, with its data.
 struct Way<'a> {
     entries: [Entry; PLACES],
     pool: &'a [f64],
@@ -306,7 +308,7 @@ struct Way<'a> {
 }
 
 impl Way<'_> {
-    /// The single step from where the instance is.
+    /// The single step from the present state of the instance.
     fn of<'a>(codes: &[Code; PLACES], instance: &'a Instance) -> Way<'a> {
         let pool = &*instance.description().pool;
         let mut numbers = instance.block().to_vec();
@@ -314,7 +316,7 @@ impl Way<'_> {
         if let Some(prepared) = prepared(&codes[0]) {
             numbers.resize(numbers.len() + prepared.len, f64::NAN);
             if let Some(prepare) = prepared.prepare {
-                // SAFETY: block, what is behind it, and pool are those of the model.
+                // SAFETY: the block, the data after it, and the pool are those of the model.
                 unsafe { prepare(numbers.as_mut_ptr(), pool.as_ptr(), 1) };
             }
         }
@@ -326,13 +328,13 @@ impl Way<'_> {
     }
 }
 
-/// Numbers that lie elsewhere in each round: a line of the cache further, through a page.
+/// Data that moves in each round: by one cache line, through a page.
 struct Moving {
     room: Vec<f64>,
-    /// Where pages begin, and where in one they lie.
+    /// Start of the pages, and the offset within one.
     page: usize,
     at: usize,
-    /// What they begin with.
+    /// Initial values.
     first: Vec<f64>,
 }
 
@@ -348,12 +350,12 @@ impl Moving {
         moving
     }
 
-    /// They are what they were at first.
+    /// Restores the initial values.
     fn again(&mut self) {
         self.room[self.page + self.at..][..self.first.len()].copy_from_slice(&self.first);
     }
 
-    /// Where they lie for one more round.
+    /// Moves to the place for the next round.
     fn next(&mut self) -> *mut f64 {
         let begin = self.page + self.at;
         self.at = (self.at + Moving::LINE) % Moving::PAGE;
@@ -362,7 +364,7 @@ impl Moving {
     }
 }
 
-/// Medians of interleaved rounds, and of these the means over the places.
+/// Medians of interleaved rounds, averaged over the places.
 fn timed(
     (hands, around): ([&Hand; PLACES], &[Around; PLACES]),
     mut ways: [Way; 3],
@@ -374,11 +376,11 @@ fn timed(
     let first = inputs.first().map_or(0, |slot| slot.index());
     let in_c: Vec<usize> = (0..outputs.len()).collect();
     let in_block: Vec<usize> = outputs.iter().map(|slot| slot.index()).collect();
-    // States, parameters, inputs and outputs, as one declares them; one more of the C that watches.
+    // States, parameters, inputs and outputs, in the order of their declaration; a second copy for the C with guards.
     let all: Vec<f64> = [x, params, &vec![0.0; inputs.len() + outputs.len()]].concat();
     let mut of_c = [Moving::new(&all), Moving::new(&all)];
-    // In turn: C one call behind the other, C that watches, C, C elsewhere; ours one call behind the other, ours, unguarded,
-    // unprepared.
+    // Kinds in order: C with dependent calls, C with guards, C, C elsewhere; ours with dependent calls, ours, without
+    // guards, without hoisting.
     let mut times = [const { [const { Vec::new() }; PLACES] }; KINDS];
     let mut order: [usize; KINDS] = std::array::from_fn(|kind| kind);
     let mut drawn = 1;
@@ -386,19 +388,21 @@ fn timed(
         let rows = number * (WARM + CALLS) % COURSE * inputs.len();
         let rows = &course[rows..][..(WARM + CALLS) * inputs.len()];
         let place = number / (ROUNDS / PLACES);
-        // What calls lies elsewhere in each round: how it meets what is called is a matter of luck, too.
+        // The calling loop is at another place in each round, because its alignment relative to the callee matters,
+        // too.
         let around = &around[number % PLACES];
         if number % (ROUNDS / PLACES) == 0 {
             of_c.iter_mut().chain(ways.iter_mut().map(|way| &mut way.numbers)).for_each(Moving::again);
         }
-        // Nobody is always the first, or behind the same: what a step finds foreseen is what ran before it has left.
+        // Random order: no kind is always first or always after the same one, because branch predictors keep the
+        // history of what ran before.
         for kind in 0..KINDS {
             order.swap(kind, draw(&mut drawn) % (kind + 1));
         }
         for kind in order {
             let calls = if kind < 4 {
                 let numbers = of_c[kind % 2].next();
-                // SAFETY: so many numbers there are.
+                // SAFETY: the data has this length.
                 let (params, u) = unsafe { (numbers.add(x.len()), numbers.add(x.len() + params.len())) };
                 // SAFETY: as above.
                 let out = unsafe { u.add(inputs.len()) };
@@ -439,7 +443,7 @@ fn timed(
             };
             let calls_of = if matches!(kind, 0 | 4) { around.in_turn } else { around.many };
             let (warm, timed) = rows.split_at(WARM * inputs.len());
-            // SAFETY: the step takes what is given to it, and there is a row for each call.
+            // SAFETY: the step matches these arguments, and there is a row for each call.
             let all = |rows: &[f64], number| unsafe { calls_of(&calls, rows.as_ptr(), number) };
             assert_eq!(all(warm, WARM), 1, "no guard fires");
             let begun = Instant::now();
@@ -458,13 +462,13 @@ fn timed(
     Times { c, c_to_c, checked, ours, bare, unprepared, c_in_turn, ours_in_turn }
 }
 
-/// A number drawn by a linear congruence: the same in every run.
+/// A number from a linear congruential generator: the same in every run.
 fn draw(last: &mut u64) -> usize {
     *last = last.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
     (*last >> 33) as usize
 }
 
-/// What stands around each call, `calls.c`: the same for each kind of step.
+/// The calling loop, `calls.c`: the same for each kind of step.
 #[repr(C)]
 struct Calls {
     step: *const (),
@@ -473,12 +477,12 @@ struct Calls {
     third: *const (),
     fourth: *mut f64,
     h: f64,
-    /// Of the status, what is asked.
+    /// The bits of the status to check.
     mask: i64,
-    /// Where a step reads its inputs, one behind the other.
+    /// Where a step reads its inputs, one after the other.
     inputs: *mut f64,
     width: usize,
-    /// Where it leaves its outputs, in numbers behind the base.
+    /// Where it writes its outputs, as indices relative to the base.
     base: *const f64,
     outputs: *const usize,
     number_of_outputs: usize,
@@ -486,7 +490,7 @@ struct Calls {
 
 type Made = unsafe extern "C" fn(&Calls, *const f64, usize) -> i32;
 
-/// The same in one of its places.
+/// The calling loop at one of its places.
 struct Around {
     many: Made,
     in_turn: Made,
@@ -494,7 +498,7 @@ struct Around {
 
 impl Around {
     fn of(library: &libloading::Library) -> Around {
-        // SAFETY: the source has them.
+        // SAFETY: the source defines them.
         let made = |name: &[u8]| *unsafe { library.get::<Made>(name) }.expect("the source has it");
         Around { many: made(b"many"), in_turn: made(b"in_turn") }
     }
@@ -520,14 +524,14 @@ fn state(description: &Description, name: &str, path: &str, ours: &Instance) -> 
     }
 }
 
-/// The inputs at each instant, one behind the other: through zero and over all that contacts do.
+/// The inputs at each instant, one after the other: through zero and over the whole working range of contacts.
 fn course(inputs: &[String]) -> Vec<f64> {
     let mut course = Vec::new();
-    // It begins again; a round that begins near the end finds its rows.
+    // The sequence repeats; a round that begins near the end continues with its first rows.
     for k in (0..COURSE).chain(0..WARM + CALLS) {
         for (number, input) in inputs.iter().enumerate() {
             let angle = std::f64::consts::TAU * k as f64 / COURSE as f64;
-            // The platform's sine, since these are only inputs.
+            // The platform's sine is good enough for inputs.
             #[allow(clippy::disallowed_methods)]
             let wave = |cycles: f64| (cycles * angle + 0.3 + number as f64).sin();
             let mixed = 0.7 * wave(7.0) + 0.3 * wave(31.0);

@@ -13,7 +13,8 @@ fn at(files: &[SourceFile], n: usize, line: usize, words: &str) -> Span {
     Span::new(FileId(n as u32), start, start + words.len())
 }
 
-/// Labels: line, words (`before|words` marks `words` directly after `before`), text. The first label is the primary one.
+/// Labels: line, words (`before|words` marks `words` directly after `before`), text. The first label is the primary
+/// one.
 fn check_golden(code: &'static str, message: &str, labels: &[(usize, &str, &str)], help: &str) {
     let read = |extension: &str| {
         let path = format!("{}/tests/errors/{code}.{extension}", env!("CARGO_MANIFEST_DIR"));

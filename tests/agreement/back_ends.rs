@@ -1,4 +1,4 @@
-//! Cases on every back end: each must give the bits of the interpreter.
+//! Runs cases on every back end: each must produce the bits of the interpreter.
 
 use crate::case::{Case, Result};
 use crate::emulator;
@@ -13,15 +13,15 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// What all back ends agreed on.
+/// The common result of all back ends.
 pub struct Agreed {
-    /// What each run of the case led to.
+    /// The result of each run of the case.
     pub results: Vec<Result>,
-    /// The widths of lanes that took part; none where there are no lanes for it.
+    /// The widths of lanes that took part; empty where the case has no code for lanes.
     pub lanes: Vec<&'static str>,
 }
 
-/// Runs cases on every back end, C at this level of optimisation (long lines take gcc long); panics at the first
+/// Runs cases on every back end, C at this optimisation level (gcc takes long for long functions); panics at the first
 /// difference, with the program.
 pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
     let expected: Vec<Vec<Result>> = cases.iter().map(Case::interpreted).collect();
@@ -43,7 +43,8 @@ pub fn compare(cases: &[Case], level: &str) -> Vec<Agreed> {
     expected.into_iter().zip(agreed).map(|(results, lanes)| Agreed { results, lanes }).collect()
 }
 
-/// What needs no other program: lanes, machine code in memory, an image. The widths of lanes that took part in each case.
+/// Back ends in this process: lanes, machine code in memory, an image. Returns the widths of lanes that took part in
+/// each case.
 fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'static str>> {
     let widths: Vec<Width> = Width::ALL.into_iter().filter(|width| width.is_here()).collect();
     let here = Target::here().expect("tests run where code is made for");
@@ -67,7 +68,7 @@ fn on_this_processor(cases: &[Case], expected: &[Vec<Result>]) -> Vec<Vec<&'stat
     cases.iter().zip(expected).map(one).collect()
 }
 
-/// Holds the results of a case against those of the interpreter.
+/// Compares the results of a case with those of the interpreter.
 fn agree(case: &Case, expected: &[Result], found: &[Result], back_end: &str) {
     assert_eq!(expected.len(), found.len(), "{}: {back_end} has lost a run", case.name);
     for (k, (expected, found)) in expected.iter().zip(found).enumerate() {
@@ -90,7 +91,7 @@ fn agree(case: &Case, expected: &[Result], found: &[Result], back_end: &str) {
     }
 }
 
-/// Equal to the bit, all NaN being one value.
+/// Equal to the bit, with all NaN as one value.
 fn equal(a: f64, b: f64) -> bool {
     a.to_bits() == b.to_bits() || a.is_nan() && b.is_nan()
 }
@@ -100,8 +101,8 @@ fn same(a: &Result, b: &Result) -> bool {
     a.0 == b.0 && a.1.len() == b.1.len() && a.1.iter().zip(&b.1).all(|(a, b)| equal(*a, *b))
 }
 
-/// What each run leads to in the last lane of a batch of the same; none if there are no lanes. What is no fixed step is
-/// interpreted between.
+/// The results of each run in the last lane of a batch of copies; none if there is no code for lanes. Functions other
+/// than the fixed step are interpreted in between.
 fn in_lanes(case: &Case, width: Width) -> Option<Vec<Result>> {
     let pool = &case.description.pool;
     let (in_lanes, step) = case.step.as_ref()?;
@@ -126,7 +127,7 @@ fn image(case: &Case, target: Target) -> Vec<u8> {
     image.unwrap_or_else(|why| panic!("{}: {why}", case.name)).to_bytes()
 }
 
-/// A file of this test's own.
+/// A path unique to this test.
 pub fn scratch(what: &str) -> PathBuf {
     static NEXT: AtomicUsize = AtomicUsize::new(0);
     let next = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -139,7 +140,7 @@ fn compiled_c(cases: &[Case], level: &str) -> Vec<Vec<Result>> {
     for (k, case) in cases.iter().enumerate() {
         let description = Description { name: format!("Case{k}"), ..case.description.clone() };
         let mut source = c::source(&case.functions, &description, &case.params);
-        // Each is a file of its own: here they share one.
+        // Each case is written as a file of its own: here they share one, so helper names are made unique.
         for name in ["table_", "bits_of", "real_of", "truncated", "as_real", "shifted", "is_less", "entry", "inside"] {
             source = source.replace(&format!("{name}("), &format!("{name}{k}("));
         }

@@ -1,5 +1,5 @@
-//! Seeds of one kind of program in batches, until there are as many programs as wanted; what was done is kept in a file,
-//! so that a campaign goes on where it was interrupted and its report is that of one that never was.
+//! Runs seeds of one kind of program in batches, up to a number of programs. Progress is stored in a file, so an
+//! interrupted campaign can be resumed and produces the same report.
 
 use crate::back_ends::compare;
 use crate::case::Case;
@@ -8,39 +8,39 @@ use std::fs;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
-/// A way to make programs of seeds.
+/// A generator of programs from seeds.
 pub struct Kind {
-    /// For reports.
+    /// Title in reports.
     pub title: &'static str,
-    /// Name of its progress.
+    /// Name of its progress file.
     pub name: &'static str,
-    /// Seeds of a batch.
+    /// Seeds per batch.
     pub batch: u64,
-    /// How gcc optimises: long lines take it long.
+    /// Optimisation level of gcc, which takes long for long functions.
     pub level: &'static str,
-    /// Programs of a seed, or why there are none: text that does not check.
+    /// The programs of a seed, or why there are none: text that does not check.
     pub make: fn(u64) -> Result<Made, String>,
 }
 
-/// What a seed gives.
+/// The programs of a seed.
 pub struct Made {
     /// Its programs.
     pub cases: Vec<Case>,
-    /// What the report should count besides.
+    /// Additional marks to count in the report.
     pub marks: Vec<String>,
 }
 
-/// A campaign under way.
+/// A campaign in progress.
 pub struct Campaign<'k> {
     kind: &'k Kind,
     progress: Option<PathBuf>,
     next: u64,
-    /// All that was seen since its beginning, before interruptions too.
+    /// Everything counted since its beginning, including before interruptions.
     pub seen: Distribution,
 }
 
 impl<'k> Campaign<'k> {
-    /// Begins, or goes on where the file says that it was left. Without a file it is not kept.
+    /// Begins, or resumes from the file. Without a file, progress is not stored.
     pub fn begin(kind: &'k Kind, progress: Option<&Path>) -> Campaign<'k> {
         let mut campaign =
             Campaign { kind, progress: progress.map(Path::to_path_buf), next: 0, seen: Distribution::default() };
@@ -56,7 +56,7 @@ impl<'k> Campaign<'k> {
         campaign
     }
 
-    /// Batches until there are `goal` programs, at most so many batches.
+    /// Runs batches until there are `goal` programs, at most `most_batches`.
     pub fn go(&mut self, goal: u64, most_batches: usize) {
         for _ in 0..most_batches {
             if self.seen.count("programs") >= goal {
@@ -64,7 +64,7 @@ impl<'k> Campaign<'k> {
             }
             self.batch();
             let Some(path) = &self.progress else { continue };
-            // Under another name until it is whole.
+            // Written under a temporary name and then renamed.
             let begun = path.with_extension("begun");
             fs::write(&begun, format!("next seed {}\n{}", self.next, self.seen.to_lines()))
                 .expect("target/ can be written");

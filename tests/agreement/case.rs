@@ -1,4 +1,4 @@
-//! What is held against itself: the functions of one program, blocks to begin with, and what is called on each.
+//! A test case for the back ends: the functions of one program, initial blocks, and the calls made on each.
 
 use abi::description::Layout;
 use abi::plan::Method;
@@ -12,20 +12,20 @@ use compiler::ir::{Func, Op};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Calls of functions, one after the other, on one block.
+/// A sequence of calls on one block.
 pub struct Run {
-    /// The block to begin with.
+    /// The initial block.
     pub start: Vec<f64>,
-    /// Which function, and how often.
+    /// The functions, and how often each is called.
     pub calls: Vec<(Function, u64)>,
 }
 
-/// The statuses, put together, and the block after the calls.
+/// The combined statuses, and the block after the calls.
 pub type Result = (u64, Vec<f64>);
 
 impl Run {
-    /// What it leads to by these calls. Behind one for a single step the block tells the count, which code may leave to
-    /// whoever calls it.
+    /// The result with this implementation of calls. After a single step the count in the block is set, because code
+    /// may leave that to the caller.
     pub fn by(&self, mut call: impl FnMut(Function, &mut [f64], u64) -> u64) -> Result {
         let mut block = self.start.clone();
         let mut status = 0;
@@ -43,35 +43,35 @@ impl Run {
 
 /// A program and its runs.
 pub struct Case {
-    /// For messages: what repeats it.
+    /// For messages: how to reproduce it.
     pub name: String,
-    /// What it was made of, for messages; empty for what never was a text.
+    /// Its source text, for messages; empty if it was generated as operations.
     pub text: String,
-    /// What it holds, for the report: `with/regimes`, `elementary/exp`.
+    /// Features that it uses, for the report: `with/regimes`, `elementary/exp`.
     pub marks: BTreeSet<String>,
-    /// Expanded to arithmetic.
+    /// With elementary functions expanded to arithmetic.
     pub functions: Vec<(Function, Func)>,
-    /// Where its numbers lie.
+    /// The layout of its block.
     pub description: Description,
     /// Defaults of its parameters.
     pub params: Vec<f64>,
-    /// What is compared.
+    /// The runs to compare.
     pub runs: Vec<Run>,
-    /// The function that makes steps as lanes take it, elementary functions not expanded; none of a model that has none.
+    /// The step function in the form for lanes, with elementary functions not expanded; none for a model without one.
     pub step: Option<(Function, Func)>,
 }
 
 impl Case {
-    /// Where its numbers lie.
+    /// The layout of its block.
     pub fn layout(&self) -> &Layout {
         &self.description.layout
     }
 
-    /// What each run leads to.
+    /// The result of each run.
     pub fn on(&self, code: &Code) -> Vec<Result> {
         let pool = &self.description.pool;
         let one = |run: &Run| {
-            // Behind the block, from the first single step on.
+            // The data after the block, from the first single step on.
             let mut prepared: Option<Vec<f64>> = None;
             run.by(|function, block, count| {
                 let single = code.made(Function::Step).filter(|_| (function, count) == (Function::Step, 1));
@@ -95,7 +95,7 @@ impl Case {
         Interpreter::new(&self.functions, self.layout(), self.description.pool.len())
     }
 
-    /// What each run leads to on the reference.
+    /// The result of each run in the reference.
     pub fn interpreted(&self) -> Vec<Result> {
         self.on(&Code::Interpreted(Arc::new(self.interpreter())))
     }
@@ -111,7 +111,7 @@ impl Case {
     }
 }
 
-/// A function made of chance, stepped a few times from random blocks.
+/// A random function, stepped a few times from random blocks.
 pub fn of_chance(seed: u64) -> Case {
     let mut random = Random(seed);
     let len = 20 + random.below(120);
@@ -119,7 +119,7 @@ pub fn of_chance(seed: u64) -> Case {
     of_func(format!("program of chance, seed {seed}"), func, &mut random)
 }
 
-/// A function over the layout of functions made of chance, stepped a few times from random blocks.
+/// A function with the layout of random functions, stepped a few times from random blocks.
 pub fn of_func(name: String, func: Func, random: &mut Random) -> Case {
     let pool: Vec<f64> = (0..POOL_LEN).map(|_| random.real()).collect();
     let layout = random::layout();
@@ -139,7 +139,8 @@ pub fn of_func(name: String, func: Func, random: &mut Random) -> Case {
     }
 }
 
-/// What a method makes of a program, with runs from seeded blocks. `step` in s; the rings of a fixed step have their size.
+/// The code of a program for a method, with runs from seeded blocks. `step` in s; the ring buffers of a fixed step have
+/// been sized.
 pub fn of_program(name: String, text: &str, program: &Program, method: Method, step: f64, random: &mut Random) -> Case {
     let functions = compiler::functions(program, method);
     let mut case = Case {
@@ -156,13 +157,13 @@ pub fn of_program(name: String, text: &str, program: &Program, method: Method, s
     case
 }
 
-/// A number for the statuses of all calls: those before, and one more.
+/// Combines the statuses of all calls: the previous ones, and one more.
 fn all_of(before: u64, status: u64) -> u64 {
     before.wrapping_mul(31).wrapping_add(status)
 }
 
-/// From the defaults; twice from parameters and inputs with edge values; from a block that a run has left, with some of
-/// its numbers changed at random, whatever they mean.
+/// Runs from the defaults; twice from parameters and inputs with edge values; and from a block after a run, with some
+/// of its numbers changed at random.
 fn runs(case: &Case, step: f64, random: &mut Random) -> Vec<Run> {
     let layout = case.layout();
     let has = |which: Function| case.functions.iter().any(|(function, _)| *function == which);
@@ -221,7 +222,7 @@ fn runs(case: &Case, step: f64, random: &mut Random) -> Vec<Run> {
     out
 }
 
-/// The block with what an adaptive step reads: a step from where the block is.
+/// Sets the inputs of an adaptive step: a step from the present point of the block.
 fn tried(mut block: Vec<f64>, layout: &Layout, step: f64) -> Vec<f64> {
     let Some(trial) = Trial::of(layout) else { return block };
     let t = block[Slot::TIME.index()];
@@ -235,7 +236,7 @@ fn tried(mut block: Vec<f64>, layout: &Layout, step: f64) -> Vec<f64> {
     block[trial.scales().range()].fill(1.0);
     block[trial.lows().range()].fill(f64::NEG_INFINITY);
     block[trial.highs().range()].fill(f64::INFINITY);
-    // So that no surface seems met, wherever it is.
+    // So that no surface is met, wherever it is.
     block[trial.sides().range()].fill(1.0);
     block[trial.here().range()].fill(1.0);
     let from = trial.from();
@@ -249,7 +250,7 @@ fn tried(mut block: Vec<f64>, layout: &Layout, step: f64) -> Vec<f64> {
     block
 }
 
-/// What a program holds, for the report.
+/// Features of a program, for the report.
 fn marks(program: &Program, method: Method) -> BTreeSet<String> {
     let description = &program.description;
     let mut out = BTreeSet::from([format!("method/{}", method.name())]);

@@ -1,14 +1,14 @@
-//! 64-bit Arm on another processor: a static C harness, compiled across, under user-mode emulation.
+//! Runs 64-bit Arm code on another processor: a cross-compiled static C harness under user-mode emulation.
 //!
-//! Compiler and emulator are taken from the system, else from Debian's packages, which are unpacked below `target/` and
-//! installed nowhere. Where neither is to be had, the test fails and says what to install.
+//! Compiler and emulator are those of the system, else from Debian's packages, unpacked below `target/` and not
+//! installed. If neither is available, the test fails and reports what to install.
 
 use crate::debian::{done, on_path, unpacked};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// What is unpacked where it is not installed. The compiler's own libraries are those of the system's compiler.
+/// Packages to unpack if not installed. The compiler's own libraries are those of the system's compiler.
 const PACKAGES: [&str; 9] = [
     "qemu-user-static",
     "binutils-aarch64-linux-gnu",
@@ -21,7 +21,7 @@ const PACKAGES: [&str; 9] = [
     "libgcc-s1-arm64-cross",
 ];
 
-/// Runs the harness on a file of cases, which gives the file of results.
+/// Runs the harness on a file of cases, which writes the file of results.
 pub fn run(cases: &Path, results: &Path) {
     static HARNESS: OnceLock<(Option<PathBuf>, PathBuf)> = OnceLock::new();
     let (emulator, harness) = HARNESS.get_or_init(harness);
@@ -36,7 +36,7 @@ pub fn run(cases: &Path, results: &Path) {
     done(command.arg(cases).arg(results), "the harness");
 }
 
-/// The emulator, where one is needed, and the harness, under its name once it is whole: other runs may be using it.
+/// The emulator, where one is needed, and the harness, renamed once complete because other runs may be using it.
 fn harness() -> (Option<PathBuf>, PathBuf) {
     let harness = Path::new(env!("CARGO_TARGET_TMPDIR")).join("harness-aarch64");
     let begun = harness.with_extension(format!("begun-{}", std::process::id()));
@@ -45,7 +45,7 @@ fn harness() -> (Option<PathBuf>, PathBuf) {
     (emulator, harness)
 }
 
-/// Compiles the harness, and gives the emulator that it needs, if any.
+/// Compiles the harness, and returns the emulator that it needs, if any.
 fn compiled(harness: &Path) -> Option<PathBuf> {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/agreement/harness.c");
     let flags = ["-std=gnu11", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1", "-static", "-o"];

@@ -1,8 +1,8 @@
-//! Well-typed texts by chance, from a seed: models with everything that the language has, their units fitting, and an
-//! experiment on them.
+//! Generates random well-typed texts from a seed: models that use the whole language, with consistent units, and an
+//! experiment.
 //!
-//! Each expression is made for a unit, of what is in scope: declarations that stand before it, so that nothing depends on
-//! itself. Numbers are often edges: zeros, subnormals, what overflows.
+//! Each expression is generated for a unit, from names in scope: earlier declarations only, so that there are no
+//! cycles. Numbers are often edge cases: zeros, subnormals, overflow.
 
 use compiler::ir::random::Random;
 
@@ -32,9 +32,9 @@ const UNITS: [(Unit, &[&str]); 13] = [
 /// Steps of the experiments: as written, and in us.
 const STEPS: [(&str, u32); 4] = [("1 ms", 1000), ("0.1 ms", 100), ("10 us", 10), ("50 ms", 50_000)];
 
-/// A text, the step of its experiment in s, and whether its top model may be built with its inputs open.
+/// A generated text, the step of its experiment in s, and whether its top model may be built with its inputs open.
 pub struct Text {
-    /// With a model `Top` and an experiment `e`.
+    /// Contains a model `Top` and an experiment `e`.
     pub text: String,
     /// In s.
     pub step: f64,
@@ -63,7 +63,7 @@ pub fn text(seed: u64) -> Text {
     Text { text: writer.out, step: f64::from(step_us) * 1e-6 }
 }
 
-/// What can be called: a table or a function.
+/// A callable: a table or a function.
 #[derive(Clone)]
 struct Callable {
     name: String,
@@ -71,7 +71,7 @@ struct Callable {
     gives: Unit,
 }
 
-/// A model as others see it.
+/// The interface of a model.
 #[derive(Clone)]
 struct Model {
     name: String,
@@ -81,16 +81,16 @@ struct Model {
     truths: Vec<String>,
 }
 
-/// What an expression may use.
+/// The names that an expression may use.
 #[derive(Clone, Default)]
 struct Scope {
     quantities: Vec<(String, Unit)>,
     truths: Vec<String>,
     /// Paths through all elements of an array of parts, for `sum` and its like.
     folds: Vec<(String, Unit)>,
-    /// Whether `t`, signals and noise may stand here.
+    /// Whether `t`, signals and noise are allowed.
     time: bool,
-    /// Whether `delay` may stand here.
+    /// Whether `delay` is allowed.
     past: bool,
 }
 
@@ -102,9 +102,9 @@ struct Writer {
     names: usize,
     functions: Vec<Callable>,
     models: Vec<Model>,
-    /// Whether anything is delayed: what is has no lanes.
+    /// Whether anything is delayed: such a model has no code for lanes.
     past: bool,
-    /// Whether there is noise: no lanes of AVX2 know the products of integers that it takes.
+    /// Whether there is noise, which needs integer products that AVX2 lacks: no AVX2 lanes.
     noise: bool,
 }
 
@@ -113,7 +113,7 @@ impl Writer {
         self.random.below(n)
     }
 
-    /// True once in `n` times.
+    /// True with probability 1/n.
     fn once_in(&mut self, n: usize) -> bool {
         self.below(n) == 0
     }
@@ -137,7 +137,7 @@ impl Writer {
         UNITS[at].0
     }
 
-    /// A unit as it is written behind a number; empty for pure numbers.
+    /// A unit as it is written after a number; empty for dimensionless numbers.
     fn written(&mut self, unit: Unit) -> String {
         if let Some((_, ways)) = UNITS.iter().find(|(known, _)| *known == unit) {
             return (*self.one(ways)).to_string();
@@ -153,13 +153,13 @@ impl Writer {
         over + &under.map(|power| format!("/{power}")).collect::<String>()
     }
 
-    /// A unit as a declaration has it, in brackets.
+    /// A unit as in a declaration, in brackets.
     fn declared(&mut self, unit: Unit) -> String {
         let written = self.written(unit);
         format!("[{}]", if written.is_empty() || written == "%" { "1" } else { &written })
     }
 
-    /// A number with its unit, not below zero.
+    /// A non-negative number with its unit.
     fn literal(&mut self, unit: Unit) -> String {
         let number = match self.below(20) {
             0 => ["0", "1e-12", "1e12", "5e-324", "2.2250738585072014e-308", "1e308", "4503599627370496.5", "1e-160"]
@@ -176,7 +176,7 @@ impl Writer {
         }
     }
 
-    /// A number of ordinary size, above zero.
+    /// A positive number of ordinary size.
     fn moderate(&mut self, unit: Unit) -> String {
         let number = self.random.within(0.05, 9.0);
         match self.written(unit) {
@@ -185,7 +185,7 @@ impl Writer {
         }
     }
 
-    /// A time of so many steps.
+    /// A time of `n` steps.
     fn steps(&self, n: usize) -> String {
         format!("{} us", n * self.step_us as usize)
     }
@@ -194,7 +194,7 @@ impl Writer {
     fn leaf(&mut self, scope: &Scope, unit: Unit) -> String {
         let fit: Vec<&(String, Unit)> = scope.quantities.iter().filter(|(_, own)| *own == unit).collect();
         if !fit.is_empty() && !self.once_in(5) {
-            // Mostly what came last, so that chains get long.
+            // Mostly the most recent names, so that dependency chains get long.
             let from = if self.once_in(2) { 0 } else { fit.len().saturating_sub(3) };
             return fit[from + self.below(fit.len() - from)].0.clone();
         }
@@ -311,7 +311,7 @@ impl Writer {
         }
     }
 
-    /// A pure number by a function.
+    /// A dimensionless number from a function.
     fn number(&mut self, scope: &Scope, depth: usize) -> String {
         let x = |writer: &mut Writer| writer.real(scope, NUMBER, depth);
         match self.below(18) {
@@ -343,7 +343,7 @@ impl Writer {
         }
     }
 
-    /// A signal of time, or chance.
+    /// A signal of time, or noise.
     fn signal(&mut self, unit: Unit) -> String {
         let height = self.moderate(unit);
         let frequency = format!("{} Hz", [0.5, 3.0, 40.0, 700.0][self.below(4)]);
@@ -423,7 +423,7 @@ impl Writer {
         self.functions.push(Callable { name, args, gives });
     }
 
-    /// A model of up to so many of each.
+    /// A model with up to `most` items of each kind.
     fn model(&mut self, name: &str, most: usize) -> Model {
         let before = self.out.len();
         let mut model = Model { name: name.into(), inputs: vec![], params: vec![], outputs: vec![], truths: vec![] };
@@ -469,7 +469,7 @@ impl Writer {
         model
     }
 
-    /// Continuous states: their names, units, and whether something has said already how they change.
+    /// Continuous states: their names, units, and whether their derivative has been defined.
     fn states(&mut self, scope: &mut Scope, most: usize) -> Vec<(String, Unit, bool)> {
         let mut states = Vec::new();
         for _ in 0..self.below(most + 1) {
@@ -654,7 +654,7 @@ impl Writer {
         model.truths.extend(modes);
     }
 
-    /// The right side of a derivative: a relaxation, or anything.
+    /// The right-hand side of a derivative: a relaxation, or any expression.
     fn rate(&mut self, scope: &Scope, name: &str, unit: Unit) -> String {
         match self.below(3) {
             0 => format!("({} - {name}) / {}", self.real(scope, unit, 2), self.moderate(TIME)),
@@ -667,7 +667,7 @@ impl Writer {
         }
     }
 
-    /// How the other states change, along time or along each other; what is defined can be read by what follows.
+    /// The derivatives of the remaining states, by time or by each other; later statements may use what is defined.
     fn derivatives(&mut self, scope: &mut Scope, states: &[(String, Unit, bool)]) {
         for (k, (name, unit, done)) in states.iter().enumerate() {
             if *done {
@@ -741,7 +741,7 @@ fn over(a: Unit, b: Unit) -> Unit {
     std::array::from_fn(|k| a[k] - b[k])
 }
 
-/// Whether exponents are such as one writes.
+/// Whether exponents are small enough to be written by hand.
 fn small(unit: Unit) -> bool {
     unit.iter().all(|exponent| exponent.abs() <= 6)
 }

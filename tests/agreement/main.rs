@@ -1,9 +1,9 @@
-//! The reference interpreter, machine code in memory, lanes, images for x86-64 and 64-bit Arm, and C give the same bits, on
-//! the models of the library and on programs made of seeds: of operations, of texts from the grammar, of texts of the
-//! library that were changed. All NaN are one value.
+//! Agreement of the back ends: the reference interpreter, machine code in memory, lanes, images for x86-64 and 64-bit
+//! Arm, and C produce the same bits, on the models of the library and on random programs: of operations, of texts from
+//! the grammar, of mutated texts of the library. All NaN count as one value.
 //!
-//! A plain run tries 2,000 programs of seeds. `FRIC_PROGRAMS=1000000 cargo test --release --test agreement seeds` goes on
-//! where an earlier run of the same command was interrupted: see docs/machine-code.md.
+//! A plain run tests 2,000 random programs. `FRIC_PROGRAMS=1000000 cargo test --release --test agreement seeds` resumes
+//! an earlier run of the same command: see docs/machine-code.md.
 
 mod back_ends;
 mod campaign;
@@ -28,7 +28,7 @@ use report::Distribution;
 use std::path::Path;
 use texts::{FIXED, Fallen};
 
-/// Programs of seeds in a plain run, of all kinds together.
+/// Random programs in a plain run, of all kinds together.
 const PLAIN: u64 = 2000;
 
 /// Functions of random operations.
@@ -49,7 +49,7 @@ const GRAMMAR: Kind = Kind {
     make: from_the_grammar,
 };
 
-/// Changed texts of the library.
+/// Mutated texts of the library.
 const MUTANTS: Kind = Kind {
     title: "changed programs of the library",
     name: "agreement-mutants",
@@ -58,8 +58,8 @@ const MUTANTS: Kind = Kind {
     make: mutate::mutant,
 };
 
-/// A text from the grammar with a fixed method, as an experiment or as a model with open inputs; every fourth by the
-/// adaptive method too.
+/// A text from the grammar with a fixed method, as an experiment or as a model with open inputs; every fourth also with
+/// the adaptive method.
 fn from_the_grammar(seed: u64) -> Result<Made, Fallen> {
     let generated = generate::text(seed);
     let (text, step) = (&generated.text, generated.step);
@@ -82,7 +82,7 @@ fn from_the_grammar(seed: u64) -> Result<Made, Fallen> {
     Ok(Made { cases, marks: Vec::new() })
 }
 
-/// Programs of seeds of one kind, a part of all: kept in a file where a campaign was asked for.
+/// Random programs of one kind, a fraction of all; progress is stored if a campaign was requested.
 fn seeds(kind: &Kind, part: (u64, u64)) -> Distribution {
     let asked: Option<u64> =
         std::env::var("FRIC_PROGRAMS").ok().map(|n| n.parse().expect("FRIC_PROGRAMS is a whole number"));
@@ -143,8 +143,8 @@ fn seeds_of_changed_texts_agree() {
     assert!(seen.count("programs with distinct results") * 10 >= programs * 9);
 }
 
-/// Every experiment of the library and of its tests, by fixed methods in turn and by the adaptive one; programs that are
-/// equal once.
+/// Every experiment of the library and of its tests, by fixed methods in turn and by the adaptive one; equal programs
+/// once.
 #[test]
 fn models_of_the_library_agree() {
     let mut cases: Vec<Case> = Vec::new();
@@ -156,7 +156,7 @@ fn models_of_the_library_agree() {
             for method in [methods.next().expect("it goes round"), Method::Adaptive] {
                 let read = texts::read(&name, &text, &experiment.name, method);
                 let (variants, step) = read.unwrap_or_else(|errors| panic!("{name}, {}: {errors:?}", experiment.name));
-                // Of the adaptive functions, which are many, those of the first combination.
+                // There are many adaptive functions: only those of the first combination.
                 let most = if method == Method::Adaptive { 1 } else { usize::MAX };
                 for variant in variants.into_iter().take(most) {
                     let name = format!("{name}, {} {}", experiment.name, variant.label);
@@ -226,8 +226,8 @@ experiment e {
     }
 }
 
-/// gcc 12 takes 0 − x for −x where it sees that x is never −0: then what a quantity that is 0 is subtracted from 0 gives
-/// another zero than everywhere else.
+/// gcc 12 replaces 0 − x by −x where it infers that x is never −0. For x = 0 the result is then −0, and 0 on all other
+/// back ends.
 #[test]
 fn what_is_subtracted_from_zero_keeps_its_sign() {
     let text = "model Zeros {
@@ -246,7 +246,7 @@ fn what_is_subtracted_from_zero_keeps_its_sign() {
     }
 }
 
-/// C that compares a mask with what it can never be compiles without a warning.
+/// C that compares a mask with an impossible value compiles without a warning.
 #[test]
 fn a_mask_is_compared_with_what_it_cannot_be() {
     let layout = random::layout();
@@ -271,7 +271,7 @@ fn a_mask_is_compared_with_what_it_cannot_be() {
     }
 }
 
-/// A campaign that was interrupted ends with the report of one that never was.
+/// An interrupted campaign ends with the same report as an uninterrupted one.
 #[test]
 fn an_interrupted_campaign_goes_on() {
     let small = |kind: &Kind| Kind { batch: 6, ..*kind };
@@ -289,7 +289,7 @@ fn an_interrupted_campaign_goes_on() {
         rest.go(15, usize::MAX);
         assert_eq!(rest.seen, whole.seen);
         assert_eq!(rest.seen.told("all"), whole.seen.told("all"));
-        // What has reached its goal is not run again, and still has its report.
+        // A campaign that has reached its goal is not run again, and still has its report.
         let mut again = Campaign::begin(&kind, Some(&progress));
         again.go(15, usize::MAX);
         assert_eq!(again.seen, whole.seen);

@@ -1,6 +1,6 @@
-//! Texts of the library, changed by chance from a seed: numbers become edges, operators, functions and names change
-//! places, terms go or come twice, expressions are wrapped, conditions turned. What still checks and is another program is
-//! kept.
+//! Mutates texts of the library from a seed: numbers become edge cases, operators, functions and names are exchanged,
+//! terms are removed or doubled, expressions are wrapped, conditions negated. A mutant is kept if it checks and differs
+//! as a program.
 
 use crate::campaign::Made;
 use crate::texts::{self, FIXED, Fallen};
@@ -15,7 +15,7 @@ use grammar::span::Span;
 use std::collections::{HashMap, HashSet};
 use std::sync::{LazyLock, Mutex};
 
-/// The library's texts that have experiments, with what can be changed in each.
+/// The library's texts with experiments, and the places that can be mutated in each.
 static TEXTS: LazyLock<Vec<Original>> = LazyLock::new(|| {
     let all = crate::library().into_iter().map(|(name, text)| Original::new(name, text));
     all.filter(|original| !original.experiments.is_empty()).collect()
@@ -30,7 +30,7 @@ struct Original {
     names: Vec<Known>,
 }
 
-/// An experiment and the places that it may depend on: those of itself and of the items that it names, they name, …
+/// An experiment and the places that it may depend on: its own, and those of the items that it uses, transitively.
 struct Experiment {
     name: String,
     places: Vec<usize>,
@@ -40,7 +40,7 @@ struct Experiment {
 struct Known {
     name: String,
     item: usize,
-    /// As written, behind it or behind its value.
+    /// As written, after the name or after its value.
     unit: Option<String>,
 }
 
@@ -52,7 +52,7 @@ struct Place {
     item: usize,
 }
 
-/// What stands there, as far as changes depend on it.
+/// The syntax at a place, as far as mutations depend on it.
 #[derive(Clone)]
 enum What {
     /// The unit as written.
@@ -66,10 +66,10 @@ enum What {
     Other,
 }
 
-/// A place and what stands there instead.
+/// A replacement at a place.
 type Edit = (Span, String);
 
-/// The program of a changed text, or why there is none.
+/// The program of a mutated text, or why there is none.
 pub fn mutant(seed: u64) -> Result<Made, Fallen> {
     let mut random = Random(seed ^ 0x6D75_7461_6E74);
     let original = &TEXTS[random.below(TEXTS.len())];
@@ -93,7 +93,7 @@ pub fn mutant(seed: u64) -> Result<Made, Fallen> {
     Ok(Made { cases: vec![case], marks })
 }
 
-/// Whether the code and the values of two programs are the same.
+/// Whether the code and the values of two programs are equal.
 fn same(a: &Program, b: &Program) -> bool {
     let params = |program: &Program| program.params.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
     params(a) == params(b)
@@ -115,7 +115,7 @@ impl Original {
             items.push((name, words.collect()));
             found.at += 1;
         }
-        // A span leaves out parentheses, which a change must not tear apart.
+        // A span excludes parentheses, which a mutation must keep balanced.
         found.places.retain(|place| balanced(&text[place.span.range()]));
         let mut experiments = Vec::new();
         for (first, item) in file.items.iter().enumerate() {
@@ -132,7 +132,7 @@ impl Original {
             }
             let inside = found.places.iter().enumerate().filter(|(_, place)| reached.contains(&place.item));
             let places: Vec<usize> = inside.map(|(place, _)| place).collect();
-            // What runs a model of another text with all its defaults has nothing to change.
+            // An experiment on a model of another text with all its defaults has nothing to mutate.
             if !places.is_empty() {
                 experiments.push(Experiment { name: experiment.name.text.clone(), places });
             }
@@ -141,7 +141,7 @@ impl Original {
         Original { name, text, experiments, places: found.places, names: found.names }
     }
 
-    /// All combinations of an experiment as it was.
+    /// All combinations of an experiment in its original form.
     fn programs(&self, experiment: &str, method: Method) -> Vec<Program> {
         type Key = (String, String, Method);
         static KNOWN: LazyLock<Mutex<HashMap<Key, Vec<Program>>>> = LazyLock::new(Default::default);
@@ -155,7 +155,7 @@ impl Original {
         made.clone()
     }
 
-    /// The text with one to four changes that do not overlap, and the ways in which it was changed.
+    /// The text with one to four mutations that do not overlap, and their kinds.
     fn changed(&self, experiment: &Experiment, random: &mut Random) -> (String, Vec<&'static str>) {
         let mut edits: Vec<Edit> = Vec::new();
         let mut ways = Vec::new();
@@ -178,7 +178,7 @@ impl Original {
     fn change(&self, place: &Place, random: &mut Random) -> (Span, String, &'static str) {
         let own = |span: Span| &self.text[span.range()];
         let here = own(place.span);
-        // What suits whatever stands there.
+        // Mutations that suit any expression.
         if random.below(4) == 0 {
             let (instead, way) = match (&place.what, random.below(7)) {
                 (What::Binary(op, ..), _) if is_truth(*op) => (format!("(not ({here}))"), "turned"),
@@ -240,7 +240,7 @@ impl Original {
     }
 }
 
-/// Numbers at which arithmetic differs if it differs at all.
+/// Numbers for which differences in arithmetic are most likely.
 const EDGES: [&str; 14] = [
     "0",
     "1",
@@ -258,7 +258,7 @@ const EDGES: [&str; 14] = [
     "709.9",
 ];
 
-/// Functions that take and give the same units, as far as that can be said.
+/// Functions with the same units of arguments and results, as far as possible.
 const FUNCTIONS: [&[&str]; 6] = [
     &["exp", "sin", "cos", "tan", "tanh", "atan", "log", "floor"],
     &["asin", "acos", "atan"],
@@ -302,7 +302,7 @@ fn instead(op: BinaryOp, random: &mut Random) -> &'static str {
     }
 }
 
-/// The name of an item, if others can name it, and where it stands.
+/// The name of an item, if others can refer to it, and its span.
 fn named(item: &Item) -> (Option<String>, Span) {
     match item {
         Item::Import(item) => (None, item.span),
@@ -318,7 +318,7 @@ fn named(item: &Item) -> (Option<String>, Span) {
     }
 }
 
-/// Whether every parenthesis that opens closes, none before it opened.
+/// Whether parentheses are balanced.
 fn balanced(text: &str) -> bool {
     let mut open = 0;
     for sign in text.chars() {

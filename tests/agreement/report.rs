@@ -1,19 +1,19 @@
-//! What programs were made of and what became of them: a collapse of a generator shows here.
+//! Statistics of generated programs and their results: they show if a generator degenerates.
 //!
-//! Counts by name, so that they add up, and go through a file and back.
+//! Counts by name, so that they can be added, and stored in a file.
 
 use crate::back_ends::Agreed;
 use crate::case::Case;
 use compiler::ir::Op;
 use std::collections::BTreeMap;
 
-/// Counts by name; what stands before `/` is a group. Lengths are counted one by one (`length/000083`), so that quantiles
-/// of a sum are exact.
+/// Counts by name; the text before `/` is a group. Each length is counted separately (`length/000083`), so that
+/// quantiles of a sum are exact.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
 pub struct Distribution(BTreeMap<String, u64>);
 
 impl Distribution {
-    /// Counts `n` more.
+    /// Adds `n` to a count.
     pub fn add(&mut self, name: &str, n: usize) {
         match self.0.get_mut(name) {
             Some(count) => *count += n as u64,
@@ -41,7 +41,7 @@ impl Distribution {
         self.0.iter().map(|(name, count)| format!("{count} {name}\n")).collect()
     }
 
-    /// None of what [`Distribution::to_lines`] has not written.
+    /// None if the lines were not written by [`Distribution::to_lines`].
     pub fn from_lines<'t>(lines: impl Iterator<Item = &'t str>) -> Option<Distribution> {
         let one = |line: &str| {
             let (count, name) = line.split_once(' ')?;
@@ -50,7 +50,7 @@ impl Distribution {
         Some(Distribution(lines.map(one).collect::<Option<_>>()?))
     }
 
-    /// Counts a case and what all back ends agreed on.
+    /// Counts a case and the common result of its back ends.
     pub fn see(&mut self, case: &Case, agreed: &Agreed) {
         self.add("programs", 1);
         for mark in &case.marks {
@@ -79,7 +79,7 @@ impl Distribution {
             self.add("value/subnormal", count(|x| x.is_subnormal()));
         }
         self.add("runs that change something", changed);
-        // A program whose runs all end alike does nothing with what it is given.
+        // A program whose runs all end alike does not depend on its inputs.
         let distinct = |a: &[f64], b: &[f64]| a.iter().zip(b).any(|(a, b)| a.to_bits() != b.to_bits());
         self.add(
             "programs with distinct results",
@@ -136,7 +136,7 @@ impl Distribution {
         out
     }
 
-    /// The length of a function that this part of all does not exceed.
+    /// The length that this fraction of all functions does not exceed.
     fn length(&self, part: f64) -> u64 {
         let mut lengths: Vec<(u64, u64)> =
             self.group("length").iter().map(|(name, n)| (name.parse().expect("a number"), *n)).collect();

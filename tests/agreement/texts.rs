@@ -1,4 +1,4 @@
-//! Texts through the whole compiler: to the programs of a fixed and of the adaptive method.
+//! Compiles texts to the programs of a fixed and of the adaptive method.
 
 use crate::case::{Case, of_program};
 use crate::support::Texts;
@@ -13,16 +13,16 @@ use grammar::diagnostic::Diagnostic;
 /// The fixed methods, in turn.
 pub const FIXED: [Method; 4] = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit];
 
-/// Operations of all functions of a program beyond which it is left out: what takes gcc minutes shows nothing new.
+/// Programs with more operations in all functions are skipped: gcc takes minutes for them, and they show nothing new.
 const MOST_OPERATIONS: usize = 5_000;
 
 /// The step of a fixed method where the text has none, in s.
 const STEP: f64 = 1e-4;
 
-/// Why a text gives no program: the code of its first mistake.
+/// Why a text has no program: the code of its first error.
 pub type Fallen = String;
 
-/// What is wrong, by its code.
+/// The first error, by its code.
 pub fn fallen(found: &[Diagnostic]) -> Fallen {
     let error = found.iter().find(|diagnostic| diagnostic.is_error());
     error.map_or_else(|| "what could not be read".into(), |error| error.code.to_string())
@@ -31,7 +31,7 @@ pub fn fallen(found: &[Diagnostic]) -> Fallen {
 /// All combinations of an experiment with a method, and the step in s: the text's own, if it has one.
 ///
 /// # Errors
-/// Everything that is wrong with it.
+/// All errors of the text.
 pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<(Vec<Variant>, f64), Vec<Diagnostic>> {
     let sources = Texts::default();
     let mut loaded = compiler::load(name, text, &sources);
@@ -50,10 +50,10 @@ pub fn read(name: &str, text: &str, experiment: &str, method: Method) -> Result<
     Ok((variants, if own > 0.0 { own } else { STEP }))
 }
 
-/// A model on its own, its inputs open, for fixed steps of `step` s.
+/// A model alone with its inputs open, for fixed steps of `step` s.
 ///
 /// # Errors
-/// Everything that is wrong with it.
+/// All errors of the text.
 pub fn model(name: &str, text: &str, model: &str, method: Method, step: f64) -> Result<Program, Vec<Diagnostic>> {
     let sources = Texts::default();
     let mut loaded = compiler::load(name, text, &sources);

@@ -1,24 +1,24 @@
-//! What every bus promises, whatever its kind: run over simulated ones, terminals, TCP and logs by `kinds.rs`, and over
-//! interfaces of a kernel by `kernel.rs`.
+//! The contract that every kind of bus fulfils: run over simulated ones, terminals, TCP and logs by `kinds.rs`, and
+//! over interfaces of a kernel by `kernel.rs`.
 
 use runtime::can::{Bus, Event, Filter, Frame, Options, Received, Refused, State};
 
 /// Two ends of one bus.
 pub struct Pair {
-    /// Opened with the options that were asked for.
+    /// Opened with the requested options.
     pub near: Box<dyn Bus>,
     /// The other end.
     pub far: Box<dyn Bus>,
-    /// What the clock of both shows.
+    /// The clock that both ends use.
     pub now_ns: Box<dyn Fn() -> u64>,
-    /// Takes the far end away.
+    /// Disconnects the far end.
     pub part: Box<dyn FnOnce(Box<dyn Bus>)>,
 }
 
-/// More than any answer takes, and what a failing test waits.
+/// Longer than any answer takes; a failing test waits this long.
 const PATIENCE_NS: u64 = 5_000_000_000;
 
-/// What has come by now.
+/// All frames received so far.
 fn drain(bus: &mut dyn Bus) -> Vec<Received> {
     std::iter::from_fn(|| bus.receive()).collect()
 }
@@ -37,12 +37,12 @@ fn expect(bus: &mut dyn Bus, now_ns: &dyn Fn() -> u64, count: usize) -> Vec<Fram
     got
 }
 
-/// The k-th of many frames that are told apart.
+/// The k-th of many distinct frames.
 fn numbered(k: u32) -> Frame {
     Frame::new(0x180 + k % 3, &k.to_be_bytes())
 }
 
-/// Checks one kind; `make` gives two fresh ends.
+/// Checks one kind; `make` returns two new ends.
 pub fn check(kind: &str, make: &dyn Fn(&Options) -> Pair) {
     order_is_kept(kind, make(&Options::default()));
     every_frame_is_carried_whole(kind, make(&Options::default()));
@@ -65,7 +65,7 @@ fn order_is_kept(kind: &str, mut pair: Pair) {
         assert_eq!(pair.far.send(frame), Ok(()), "{kind}");
     }
     let before_ns = (pair.now_ns)();
-    // What comes first may be an answer to what the near end has sent.
+    // The first frame may be an answer to what the near end has sent.
     let received = loop {
         assert!(pair.near.wait(before_ns + PATIENCE_NS), "{kind}: no frame comes");
         if let Some(received) = pair.near.receive() {
@@ -74,7 +74,7 @@ fn order_is_kept(kind: &str, mut pair: Pair) {
     };
     let Received::Frame(first, stamp_ns) = received else { panic!("{kind}: {received:?} is no frame") };
     assert_eq!(first, sent[0], "{kind}");
-    // Stamped when it came, on the clock that everybody reads.
+    // Stamped at arrival, on the shared clock.
     assert!(stamp_ns <= (pair.now_ns)() && stamp_ns + PATIENCE_NS > before_ns, "{kind}: stamped {stamp_ns}");
     assert_eq!(expect(&mut *pair.near, &pair.now_ns, 29), sent[1..], "{kind}, back");
 }
@@ -90,7 +90,7 @@ fn every_frame_is_carried_whole(kind: &str, mut pair: Pair) {
         Frame::remote_extended(0x701, 8),
     ];
     for frame in all {
-        // The card that QEMU emulates makes something else of this one.
+        // The card emulated by QEMU alters this one.
         if kind == "SJA1000" && frame.is_remote() && frame.is_extended() {
             continue;
         }
@@ -101,24 +101,24 @@ fn every_frame_is_carried_whole(kind: &str, mut pair: Pair) {
     }
 }
 
-/// How many frames came or are counted as lost.
+/// How many frames arrived or are counted as lost.
 fn counted(got: &[Received], near: &dyn Bus) -> u64 {
     frames(got).len() as u64 + near.health().lost
 }
 
-/// Waits until so many frames that the far end sent have come or are counted as lost.
+/// Waits until `count` frames of the far end have arrived or are counted as lost.
 fn gather(pair: &mut Pair, got: &mut Vec<Received>, count: u64) {
     let until_ns = (pair.now_ns)() + PATIENCE_NS;
     while counted(got, &*pair.near) < count && (pair.now_ns)() < until_ns {
-        // What the far end still has in hand goes out when it is asked.
+        // The far end sends its queued frames when it is polled.
         drain(&mut *pair.far);
         pair.near.wait((pair.now_ns)() + 10_000_000);
         got.extend(drain(&mut *pair.near));
     }
 }
 
-/// With a reader that comes when it is called, nothing is lost; but a virtual interface never says that it is full, and
-/// then its losses are counted.
+/// With a reader that reads whenever it is woken, nothing is lost. But a virtual interface never reports that it is
+/// full, and then its losses are counted.
 fn a_burst_arrives_whole(kind: &str, mut pair: Pair) {
     let mut got = Vec::new();
     for k in 0..2000 {
@@ -135,11 +135,11 @@ fn a_burst_arrives_whole(kind: &str, mut pair: Pair) {
     assert_eq!(lost as u64, pair.near.health().lost, "{kind}: {} of 2000", got.len());
     let mut all = (0..2000).map(numbered);
     assert!(got.iter().all(|got| all.any(|sent| sent == *got)), "{kind}: order is kept");
-    // Only who may enlarge its buffer beyond everybody's limit has room for a burst.
+    // A burst fits only if the process may enlarge its buffer beyond the common limit.
     assert!(lost == 0 || kind == "vcan" && std::env::var("GUEST").is_err(), "{kind}: {lost} lost");
 }
 
-/// With a reader that sleeps, what does not arrive was refused or is counted, and no call waits.
+/// With a reader that sleeps, every missing frame was refused or is counted, and no call blocks.
 fn what_is_taken_arrives_or_is_counted(kind: &str, mut pair: Pair) {
     let mut taken = 0;
     for k in 0..20_000 {
@@ -206,7 +206,7 @@ fn a_peer_that_goes_is_a_fault(kind: &str, pair: Pair) {
     }
     assert!(events.contains(&Event::Down), "{kind}: {events:?}");
     assert_eq!(near.health().state, State::Down, "{kind}");
-    // A stream may take a little before it says so.
+    // A stream may take a moment to report it.
     let refused = (0..1000).map(|k| near.send(numbered(k))).find(Result::is_err);
     assert_eq!(refused, Some(Err(Refused::Down)), "{kind}");
     assert_eq!(frames(&drain(&mut *near)), [], "{kind}");

@@ -1,5 +1,5 @@
-//! Interfaces of a real kernel: the contract of buses, states, errors, and what is said of an interface. Needs a kernel
-//! with CAN and the right to make interfaces: `runner` sees to both.
+//! Interfaces of a real kernel: the bus contract, states, errors, and the information about an interface. Needs a
+//! kernel with CAN and the right to create interfaces: `runner` provides both.
 
 mod contract;
 mod rig;
@@ -17,10 +17,10 @@ use std::sync::{Arc, Mutex};
 
 const RATE: u32 = 1_000_000;
 
-/// The cards are two, and tests are many.
+/// There are two cards, and many tests.
 static CARDS: Mutex<()> = Mutex::new(());
 
-/// A virtual interface of its own for each pair.
+/// A new virtual interface for each pair.
 fn fresh() -> String {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let name = format!("vcan{}", NEXT.fetch_add(1, Ordering::Relaxed));
@@ -32,7 +32,7 @@ fn open(name: &str) -> SocketCan {
     SocketCan::open(name, &Options::default(), Monotonic::new()).expect("it is up")
 }
 
-/// Whether this is the guest of `tests/can`, with its cards. Elsewhere only what virtual interfaces show can be seen.
+/// Whether this is the virtual machine of `tests/can`, with its cards. Elsewhere only virtual interfaces can be tested.
 fn guest() -> bool {
     let guest = std::env::var("GUEST").is_ok();
     if !guest {
@@ -65,7 +65,7 @@ fn two_cards_keep_the_contract() {
     let _cards = CARDS.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     contract::check("SJA1000", &|options| {
         for name in ["can0", "can1"] {
-            // Down first: a bit rate is set before an interface is taken up.
+            // Down first: a bit rate can be set only before an interface is up.
             socketcan::take_down(name).expect("we may");
             socketcan::take_up(name, Some(RATE)).expect("the driver is loaded");
         }
@@ -177,7 +177,7 @@ fn an_interface_that_comes_back_works_again() {
     assert_eq!(near.health().state, State::Active);
 }
 
-/// A stamp is the kernel's: the age of a frame when it is read, not when it is looked at.
+/// A time stamp is the kernel's: the age of a frame, not the time at which it is read.
 #[test]
 fn frames_are_stamped_when_they_come() {
     let (name, clock) = (fresh(), Monotonic::new());
@@ -201,7 +201,7 @@ fn prepared_frames_arrive() {
     assert!(matches!(far.receive(), Some(Received::Frame(frame, _)) if frame == stop));
 }
 
-/// What comes faster than it can be read, through two cards. Whatever is missing has been told.
+/// Frames faster than they can be read, through two cards. Every missing frame has been reported.
 #[test]
 fn a_flood_is_read_or_its_loss_is_told() {
     if !guest() {
@@ -242,7 +242,7 @@ fn a_flood_is_read_or_its_loss_is_told() {
     assert!(read > sent / 2 && (read == sent || lost > 0), "{read} read, {lost} told as lost");
 }
 
-/// The kernel's own gateway between two virtual buses, with rules. `-e`: what it forwards, sockets there can read.
+/// The kernel's own gateway between two virtual buses, with rules. `-e`: forwarded frames can be read by sockets there.
 fn gateway(rules: &[&[&str]]) {
     let run = |args: &[&str]| {
         let output = Command::new("cangw").args(args).output().unwrap_or_else(|error| panic!("cangw: {error}"));
@@ -252,8 +252,8 @@ fn gateway(rules: &[&[&str]]) {
     rules.iter().for_each(|rule| run(rule));
 }
 
-/// A rig of 50 Hz on one side of a gateway, its drives on the other, until it has been armed for a while; then the rules
-/// change. Why it stopped, and after how many cycles; no drive has torque then.
+/// A rig at 50 Hz on one side of a gateway, its drives on the other, until it has been armed for a while; then the
+/// rules change. Returns why it stopped, and after how many cycles; no drive has torque then.
 fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
     let (near, far) = (fresh(), fresh());
     gateway(&[&["-A", "-e", "-s", &near, "-d", &far], &["-A", "-e", "-s", &far, "-d", &near]]);
@@ -288,8 +288,8 @@ fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
     noticed.expect("a stop has its cause")
 }
 
-/// Rows of the fault campaign on a kernel: frames that a rule drops, a data word that a rule rewrites, an interface that
-/// goes down.
+/// Rows of the fault campaign on a kernel: frames that a rule drops, a data word that a rule rewrites, an interface
+/// that goes down.
 #[test]
 fn a_rig_stops_when_the_kernel_drops_or_rewrites_its_frames() {
     if !guest() {

@@ -1,4 +1,4 @@
-//! The contract of buses over the buses that need no kernel with CAN.
+//! The bus contract for kinds of buses that need no kernel with CAN.
 
 mod contract;
 
@@ -15,7 +15,7 @@ fn simulated(world: Simulation) -> impl Fn(&Options) -> Pair {
         let Options { bit_rate, filter, listen_only } = options.clone();
         let (near, far) = (bus.join("near", Join { bit_rate, filter, listen_only }), bus.port("far"));
         let clock = world.clone();
-        // Somebody must acknowledge what the far end sends to one that only listens.
+        // Frames of the far end to a listen-only one must be acknowledged.
         let part = move |_| bus.take_down("near");
         Pair {
             near: Box::new(near),
@@ -44,7 +44,7 @@ fn serial_over_a_pseudo_terminal() {
         let path = far.path().expect("a door has a path").to_path_buf();
         let options = Options { bit_rate: Some(1_000_000), ..options.clone() };
         let near = Slcan::open(&path, &options, clock).expect("an adapter");
-        // The door hears that the bus is open.
+        // The door is notified that the bus is open.
         assert!(far.wait(clock.now_ns() + 5_000_000_000));
         while far.receive().is_some() {}
         Pair {
@@ -56,7 +56,7 @@ fn serial_over_a_pseudo_terminal() {
     });
 }
 
-/// Serves greetings until a client is through.
+/// Serves greetings until a client is connected.
 fn served(
     server: &mut Server,
     clock: Monotonic,
@@ -70,7 +70,7 @@ fn served(
             while connection.receive().is_some() {}
         }
     }
-    // What was sent in the pause behind the greetings would not be heard.
+    // Frames sent in the pause after the greetings would be lost.
     clock.sleep_until(clock.now_ns() + 30_000_000);
     (opening.join().expect("greeted"), connections.remove(0))
 }
@@ -92,7 +92,7 @@ fn text_over_tcp() {
     });
 }
 
-/// A frame that another thread sends arrives, whatever the bus is in the middle of.
+/// A frame that another thread sends arrives, whatever the bus is doing at the moment.
 #[test]
 fn prepared_frames_arrive() {
     let clock = Monotonic::new();

@@ -1,8 +1,8 @@
-//! The gates of real time, where time is exact: a loop sends SYNC and a set-point and waits for a drive's answer, on a
-//! kernel with PREEMPT_RT whose nanoseconds are counted instructions. The same program meets the same times on any host,
-//! however busy; bounds are gated, not values, since each build of it moves them a little.
+//! Real-time gates with exact time: a loop sends SYNC and a set-point and waits for a drive's answer, on a kernel with
+//! PREEMPT_RT whose nanoseconds are counted instructions. The same program has the same timing on any host, however
+//! busy. Bounds are checked, not values, because each build changes them slightly.
 //!
-//! Each gate is also seen red: with a lock, an allocation, a system call, or memory that was not locked.
+//! Each gate is also shown to fail: with a lock, an allocation, a system call, or memory that is not locked.
 
 mod rig;
 
@@ -22,37 +22,37 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Once};
 use std::time::Duration;
 
-/// A loop at 80 stands above the drive at 79, which waits for it.
+/// The loop has priority 80, above the drive at 79, which waits for it.
 const LOOP: i32 = 80;
 const DRIVE: i32 = 79;
 
-/// Name of the gate of wake-ups.
+/// Name of the gate on wake-up latency.
 const LATENESS: &str = "lateness, ns";
 
-/// Latest wake-up.
+/// Largest wake-up latency.
 const LATENESS_NS: u64 = 6_000;
-/// The same in a whole rig, where a frame of the drives may just be taken from a card: well below the twentieth of a
-/// period that `fric bench-rt` asks for.
+/// The same in a whole rig, where a frame of the drives may just be read from a card: well below the twentieth of a
+/// period that `fric bench-rt` requires.
 const LATENESS_RIG_NS: u64 = 20_000;
 
-/// From before SYNC is handed over to when its answer has been read.
+/// From before SYNC is sent to after its answer has been read.
 const ANSWER_NS: u64 = 110_000;
 
-/// What a gate looks at.
+/// The measurements of a gate.
 #[derive(Default)]
 struct Outcome {
     lateness: Histogram,
     answer: Histogram,
-    /// Cycles without an answer in time, or not over at the next one's begin.
+    /// Cycles without an answer in time, or not finished when the next one begins.
     missed: u64,
     heap_calls: u64,
     page_faults: u64,
-    /// System calls other than to sleep, wait, receive and send on the bus.
+    /// System calls other than those to sleep, wait, receive and send on the bus.
     foreign_calls: u64,
 }
 
 impl Outcome {
-    /// The gates that are red, with what they saw.
+    /// The gates that fail, with their measurements.
     fn red(&self) -> Vec<String> {
         self.red_beyond(LATENESS_NS)
     }
@@ -74,16 +74,16 @@ impl Outcome {
     }
 }
 
-/// What is done wrong, once every hundred cycles.
+/// A deliberate violation, once every hundred cycles.
 #[derive(Clone, Copy, PartialEq)]
 enum Planted {
     Nothing,
-    /// A lock that a thread without priority holds for three periods, again and again.
+    /// A lock that a thread without priority repeatedly holds for three periods.
     Lock,
     Allocation,
     /// A line of a log.
     SystemCall,
-    /// Memory that is not locked: fresh pages are mapped when they are touched.
+    /// Memory that is not locked: new pages are mapped when they are touched.
     Unlocked,
 }
 
@@ -93,11 +93,11 @@ struct Plan {
     rate_hz: u64,
     cycles: u64,
     planted: Planted,
-    /// Whether a thread that computes and one that writes memory run beside it, without priority.
+    /// Whether a computing thread and a memory-writing thread run at the same time, without priority.
     loaded: bool,
 }
 
-/// Waits until all that was printed has left by the serial line: its interrupts come from outside of the guest's time.
+/// Waits until all output has left the serial line, because its interrupts come from outside the simulated time.
 fn silence() {
     std::io::stdout().flush().expect("somebody reads");
     // SAFETY: takes no pointers.
@@ -110,7 +110,7 @@ fn run(plan: &Plan) -> Outcome {
         "these gates hold in the guest only: start them as `cargo test`, which goes through tests/can/runner"
     );
     silence();
-    // Locked memory is the process's: what an earlier gate locked is let go.
+    // Locked memory belongs to the process: release what an earlier gate locked.
     // SAFETY: takes no pointers.
     unsafe { libc::munlockall() };
     let over = Arc::new(AtomicBool::new(false));
@@ -148,12 +148,12 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     let memory = planted != Planted::Unlocked;
     let real_time = threads::enter(&Wishes { priority: LOOP, memory, ..Wishes::default() });
     assert_eq!(real_time.refused(), [], "root of the guest may do all of it");
-    // What a recorder would fill, a page every few cycles. Reserved, and mapped only where memory is locked.
+    // The data of a recorder, a page every few cycles. Reserved, and mapped only if memory is locked.
     let mut record: Vec<u64> = Vec::with_capacity(64 * cycles as usize);
     let mut outcome = Outcome::default();
     let period_ns = 1_000_000_000 / rate_hz;
     let origin_ns = clock.now_ns() + 10_000_000;
-    // The first cycles warm up what no setting can: a few, as a rig has hundreds before it is armed.
+    // The first cycles warm up what no setting can: a few, whereas a rig has hundreds before it is armed.
     let warm = 20;
 
     let fd = bus.descriptor().expect("a socket");
@@ -198,7 +198,7 @@ fn cycle(near: &str, rate_hz: u64, cycles: u64, planted: Planted, lock: &Mutex<u
     outcome.foreign_calls = FOREIGN.load(Ordering::Relaxed);
     outcome.page_faults = threads::suffered().page_faults - faults_before;
     std::hint::black_box(&record);
-    // Nothing more may be called on this thread than a loop may: what it holds is left to the end of the process.
+    // The loop's thread may make no more calls than a loop may: its resources are leaked until the process ends.
     std::mem::forget((bus, log, real_time, record));
     outcome
 }
@@ -264,15 +264,15 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// System calls that a loop may not make, refused and counted.
+/// Forbidden system calls of a loop, refused and counted.
 static FOREIGN: AtomicU64 = AtomicU64::new(0);
 
 extern "C" fn foreign(_signal: libc::c_int) {
     FOREIGN.fetch_add(1, Ordering::Relaxed);
 }
 
-/// From now on this thread may sleep, wait, receive, write to the bus, take locks and end; any other system call is not
-/// done but counted.
+/// From now on this thread may sleep, wait, receive, write to the bus, take locks and end; any other system call is
+/// refused and counted.
 fn watch_calls(bus: i32) {
     static HANDLER: Once = Once::new();
     HANDLER.call_once(|| {
@@ -291,7 +291,7 @@ fn watch_calls(bus: i32) {
         libc::SYS_getsockopt,
         libc::SYS_futex,
         libc::SYS_rt_sigreturn,
-        // What the gate itself asks, and how a thread ends.
+        // Calls of the gate itself, and the end of a thread.
         libc::SYS_getrusage,
         libc::SYS_exit,
         libc::SYS_munmap,
@@ -318,7 +318,7 @@ fn watch_calls(bus: i32) {
             && libc::prctl(libc::PR_SET_SECCOMP, libc::SECCOMP_MODE_FILTER, &raw const code) == 0
     };
     assert!(set, "the guest's kernel has seccomp: {}", std::io::Error::last_os_error());
-    // Its memory stays: giving it back could need a call.
+    // Its memory is leaked: freeing it could need a system call.
     std::mem::forget(program);
 }
 
@@ -326,13 +326,13 @@ fn filter(code: u32, k: u32, yes: u8, no: u8) -> libc::sock_filter {
     libc::sock_filter { code: code as u16, jt: yes, jf: no, k }
 }
 
-/// Tests take turns: there is one processor, and what one does is late for the other.
+/// Tests take turns: there is one processor, so one would delay the other.
 static TURN: Mutex<()> = Mutex::new(());
 
 fn interfaces() {
     static INTERFACES: Once = Once::new();
     INTERFACES.call_once(|| {
-        // Large blocks are fresh pages each time: else a test could be given what an earlier one has touched.
+        // Large blocks get new pages each time; otherwise a test could reuse pages that an earlier one has touched.
         // SAFETY: takes no pointers.
         assert_eq!(unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, 128 << 10) }, 1);
         socketcan::make_virtual("vcan0").expect("the kernel has vcan");
@@ -342,8 +342,8 @@ fn interfaces() {
     });
 }
 
-/// The loop of a whole rig from its start-up on: listening, identifying, configuring, enabling, the tests of time-outs and
-/// signs, then so many cycles of the model. Safety and a log included.
+/// The loop of a whole rig from its start-up on: listening, identification, configuration, enabling, the tests of
+/// time-outs and polarity, then `cycles` cycles of the model. Safety and a log included.
 fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
     let asked = rig::pulsed(1_000_000);
     let clock = Monotonic::new();
@@ -375,13 +375,13 @@ fn whole_rig(cycles: u64) -> (Outcome, Counts, Option<End>) {
         missed: hil.counts().missed + hil.counts().stale,
     };
     let (counts, ended) = (hil.counts().clone(), hil.ended().cloned());
-    // Nothing more may be called on this thread than a loop may: what it holds is left to the end of the process.
+    // The loop's thread may make no more calls than a loop may: its resources are leaked until the process ends.
     std::mem::forget((hil, real_time, operator));
     (outcome, counts, ended)
 }
 
-/// Two drives, five frames each way in a period, the model, the safety and the log: what `fric hil` does. Nothing is
-/// missed from the moment on at which the drives may be enabled.
+/// Two drives, five frames each way per period, the model, the safety and the log, as in `fric hil`. Nothing is missed
+/// once the drives may be enabled.
 #[test]
 fn a_whole_rig_at_1_khz() {
     let _turn = TURN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
@@ -438,8 +438,8 @@ fn gate(name: &str, plan: &Plan) -> Outcome {
     outcome
 }
 
-/// As [`gate`], with what is red. In one measurement of twenty the kernel's own work falls together with a wake-up, 2.7 µs
-/// more: lateness alone, and nothing else, may be measured a second time.
+/// As [`gate`], but returns the failures. In one measurement of twenty the kernel's own work coincides with a wake-up,
+/// 2.7 µs more: latency alone, and nothing else, may be measured a second time.
 fn red(name: &str, plan: &Plan) -> Vec<String> {
     let red = gate(name, plan).red();
     if !matches!(&red[..], [only] if only.starts_with(LATENESS)) {
@@ -474,7 +474,7 @@ fn beside_load() {
     assert_eq!(red("loaded", &Plan { cycles: 1000, loaded: true, ..CARDS }), [""; 0]);
 }
 
-/// Each protection is seen to be one: without it, the gate that should be red is.
+/// Each protection is effective: without it, the corresponding gate fails.
 #[test]
 fn what_does_not_belong_into_a_loop_turns_a_gate_red() {
     for (planted, name, gate_name) in [

@@ -1,4 +1,4 @@
-//! A whole rig: two drives in torque mode, pulsed one after the other, and the drives themselves.
+//! A whole rig: two drives in torque mode with alternating pulses, and the drives themselves.
 
 use abi::rig::{Bus as BusOf, Cia402, Kind, Mode, Node, Output, Overrun, Plant, Rig, Signal, What, Within};
 use abi::series::Method;
@@ -67,8 +67,8 @@ pub fn pulsed(period_ns: u64) -> Identification {
     Identification::new(&rig).expect("its drives take torques")
 }
 
-/// The drives of a rig on an interface, until it is over: whether any of them still has torque then. `priority`: of a
-/// thread in real time; none for an ordinary one.
+/// Runs the drives of a rig on an interface, until it ends; returns whether any of them still has torque then.
+/// `priority`: real-time priority of the thread; none for an ordinary one.
 pub fn drives(rig: &Rig, interface: &str, priority: Option<i32>, over: &AtomicBool) -> bool {
     let clock = Monotonic::new();
     let mut bus = SocketCan::open(interface, &Options::default(), clock).expect("it is up");

@@ -1,6 +1,7 @@
-//! Packages whose hashes are right and whose content is not: each is refused by the check or runs without a panic or a hang.
+//! Packages with correct hashes and corrupted contents: each is refused by the check or runs without a panic or a hang.
 //!
-//! `FRIC_CHANGES=10000 cargo test --test deploy changed_packages` tries as many; `FRIC_SEED=n FRIC_CHANGES=1` repeats one.
+//! `FRIC_CHANGES=10000 cargo test --test deploy changed_packages` tests that many; `FRIC_SEED=n FRIC_CHANGES=1` repeats
+//! one.
 
 use crate::{FRIC_RIG, fine, folder, said, text};
 use abi::image::Image;
@@ -23,7 +24,7 @@ impl Dice {
     }
 }
 
-/// Writes over some bytes: bits, bytes that are limits, counts, numbers that are none.
+/// Overwrites some bytes: bits, limits, counts, numbers that are not finite.
 fn spoil(bytes: &mut Vec<u8>, dice: &mut Dice) {
     let words: [[u8; 8]; 7] = [
         f64::NAN.to_le_bytes(),
@@ -50,12 +51,12 @@ fn spoil(bytes: &mut Vec<u8>, dice: &mut Dice) {
     }
 }
 
-/// A package with one section changed, its hashes mended.
+/// A package with one section changed and its hashes corrected.
 fn changed(package: &Package, seed: u64) -> (Package, &'static str) {
     let mut dice = Dice(Chance(seed));
     let mut package = package.clone();
-    // The plan most of all. What a program says of itself is a promise about its code, which only a signature holds:
-    // a change there must not upset who reads it, and is not run.
+    // Mostly the plan. The description of a program is a promise about its code, which only a signature protects: a
+    // change there must not break its readers, and is not run.
     let section = ["rig", "rig", "rig", "rig", "rig", "live", "head", "control", "plant", "name"][dice.below(10)];
     let at = |package: &Package| package.sections.iter().position(|it| it.name == section).unwrap();
     match section {
@@ -69,7 +70,7 @@ fn changed(package: &Package, seed: u64) -> (Package, &'static str) {
             let mut image = Image::read(&package.sections[at].bytes).unwrap();
             let mut bytes = abi::encode::Encode::to_bytes(&image.description);
             spoil(&mut bytes, &mut dice);
-            // What is no description any more is refused where it is read.
+            // An invalid description is refused by the reader.
             if let Ok(description) = abi::encode::Encode::from_bytes(&bytes) {
                 image.description = description;
                 package.sections[at].bytes = image.to_bytes();
@@ -83,7 +84,7 @@ fn changed(package: &Package, seed: u64) -> (Package, &'static str) {
     (package, section)
 }
 
-/// What a command came to; none if it hangs.
+/// The output of a command; none if it hangs.
 fn within(command: &mut Command) -> Option<Output> {
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let begun = Instant::now();

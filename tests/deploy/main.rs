@@ -1,5 +1,5 @@
-//! Packages and the way to the rig's computer: built twice to the same bytes, refused if a bit differs, deployed over a
-//! real sshd on this machine, rolled back, run, and the recording replayed to the bit.
+//! Packages and their deployment: reproducible builds, refusal of changed bits, deployment over a real sshd on this
+//! machine, rollback, running, and bit-identical replay of the recording.
 
 #[path = "../support/debian.rs"]
 mod debian;
@@ -56,7 +56,7 @@ fn text(bus: &str) -> String {
     RIG.replace("BUS", bus)
 }
 
-/// The rig at a pace that a busy computer keeps, in real time and over TCP.
+/// The rig at a rate that a busy computer can keep, in real time and over TCP.
 fn unhurried(bus: &str) -> String {
     let changes = [
         ("rate     1 ms", "rate     10 ms"),
@@ -73,7 +73,7 @@ fn unhurried(bus: &str) -> String {
     })
 }
 
-/// A folder of its own for one test, empty at its start.
+/// A folder for one test, empty at its start.
 fn folder(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("deploy-{name}"));
     let _ = fs::remove_dir_all(&path);
@@ -82,7 +82,7 @@ fn folder(name: &str) -> PathBuf {
 }
 
 fn fric(folder: &Path, args: &[&str]) -> Output {
-    // Keys that are made on first use belong to the test.
+    // Keys created on first use belong to the test.
     let config = folder.join("config");
     Command::new(env!("CARGO_BIN_EXE_fric"))
         .current_dir(folder)
@@ -110,7 +110,7 @@ fn fails(folder: &Path, args: &[&str], why: &str) {
     assert!(output.status.code() == Some(1) && told.contains(why), "fric {args:?}\n{told}");
 }
 
-/// The small program, built beside this one.
+/// The `fric-rig` program, built beside this one.
 static FRIC_RIG: LazyLock<PathBuf> = LazyLock::new(|| {
     let beside = Path::new(env!("CARGO_BIN_EXE_fric")).with_file_name("fric-rig");
     if !beside.exists() {

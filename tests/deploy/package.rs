@@ -1,4 +1,4 @@
-//! What is in a package: equal bytes for equal texts, every bit of it held, signed, and the same numbers on other
+//! Contents of packages: equal bytes for equal texts, every bit verified, signed, and equal results on other
 //! processors.
 
 use crate::{FRIC_RIG, debian, emulator, fails, fine, folder, fric, said, text};
@@ -26,7 +26,7 @@ fn two_builds_give_equal_bytes_and_no_bit_may_differ() {
     }
     assert!(fine(&folder, &["inspect", "--sources", "a.fricpkg"]).contains("overspeed"));
     assert!(Package::read(&bytes).is_ok());
-    // Positions all over the file, each with another bit: the same every time.
+    // Positions throughout the file, each with another bit: the same every time.
     let mut at = 1usize;
     for k in 0..500 {
         at = (at * 48_271 + k) % bytes.len();
@@ -97,7 +97,7 @@ fn the_stock_tool_checks_our_signatures_and_we_check_its() {
     );
     assert!(said(&told).contains("Trusted comment: rig rtfs, "), "{}", said(&told));
 
-    // A pair that the stock tool made signs and is trusted just so; and what it signs is signed.
+    // A key pair of the stock tool signs and is trusted in the same way; and its signatures are valid.
     fs::create_dir(folder.join("theirs")).unwrap();
     let made = stock(&["-G", "-W", "-p", "theirs/bert.pub", "-s", "theirs/bert.key"]);
     assert!(made.status.success(), "{}", said(&made));
@@ -172,10 +172,11 @@ fn chance(k: u64) -> f64 {
     ((x ^ (x >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
 }
 
-/// What the functions of a program leave in a block.
+/// Blocks after the functions of a program.
 type Blocks = Vec<Vec<f64>>;
 
-/// Both programs of a rig's package, stepped from several starts: inputs of chance, as held readings are.
+/// Both programs of a rig's package, stepped from several starts with random inputs, held during a step as readings
+/// are.
 #[test]
 fn a_package_for_arm_runs_to_the_bit_as_one_for_x86() {
     const STARTS: u64 = 8;

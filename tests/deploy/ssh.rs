@@ -1,4 +1,4 @@
-//! The way to the rig's computer and back, over a real sshd on this machine: deployed, run, rolled back, interrupted.
+//! Deployment over a real sshd on this machine: deployed, run, rolled back, interrupted.
 
 use crate::{FRIC_RIG, debian, fine, folder, fric, said, unhurried};
 use std::fs;
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
-/// A real sshd on a port of its own, with keys of its own; ended when it goes.
+/// A real sshd on a port of its own, with keys of its own; ended on drop.
 struct Sshd {
     child: Child,
     options: Vec<String>,
@@ -44,7 +44,7 @@ impl Sshd {
         );
         fs::write(folder.join("sshd_config"), config).unwrap();
         let libraries = sshd.parent().unwrap().join("../lib/x86_64-linux-gnu");
-        // A server of root wants a user and a folder of its own: in a view of the file system that only it has.
+        // As root, sshd needs a user and a folder: provide them in a private mount namespace.
         let script = "set -e; sshd=$1; dir=$2; \
                       if [ $(id -u) = 0 ] && ! { getent passwd sshd && [ -d /run/sshd ]; } >/dev/null; then \
                         { cat /etc/passwd; echo 'sshd:x:74:65534::/run/sshd:/usr/sbin/nologin'; } > $dir/passwd; \
@@ -88,7 +88,7 @@ impl Drop for Sshd {
     }
 }
 
-/// The rig's computer: reached over ssh, and looked at directly.
+/// The rig's computer: reached over ssh, and inspected directly.
 struct There {
     folder: PathBuf,
     dir: PathBuf,
@@ -127,7 +127,7 @@ impl There {
         said(&output)
     }
 
-    /// `fric-rig …`, as somebody who sits there types it.
+    /// `fric-rig …`, as typed on that computer.
     fn local(&self, args: &[&str]) -> Output {
         Command::new(&*FRIC_RIG).args(args).arg("--dir").arg(&self.dir).output().unwrap()
     }
@@ -142,12 +142,12 @@ impl There {
         fs::read_link(self.dir.join("current")).ok()
     }
 
-    /// What a rig that `start` started has said.
+    /// The output of a rig started by `start`.
     fn out(&self) -> String {
         fs::read_to_string(self.dir.join("log/rig.out")).unwrap_or_default()
     }
 
-    /// What the rig that runs says of itself: package, stage, cycles; empty if none runs.
+    /// The state that the running rig reports: package, stage, cycles; empty if none runs.
     fn state(&self) -> (String, String, u64) {
         let status = said(&self.local(&["status"]));
         let Some(state) = status.lines().find_map(|line| line.strip_prefix("runs: ")) else {
@@ -159,7 +159,7 @@ impl There {
         (package.into(), stage.into(), cycles.parse().expect("a number"))
     }
 
-    /// Waits until the rig says so.
+    /// Waits until the rig reports a state.
     #[track_caller]
     fn wait(&self, what: &str, mut holds: impl FnMut(&(String, String, u64)) -> bool) -> (String, String, u64) {
         let begun = Instant::now();
@@ -183,7 +183,7 @@ impl There {
 
 impl Drop for There {
     fn drop(&mut self) {
-        // A test that failed leaves no rig behind.
+        // A failed test leaves no rig running.
         let process = fs::read_to_string(self.dir.join("lock")).unwrap_or_default();
         if !self.state().0.is_empty() && !process.trim().is_empty() {
             let _ = Command::new("kill").args(["-9", process.trim()]).status();
@@ -199,7 +199,7 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     let there = There::new(folder.clone());
     let trusted = folder.join("trusted").display().to_string();
 
-    // With a trusted key there, what is not signed is refused, and nothing is installed.
+    // With a trusted key there, an unsigned package is refused, and nothing is installed.
     fine(&folder, &["key", "new", "trusted/anna"]);
     let refused = there.over_ssh("deploy", &["rig.fric", "--trusted", &trusted]);
     let told = said(&refused);
@@ -227,18 +227,18 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     }
     assert_eq!(there.current().as_ref(), Some(&first));
 
-    // One that is whole and does not start gives way to the one before.
+    // A complete one that does not start is replaced by the previous one.
     let refused = there.over_ssh("deploy", &["bad.fric", "--start"]);
     assert!(!refused.status.success(), "{}", said(&refused));
     assert!(said(&refused).contains(": registered key "), "{}", said(&refused));
     assert!(said(&refused).contains("it does not start") && said(&refused).contains("back to "), "{}", said(&refused));
     assert_eq!(there.current().as_ref(), Some(&first));
 
-    // The good one starts and runs by itself on its simulated drives; another one is refused beside it.
+    // The good one starts and runs by itself with its simulated drives; another one is refused at the same time.
     let started = there.local(&["start", "--roll", "1.5MB", "--keep", "20MB"]);
     assert!(started.status.success(), "{}", said(&started));
     there.wait("running", |state| state.2 > 10);
-    // The sizes of logs are those of the process that runs.
+    // The size limits of logs reach the running process.
     let process = said(&started).lines().find_map(|line| line.strip_prefix("started, process ").map(str::to_string));
     let words = fs::read_to_string(format!("/proc/{}/cmdline", process.unwrap().trim())).unwrap().replace('\0', " ");
     assert!(words.contains("--roll 1500kB") && words.contains("--keep 20000kB"), "{words}");
@@ -249,7 +249,7 @@ fn what_is_wrong_with_a_package_changes_nothing_there() {
     assert!(said(&there.local(&["start"])).contains("it runs"));
     there.ends();
 
-    // What is not reached says so.
+    // An unreachable host is reported.
     let nobody = fric(&folder, &["fetch-log", &there.host, "-o", "Port=1"]);
     assert!(!nobody.status.success() && said(&nobody).contains("there are no logs"), "{}", said(&nobody));
 }
@@ -264,8 +264,8 @@ impl Drop for Drives {
     }
 }
 
-/// From one computer to the drives: built here, deployed over ssh, run against simulated drives behind socketcand, and
-/// every recording computed again here to the bit. A second package is taken over only once no drive has torque.
+/// From one computer to the drives: built here, deployed over ssh, run with simulated drives over socketcand, and every
+/// recording replayed here to the bit. A second package is activated only once no drive has torque.
 #[test]
 fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     let folder = folder("socketcand");
@@ -276,7 +276,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     fs::write(folder.join("rig.fric"), &rig).unwrap();
     fs::write(folder.join("other.fric"), rig.replace("1 rad)", "0.5 rad)")).unwrap();
     fs::write(folder.join("bad.fric"), rig.replace(&format!("127.0.0.1:{port}"), "127.0.0.1:1")).unwrap();
-    // The drives behind the bus: the plant of the same package, by the small program.
+    // The drives on the bus: the plant of the same package, by `fric-rig`.
     fine(&folder, &["build", "rig.fric", "-o", "rig.fricpkg"]);
     let drives = Command::new(&*FRIC_RIG)
         .current_dir(&folder)
@@ -299,7 +299,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     there.says("arm");
     let (_, _, cycles) = there.wait("running", |state| state.2 > 20);
 
-    // Parameters change by what the package carries: whole, or refused in the words of a start.
+    // Parameters change according to the package: as a whole, or refused with the message of a start.
     let taken = there.local(&["say", "set fr.Fs = 0.5 N·m, fr.Fc = 0.3 N·m"]);
     assert!(taken.status.success() && said(&taken).contains("not judged: whether the fixed step"), "{}", said(&taken));
     for (set, why) in [
@@ -313,7 +313,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
         assert!(!output.status.success() && said(&output).contains(why), "{set}: {}", said(&output));
     }
 
-    // Another package while drives have torque: installed, and not taken over.
+    // Another package while drives have torque: installed, but not activated.
     let told = there.deploys(&["other.fric", "--start"]);
     assert!(!told.contains("made a key") && !told.contains("registered"), "only the first time: {told}");
     assert!(told.contains("it takes the package over as soon as no drive has torque"), "{told}");
@@ -325,7 +325,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     there.says("stop");
     there.wait("taken over", |state| state.0 == name(&second) && state.1.contains("enable"));
 
-    // At rest a package is taken over at once, and one that cannot start gives way to the one before.
+    // At rest a package is activated at once, and one that cannot start is replaced by the previous one.
     let refused = there.over_ssh("deploy", &["bad.fric", "--start"]);
     let told = said(&refused);
     assert!(!refused.status.success() && told.contains("back to "), "{told}\n{}", there.out());
@@ -350,7 +350,7 @@ fn a_rig_is_deployed_run_over_socketcand_and_replayed_to_the_bit() {
     assert!(whole >= 2);
 }
 
-/// `FRIC_INTERRUPTS=100 cargo test --test deploy interrupted` kills as many.
+/// `FRIC_INTERRUPTS=100 cargo test --test deploy interrupted` kills that many.
 #[test]
 fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
     let tries: u32 = std::env::var("FRIC_INTERRUPTS").map_or(4, |n| n.parse().expect("a number"));
@@ -361,7 +361,7 @@ fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
     there.deploys(&["rig.fric", "--start"]);
     let first = there.current().unwrap().display().to_string();
     let (_, _, mut cycles) = there.wait("running", |state| state.2 > 0);
-    // How long a whole one takes, without its start.
+    // The duration of a complete one, without its start.
     let begun = Instant::now();
     fs::write(folder.join("next.fric"), format!("// whole\n{rig}")).unwrap();
     there.deploys(&["next.fric"]);
@@ -374,10 +374,10 @@ fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
         command.env("XDG_CONFIG_HOME", folder.join("config"));
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
         let mut child = command.spawn().unwrap();
-        // Spread over its whole time by the golden ratio, and a little beyond.
+        // Spread over this duration by the golden ratio, and slightly beyond.
         let part = (f64::from(k) * 0.618_034 + 0.3).fract() * 1.1;
         std::thread::sleep(whole.mul_f64(part));
-        // With its ssh and scp.
+        // Including its ssh and scp.
         let _ = Command::new("kill").args(["-9", "--", &format!("-{}", child.id())]).status();
         let _ = child.wait();
 
@@ -388,7 +388,7 @@ fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
         let checked = Command::new(&*FRIC_RIG).arg("check").arg(&current).output().unwrap();
         assert!(checked.status.success(), "try {k}: {}", said(&checked));
     }
-    // And the next whole one arrives, whatever the others left behind.
+    // The next complete one succeeds, whatever the interrupted ones left.
     fs::write(folder.join("next.fric"), format!("// at last\n{rig}")).unwrap();
     there.deploys(&["next.fric"]);
     let last = there.current().unwrap().display().to_string();
@@ -398,7 +398,7 @@ fn a_deployment_that_is_interrupted_leaves_the_rig_running_what_it_ran() {
     there.ends();
 }
 
-/// The state is told for as long as the rig runs, and no longer.
+/// The state is reported for as long as the rig runs, and no longer.
 #[test]
 fn a_started_rig_is_followed_until_it_ends() {
     let folder = folder("followed");

@@ -1,4 +1,4 @@
-//! Whom a rig's computer trusts, and whom the developer's does: keys, ages of packages, names from the other side.
+//! Trust between a rig's computer and the developer's: keys, ages of packages, names from the other side.
 
 use crate::{FRIC_RIG, fails, fine, folder, fric, said, text};
 use runtime::package::Package;
@@ -41,23 +41,23 @@ fn an_unsigned_package_moves_no_real_drive() {
     refuses(&folder, &[&["install", "real.fricpkg"], &store[..], &nobody].concat(), unsigned);
     assert!(!folder.join("store").exists(), "nothing is made for what is refused");
     refuses(&folder, &[&["run", "real.fricpkg"], &store[..], &nobody].concat(), unsigned);
-    // Another bus put under it counts, in either direction.
+    // A replacement of its bus counts, in either direction.
     let other = ["run", "sim.fricpkg", "--bus", "can0=socketcan:nosuchcan"];
     refuses(&folder, &[&other, &store[..], &nobody].concat(), unsigned);
     let fast = ["--sim", "--fast", "--for", "20ms"];
     takes(&folder, &[&["run", "real.fricpkg"], &fast[..], &store, &nobody].concat());
     takes(&folder, &with(&["check", "sim.fricpkg"], &nobody));
-    // Said, it goes on, up to the bus that is not there.
+    // With permission it continues, up to the missing bus.
     let allowed = [&["run", "real.fricpkg", "--allow-unsigned"], &store[..], &nobody].concat();
     refuses(&folder, &allowed, "bus `can0`: ");
     takes(&folder, &with(&["check", "real.fricpkg", "--allow-unsigned"], &nobody));
-    // Where a key is trusted, nothing unsigned runs at all.
+    // Once a key is trusted, nothing unsigned runs at all.
     fine(&folder, &["key", "new", "trusted/anna"]);
     for package in ["real.fricpkg", "sim.fricpkg"] {
         let check = ["check", package, "--allow-unsigned", "--trusted", "trusted"];
         refuses(&folder, &check, "this computer trusts anna only");
     }
-    // A signature by a key that nobody trusts is none.
+    // A signature with an untrusted key does not count.
     fine(&folder, &["build", "real.fric", "-o", "signed.fricpkg", "--sign", "trusted/anna.key"]);
     refuses(
         &folder,
@@ -85,15 +85,15 @@ fn a_package_that_was_signed_earlier_is_not_installed_over_a_later_one() {
     takes(&folder, &words("new.fricpkg"));
     takes(&folder, &[&words("old.fricpkg")[..], &["--allow-older"]].concat());
     takes(&folder, &words("new.fricpkg"));
-    // Going back is asked for by its own name.
+    // Going back has a command of its own.
     takes(&folder, &["rollback", "--dir", "store"]);
-    // The time is no part of the package: the same text still gives the same bytes.
+    // The time is not part of the package: the same text still gives the same bytes.
     let bytes = fs::read(folder.join("new.fricpkg")).unwrap();
     build("new.fricpkg", "new");
     assert!(fs::read(folder.join("new.fricpkg")).unwrap() == bytes);
 }
 
-/// `ssh` and `scp` of this test: they answer what its files say, and note what they were asked.
+/// Fake `ssh` and `scp` for this test: they answer from files, and record what they were asked.
 struct Fake {
     folder: PathBuf,
 }
@@ -103,7 +103,7 @@ impl Fake {
         let folder = folder(name);
         let bin = folder.join("bin");
         fs::create_dir(&bin).unwrap();
-        // The last word of ssh is the command; that of scp the target, the one before it the source.
+        // The last argument of ssh is the command; that of scp the target, the one before it the source.
         let ssh = format!(
             "#!/bin/sh\nfor last; do :; done\necho \"$last\" >> {0}/asked\n\
              case \"$last\" in *' target') echo {1};; *'ls -1t'*) cat {0}/listing;; *mktemp*) mkdir -p there; echo there;;\n\
@@ -168,7 +168,7 @@ fn a_log_is_fetched_under_one_name_in_one_folder() {
     for name in &names[..names.len() - 1] {
         assert!(!fake.fric(&["fetch-log", "a@b", "--", name]).status.success(), "{name:?}");
     }
-    // One by one, and each the only one.
+    // One by one, each alone.
     for name in &names[..names.len() - 1] {
         fs::write(fake.folder.join("listing"), name).unwrap();
         let output = fake.fric(&["fetch-log", "a@b"]);
@@ -195,11 +195,11 @@ fn what_is_sent_lies_in_a_private_folder_that_goes() {
     let asked = fs::read_to_string(fake.folder.join("asked")).unwrap();
     assert_eq!(asked.matches("rm -rf -- there").count(), 2, "the folder there goes too, whatever happens:\n{asked}");
 
-    // The key that was made is its owner's alone.
+    // The new key is readable by its owner only.
     let key = fs::metadata(fake.folder.join("config/fric/deploy.key")).unwrap();
     assert_eq!(key.mode() & 0o777, 0o600);
 
-    // A package whose rig has a name that leads elsewhere.
+    // A package whose rig has a name that leads to another folder.
     let package = Package { rig: "../../x".into(), target: runtime::package::here(), ..Package::default() };
     fs::write(fake.folder.join("bad.fricpkg"), package.to_bytes()).unwrap();
     let output = fake.fric(&["deploy", "a@b", "bad.fricpkg"]);
@@ -226,7 +226,7 @@ fn a_log_in_parts_is_fetched_whole() {
     assert_eq!(fetched(&["--all"]).len(), 5);
 }
 
-/// A key appears with the mode that it keeps.
+/// A key is created with its final mode.
 #[test]
 fn a_secret_key_is_never_readable_by_others() {
     let folder = folder("secret");

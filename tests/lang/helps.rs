@@ -1,11 +1,11 @@
-//! What a help proposes is accepted: each mistake, the words of its help, and the text with the help applied.
+//! Suggestions of diagnostics are accepted: each error, the text of its help, and the program with the help applied.
 
 use super::support::{Texts, checked, line};
 
 const IMPORTS: &str =
     "import std.bench\nimport std.friction\nimport std.control\nimport std.plant\nimport std.observer\n";
 
-/// A slip, what its help says, and the text that follows it. One mistake gives one message.
+/// An error, its help, and the text with the help applied. One error gives one message.
 const SLIPS: &[(&str, &str, &str)] = &[
     // A unit is read from left to right.
     (

@@ -1,5 +1,4 @@
-//! What several tests share: texts with the library beside them, what is wrong with them as short lines, and runs on
-//! every back end.
+//! Shared by several tests: texts with the library, their diagnostics as short lines, and runs on every back end.
 
 #![allow(dead_code, reason = "each test uses its part")]
 
@@ -12,7 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
-/// Where the project lies.
+/// The root folder of the project.
 pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
@@ -77,7 +76,7 @@ impl Sources for Texts {
     }
 }
 
-/// What is wrong with a text, and the text as it was read.
+/// The diagnostics of a text, and the loaded text.
 pub fn checked(name: &str, text: &str, sources: &Texts) -> (Loaded, Vec<Diagnostic>) {
     let mut loaded = compiler::load(name, text, sources);
     let found = compiler::check(&mut loaded, sources);
@@ -87,7 +86,7 @@ pub fn checked(name: &str, text: &str, sources: &Texts) -> (Loaded, Vec<Diagnost
     (loaded, found)
 }
 
-/// A diagnostic has a code, words, and places that lie in its texts at the boundaries of characters.
+/// Checks that a diagnostic has a code, a message, and labels inside its texts at character boundaries.
 #[track_caller]
 pub fn sound(loaded: &Loaded, diagnostic: &Diagnostic) {
     let code = diagnostic.code;
@@ -100,7 +99,7 @@ pub fn sound(loaded: &Loaded, diagnostic: &Diagnostic) {
     }
 }
 
-/// `2:18 E0101 cannot add a force and a velocity`; in another text than the first with its name before.
+/// `2:18 E0101 cannot add a force and a velocity`; with the file name first, if not in the first text.
 pub fn line(loaded: &Loaded, diagnostic: &Diagnostic) -> String {
     let first_line = diagnostic.message.lines().next().unwrap_or_default();
     format!("{} {} {first_line}", place(loaded, diagnostic.span()), diagnostic.code)
@@ -118,11 +117,11 @@ fn place(loaded: &Loaded, span: Span) -> String {
     }
 }
 
-/// Runs an experiment on the interpreter and as machine code; both must agree to the bit. One result for each case of
+/// Runs an experiment in the interpreter and as machine code; both must agree to the bit. One result for each case of
 /// its sweeps.
 ///
 /// # Errors
-/// What is wrong with the experiment.
+/// Diagnostics of the experiment.
 #[track_caller]
 pub fn run(
     loaded: &mut Loaded,
@@ -135,7 +134,7 @@ pub fn run(
             runtime::engine::run(case.instance.clone(), &case.experiment, &mut |_| Continue::Continue(()))
         };
         let (result, reference) = (go(&machine), go(&interpreted));
-        // Numbers are printed so that they can be read back: equal words are equal bits, and NaN equals NaN.
+        // Numbers are printed so that they parse back: equal texts mean equal bits, and NaN equals NaN.
         assert_eq!(
             format!("{result:?}"),
             format!("{reference:?}"),
@@ -148,10 +147,10 @@ pub fn run(
     Ok(results)
 }
 
-/// A hundred of its steps, else of 1 ms, with each fixed method on both back ends, every slot compared.
+/// Compares every slot after a hundred steps of its length, else of 1 ms, with each fixed method on both back ends.
 ///
 /// # Errors
-/// What is wrong with the experiment.
+/// Diagnostics of the experiment.
 #[track_caller]
 pub fn agree(loaded: &mut Loaded, sources: &Texts, experiment: &str) -> Result<(), Vec<Diagnostic>> {
     let own = both(loaded, sources, experiment, Changes::default())?

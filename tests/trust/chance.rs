@@ -1,6 +1,6 @@
-//! Chance for properties: a seeded generator, and how many cases are tried.
+//! Randomness for properties: a seeded generator, and the number of cases.
 
-/// The runtime's generator, with the draws that cases are made of.
+/// The runtime's generator, with draws for cases.
 pub struct Chance(runtime::rng::Chance);
 
 impl Chance {
@@ -19,25 +19,25 @@ impl Chance {
         self.0.between(low, high)
     }
 
-    /// Its logarithm is uniform in [low, high); both positive.
+    /// Log-uniform in [low, high); both positive.
     #[allow(clippy::disallowed_methods, reason = "cases may differ in their last digit between machines")]
     pub fn decades(&mut self, low: f64, high: f64) -> f64 {
         let (low, high) = (low.ln(), high.ln());
         self.within(low, high).exp()
     }
 
-    /// From 0 up to `n`, without it.
+    /// Uniform in 0..n.
     pub fn below(&mut self, n: usize) -> usize {
         (self.0.number() % n as u64) as usize
     }
 
-    /// One of these.
+    /// One of the elements.
     pub fn of<T: Copy>(&mut self, all: &[T]) -> T {
         all[self.below(all.len())]
     }
 }
 
-/// The seeds of a property: `plain` of them, or as many as `FRIC_CASES` says, from `FRIC_SEED` on.
+/// The seeds of a property: `plain` of them, or the number in `FRIC_CASES`, from `FRIC_SEED` on.
 pub fn seeds(plain: u64) -> std::ops::Range<u64> {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let first = number("FRIC_SEED").unwrap_or(1);

@@ -1,10 +1,10 @@
-//! The delay at which `check` calls an emulated contact unstable (W0801) is the one at which `fric predict` does.
+//! The delay at which `check` reports an emulated contact as unstable (W0801) is the one that `fric predict` computes.
 
 use crate::chance::{Chance, seeds};
 use compiler::rig::Emulated;
 use runtime::coupling::loop_stability::{Late, Loop, Shaft, Step};
 
-/// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m², stepped over the coming period with
+/// A contact with this natural frequency and damping ratio on an inertia of 1 kg·m², stepped over the next period with
 /// the newest speed: z' = z + T v, F = K z' + B v.
 fn sampled(contact: Emulated) -> Loop {
     let Emulated { natural, damping_ratio, period, lag } = contact;
@@ -33,7 +33,7 @@ fn the_lint_and_predict_agree_on_the_largest_delay() {
         let lag = chance.within(0.05, 0.4) * Emulated { natural, damping_ratio, period, lag: 0.0 }.limit();
         let contact = Emulated { natural, damping_ratio, period, lag };
         let lint = contact.limit();
-        // A contact that no dead time leaves stable has no limit to compare.
+        // A contact that is unstable at any dead time has no limit to compare.
         let Some(dead) = sampled(contact).limit(0).filter(|dead| *dead > 0.0) else { continue };
         compared += 1;
         let predict = 0.5 * period + lag + dead;

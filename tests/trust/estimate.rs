@@ -1,10 +1,11 @@
-//! The numerical errors that are printed beside measures, judged: how often the true error lies within three of them.
+//! Coverage of the numerical errors that are printed with measures: how often the true error is within three estimates.
 //!
-//! Every experiment of the library and its tests is run by each method, at several tolerances or steps; the truth is an adaptive
-//! run at tol 1e-13. A measure counts as covered if its distance to the truth is at most three times its estimate and what is
-//! not known of the truth: twice its distance to a run at tol 1e-12, and rounding. `cargo test` takes a sample of the space,
-//! chosen by a seed that is printed (`FRIC_SEED=7` takes another one); `cargo test --test trust -- --ignored --nocapture survey`
-//! takes all and prints the table of docs/numerics.md, `EVERY=6` every sixth experiment.
+//! Every experiment of the library and its tests is run by each method, at several tolerances or steps; the reference
+//! is an adaptive run at tol 1e-13. A measure counts as covered if its distance to the reference is at most three times
+//! its estimate plus the uncertainty of the reference: twice its distance to a run at tol 1e-12, and rounding. `cargo
+//! test` takes a sample of the space, chosen by a seed that is printed (`FRIC_SEED=7` takes another one); `cargo test
+//! --test trust -- --ignored --nocapture survey` takes all and prints the table of docs/numerics.md, `EVERY=6` every
+//! sixth experiment.
 
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, root, texts_below};
@@ -16,7 +17,7 @@ use runtime::run::verdict::Reading;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// What part of the true error an estimate must cover: three times itself, in so many measures of all.
+/// Required coverage: within this many estimates, for this share of measures.
 const TIMES: f64 = 3.0;
 const SHARE: f64 = 0.99;
 
@@ -27,12 +28,14 @@ const STEPS: [f64; 2] = [1e-3, 1e-4];
 const MOST_STEPS: f64 = 4e5;
 const FEW_STEPS: f64 = 3e4;
 
-/// A sample has so many measures at least, by so many solvers of each experiment drawn.
+/// Least number of measures in a sample, and number of solvers for each experiment drawn.
 const SAMPLE: u64 = 300;
 const SOLVERS: usize = 4;
-/// Part of a sample that must be covered: the share of the whole, less three deviations of a sample of this size.
+/// Required share of covered measures in a sample: that of the whole, less three standard deviations for this sample
+/// size.
 const SHARE_OF_SAMPLE: f64 = 0.972;
-/// Part of a sample whose error is at most the estimate itself. Fewer: estimates are too small altogether.
+/// Required share of measures whose error is at most the estimate itself. A smaller share means that estimates are
+/// generally too small.
 const WITHIN_ONE: f64 = 0.80;
 
 /// How an experiment is run: its method, and its tolerance or its step in s.
@@ -58,17 +61,17 @@ struct Count {
     covered: u64,
     /// Of these, within the estimate itself.
     within: u64,
-    /// What of these two counts would be left if all estimates were half as large, or a tenth.
+    /// How many would be covered if all estimates were half as large, or a tenth.
     halved: u64,
     tenth: u64,
-    /// Number of measures without an estimate, since a companion run failed.
+    /// Number of measures without an estimate, because a companion run failed.
     unknown: u64,
-    /// Estimates of more than ten times the true error, of those whose error is more than rounding.
+    /// Estimates of more than ten times the true error, among those whose error exceeds rounding.
     generous: u64,
     tallied: u64,
 }
 
-/// An experiment of a text on disk.
+/// An experiment of a file.
 struct Subject {
     path: PathBuf,
     name: String,
@@ -100,17 +103,17 @@ fn readings(outcome: &Outcome) -> Vec<&Reading> {
     outcome.verdicts.iter().flat_map(|verdict| &verdict.readings).collect()
 }
 
-/// What is judged, and how.
+/// The configuration of a survey.
 struct Survey<'a> {
     table: BTreeMap<String, Count>,
-    /// Gets every measure that is not covered.
+    /// Receives every measure that is not covered.
     tell: &'a mut dyn FnMut(String),
     /// Most fixed steps of a run.
     steps: f64,
 }
 
 impl Survey<'_> {
-    /// Judges the estimates of one experiment by these solvers; number of measures judged.
+    /// Judges the estimates of one experiment by these solvers; returns the number of measures judged.
     fn take(&mut self, subject: &Subject, settings: &[Setting]) {
         let text = std::fs::read_to_string(&subject.path).unwrap();
         let mut loaded = compiler::load(&subject.path.display().to_string(), &text, &Texts::default());
@@ -119,7 +122,7 @@ impl Survey<'_> {
         if cases.iter().any(|case| case.experiment.bench.is_some()) {
             return; // A dry run has no exact solution: its rig is stepped.
         }
-        // Of a sweep the first and the last.
+        // For a sweep, the first and the last case.
         let chosen: Vec<usize> = [0, cases.len() - 1].into_iter().take(cases.len()).collect();
         let truths: Vec<Option<Vec<(f64, f64)>>> = chosen.iter().map(|k| truth(&cases[*k])).collect();
         for setting in settings {
@@ -162,7 +165,7 @@ impl Survey<'_> {
             }
             let error = if reading.value == *true_value { 0.0 } else { (reading.value - true_value).abs() };
             count.measures += 1;
-            // Rounding, of the quantity and of what is as good as nothing in any unit of the library.
+            // Rounding, relative to the quantity, and a negligible amount in any unit of the library.
             let unsure = &(unsure + 1e-11 * reading.scale + 1e-18);
             let covered = error <= TIMES * estimate + unsure;
             count.covered += u64::from(covered);
@@ -200,8 +203,8 @@ impl Survey<'_> {
     }
 }
 
-/// Each measure of the exact solution, and how far it may be off. The two runs have other longest steps, for where these decide
-/// all steps, two runs agree whatever their tolerance.
+/// Each measure of the reference solution, and its uncertainty. The two runs have different longest steps: where these
+/// limit all steps, two runs with the same limit would agree whatever their tolerance.
 fn truth(case: &Case) -> Option<Vec<(f64, f64)>> {
     let at = |tol, parts| go(case, Solver { tol, parts, ..case.experiment.solver });
     let (best, second) = (at(1e-13, 200.0)?, at(1e-12, 137.0)?);
@@ -273,12 +276,12 @@ fn estimates_cover_the_true_error_of_a_sample() {
         );
         println!("{counts}");
         assert!(covered >= SHARE_OF_SAMPLE && within >= WITHIN_ONE, "{counts}\n{missed}");
-        // Estimates that are too small altogether would be noticed.
+        // Estimates that are generally too small would be detected.
         assert!(halved < WITHIN_ONE && tenth < SHARE_OF_SAMPLE, "{counts}");
     }
 }
 
-/// A mass that friction alone stops, and where and when it does so by the equations of the contact.
+/// A mass that friction alone stops, and the position and time of the stop by the equations of the contact.
 fn thrown(method: Method, step: f64, [m, coulomb, start, duration]: [f64; 4]) -> String {
     format!(
         "import std.interfaces
@@ -304,9 +307,10 @@ experiment stop {{
     )
 }
 
-/// Steps of h, h/2 and h/4 all stop a mass at the same point if its contact begins to hold in the last quarter of a step before
-/// it: three runs that agree and are off. What is compared with runs that locate the event is not: with companions of the
-/// method itself (no adaptive program in `estimate::errors`) 6 of the first 10 cases are not covered.
+/// Steps of h, h/2 and h/4 all stop a mass at the same point if its contact begins to hold in the last quarter of a
+/// step before it: three runs agree and are wrong. A comparison with runs that locate the event detects this; with
+/// companions of the method itself (no adaptive program in `estimate::errors`), 6 of the first 10 cases are not
+/// covered.
 #[test]
 fn a_contact_that_holds_just_before_a_point_of_all_steps_is_judged() {
     let band = 1e-3;

@@ -1,8 +1,8 @@
-//! What must not change the result of an adaptive run: observers, its length, the unit in which a text is written, the
-//! size of the system; and what its tolerance promises.
+//! Invariances of adaptive runs: observers, the length of the run, the units of the text and the scale of the system
+//! must not change the result; and the accuracy that its tolerance promises.
 //!
-//! Each property draws experiments from contacts of the library, benches, excitations, lengths and windows. A failure is
-//! reduced to the shortest experiment that still fails and printed as a text, with the number of the case.
+//! Each property draws random experiments from contacts of the library, benches, excitations, lengths and windows. A
+//! failure is shrunk to the shortest experiment that still fails and printed as a text, with the number of the case.
 
 #![allow(clippy::disallowed_methods, reason = "a bound of a test may use the platform's functions")]
 
@@ -12,12 +12,12 @@ use compiler::{Case, Changes, Options};
 use runtime::engine::{self, Continue, Outcome};
 use std::fmt::Write;
 
-/// Even in its logarithm, with three digits so that texts stay short.
+/// Log-uniform, with three digits so that texts stay short.
 fn between(chance: &mut Chance, low: f64, high: f64) -> f64 {
     format!("{:.2e}", low * (high / low).powf(chance.within(0.0, 1.0))).parse().expect("it was printed")
 }
 
-/// One experiment: its instance, its length in s, and statements that only look.
+/// One experiment: its instance, its length in s, and statements that only observe.
 #[derive(Clone)]
 struct Drawn {
     models: String,
@@ -56,7 +56,7 @@ impl Drawn {
         Ok(instance.block()[states].iter().map(|x| x.to_bits()).collect())
     }
 
-    /// The first reading of each of its expectations, and when it was.
+    /// The first reading of each of its expectations, and its time.
     fn readings(&self, tol: f64) -> Vec<(f64, Option<f64>)> {
         let Case { instance, experiment, .. } = self.compiled(tol);
         let outcome: Outcome = engine::run(instance, &experiment, &mut |_| Continue::Continue(()))
@@ -68,7 +68,7 @@ impl Drawn {
         outcome.verdicts.iter().map(first).collect()
     }
 
-    /// The states named so at 200 instants up to `until`, row by row, or why it stopped.
+    /// The named states at 200 instants up to `until`, row-major, or why it stopped.
     fn course(&self, tol: f64, until: f64, paths: &[&str]) -> Result<Vec<f64>, String> {
         let Case { instance, experiment, .. } = self.compiled(tol);
         let instants: Vec<f64> = (1..=200).map(|k| until * f64::from(k) / 200.0).collect();
@@ -105,7 +105,7 @@ fn contact(random: &mut Chance) -> String {
     }
 }
 
-/// A bench that moves the contact, and whether it is one of those on which it sticks and slips.
+/// A bench that moves the contact, and whether it can show stick-slip.
 fn instance(random: &mut Chance) -> String {
     let contact = contact(random);
     match random.below(4) {
@@ -124,7 +124,7 @@ fn instance(random: &mut Chance) -> String {
     }
 }
 
-/// Statements that look at a run, none of which may change it.
+/// Statements that observe a run, none of which may change it.
 fn observers(random: &mut Chance, duration: f64) -> Vec<String> {
     let quantity = |random: &mut Chance| random.of(&["x", "v", "F", "abs(v)", "F * v", "max(v, 0.1 m/s)"]);
     let one = |random: &mut Chance| {
@@ -151,14 +151,14 @@ fn drawn(random: &mut Chance) -> Drawn {
     Drawn { models: String::new(), run, duration: between(random, 5.0, 60.0), observers: Vec::new() }
 }
 
-/// How often each property is tried; more with `TRUST_CASES`, from another one on with `TRUST_SEED`.
+/// How often each property is tested; more with `TRUST_CASES`, starting at `TRUST_SEED`.
 fn cases(usual: u64) -> impl Iterator<Item = u64> {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let first = number("TRUST_SEED").unwrap_or(0);
     first..first + number("TRUST_CASES").unwrap_or(usual)
 }
 
-/// Reports a case that fails, after what need not be in it is taken out.
+/// Reports a failing case after removing everything that is not needed to fail.
 fn shrink(mut drawn: Drawn, fails: &mut dyn FnMut(&Drawn) -> Option<String>) -> String {
     loop {
         let mut smaller: Vec<Drawn> = (0..drawn.observers.len())
@@ -177,15 +177,15 @@ fn shrink(mut drawn: Drawn, fails: &mut dyn FnMut(&Drawn) -> Option<String>) -> 
     }
 }
 
-/// Largest difference of two courses of one quantity, as a part of the largest value of either.
+/// Largest difference of two signals, relative to the largest value of either.
 fn difference(a: &[f64], b: &[f64]) -> f64 {
     let reach = a.iter().chain(b).fold(0.0f64, |reach, x| reach.max(x.abs()));
     let most = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     if reach > 0.0 { most / reach } else { 0.0 }
 }
 
-/// An observer changes no bit of a run. Before windows were cut from the polynomial of a step, 45 of these 60 cases failed, the
-/// first with seed 0.
+/// An observer changes no bit of a run. Before window edges were interpolated from the polynomial of a step, 45 of
+/// these 60 cases failed, the first with seed 0.
 #[test]
 fn whoever_looks_changes_nothing() {
     for seed in cases(60) {
@@ -205,7 +205,8 @@ fn whoever_looks_changes_nothing() {
 }
 
 /// A longer run passes the same points: positions differ by no more than the tolerance explains. Before kinks below the
-/// tolerance were located, 5 of these 40 cases failed; in the first that ran to its end, seed 14, by 20 % of the position.
+/// tolerance were located, 5 of these 40 cases failed; in the first that ran to its end, seed 14, by 20 % of the
+/// position.
 #[test]
 fn a_longer_run_goes_the_same_way() {
     for seed in cases(40) {
@@ -228,8 +229,9 @@ fn a_longer_run_goes_the_same_way() {
     }
 }
 
-/// A smaller tolerance moves a result by no more than the larger one allows. Before kinks below the tolerance were located, 10 of
-/// these 40 cases failed, the first with seed 9: Karnopp with a dead band of 10 µm/s, off by 7 % at tol 1e-5.
+/// A smaller tolerance changes a result by no more than the larger one allows. Before kinks below the tolerance were
+/// located, 10 of these 40 cases failed, the first with seed 9: Karnopp with a dead band of 10 µm/s, off by 7 % at tol
+/// 1e-5.
 #[test]
 fn a_tolerance_holds_its_promise() {
     for seed in cases(40) {
@@ -251,8 +253,8 @@ fn a_tolerance_holds_its_promise() {
     }
 }
 
-/// A bristle on a spring in a text of one's own, every quantity written in drawn units; `length`, `force` and `time`
-/// multiply all lengths, forces and times.
+/// A bristle on a spring in a generated text, every quantity written in random units; `length`, `force` and `time`
+/// scale all lengths, forces and times.
 fn own_text(random: &mut Chance, units: bool, length: f64, force: f64) -> Drawn {
     // A value in SI in one of these units.
     let mut write = |value: f64, names: &[(&str, f64)]| {
@@ -307,7 +309,7 @@ fn a_text_in_other_units_says_the_same() {
     }
 }
 
-/// Nor does the size of a system: lengths and forces multiplied by powers of a thousand multiply its results.
+/// Nor on the scale of a system: multiplying lengths and forces by powers of a thousand multiplies its results.
 #[test]
 fn a_system_of_another_size_does_the_same() {
     for seed in cases(30) {
@@ -324,7 +326,7 @@ fn a_system_of_another_size_does_the_same() {
     }
 }
 
-/// An integral is as good as the same quantity as a state: both converge with the tolerance, down to rounding.
+/// An integral is as accurate as the same quantity as a state: both converge with the tolerance, down to rounding.
 #[test]
 fn areas_and_extremes_converge_with_the_tolerance() {
     let models = "model Swing {
@@ -354,7 +356,7 @@ fn areas_and_extremes_converge_with_the_tolerance() {
         duration: 10.0,
         observers: observers.map(String::from).into(),
     };
-    // x = e^(−d t) (cos ω t + d/ω sin ω t) with d = 0.1 1/s: its moments by the rule of Simpson over a million parts.
+    // x = e^(−d t) (cos ω t + d/ω sin ω t) with d = 0.1 1/s: its moments by Simpson's rule with a million intervals.
     let (d, omega) = (0.1f64, (9.0f64 - 0.01).sqrt());
     let x = |t: f64| (-d * t).exp() * ((omega * t).cos() + d / omega * (omega * t).sin());
     let simpson = |f: &dyn Fn(f64) -> f64, from: f64, to: f64| {
@@ -388,7 +390,7 @@ fn areas_and_extremes_converge_with_the_tolerance() {
     }
 }
 
-/// Rounding errors of a body at rest cross nothing.
+/// Rounding errors of a body at rest cause no crossings.
 #[test]
 fn a_body_at_rest_crosses_nothing() {
     for (contact, least, most) in [("LuGre()", 3.0, 8.0), ("KFM()", 1.0, 8.0), ("Karnopp()", 1.0, 8.0)] {
@@ -404,7 +406,7 @@ fn a_body_at_rest_crosses_nothing() {
     }
 }
 
-/// `DahlPower` runs in its whole range, and ends at Fc where its exponent is below 1.
+/// `DahlPower` runs in its whole parameter range, and ends at Fc where its exponent is below 1.
 #[test]
 fn any_exponent_of_dahl_runs() {
     for tenths in 0..=20 {
@@ -422,8 +424,8 @@ fn any_exponent_of_dahl_runs() {
     }
 }
 
-/// A contact with a narrow dead band lets go when the spring has passed its stiction, whoever looks, however long the run:
-/// v = vp (1 − cos ωτ) is Dv after 2/ω asin √(Dv/(2 vp)), where ω² = k/m.
+/// A contact with a narrow dead band breaks away when the spring has exceeded its stiction, with any observers and any
+/// length of the run: v = vp (1 − cos ωτ) is Dv after 2/ω asin √(Dv/(2 vp)), where ω² = k/m.
 #[test]
 fn a_narrow_band_lets_go_in_time() {
     for (band, width) in [("1 um/s", 1e-6), ("10 um/s", 1e-5), ("0.1 mm/s", 1e-4f64)] {

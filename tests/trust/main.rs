@@ -1,6 +1,7 @@
 //! Properties of results over the library, its methods and the space of their parameters, with printed seeds.
 //!
-//! A plain run tries a few hundred cases; `FRIC_CASES=10000 cargo test --release --test trust` more, `FRIC_SEED=7` others.
+//! A plain run tests a few hundred cases; `FRIC_CASES=10000 cargo test --release --test trust` more, `FRIC_SEED=7`
+//! others.
 
 mod chance;
 mod crossings;

@@ -1,6 +1,8 @@
-//! No method loses to Euler's at the same step, and linear systems that are no chain are exact with `expo`.
+//! No method is less accurate than Euler's at the same step, and linear systems that are not a chain are exact with
+//! `expo`.
 //!
-//! Contacts, observers and controllers of the library, moved by a sine or held, against rk4 with a hundredth of the step.
+//! Contacts, observers and controllers of the library, moved by a sine or held, against rk4 with a hundredth of the
+//! step.
 
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, checked, root, texts_below};
@@ -8,15 +10,17 @@ use abi::Instance;
 use compiler::{Changes, Options};
 use std::borrow::Cow;
 
-/// What is run, and the quantity that is compared. `SPEED` is a sine of the speed, `FORCE` of the force, `PLACE` of a place.
+/// What is run, and the quantity to compare. `SPEED` is a sine of the speed, `FORCE` of the force, `PLACE` of a
+/// position.
 #[derive(Clone)]
 struct Bench {
     run: Cow<'static, str>,
     quantity: &'static str,
-    /// Linear and in one circle, or of single states; moved by constants only: `expo` is exact.
+    /// Whether it is linear and consists of one cycle or of single states, with constant inputs only: then `expo` is
+    /// exact.
     exact: bool,
-    /// A force that jumps with the state, or comes close to it within a step: every method is off by where in a step the
-    /// jump falls, so that a single run says little. Such are judged together.
+    /// Whether the force jumps with the state, or nearly so within a step: the error of every method depends on the
+    /// position of the jump within a step, so a single run shows little. Such benches are judged together.
     jumps: bool,
 }
 
@@ -31,10 +35,10 @@ const fn exact(run: &'static str, quantity: &'static str) -> Bench {
 const BENCHES: &[Bench] = &[
     exact("ExtendedStateObserver(y = 0 m, u = 2 N, w = RATE)", "F_hat"),
     exact("DisturbanceObserver(v = 0 m/s, u = 1 N, T = 1 / RATE)", "F_hat"),
-    // A chain: its states do not need each other, are taken one after the other, and are of order 2.
+    // A chain: its states are not coupled both ways, are integrated one after the other, and are of order 2.
     bench("DisturbanceObserver2(v = 0 m/s, u = 1 N, T = 1 / RATE)", "F_hat"),
     exact("SpringBench(vp = 0 m/s, x_start = 1 m, k = 400 N/m, fr = Viscous())", "x"),
-    // Its play is a choice of the twist, so its states are iterated, of order 2.
+    // Its play is a choice by the twist, so its states are iterated, of order 2.
     bench("TwoMass(d = 0 N·s/m, x_start = 1 mm)", "x1"),
     exact("Axis(F_motor = 2 N, F_load = 1 N)", "x"),
     exact("Cascade(r = 10 mm, y = 0 m)", "u"),
@@ -71,7 +75,7 @@ const BENCHES: &[Bench] = &[
     bench("StoppedAxis(u = FORCE, low = -1 mm, high = 1 mm)", "x"),
     bench("BandedBench(u = FORCE, v_start = 20 mm/s)", "x"),
     bench("ObserverBench(u = FORCE, fr = LuGre())", "error"),
-    // Observers of a mass that slides against a friction that is news to them, and stays above any speed at which it jumps.
+    // Observers of a mass that slides with friction unknown to them, at speeds above any jump.
     bench(
         "ObserverBench(u = FORCE, v_start = 3 m/s, fr = Coulomb(Fc = 2 N), obs = ExtendedStateObserver(v_start = 3 m/s, w = RATE))",
         "F_hat",
@@ -95,8 +99,8 @@ const BENCHES: &[Bench] = &[
     bench("Hold()", "x"),
     bench("TrackingServo(f = 5 Hz)", "x"),
 ];
-/// Contacts of the library, each moved by a sine and under a mass that is thrown and pushed. Where the contact is held by what
-/// it knows of its mass, it is told.
+/// Contacts of the library, each moved by a sine and under a mass that is thrown and pushed. A contact that holds by
+/// means of its mass receives the mass.
 const CONTACTS: &[&str] = &[
     "Ambrosio",
     "Armstrong",
@@ -155,7 +159,7 @@ const CONTACTS: &[&str] = &[
     "Viscous",
     "ViscousPowers",
 ];
-/// Parts of models above, which are stepped with them; and what has no step of its own.
+/// Parts of models above, which are tested with them; and models without a step of their own.
 const WITHIN: &[&str] = &[
     "AtanSign",
     "BandedAxis",
@@ -171,7 +175,7 @@ const WITHIN: &[&str] = &[
     "TanhSign",
 ];
 const METHODS: [&str; 3] = ["expo", "implicit", "rk4"];
-/// How many times Euler's error a single run across a jump may have.
+/// Largest error of a single run across a jump, as a multiple of Euler's.
 const WORST: f64 = 10.0;
 const STEPS: [f64; 4] = [1e-4, 5e-4, 1e-3, 2e-3];
 /// Models with ticks of 1 ms.
@@ -202,7 +206,7 @@ fn benches() -> Vec<Bench> {
     BENCHES.iter().cloned().chain(CONTACTS.iter().flat_map(of)).collect()
 }
 
-/// What a seed decides.
+/// The choices of a seed.
 struct Case<'a> {
     bench: &'a Bench,
     run: String,
@@ -221,14 +225,14 @@ impl<'a> Case<'a> {
             .replace("FORCE", &format!("sine({size:.3} N, {frequency:.3} Hz)"))
             .replace("PLACE", &format!("sine({size:.3} mm, {frequency:.3} Hz)"))
             .replace("RATE", &format!("{rate:.3} 1/s"));
-        // Ticks of 1 ms fall on whole steps.
+        // Ticks of 1 ms are at whole steps.
         let sampled = SAMPLED.iter().any(|name| run.contains(name));
         let step = chance.of(if sampled { &STEPS[..3] } else { &STEPS });
         Case { bench, run, step }
     }
 }
 
-/// The quantity after each step of 0.1 s of simulated time, with `parts` steps of the method in one; NaN from where a
+/// The quantity every 0.1 s of simulated time, with each step divided into `parts` steps of the method; NaN after a
 /// guard has stopped the run.
 fn course(case: &Case, method: &str, parts: u32) -> Result<Vec<f64>, String> {
     let step = case.step / f64::from(parts);
@@ -256,7 +260,7 @@ experiment it {{ run {} for 1 s  solver {method} step {} us }}",
     Ok(values)
 }
 
-/// Largest distance of two courses; infinite where one is no number.
+/// Largest distance of two signals; infinite if one is NaN.
 fn distance(a: &[f64], b: &[f64]) -> f64 {
     let largest =
         |most: f64, (a, b): (&f64, &f64)| if (a - b).is_finite() { most.max((a - b).abs()) } else { f64::INFINITY };
@@ -267,7 +271,7 @@ fn size(a: &[f64]) -> f64 {
     a.iter().fold(0.0, |most, a| a.abs().max(most))
 }
 
-/// The greatest errors of Euler's method and of the others, and the size of what is compared.
+/// The greatest errors of Euler's method and of the others, and the range of the quantity.
 fn errors(case: &Case) -> Result<(f64, [f64; 3], f64), String> {
     let reference = course(case, "rk4", 100)?;
     let error = |method: &str| course(case, method, 1).map(|course| distance(&course, &reference));
@@ -278,14 +282,14 @@ fn errors(case: &Case) -> Result<(f64, [f64; 3], f64), String> {
     Ok((error("euler")?, all, size(&reference)))
 }
 
-/// What is wrong with the methods of a case.
+/// The failures of the methods in a case.
 fn judge(euler: f64, all: &[f64; 3], range: f64) -> Vec<String> {
     let mut wrong = Vec::new();
     for (method, error) in METHODS.iter().zip(all) {
-        // Where Euler's is beyond the stability of explicit methods, rk4 may be too. A run that was stopped has said so: `z` of
-        // LuGre left its range, `s` of BristleMass is no number. At σ0 |v| h/g > 2.8 such steps of rk4 throw the bristle off;
-        // Euler's do so from 2 on, but stay where a deflection in the steady state has exactly the rate 0, or where a tip that
-        // is thrown to and fro sticks in between.
+        // Where Euler's is beyond the stability of explicit methods, rk4 may be too. A run that was stopped has
+        // reported it: `z` of LuGre left its range, `s` of BristleMass is not a number. At σ0 |v| h/g > 2.8 rk4 is
+        // unstable for the bristle; Euler's method is from 2 on, but stays bounded where a deflection in the steady
+        // state has exactly the rate 0, or where an oscillating tip sticks in between.
         let beyond = *method == "rk4" && (euler > range || error.is_infinite());
         // Below 1e-15 in SI is rounding.
         if !beyond && *error > 1.02 * euler + 1e-7 * range + 1e-15 {
@@ -311,8 +315,8 @@ fn every_model_of_the_library_is_stepped() {
     assert!(missing.is_empty(), "stepped by no bench: {missing:?}");
 }
 
-/// On the code before a joint exponential, `expo` fails in case 134 of seed 1 on: 2.6 N, 70 times Euler's error, for an
-/// extended-state observer of 376 1/s at 0.5 ms on a sliding mass.
+/// With the code before the joint exponential, `expo` fails in case 134 of seed 1 on: 2.6 N, 70 times Euler's error,
+/// for an extended-state observer of 376 1/s at 0.5 ms on a sliding mass.
 #[test]
 fn no_method_loses_to_euler() {
     let benches: Vec<Bench> = benches().into_iter().filter(|bench| !bench.jumps).collect();
@@ -330,11 +334,12 @@ fn no_method_loses_to_euler() {
     assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
 }
 
-/// Over all contacts under a mass, the error of each method is on average below that of Euler's, and nowhere many times it.
+/// Over all contacts under a mass, the error of each method is on average below that of Euler's, and nowhere many times
+/// larger.
 ///
 /// Where Euler's error is above a quarter of the range, its step does not resolve the contact at all. `implicit` is not
-/// judged on BreakAwayTanh: its force falls so steeply with the speed that 1 = γ h λ can hold, λ the rate at which a
-/// disturbance grows; near that point the linear equations of a step are singular, and `run` says `undecided`.
+/// judged on BreakAwayTanh: its force falls so steeply with the speed that 1 = γ h λ can hold, with λ the rate at which
+/// a disturbance grows; near that point the linear equations of a step are singular, and `run` reports `undecided`.
 #[test]
 #[allow(clippy::disallowed_methods, reason = "a mean that is compared with 1")]
 fn under_a_mass_no_method_loses_to_euler_on_average() {
@@ -352,7 +357,7 @@ fn under_a_mass_no_method_loses_to_euler_on_average() {
             if METHODS[k] == "implicit" && case.run.contains("BreakAwayTanh") {
                 continue;
             }
-            // As above: the run says which range was left, and `check` up to which speed the step is stable (W0704).
+            // As above: the run reports which range was left, and `check` up to which speed the step is stable (W0704).
             if METHODS[k] == "rk4" && error.is_infinite() {
                 println!("seed {seed}, step {:e} s, {}: rk4 leaves a range", case.step, case.run);
                 continue;
@@ -375,7 +380,7 @@ fn under_a_mass_no_method_loses_to_euler_on_average() {
     assert!(failed.is_empty(), "{} fail:\n{}", failed.len(), failed.join("\n"));
 }
 
-/// Before states took the exponential of their matrix together, it failed in 14 of 36 cases, first with seed 2.
+/// Before the states used the exponential of their matrix jointly, 14 of 36 cases failed, the first with seed 2.
 #[test]
 fn linear_circles_are_exact_with_expo() {
     let benches: Vec<Bench> = BENCHES.iter().filter(|bench| bench.exact).cloned().collect();
@@ -397,8 +402,9 @@ fn linear_circles_are_exact_with_expo() {
 
 /// `check` warns of `implicit` where the model itself grows so fast that 1 = γ h λ can hold, and only there.
 ///
-/// A mass on BreakAwayTanh, whose force falls from v_brk on; λ from its formula. Where the largest γ h λ is between 0.6 and
-/// 0.9 both answers are right. A point that is let go, as the other searches do, finds none of the narrow ones.
+/// A mass on BreakAwayTanh, whose force falls from v_brk on; λ from its formula. Where the largest γ h λ is between 0.6
+/// and 0.9, both answers are correct. A search from a point that is released, as in the other searches, finds none of
+/// the narrow ones.
 #[test]
 #[allow(clippy::disallowed_methods, reason = "the force by its formula, compared with a tolerance")]
 fn check_warns_where_implicit_is_singular() {

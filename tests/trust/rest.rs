@@ -1,7 +1,8 @@
-//! Contacts that hold come to rest exactly, stay there, and let go at their stiction, in fixed steps.
+//! Contacts that can hold come to rest exactly, stay at rest, and break away at their stiction, in fixed steps.
 //!
-//! A mass or an inertia is thrown under a constant load below Coulomb friction. Once it should have stopped, its speed is 0
-//! to the bit and its place does not change, until a ramp of the load reaches the stiction. Inertias go over six decades.
+//! A mass or an inertia is thrown under a constant load below Coulomb friction. Once it should have stopped, its speed
+//! is 0 to the bit and its position does not change, until a ramp of the load reaches the stiction. Inertias span six
+//! decades.
 
 use crate::chance::{Chance, seeds};
 use crate::support::{Texts, checked};
@@ -30,10 +31,10 @@ model Thrown {
 }
 ";
 
-/// A contact that declares to hold, as a mass and as an inertia have it.
+/// A contact that declares to hold, as used with a mass and with an inertia.
 struct Contact {
     name: &'static str,
-    /// Arguments that bind it to the mass, and those it has in the slot.
+    /// Arguments that connect it to the mass, and those it has in the slot.
     slot: &'static str,
     /// The least force at which it lets go, as a formula of Fc and Fs: the stiction that it reaches by then.
     dwells: bool,
@@ -50,14 +51,14 @@ const CONTACTS: [Contact; 6] = [
 const METHODS: [Method; 4] = [Method::Euler, Method::Rk4, Method::Expo, Method::Implicit];
 const STEPS: [f64; 4] = [1e-4, 5e-4, 1e-3, 2e-3];
 
-/// One case: everything that a seed decides.
+/// One case: all choices of a seed.
 #[derive(Clone, Debug)]
 struct Case {
     contact: usize,
     rotary: bool,
     method: Method,
     step: f64,
-    /// In SI, as are all below.
+    /// In SI, as all of the following.
     inertia: f64,
     coulomb: f64,
     stiction: f64,
@@ -70,7 +71,7 @@ impl Case {
     fn of(seed: u64) -> Case {
         let mut chance = Chance::new(seed);
         let inertia = chance.decades(1e-3, 1e3);
-        // The library's own friction, or one that stops the mass within some tenths of a second.
+        // The library's default friction, or one that stops the mass within some tenths of a second.
         let coulomb = if chance.of(&[true, false]) { 1.0 } else { inertia * chance.decades(1.0, 30.0) };
         let stiction = coulomb * chance.within(1.05, 2.0);
         let sign = chance.of(&[1.0, -1.0]);
@@ -91,7 +92,7 @@ impl Case {
     }
 }
 
-/// Compiled benches, by what cannot be changed in a block.
+/// Compiled benches, by the choices that are compiled in.
 #[derive(Default)]
 struct Benches(HashMap<(usize, bool, u8, u64), Instance>);
 
@@ -102,7 +103,7 @@ impl Benches {
     }
 }
 
-/// The bench with the contact of a case in its slot, by its method and its step.
+/// The bench with the contact of a case in its slot, for its method and its step.
 fn compiled(case: &Case) -> Instance {
     let law = if case.rotary { "rotary Tustin" } else { "Tustin" };
     let viscous = if case.rotary { "N·m·s" } else { "N·s/m" };
@@ -125,13 +126,13 @@ fn slot(instance: &Instance, path: &str) -> Slot {
     instance.description().quantity(path).unwrap_or_else(|| panic!("there is no `{path}`")).slot
 }
 
-/// When the ramp begins: after twice as long as friction needs against the load, and some steps.
+/// When the ramp begins: after twice the time that friction needs against the load, and some steps.
 fn begin(case: &Case) -> f64 {
     let least = (case.coulomb - case.load.abs()) / case.inertia;
     2.0 * case.speed.abs() / least + 30.0 * case.step
 }
 
-/// The bench of a case with its values in place, before the start.
+/// The bench of a case with its values set, before the start.
 fn prepared(benches: &mut Benches, case: &Case) -> Instance {
     let contact = &CONTACTS[case.contact];
     let mut run = benches.get(case);
@@ -156,7 +157,7 @@ fn prepared(benches: &mut Benches, case: &Case) -> Instance {
     run
 }
 
-/// Runs a case; what is wrong with it, in words.
+/// Runs a case; returns what is wrong with it, in words.
 fn judge(benches: &mut Benches, case: &Case) -> Result<(), String> {
     let contact = &CONTACTS[case.contact];
     let mut run = prepared(benches, case);
@@ -184,7 +185,7 @@ fn judge(benches: &mut Benches, case: &Case) -> Result<(), String> {
         if let Some(slot) = stiction {
             limit = run.get(slot);
         }
-        // The sampled contact sees the load a step late, and then takes out what speed came of it.
+        // The sampled contact measures the load a step late, and then removes the resulting speed.
         let late = if contact.name == "KFMClip" { case.rate * case.step / case.inertia * case.step } else { 0.0 };
         let place = *place.get_or_insert(run.get(x));
         if pull < limit {

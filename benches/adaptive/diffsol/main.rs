@@ -1,5 +1,5 @@
-//! The two loops of `loops.h` by the solvers of diffsol: `LOOP METHOD TOL ROUNDS` prints the least processor time of a run
-//! in s, then the position at 201 instants.
+//! Runs the two loops of `loops.h` with the solvers of diffsol: `LOOP METHOD TOL ROUNDS` prints the least processor
+//! time of a run in s, then the position at 201 instants.
 
 use diffsol::{NalgebraLU, NalgebraMat, OdeBuilder, OdeSolverMethod};
 
@@ -22,7 +22,7 @@ fn bristle(v: f64, z: f64) -> (f64, f64, f64) {
 
 fn processor_time() -> f64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: the clock is there, and the place to write to is our own.
+    // SAFETY: the clock exists, and `now` is a valid place to write to.
     unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &mut now) };
     now.tv_sec as f64 + 1e-9 * now.tv_nsec as f64
 }
@@ -37,7 +37,7 @@ macro_rules! run {
             .init(|_p, _t, x: &mut [f64]| x.fill(0.0), $states)
             .build()
             .expect("the loop is well posed");
-        // As CVODE beside: kinks cost many tries.
+        // As in the CVODE program: kinks cost many attempts.
         problem.ode_options.max_error_test_failures = 1000;
         problem.ode_options.max_nonlinear_solver_failures = 100_000_000;
         problem.ode_options.min_timestep = 1e-18;
@@ -49,7 +49,7 @@ macro_rules! run {
         };
         match result {
             Ok((x, _)) => std::iter::once(0.0).chain((0..INSTANTS).map(|k| x[(0, k)])).collect(),
-            // No tolerance that can be kept.
+            // The tolerance cannot be met.
             Err(_) => vec![f64::NAN; INSTANTS + 1],
         }
     }};
