@@ -316,7 +316,7 @@ Servo
     }
 
     #[test]
-    fn what_comes_from_no_part_stands_before_its_input() {
+    fn an_unconnected_input_shows_its_expression() {
         let picture = svg(&model(
             "model Loop {\n  state v [m/s] = 0\n  part fr = LuGre(v = v)\n  dv/dt = (1 N - fr.F) / 1 kg\n}",
         ));

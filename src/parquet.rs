@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_comes_back_with_its_kinds_and_gaps() {
+    fn a_table_survives_the_round_trip_with_types_and_nulls() {
         let csv = "run,Fs,holds,status\n7,1e-5,true,ok\n8,,false,\"stopped: a, b\"\n9,NaN,,ok\n";
         let file = again("kinds", csv, true);
         let rows: Vec<String> = file.get_row_iter(None).unwrap().map(|row| row.unwrap().to_string()).collect();
@@ -152,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_told_with_its_row() {
+    fn an_invalid_cell_is_reported_with_its_row() {
         let refused = |csv: &str| from_csv(csv.as_bytes(), false, &columns(), Vec::new()).unwrap_err().to_string();
         assert_eq!(refused("7,1,true,ok\n8,x,true,ok\n"), "row 2: fr.Fs [N] cannot be `x`");
         assert!(refused("7,1,true,ok\n8\n").contains("found record with 1 fields"));

@@ -218,7 +218,7 @@ mod tests {
     /// A secret, and a file that is readable only by its owner, are never readable by others, not even in part in a
     /// temporary file.
     #[test]
-    fn what_is_secret_is_secret_from_its_first_byte() {
+    fn a_secret_is_never_readable_by_others() {
         let folder = tempfile::tempdir().unwrap();
         let (key, text) = (folder.path().join("keys/a.key"), folder.path().join("a.fric"));
         fs::write(&text, "x").unwrap();
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_at_the_name_of_the_neighbour_is_not_written_through() {
+    fn a_link_at_the_name_of_the_temporary_file_is_not_followed() {
         let folder = tempfile::tempdir().unwrap();
         let (path, victim) = (folder.path().join("a"), folder.path().join("victim"));
         fs::write(&victim, "as it was").unwrap();
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_text_is_refused_with_its_place() {
+    fn a_file_that_is_not_text_is_refused_with_the_position() {
         assert_eq!(text(b"a\0b".to_vec()).unwrap_err(), "it is not a text: byte 1 is zero");
         assert_eq!(text(b"a\nb\xff".to_vec()).unwrap_err(), "it is not a text in UTF-8: line 2, byte 3 of the file");
     }

@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_stands_behind_the_digits_it_concerns() {
+    fn an_error_follows_the_digits_it_belongs_to() {
         let shown = |value: f64, error: f64| uncertain(value, error, &Unit::none(), 9);
         assert_eq!(shown(6.362812, 1.2e-5), "6.36281(2)");
         assert_eq!(shown(6.362812, 1e-5), "6.36281(1)");

@@ -324,7 +324,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_json_has_no_number_for_is_a_string() {
+    fn non_finite_numbers_are_json_strings() {
         let numbers = [1.5, f64::INFINITY, f64::NEG_INFINITY, f64::NAN].map(number);
         assert_eq!(Value::from(numbers.to_vec()).to_string(), r#"[1.5,"inf","-inf","nan"]"#);
     }

@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_answered_is_answered_again() {
+    fn a_snapshot_returns_the_recorded_answers() {
         let keeping = Keeping::new(&Some2);
         let library = keeping.library("std.a");
         let file = keeping.file("f", "p.fric");

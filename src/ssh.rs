@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_reach_the_other_shell_as_they_are() {
+    fn arguments_reach_the_remote_shell_unchanged() {
         assert_eq!(quoted("/var/lib/fric"), "/var/lib/fric");
         assert_eq!(quoted("a b"), "'a b'");
         assert_eq!(quoted("it's; rm"), "'it'\\''s; rm'");

@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn one_writes_a_table_and_what_is_finished_leaves_nothing() {
+    fn one_process_writes_a_table_and_a_finished_one_leaves_no_lock_file() {
         let folder = tempfile::tempdir().unwrap();
         let table = folder.path().join("a.csv");
         let marker = folder.path().join(".a.csv.unfinished");
@@ -237,7 +237,7 @@ mod tests {
     /// Any byte changed, removed or added, any row removed or doubled, any truncation: the part that is resumed is a
     /// prefix of what was written, unless the change lies after the last checkpoint and leaves a row of valid form.
     #[test]
-    fn what_is_gone_on_with_is_as_it_was_written() {
+    fn the_resumed_part_is_a_prefix_of_what_was_written() {
         let folder = tempfile::tempdir().unwrap();
         let table = folder.path().join("a.csv");
         let whole = interrupted(&table);

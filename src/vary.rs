@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn slips_are_told() {
+    fn mistakes_are_reported() {
         let told = |text: &str| parse(text).unwrap_err();
         assert!(told("fr.Fs").contains("fr.Fs = 1 N .. 2 N by 0.1 N"));
         assert!(told("fr.Fs = 1 N .. 2 N").contains("by 0.1 N"));

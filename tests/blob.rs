@@ -47,7 +47,7 @@ fn here() -> Target {
 }
 
 #[test]
-fn what_is_loaded_runs_to_the_bit_as_what_was_compiled() {
+fn a_loaded_model_runs_bit_identical_to_a_compiled_one() {
     let (image, mut compiled) = servo(here());
     let model = loaded(&image).unwrap();
     assert_eq!(*model.description, **compiled.description());
@@ -67,7 +67,7 @@ fn equal_models_give_equal_bytes() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn an_unsuitable_image_is_refused() {
     let (image, _) = servo(here());
     let mut bytes = image.to_bytes();
     let middle = bytes.len() - image.code.len() / 2;

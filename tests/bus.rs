@@ -94,7 +94,7 @@ fn a_log_is_played_and_kept() {
 }
 
 #[test]
-fn what_cannot_be_opened_is_told_with_what_mends_it() {
+fn a_bus_that_cannot_be_opened_is_reported_with_a_remedy() {
     for (arguments, code, said) in [
         (&["bus"][..], 2, "ADDRESS"),
         (&["bus", "vector:0"], 2, "`vector` is no kind of bus; there are sim:bench, can0"),
@@ -116,7 +116,7 @@ fn what_cannot_be_opened_is_told_with_what_mends_it() {
 }
 
 #[test]
-fn the_machine_is_looked_at_and_measured() {
+fn the_machine_is_checked_and_measured() {
     let looked = fric(&["doctor"]);
     let page = text(&looked.stdout);
     assert_eq!(looked.status.code(), Some(0), "{page}");

@@ -57,7 +57,7 @@ fn close(a: f64, b: f64) {
 }
 
 #[test]
-fn what_is_delayed_goes_on_to_the_bit() {
+fn delayed_quantities_continue_bit_identically() {
     let mut old = echo(1e-3, &[]);
     assert_eq!(old.advance(100), 0);
     let mut new = at_its_time(echo(1e-3, &[]), &old, 1e-3);
@@ -93,7 +93,7 @@ fn a_period_that_was_changed_counts() {
 
 /// If time starts anew, there is no history: that is reported.
 #[test]
-fn a_past_behind_the_start_is_told_to_be_lost() {
+fn a_lost_history_is_reported() {
     let mut old = echo(1e-3, &[]);
     assert_eq!(old.advance(100), 0);
     let mut new = echo(1e-3, &[]);

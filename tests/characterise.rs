@@ -78,7 +78,7 @@ fn lugre_breaks_away_as_published_and_drifts() {
 }
 
 #[test]
-fn the_table_of_phenomena_is_what_the_catalogue_says() {
+fn the_table_of_phenomena_matches_the_catalogue() {
     assert_eq!(verdicts(&answers("kfm", "KFM"), &TABLE), "++--.--.");
     assert_eq!(verdicts(&answers("karnopp", "Karnopp"), &TABLE), "++--.--.");
     // Its break-away force depends on the history: the overshoot after a reversal is twice that from rest.
@@ -172,7 +172,7 @@ fn a_sampled_model_is_stepped_by_its_period() {
 }
 
 #[test]
-fn what_cannot_be_characterised_is_told_why() {
+fn a_model_that_cannot_be_characterised_is_refused_with_a_reason() {
     let folder = folder("refused");
     fs::write(folder.join("mine.fric"), MINE).unwrap();
     let refused = |args: &[&str]| {

@@ -104,7 +104,7 @@ fn exit_codes_tell_how_it_went() {
 }
 
 #[test]
-fn wrong_usage_is_told_apart_from_wrong_input() {
+fn wrong_usage_and_wrong_input_have_different_exit_codes() {
     let folder = Folder::new("usage").with("pull.fric", PULL);
     folder.check(&["--nothing"], 2, "unexpected argument '--nothing'");
     folder.check(&["rnu"], 2, "unrecognized subcommand 'rnu'");
@@ -181,7 +181,7 @@ fn quiet_says_nothing_when_all_is_well() {
 }
 
 #[test]
-fn a_reader_that_goes_away_is_no_failure() {
+fn a_closed_pipe_is_no_failure() {
     let folder = Folder::new("closed-pipe").with("pull.fric", PULL);
     for args in [&["run", "pull.fric", "holds"][..], &["man"], &["completions", "bash"], &["test", "pull.fric"]] {
         let mut child = folder.fric(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -327,7 +327,7 @@ fn a_sweep_is_one_figure_and_a_file_of_data_each() {
 }
 
 #[test]
-fn a_model_can_be_taken_away() {
+fn a_model_can_be_exported() {
     let folder = Folder::new("build").with("pull.fric", PULL);
     let (source, _) = folder.check(&["build", "pull.fric", "Contact", "--emit", "c"], 0, "CONTACT_Fc");
     assert!(source.contains("uint64_t contact_step(double *block, uint64_t count)"), "{source}");
@@ -351,7 +351,7 @@ fn a_model_can_be_taken_away() {
 /// Listings name the slots of the block, contain one function after the other, and show the code that runs: expanded,
 /// fused, without calls except of the function itself for more than one iteration.
 #[test]
-fn what_is_made_on_the_way_can_be_read() {
+fn intermediate_forms_are_readable() {
     let folder = Folder::new("listings").with("pull.fric", PULL);
     for (name, method, functions) in [
         ("Pull", "expo", &["start", "outputs", "step"][..]),
@@ -506,7 +506,7 @@ fn a_text_that_names_a_pipe_is_refused_at_once() {
 }
 
 #[test]
-fn an_error_that_exceeds_the_margin_leaves_the_verdict_open() {
+fn an_error_that_exceeds_the_margin_makes_the_verdict_undecided() {
     let text = r#"
 model Decay {
   state x [m] = 1 m

@@ -27,7 +27,7 @@ fn rows(case: &Case, every: f64) -> Vec<Vec<f64>> {
 /// Mutants tried by hand: rows of fixed steps come one step late (fails in case 0 of seed 1); rows of adaptive runs are
 /// the end of the step in place of a point of its polynomial (case 2).
 #[test]
-fn rows_lie_on_the_course_of_the_run() {
+fn rows_of_a_grid_agree_with_the_run() {
     let from =
         |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
     let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 40));

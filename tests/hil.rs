@@ -284,7 +284,7 @@ fn the_predicted_limit_is_where_the_simulated_rig_begins_to_chatter() {
 }
 
 #[test]
-fn a_cycle_asks_nothing_of_the_heap() {
+fn a_cycle_does_not_allocate() {
     for made in [ready(&[]), rig_of("stick_slip.fric", "ahead", &[])] {
         let (mut hil, _world, rig) = started(made, 10.0);
         while hil.counts().cycles < 100 {
@@ -372,7 +372,7 @@ fn a_contact_that_is_too_late_is_refused_and_runs_where_it_looks_ahead() {
 }
 
 #[test]
-fn what_stops_a_rig_is_told_and_is_exit_code_3() {
+fn the_cause_of_a_stop_is_reported_with_exit_code_3() {
     let folder = folder("hil-stops");
     let example = example();
     let stops = |fault: &str| run(&folder, &["hil", "--sim", "--fast", "--for", "20s", "--inject", fault, &example], 3);
@@ -387,7 +387,7 @@ fn what_stops_a_rig_is_told_and_is_exit_code_3() {
 }
 
 #[test]
-fn what_the_drives_are_like_is_measured() {
+fn drive_properties_are_identified() {
     let folder = folder("hil-identify");
     let said = run(&folder, &["hil", "--sim", "--fast", "--identify", &example()], 0);
     let line = said.lines().find(|line| line.contains("drive load")).unwrap_or_else(|| panic!("{said}"));
@@ -402,7 +402,7 @@ fn what_the_drives_are_like_is_measured() {
 }
 
 #[test]
-fn wrong_usage_is_told() {
+fn wrong_usage_is_reported() {
     let folder = folder("hil-usage");
     let example = example();
     let said = run(&folder, &["hil", &example], 1);

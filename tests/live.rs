@@ -214,7 +214,7 @@ fn same_rig(ready: &Ready, set: &[(Slot, f64)], other: &Ready) -> Result<(), Str
 }
 
 #[test]
-fn a_set_is_judged_as_a_start_with_the_same_values() {
+fn a_set_is_validated_like_a_start_with_the_same_values() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let runs = number("FRIC_RUNS").unwrap_or(60);
     let seeds: Vec<u64> = number("FRIC_SEED").map_or((0..runs).collect(), |seed| vec![seed]);

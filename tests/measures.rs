@@ -96,7 +96,7 @@ experiment e {{
 /// Intervals and duration of a condition, compared with the rows of a recording. A mutant that does not count the
 /// interval at the begin fails in case 13 of seed 1.
 #[test]
-fn phases_are_those_of_the_recording() {
+fn intervals_of_a_condition_match_the_recording() {
     let (seed, runs) = (of_environment("FRIC_SEED", 1), of_environment("FRIC_RUNS", 60) / 3);
     let mut random = Random(seed);
     let mut phases = 0;

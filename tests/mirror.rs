@@ -54,7 +54,7 @@ fn mirrored(solver: &str, h: f64, steps: u32) {
 }
 
 #[test]
-fn odd_models_answer_in_mirror_image() {
+fn odd_models_have_mirror_symmetry() {
     mirrored("expo step 1 ms", 1e-3, 2000);
     mirrored("implicit step 1 ms", 1e-3, 2000);
     mirrored("rk4 step 10 us", 1e-5, 20_000);

@@ -299,7 +299,7 @@ fn halving_the_step_shows_the_order_of_every_method() {
 }
 
 #[test]
-fn another_solver_is_asked_and_its_distance_told() {
+fn a_cross_check_reports_the_distance_to_another_solver() {
     let folder = Folder::new("cross");
     let (out, _) = folder.run(&["run", "m.fric", "coast", "--cross"], 0);
     assert!(out.contains("adaptive tol 1e-6 against expo step 100 µs") && out.contains("would do"), "{out}");
@@ -370,7 +370,7 @@ fn a_sweep_has_the_same_bytes_however_it_is_run() {
 
 /// Two sweeps into one table; and resuming after rows were lost or changed.
 #[test]
-fn one_sweep_writes_a_table_and_goes_on_with_sound_rows_only() {
+fn a_table_has_one_writer_and_is_resumed_after_intact_rows_only() {
     let folder = Folder::new("alone");
     let read = |name: &str| fs::read(folder.0.join(name)).unwrap();
     let long = |runs: &'static str, out: &'static str| {

@@ -389,7 +389,7 @@ fn mistakes_are_named_with_their_remedy() {
 const PULLED: &str = "import std.bench\nimport std.friction\n\nexperiment drawn {\n  run    SpringBench(k = 2 N/m, vp = 0.1 m/s, fr = LuGre()) for 3 s\n  expect max(v) < 9 m/s after 2 s\n}\n";
 
 #[test]
-fn what_was_run_last_can_be_asked_whatever_its_windows() {
+fn the_last_run_can_be_queried_with_any_windows() {
     let folder = folder("asked");
     fs::write(folder.join("p.fric"), PULLED).unwrap();
     let answers = [

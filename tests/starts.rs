@@ -100,7 +100,7 @@ fn places(loaded: &Loaded, experiment: &str, state: &str) -> Option<(std::ops::R
 }
 
 #[test]
-fn from_outside_as_in_the_text() {
+fn an_initial_value_from_outside_equals_one_in_the_text() {
     let from =
         |name: &str, otherwise: u64| std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(otherwise);
     let (seed, runs) = (from("FRIC_SEED", 1), from("FRIC_RUNS", 60));
@@ -168,7 +168,7 @@ fn from_outside_as_in_the_text() {
 
 /// In a part of a part, an element of an array, a slot's new model and a rotary twin.
 #[test]
-fn wherever_the_state_is() {
+fn initial_values_of_nested_states() {
     let text = "
 import std.bench
 import std.friction

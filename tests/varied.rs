@@ -172,7 +172,7 @@ experiment e { run A(v = sine(1 m, 1 Hz)) for 100 ms  solver rk4 step 1 ms  expe
 ];
 
 #[test]
-fn whatever_a_parameter_decides() {
+fn vary_and_set_agree_for_everything_a_parameter_determines() {
     for (_, text, values, unit, built_in) in DECIDES {
         // An experiment knows the parameters of what it runs by their names.
         let text = text.replace("e_step", "p");

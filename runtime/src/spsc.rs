@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_goes_in_comes_out_in_order_and_full_is_an_answer() {
+    fn values_arrive_in_order_and_a_full_queue_is_reported() {
         let (mut sender, mut receiver) = queue(3);
         assert!(sender.push(1) && sender.push_all(&[2, 3]));
         assert!(!sender.push(4) && !sender.push_all(&[4]));

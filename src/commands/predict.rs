@@ -165,8 +165,8 @@ fn judged(ready: &Ready, contact: &Contact) -> (String, Value, bool) {
     (words, object, stable)
 }
 
-/// How far above the poles of the predictor's observer (at a period of 1 ms), in units of (1 − θ)/T, a resonance of the
-/// shaft must lie for the shaft to count as rigid.
+/// The lowest resonance in rad/s with which the shaft counts as rigid: 6 times (1 − θ)/T, the poles of the predictor's
+/// observer, for θ = 0.9 and a period T of 1 ms.
 const RIGID: f64 = 6.0 * (1.0 - 0.9) / 1e-3;
 
 /// The resonances of the shaft alone.
@@ -189,7 +189,8 @@ fn resonances(ready: &Ready, contact: &Contact) -> (String, Value) {
     (words, Value::Array(out))
 }
 
-/// The parameters that set the stiffness and the damping of the contact, with the range of each that is stable.
+/// The parameter that sets the contact's stiffness, with its largest stable value; the one that sets its damping, with
+/// the value that allows the most delay.
 fn advised(ready: &Ready, contact: &Contact, tau: f64) -> (String, Value) {
     let here = contact.at(ready, &[], 0.0);
     let own = contact.stiffness(&here);

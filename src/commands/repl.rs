@@ -596,7 +596,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn curves_over_something_are_told_from_curves_over_time() {
+    fn plots_against_a_quantity_are_distinguished_from_plots_over_time() {
         let read = over("f.F against f.v = -5 mm/s .. 5 mm/s steady");
         assert_eq!(read, Some(("f.F", "f.v".to_string(), "-5 mm/s", "5 mm/s", true)));
         let read = over("f.F, f.g against f.Fs = 1 N .. 2 N");

@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_to_and_fro_is_bounded_too() {
+    fn the_points_of_noise_are_bounded_too() {
         let points: Line = (0..400_000u64).map(|i| ((i * 7919 % 701) as f64, (i * 104_729 % 199) as f64)).collect();
         assert!(lines(&points, 700.0, 200.0)[0].len() <= 30_000);
     }

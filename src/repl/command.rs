@@ -200,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_told_apart() {
+    fn lines_are_classified() {
         let instance = |name: &str, at| Line::Instance(name.into(), at);
         let setting = |path: &str, at| Line::Setting(path.into(), at);
         assert_eq!(read("  // nothing"), Line::Nothing);
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_pasted_is_taken_apart_where_an_input_ends() {
+    fn pasted_text_is_split_into_inputs() {
         let text = "const m = 2 kg\nmodel M {\n  input v [m/s]\n}\n1 N +\n2 N\nf(";
         assert_eq!(inputs(text), ["const m = 2 kg\n", "model M {\n  input v [m/s]\n}\n", "1 N +\n2 N\n", "f("]);
         assert_eq!(inputs("1 N"), ["1 N"]);

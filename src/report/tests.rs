@@ -283,7 +283,7 @@ fn json_has_every_place() {
 }
 
 #[test]
-fn twenty_thousand_mistakes_are_told_without_delay() {
+fn twenty_thousand_errors_are_reported_without_delay() {
     let files = [file("a.fric", &"x;".repeat(20_000))];
     let all: Vec<Diagnostic> = (0..20_000)
         .map(|i| Diagnostic::error("E0001", "odd").label(Span::new(FileId(0), 2 * i, 2 * i + 1), ""))

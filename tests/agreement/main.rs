@@ -229,7 +229,7 @@ experiment e {
 /// gcc 12 replaces 0 − x by −x where it infers that x is never −0. For x = 0 the result is then −0, and 0 on all other
 /// back ends.
 #[test]
-fn what_is_subtracted_from_zero_keeps_its_sign() {
+fn zero_minus_zero_is_positive_zero() {
     let text = "model Zeros {
   param  a = 0 N
   output w [N] = 0 - abs(a)
@@ -248,7 +248,7 @@ fn what_is_subtracted_from_zero_keeps_its_sign() {
 
 /// C that compares a mask with an impossible value compiles without a warning.
 #[test]
-fn a_mask_is_compared_with_what_it_cannot_be() {
+fn a_mask_compared_with_an_impossible_value_compiles_without_a_warning() {
     let layout = random::layout();
     let mask = [
         Op::Load(layout.states.slot(0)),

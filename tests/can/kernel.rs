@@ -203,7 +203,7 @@ fn prepared_frames_arrive() {
 
 /// Frames faster than they can be read, through two cards. Every missing frame has been reported.
 #[test]
-fn a_flood_is_read_or_its_loss_is_told() {
+fn a_flood_is_read_or_its_loss_is_reported() {
     if !guest() {
         return;
     }

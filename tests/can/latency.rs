@@ -476,7 +476,7 @@ fn beside_load() {
 
 /// Each protection is effective: without it, the corresponding gate fails.
 #[test]
-fn what_does_not_belong_into_a_loop_turns_a_gate_red() {
+fn each_violation_of_the_loop_fails_its_gate() {
     for (planted, name, gate_name) in [
         (Planted::Lock, "lock", "missed cycles"),
         (Planted::Allocation, "allocation", "heap calls"),

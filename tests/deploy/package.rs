@@ -58,7 +58,7 @@ fn a_package_is_signed_and_its_signer_named() {
 }
 
 #[test]
-fn what_cannot_be_packed_is_told() {
+fn unpackable_rigs_are_reported() {
     let folder = folder("told");
     fs::write(folder.join("rig.fric"), text("sim(\"bench\")")).unwrap();
     fs::write(folder.join("model.fric"), "model M {\n  output F [N] = 1 N\n}\n").unwrap();

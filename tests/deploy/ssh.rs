@@ -192,7 +192,7 @@ impl Drop for There {
 }
 
 #[test]
-fn what_is_wrong_with_a_package_changes_nothing_there() {
+fn a_bad_package_changes_nothing_on_the_target() {
     let folder = folder("ssh");
     fs::write(folder.join("rig.fric"), unhurried("sim(\"bench\")")).unwrap();
     fs::write(folder.join("bad.fric"), unhurried("can(\"nosuchcan\", 1 Mbit/s)")).unwrap();

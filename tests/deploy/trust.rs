@@ -178,7 +178,7 @@ fn a_log_is_fetched_under_one_name_in_one_folder() {
 }
 
 #[test]
-fn what_is_sent_lies_in_a_private_folder_that_goes() {
+fn files_are_sent_through_a_private_temporary_folder() {
     let fake = Fake::new("staging");
     fs::write(fake.folder.join("rig.fric"), text("sim(\"bench\")")).unwrap();
     for broken in [false, true] {

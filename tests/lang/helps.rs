@@ -78,7 +78,7 @@ const SLIPS: &[(&str, &str, &str)] = &[
 ];
 
 #[test]
-fn what_a_help_proposes_is_accepted() {
+fn the_help_of_a_diagnostic_is_accepted() {
     let sources = Texts::default();
     for (wrong, help, right) in SLIPS {
         let (loaded, found) = checked("wrong.fric", &format!("{IMPORTS}{wrong}\n"), &sources);

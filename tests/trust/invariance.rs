@@ -187,7 +187,7 @@ fn difference(a: &[f64], b: &[f64]) -> f64 {
 /// An observer changes no bit of a run. Before window edges were interpolated from the polynomial of a step, 45 of
 /// these 60 cases failed, the first with seed 0.
 #[test]
-fn whoever_looks_changes_nothing() {
+fn observers_change_no_bit() {
     for seed in cases(60) {
         let mut random = Chance::plain(seed);
         let mut case = drawn(&mut random);
@@ -208,7 +208,7 @@ fn whoever_looks_changes_nothing() {
 /// tolerance were located, 5 of these 40 cases failed; in the first that ran to its end, seed 14, by 20 % of the
 /// position.
 #[test]
-fn a_longer_run_goes_the_same_way() {
+fn a_longer_run_passes_the_same_points() {
     for seed in cases(40) {
         let mut random = Chance::plain(1000 + seed);
         let case = drawn(&mut random);
@@ -295,7 +295,7 @@ fn own_text(random: &mut Chance, units: bool, length: f64, force: f64) -> Drawn 
 
 /// A unit is notation: no result depends on it.
 #[test]
-fn a_text_in_other_units_says_the_same() {
+fn results_do_not_depend_on_the_units_of_the_text() {
     for seed in cases(30) {
         let mut random = Chance::plain(3000 + seed);
         let tol = random.of(&[1e-6, 1e-8]);
@@ -311,7 +311,7 @@ fn a_text_in_other_units_says_the_same() {
 
 /// Nor on the scale of a system: multiplying lengths and forces by powers of a thousand multiplies its results.
 #[test]
-fn a_system_of_another_size_does_the_same() {
+fn results_scale_with_the_system() {
     for seed in cases(30) {
         let mut random = Chance::plain(4000 + seed);
         let tol = random.of(&[1e-6, 1e-8]);
@@ -427,7 +427,7 @@ fn any_exponent_of_dahl_runs() {
 /// A contact with a narrow dead band breaks away when the spring has exceeded its stiction, with any observers and any
 /// length of the run: v = vp (1 − cos ωτ) is Dv after 2/ω asin √(Dv/(2 vp)), where ω² = k/m.
 #[test]
-fn a_narrow_band_lets_go_in_time() {
+fn a_narrow_dead_band_breaks_away_in_time() {
     for (band, width) in [("1 um/s", 1e-6), ("10 um/s", 1e-5), ("0.1 mm/s", 1e-4f64)] {
         let exact = 7.5 + 2f64.sqrt() * (width / 0.2).sqrt().asin();
         for duration in [8.0, 20.0, 40.0, 80.0, 100.0] {

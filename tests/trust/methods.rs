@@ -318,7 +318,7 @@ fn every_model_of_the_library_is_stepped() {
 /// With the code before the joint exponential, `expo` fails in case 134 of seed 1 on: 2.6 N, 70 times Euler's error,
 /// for an extended-state observer of 376 1/s at 0.5 ms on a sliding mass.
 #[test]
-fn no_method_loses_to_euler() {
+fn no_method_is_less_accurate_than_euler() {
     let benches: Vec<Bench> = benches().into_iter().filter(|bench| !bench.jumps).collect();
     let seeds = seeds(2 * benches.len() as u64);
     println!("seeds {seeds:?}");
@@ -342,7 +342,7 @@ fn no_method_loses_to_euler() {
 /// a disturbance grows; near that point the linear equations of a step are singular, and `run` reports `undecided`.
 #[test]
 #[allow(clippy::disallowed_methods, reason = "a mean that is compared with 1")]
-fn under_a_mass_no_method_loses_to_euler_on_average() {
+fn under_a_mass_no_method_is_less_accurate_than_euler_on_average() {
     let benches: Vec<Bench> = benches().into_iter().filter(|bench| bench.jumps).collect();
     let seeds = seeds(benches.len() as u64);
     println!("seeds {seeds:?}");
@@ -382,7 +382,7 @@ fn under_a_mass_no_method_loses_to_euler_on_average() {
 
 /// Before the states used the exponential of their matrix jointly, 14 of 36 cases failed, the first with seed 2.
 #[test]
-fn linear_circles_are_exact_with_expo() {
+fn linear_cycles_are_exact_with_expo() {
     let benches: Vec<Bench> = BENCHES.iter().filter(|bench| bench.exact).cloned().collect();
     let seeds = seeds(6 * benches.len() as u64);
     println!("seeds {seeds:?}");

@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn what_oscillates_for_ever_is_named() {
+    fn an_undamped_oscillation_is_reported() {
         let why = settled(models::oscillator()).err().expect("an oscillator does not rest");
         assert!(matches!(&why, Restless::Moves { .. } | Restless::Failed(_)), "{why}");
         assert!(why.to_string().contains("rest") || why.to_string().contains("steps"), "{why}");

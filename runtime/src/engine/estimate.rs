@@ -412,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn a_decay_is_as_far_off_as_is_said() {
+    fn the_error_estimate_of_a_decay_is_close() {
         for experiment in [adaptive(1.0, 1e-3), adaptive(1.0, 1e-5), fixed(1.0, 0.1), fixed(1.0, 0.01)] {
             let (error, estimate) = decay(experiment.clone());
             let fits = error > 0.0 && error <= 3.0 * estimate && estimate <= 10.0 * error + 1e-15;
@@ -421,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_ends_beside_its_duration_is_judged_there() {
+    fn the_estimate_covers_a_run_that_ends_beside_its_duration() {
         // Exact except for where it ends: at 1 s and at 1.1 s, with half and a quarter of the step too.
         let instance = models::decay();
         for (duration, kind) in [(1.004, MeasureKind::Final), (1.096, MeasureKind::Final), (1.004, MeasureKind::Min)] {
@@ -436,7 +436,7 @@ mod tests {
 
     /// sin t has its maximum of 1 at π/2. For many steps the nearest point is one that all three runs share.
     #[test]
-    fn an_extreme_between_points_that_all_runs_share_is_judged() {
+    fn the_estimate_covers_an_extreme_between_points_that_all_runs_share() {
         let instance = models::oscillator();
         let mut shared = 0;
         for k in 0..200 {
@@ -460,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn an_open_verdict_names_what_decides() {
+    fn an_undecided_verdict_names_a_solver_that_decides() {
         let instance = models::decay();
         // Ten seconds: with the fifty steps of one second the error of this decay would be rounding at any tolerance.
         for mut experiment in [fixed(1.0, 0.1), adaptive(10.0, 1e-3)] {

@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_grid_is_refused() {
+    fn invalid_grids_are_refused() {
         let adaptive = models::adaptive(1.0, 1e-6);
         let said = |every: f64| instants(every, &adaptive).unwrap_err();
         assert!(said(0.0).contains("greater than 0") && said(-1.0).contains("greater than 0"));

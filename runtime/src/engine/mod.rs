@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_duration_that_is_no_whole_number_of_steps_is_rounded_and_said() {
+    fn a_duration_of_a_fractional_number_of_steps_is_rounded_with_a_note() {
         let outcome = go(models::decay(), &fixed(1.0, 0.3)).unwrap();
         assert_eq!(outcome.work.steps, 3);
         assert_eq!(outcome.notes, ["The run ends at 0.9 s, after a whole number of steps."]);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_named_at_its_first_step() {
+    fn the_first_non_finite_value_is_named_with_its_step() {
         let drawn = {
             let instance = blow_up().build();
             let mut experiment = fixed(20.0, 1e-3);

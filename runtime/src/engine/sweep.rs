@@ -174,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_come_in_order_whatever_the_threads() {
+    fn results_come_in_order_for_any_number_of_threads() {
         for threads in [1, 2, 5] {
             let mut seen = Vec::new();
             let job = |n: u64| {
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_done_is_kept_when_somebody_stops() {
+    fn completed_results_are_kept_when_a_sweep_is_stopped() {
         let mut seen = 0;
         ordered(0..1_000_000, 3, &|desk| one_by_one(desk, &Some), &mut |n, _| {
             seen = n + 1;

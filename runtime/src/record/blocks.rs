@@ -183,7 +183,7 @@ mod tests {
     }
 
     #[test]
-    fn blocks_come_back() {
+    fn blocks_survive_the_round_trip() {
         let (file, blocks) = file();
         assert_eq!(read(&file), Some((blocks, End::Whole)));
         assert_eq!(read(b"something else"), None);
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_cut_at_any_byte_gives_a_prefix() {
+    fn a_file_truncated_at_any_byte_reads_as_a_prefix() {
         let (file, blocks) = file();
         let mut longest = 0;
         for cut in MAGIC.len()..file.len() {

@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_has_it_until_it_goes() {
+    fn one_process_holds_the_claim_until_it_ends() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.friclog");
         let first = Claim::on(&path).unwrap();

@@ -83,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_whole_or_as_it_was() {
+    fn files_are_written_atomically() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.csv");
         fs::write(&path, "before").unwrap();

@@ -678,7 +678,7 @@ mod tests {
     }
 
     #[test]
-    fn sections_come_back() {
+    fn sections_survive_the_round_trip() {
         assert_eq!(Sections::read(&head().bytes()), Some(head()));
         let bytes = head().bytes();
         for cut in 0..bytes.len() {
@@ -731,7 +731,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_drops_counts_and_says_so() {
+    fn a_full_queue_drops_messages_and_logs_their_number() {
         let (queue, mut end) = queue(16);
         let shared = Arc::new(Shared::default());
         let mut log = Log { queue, shared, patient: false, boxed: false, lost: 0, dropped: 0, thread: None };
@@ -767,7 +767,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_was_not_ended_is_read_as_far_as_it_goes() {
+    fn an_unfinished_log_is_readable_up_to_its_end() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         let mut log = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
@@ -822,7 +822,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_that_is_cut_ends_the_log_there_and_a_part_of_another_log_is_not_taken() {
+    fn a_truncated_part_ends_the_log_and_a_part_of_another_log_is_ignored() {
         let folder = tempfile::tempdir().unwrap();
         let limits = Limits { part: 3000, ..Limits::default() };
         let (path, written) = in_parts(folder.path(), 1, limits);
@@ -846,7 +846,7 @@ mod tests {
     }
 
     #[test]
-    fn all_parts_together_stay_within_what_may_be_kept() {
+    fn all_parts_together_stay_within_the_limit() {
         let folder = tempfile::tempdir().unwrap();
         let keep = 40_000;
         let path = folder.path().join("a.friclog");
@@ -875,7 +875,7 @@ mod tests {
     }
 
     #[test]
-    fn one_writes_a_log_and_the_other_changes_nothing() {
+    fn only_one_process_writes_a_log() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log");
         let mut first = Log::begin(settings(Sink::File(path.clone(), Limits::default())), &head()).unwrap();
@@ -895,7 +895,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_log_is_refused() {
+    fn a_file_that_is_not_a_log_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x");
         let why = |path: &Path| Reader::open(path).err().unwrap();

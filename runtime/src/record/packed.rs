@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn any_block_comes_back() {
+    fn any_block_survives_the_round_trip() {
         for seed in 0..500 {
             let block = block(&mut Chance(seed));
             let packed = pack(&block);
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_packed_here_does_not_unpack() {
+    fn foreign_bytes_do_not_unpack() {
         for seed in 0..500 {
             let mut chance = Chance(seed);
             let block = block(&mut chance);

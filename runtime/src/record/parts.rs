@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_log_takes_the_parts_of_an_old_one_away() {
+    fn a_new_log_removes_the_parts_of_an_old_one() {
         let folder = tempfile::tempdir().unwrap();
         let first = folder.path().join("a.friclog");
         (1..=3).for_each(|number| drop(create(&first, number).unwrap()));
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_logs_go_and_nothing_else() {
+    fn only_the_oldest_logs_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let named = |name: &str| folder.path().join(name);
         let now = SystemTime::now();

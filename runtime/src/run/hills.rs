@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn wiggles_below_the_threshold_are_none_also_where_the_largest_value_comes_late() {
+    fn wiggles_below_the_threshold_are_no_peaks_even_if_the_largest_value_comes_late() {
         let wiggle = |k: i32| (f64::from(k), f64::from(k) + 1e-3 * f64::from(k % 2));
         let mut points: Vec<Point> = (0..100).map(wiggle).collect();
         assert_eq!(peaks(1e-6, &points), []);

@@ -753,7 +753,7 @@ mod tests {
     }
 
     #[test]
-    fn windows_are_cut_on_the_line_between_points() {
+    fn window_edges_are_interpolated_linearly() {
         let points = [(0.0, 0.0), (2.0, 4.0), (3.0, 4.0)];
         assert_eq!(taken(MeasureKind::Min, (0.5, 1.5), &points), Ok((1.0, Some(0.5))));
         assert_eq!(taken(MeasureKind::Max, (0.5, 1.5), &points), Ok((3.0, Some(1.5))));

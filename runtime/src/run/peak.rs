@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jump_at_a_known_instant_hides_nothing_before_it() {
+    fn a_jump_at_a_known_instant_adds_no_error_before_it() {
         let mut peak = Peak::greatest();
         for (t, v) in [(1.0, 0.0), (2.0, 0.0), (3.0, 5.0), (4.0, 4.0), (5.0, 3.1)] {
             peak.see(t, v);
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_unseen_where_a_value_is_held() {
+    fn a_held_value_has_no_unseen_extreme() {
         let held = |t: f64| (0.5 * (t / 4.0).floor()).sin();
         let level = |t: f64| t.clamp(-3.0, 3.0);
         assert_eq!([seen(held, 0.5).1, seen(level, 0.0).1, seen(|_| 7.0, 0.0).1], [0.0; 3]);

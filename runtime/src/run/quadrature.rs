@@ -80,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ten_million_points_lose_nothing() {
+    fn ten_million_points_sum_without_rounding_error() {
         let mut sum = Sum::default();
         (0..10_000_000).for_each(|_| sum.add(0.1));
         assert_eq!(sum.total(), 1_000_000.0);

@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn the_comparison_that_decides_gives_the_margin() {
+    fn the_margin_is_that_of_the_deciding_comparison() {
         let loose = || Box::new(Formula::Less(max(), number(10.0)));
         let tight = || Box::new(Formula::Greater(min(), number(-2.1)));
         let both = alone(Formula::And(loose(), tight()));
@@ -488,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_holds_nothing() {
+    fn nan_fails_every_comparison() {
         let zero = || Box::new(Formula::Add(max(), min()));
         let verdict = alone(Formula::Not(Box::new(Formula::Less(Box::new(Formula::Divide(zero(), zero())), max()))));
         assert!(!verdict.holds && verdict.problem.unwrap().contains("not a number"));
@@ -506,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_larger_than_the_margin_leaves_the_verdict_open() {
+    fn an_error_larger_than_the_margin_makes_the_verdict_undecided() {
         let below = |limit: f64| Formula::Less(max(), number(limit));
         let finer = [(2.01, -2.0), (2.012, -2.0)];
         let clear = with_error(below(2.5), finer);
@@ -530,13 +530,13 @@ mod tests {
     }
 
     #[test]
-    fn a_truth_value_on_which_finer_runs_disagree_is_open() {
+    fn a_truth_value_on_which_finer_runs_disagree_is_undecided() {
         let same = [(1.0, -2.0), (1.0, -2.0)];
         assert!(with_error(*max(), same).decided && !with_error(*max(), [(1.0, 0.0), (0.0, 0.0)]).decided);
     }
 
     #[test]
-    fn agreement_on_an_extreme_leaves_the_course_of_the_finest_run_open() {
+    fn agreement_on_an_extreme_does_not_decide_what_happens_between_points() {
         let [mut own, mut fine] = [readings(2.0, -2.0), readings(2.01, -2.0)];
         (own[0].unseen, fine[0].unseen) = (0.5, 0.02);
         let condition = Formula::Less(Box::new(Formula::Multiply(number(3.0), max())), number(6.08));
@@ -547,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quantity_that_is_all_rounding_is_as_uncertain_as_it_is_large() {
+    fn a_quantity_of_rounding_errors_has_an_error_of_its_own_size() {
         let mut noise = readings(4e-16, 0.0);
         noise.iter_mut().for_each(|reading| reading.scale = 4e-16);
         let below = |limit: f64| Formula::Less(max(), number(limit));
@@ -556,7 +556,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_seen_at_points_alone_is_as_coarse_as_they_are() {
+    fn the_spacing_of_points_limits_the_accuracy() {
         let mut coarse = readings(2.0, -2.0);
         coarse[0].resolution = 0.1;
         let condition = Formula::Less(Box::new(Formula::Multiply(number(3.0), max())), number(6.2));

@@ -628,7 +628,7 @@ impl Adaptive {
         }
         self.h = self.h.min(self.creep);
         self.creep = f64::INFINITY;
-        // A release before that instant has been located by bisection.
+        // Steps approach that instant by halving, so a release before it is located.
         if self.suspect - reached <= 256.0 * f64::EPSILON * reached {
             self.suspect = f64::INFINITY;
         }

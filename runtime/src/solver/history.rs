@@ -63,7 +63,7 @@ impl History {
         self.lines.iter().map(least).fold(f64::INFINITY, f64::min)
     }
 
-    /// The present values of the delayed quantities in the block.
+    /// The present values of the quantities that are delayed, from the block.
     pub(crate) fn present(&self, instance: &Instance) -> Vec<f64> {
         self.lines.iter().map(|line| instance.get(line.delay.source)).collect()
     }

@@ -7,7 +7,7 @@ use super::linear;
 /// a vector is used.
 const MOST_SQUARED: usize = 64;
 
-/// Number of power iterations: before the norm is counted, and while it is.
+/// Number of power iterations: before the growth of the vector is averaged, and while it is.
 const MULTIPLIED: (usize, usize) = (8, 16);
 
 /// Positions of the entries of a Jacobian.
@@ -138,7 +138,7 @@ mod tests {
 
     /// 100 masses on springs, at ±316 i, and 100 states that decay at 20 1/s: dense, or with nonzero entries only.
     #[test]
-    fn of_few_entries_the_same_is_known_as_of_all() {
+    fn sparse_and_dense_estimates_agree() {
         let n = 300;
         let (mut coupled, mut values, mut all) = (Vec::new(), Vec::new(), vec![0.0; n * n]);
         for k in 0..100u32 {

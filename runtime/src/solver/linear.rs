@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn a_singular_system_is_told() {
+    fn a_singular_system_is_reported() {
         assert!(!factor::<2>(2, &mut [1.0, 2.0, 2.0, 4.0], &mut [0, 0]));
         assert!(factor::<0>(0, &mut [], &mut []));
     }

@@ -34,7 +34,7 @@ fn a_decay_is_as_accurate_as_asked() {
 }
 
 #[test]
-fn an_oscillator_goes_explicit_and_its_measures_are_as_good_as_its_states() {
+fn an_oscillator_uses_the_explicit_method_and_its_measures_are_as_accurate_as_its_states() {
     let instance = models::oscillator();
     let mut experiment = adaptive(100.0, 1e-8);
     for kind in [MeasureKind::Max, MeasureKind::Period, MeasureKind::Rms, MeasureKind::Final] {
@@ -461,7 +461,7 @@ fn a_surface_that_is_only_grazed_is_found() {
 }
 
 #[test]
-fn regimes_that_pass_the_buck_are_chatter() {
+fn regimes_that_switch_in_a_cycle_are_chatter() {
     let instance = Model::new("Buck")
         .state("x", "m")
         .automaton(&["left", "right"])
@@ -494,7 +494,7 @@ fn a_watched_range_stops_an_adaptive_run_too() {
 }
 
 #[test]
-fn what_blows_up_is_named() {
+fn a_blow_up_is_reported_with_its_state() {
     let blow_up = |power: i32| {
         Model::new("BlowUp")
             .state("x", "m")

@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn a_singular_system_is_told_and_leaves_nothing_behind() {
+    fn a_singular_system_is_reported_and_leaves_no_state() {
         let mut sparse = Sparse::new(2, &[(0, 0), (0, 1), (1, 0), (1, 1)]);
         assert!(!sparse.factor(0.0, &[1.0, 2.0, 2.0, 4.0]));
         assert!(!sparse.factor(0.0, &[f64::NAN, 2.0, 2.0, 4.0]));

@@ -119,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_is_the_same_number_again() {
+    fn a_literal_parses_to_the_same_number() {
         for si in [0.1 + 0.2, -1e-300, 5e17, 0.0] {
             let text = literal(&quantity(si, "N"));
             let mut session = Session::default();
