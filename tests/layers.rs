@@ -23,7 +23,8 @@ const CRATES: [(&str, &str, &[&str]); 6] = [
     ("fric", "src/main.rs", &["grammar", "abi", "compiler", "runtime"]),
 ];
 
-/// Where an outside crate may be named: files or folders. A crate without a home of its own says so with the root.
+/// Where an outside crate may be named: files or folders. A crate used throughout one of ours has the source folder of
+/// that crate as its home.
 const HOMES: &[(&str, &[&str])] = &[
     ("can-dbc", &["compiler/src/rig/dbc.rs"]),
     ("clap", &["src/args.rs", "src/compile.rs", "src/main.rs", "src/commands/mod.rs", "rig/src/main.rs"]),

@@ -83,7 +83,7 @@ pub struct Entry {
     sweep: Option<String>,
     plots: Vec<String>,
     expects: Vec<String>,
-    /// Greatest fixed step in s for a model that chatters, and the number of steps wanted.
+    /// Greatest fixed step in s for a model that chatters, and the intended number of steps.
     longest: f64,
     fine: f64,
 }

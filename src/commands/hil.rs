@@ -233,7 +233,7 @@ fn measured(asked: &Identification, rows: &[identify::Row], terminal: &mut Termi
     }
 }
 
-/// What a run does besides the control cycle.
+/// Tasks of a run in addition to the control cycle.
 #[derive(Default)]
 struct Asked<'a> {
     log: Option<(Settings, Sections)>,

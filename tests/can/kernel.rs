@@ -258,7 +258,7 @@ fn through_a_gateway(changed: impl Fn(&str, &str)) -> (Cause, u64) {
     let (near, far) = (fresh(), fresh());
     gateway(&[&["-A", "-e", "-s", &near, "-d", &far], &["-A", "-e", "-s", &far, "-d", &near]]);
     let mut asked = rig::pulsed(20_000_000);
-    // A busy host may be late by itself.
+    // A busy host may cause overruns of its own.
     asked.rig.overrun = Overrun::Hold(50);
     let over = Arc::new(AtomicBool::new(false));
     let drives = {

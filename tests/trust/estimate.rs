@@ -120,7 +120,7 @@ impl Survey<'_> {
         let adaptive = Changes { method: Some(Method::Adaptive), tol: Some(1e-6), ..Changes::default() };
         let Some(cases) = compiled(&mut loaded, &subject.name, adaptive) else { return };
         if cases.iter().any(|case| case.experiment.bench.is_some()) {
-            return; // A dry run has no exact solution: its rig is stepped.
+            return; // A SIL run has no exact solution: its rig has fixed steps.
         }
         // For a sweep, the first and the last case.
         let chosen: Vec<usize> = [0, cases.len() - 1].into_iter().take(cases.len()).collect();

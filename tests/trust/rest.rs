@@ -36,7 +36,7 @@ struct Contact {
     name: &'static str,
     /// Arguments that connect it to the mass, and those it has in the slot.
     slot: &'static str,
-    /// The least force at which it lets go, as a formula of Fc and Fs: the stiction that it reaches by then.
+    /// Whether its stiction grows with the time at rest; the reached value is its output `F_max`.
     dwells: bool,
 }
 

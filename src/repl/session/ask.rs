@@ -236,7 +236,7 @@ impl Session {
         Err(Fault::Words(format!("there is no experiment or instance `{name}`; {help}")))
     }
 
-    /// The last run besides the instances: its name, and its quantities without parameters.
+    /// The last run other than of the instances: its name, and its quantities without parameters.
     pub fn staged(&self) -> Option<(String, Vec<String>)> {
         let (what, setup) = self.stage.as_ref()?;
         let name = match what {

@@ -107,7 +107,7 @@ pub struct Session {
     used: Vec<Used>,
     /// The instances.
     bench: Setup,
-    /// The last run besides the instances, and its changes.
+    /// The last run other than of the instances, and its changes.
     stage: Option<(What, Setup)>,
     /// Whether the previous line was about the instances.
     at_bench: bool,
