@@ -5,8 +5,8 @@
 
 #![deny(clippy::print_stdout, clippy::print_stderr, reason = "a closed pipe must not panic: see terminal.rs")]
 
-mod compile;
 mod quantity;
+mod compile;
 mod vary;
 mod args;
 mod equations;
