@@ -1,48 +1,49 @@
-//! The last stage before the bus: what no output may exceed, and how a rig stops.
+//! Safety supervisor: the last stage before the bus. It limits every output and decides how a rig stops.
 //!
-//! In: what the model asks for, what was measured, what went wrong anywhere. Out: what is permitted, and whether the
-//! drives follow, stop quickly or are disabled. Knows neither buses nor models.
+//! In: the model's requests, measured speeds and positions, faults reported by any other part. Out: the permitted
+//! outputs, and a command to the drives (follow, quick stop, disable). Knows neither buses nor models.
 //!
-//! It decides in the cycle that brings it the measurements. A trip latches: nothing leads out of it. Limits can be narrowed
-//! while running and never widened. It allocates nothing after [`Supervisor::new`] and holds no unsafe code.
+//! It decides in the same cycle in which the measurements arrive. A trip latches: no transition leaves it. Limits can
+//! be narrowed while the rig runs, never widened. Nothing is allocated after [`Supervisor::new`], and the file contains
+//! no unsafe code.
 //!
-//! Software is not the safety function of a machine: the emergency stop acts by wire on the safe torque off of the
-//! drives. This is the layer before.
+//! Software is not the safety function of a machine: the emergency stop acts by wire on the safe torque off (STO) of
+//! the drives. This supervisor is a layer before that.
 
 #![forbid(unsafe_code)]
 
 #[cfg(all(feature = "mutants", not(debug_assertions)))]
 compile_error!("mutants switch protections off: they are for tests, never for an optimised build");
 
-/// Limits of one output. Values are in its own unit, SI.
+/// Limits of one output, in the output's own SI unit.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct OutputLimits {
-    /// Least permitted value.
+    /// Lowest permitted value.
     pub low: f64,
-    /// Greatest permitted value.
+    /// Highest permitted value.
     pub high: f64,
-    /// Greatest change per second; infinite: none.
+    /// Highest rate of change per second; infinite: no limit.
     pub slew: f64,
-    /// Where it goes on any stop, between `low` and `high`.
+    /// Target value of every stop, between `low` and `high`.
     pub safe: f64,
-    /// Index of the drive it moves, if it moves one.
+    /// Index of the drive that this output commands, if any.
     pub drive: Option<usize>,
-    /// It is a torque in N·m: power is torque times speed.
+    /// Whether the output is a torque in N·m; then its power is torque times speed.
     pub torque: bool,
 }
 
-/// Limits of one drive; infinite where it has none.
+/// Limits of one drive; infinite where there is no limit.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct DriveLimits {
-    /// Greatest speed, rad/s.
+    /// Highest speed, rad/s.
     pub speed: f64,
-    /// Permitted positions, rad.
+    /// Permitted range of positions, rad.
     pub travel: (f64, f64),
-    /// Greatest power, W.
+    /// Highest power, W.
     pub power: f64,
 }
 
-/// What was measured of one drive, as far as it is known: SI.
+/// Measured speed and position of one drive, where known; SI.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Seen {
     /// rad/s
@@ -51,71 +52,71 @@ pub struct Seen {
     pub position: Option<f64>,
 }
 
-/// How long what is borne, in cycles.
+/// Time-outs, in cycles.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Timeouts {
-    /// Arming: the outputs come up from their safe values.
+    /// Ramp after arming, in which outputs rise from their safe values.
     pub ramp: u32,
-    /// An output outside its limits without a break: then a controlled stop.
+    /// Longest unbroken time for which an output may be outside its limits before a controlled stop.
     pub clamped: u32,
-    /// From a controlled stop to the quick stop, and from there to disabled, whatever is measured.
+    /// Longest time from a controlled stop to the quick stop, and from there to disabled, whatever is measured.
     pub standstill: u32,
 }
 
 /// Why a rig stops.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Cause {
-    /// The operator or a signal of the system asked for it.
+    /// The operator or a signal of the operating system requested the stop.
     Asked,
-    /// The model's request for this output is not a number.
+    /// The model's request for this output is not finite.
     NotFinite(usize),
-    /// The model left a declared range: the number of its guard, from 1.
+    /// The model left a declared range; the number of its guard, from 1.
     Guard(u64),
     /// This output was outside its limits for too long.
     Clamped(usize),
-    /// A condition of the rig holds.
+    /// A stop condition of the rig holds; its index.
     Condition(usize),
-    /// So many ticks were missed.
+    /// This many ticks were missed.
     Overrun(u32),
     /// A drive is faster than permitted, rad/s.
     Speed(usize, f64),
     /// A drive is outside its travel, rad.
     Travel(usize, f64),
-    /// The shaft gets faster against the torque on it; the drive that gained most.
+    /// The shaft accelerates against the applied torque (a sign is wrong); the drive whose speed rose most.
     RunAway(usize),
-    /// A signal did not come for too long; its index among those read.
+    /// A signal was missing for too long; its index among the signals read.
     Lost(usize),
     /// A signal was not credible for too long.
     Implausible(usize),
-    /// A drive shows another mode than asked for, or does not follow commands.
+    /// A drive reports another mode of operation than requested, or does not follow its commands.
     NotFollowing(usize),
-    /// A drive is in fault, stopped by itself, fell silent or started anew: see its status.
+    /// A drive is in fault, stopped by itself, stopped answering or restarted; see its status.
     Drive(usize),
-    /// A bus does not carry: see its event.
+    /// A bus does not work; see its event.
     Bus(usize),
-    /// Set-points are at risk: frames were lost by the bus.
+    /// Set-points are at risk because this bus loses frames.
     Overload(usize),
-    /// Somebody else commands: the bus and the identifier of the frame.
+    /// Another participant sends commands; bus and identifier of its frame.
     Foreign(usize, u32),
-    /// More energy came back than a friction can hold.
+    /// A contact returned more energy than friction can store (passivity observer).
     Energy,
-    /// The shaft is not as told, and the loop is stable only while its commands look ahead.
+    /// The shaft deviates from its model, and the loop is stable only with the predictor.
     Unpredictable,
-    /// No cycle ended in time.
+    /// The cycle did not end in time.
     Watchdog,
 }
 
-/// What a cause leads to.
+/// How a rig stops.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Reaction {
-    /// Outputs go to their safe values within their slew, then as [`Reaction::Quick`].
+    /// Outputs move to their safe values at their slew rate, then as [`Reaction::Quick`].
     Controlled,
-    /// Quick stop of all drives at once; disabled at standstill or after a time.
+    /// Quick stop of all drives at once; disabled at standstill or after a time-out.
     Quick,
 }
 
 impl Cause {
-    /// What it leads to.
+    /// The reaction to this cause.
     pub fn reaction(self) -> Reaction {
         match self {
             Cause::Asked
@@ -142,7 +143,7 @@ impl Cause {
 }
 
 impl Cause {
-    /// As two words, never both 0: kind and index, then a value.
+    /// Encodes the cause as two words, never both 0: kind and index, then a value.
     pub fn to_words(self) -> [u64; 2] {
         let (kind, index, value) = match self {
             Cause::Asked => (1, 0, 0),
@@ -168,7 +169,7 @@ impl Cause {
         [kind << 32 | index as u64, value]
     }
 
-    /// The other way round. None if they stand for nothing.
+    /// Decodes the words of [`Cause::to_words`]. None if they encode no cause.
     pub fn from_words([first, value]: [u64; 2]) -> Option<Cause> {
         let (i, small) = ((first & 0xffff_ffff) as usize, u32::try_from(value).ok());
         Some(match first >> 32 {
@@ -196,32 +197,32 @@ impl Cause {
     }
 }
 
-/// What drives are told.
+/// Command of the safety stage to the state machines of the drives.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum DriveCommand {
-    /// Not armed: enabled drives get their safe values.
+    /// Not armed: enabled drives receive their safe values.
     Wait,
     /// Follow the permitted outputs.
     Follow,
     /// Quick stop.
     QuickStop,
-    /// Take the power away.
+    /// Disable the power stage.
     Disable,
 }
 
-/// Why an output is not what was asked for. Several may hold at once.
+/// Reasons why an output differs from its request, as bits; several may hold at once.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Clamps(pub u8);
 
 impl Clamps {
-    /// Outside `low .. high`.
+    /// The request is outside `low .. high`.
     pub const RANGE: Clamps = Clamps(1);
-    /// Faster than the slew.
+    /// The request changes faster than the slew limit.
     pub const SLEW: Clamps = Clamps(2);
-    /// More than the power.
+    /// The request exceeds the power limit.
     pub const POWER: Clamps = Clamps(4);
 
-    /// Whether one of these holds.
+    /// Whether any of the reasons in `other` holds.
     pub fn has(self, other: Clamps) -> bool {
         self.0 & other.0 != 0
     }
@@ -234,34 +235,34 @@ impl Clamps {
 /// Why a set of limits is refused.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Refused {
-    /// Not `low <= safe <= high`, or one of them is not a number.
+    /// Not `low <= safe <= high`, or one of them is NaN.
     Range(usize),
-    /// The slew of an output is not above 0: it could never be stopped.
+    /// The slew of an output is not above 0, so it could never be stopped.
     Slew(usize),
-    /// Speed, travel or power of a drive is negative or not a number.
+    /// Speed, travel or power of a drive is negative or NaN.
     Drive(usize),
-    /// A torque or another command of a drive has no bounds.
+    /// An output that commands a drive has no finite range.
     Unbounded(usize),
-    /// An output names a drive that is not there.
+    /// An output names a drive that does not exist.
     NoDrive(usize),
-    /// Wider than before.
+    /// The limits are wider than those in force.
     Wider(usize),
 }
 
-/// Where a rig is between arming and standing still.
+/// State machine of the supervisor, from idle through armed to disabled.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Stage {
     Idle,
-    /// For so many cycles.
+    /// Cycles since arming.
     Armed(u32),
-    /// For so many cycles.
+    /// Cycles in this stage.
     Slewing(u32),
-    /// For so many cycles.
+    /// Cycles in this stage.
     Quick(u32),
     Disabled,
 }
 
-/// A protection, for tests that switch one off to see that it is missed.
+/// A protection that mutation tests can switch off, to show that a test then fails.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Protection {
@@ -312,7 +313,7 @@ pub enum Protection {
 }
 
 impl Protection {
-    /// All of them, with the names by which the environment variable `FRIC_MUTANT` knows them.
+    /// All protections, with their names in the environment variable `FRIC_MUTANT`.
     pub const ALL: [(&'static str, Protection); 44] = [
         ("finite", Protection::Finite),
         ("range", Protection::Range),
@@ -361,35 +362,35 @@ impl Protection {
     ];
 }
 
-/// Part of the speed limit that a shaft may gain against its torque before it counts as a run-away.
+/// Share of the speed limit by which a shaft may accelerate against its torque before it counts as a run-away.
 const RUN_AWAY: f64 = 0.1;
-/// Part of the speed limit below which a drive counts as standing.
+/// Share of the speed limit below which a drive counts as being at standstill.
 const STANDSTILL: f64 = 0.01;
 
-/// Watches over the outputs of one rig.
+/// Supervises the outputs of one rig.
 pub struct Supervisor {
     outputs: Vec<OutputLimits>,
     drives: Vec<DriveLimits>,
     patience: Timeouts,
-    /// Cycle in s.
+    /// Period of a cycle, s.
     period: f64,
     stage: Stage,
     cause: Option<Cause>,
     permitted: Vec<f64>,
     clamps: Vec<Clamps>,
-    /// Cycles for which each output has been outside its range or power without a break.
+    /// Unbroken number of cycles for which each output has been outside its range or power limit.
     clamped: Vec<u32>,
-    /// Least speed of each drive since torque began to brake the shaft, as part of its limit.
+    /// Lowest speed of each drive since the torque began to brake the shaft, as a share of its limit.
     least: Vec<f64>,
     #[cfg(feature = "mutants")]
     missing: Option<Protection>,
 }
 
 impl Supervisor {
-    /// Watches over outputs and drives at a period in ns.
+    /// A supervisor of these outputs and drives; `period_ns`: period of a cycle.
     ///
     /// # Errors
-    /// Limits that cannot be kept.
+    /// Limits that contradict each other or cannot be enforced.
     pub fn new(
         outputs: &[OutputLimits],
         drives: &[DriveLimits],
@@ -433,12 +434,12 @@ impl Supervisor {
         })
     }
 
-    /// What may be sent, one value an output.
+    /// The permitted outputs, one value per output.
     pub fn permitted(&self) -> &[f64] {
         &self.permitted
     }
 
-    /// Why outputs are not what was asked for, one an output.
+    /// Reasons why outputs differ from their requests, one entry per output.
     pub fn clamps(&self) -> &[Clamps] {
         &self.clamps
     }
@@ -448,22 +449,23 @@ impl Supervisor {
         &self.outputs
     }
 
-    /// Why the rig stops or has stopped: the first cause.
+    /// The first cause of the stop, if the rig stops or has stopped.
     pub fn cause(&self) -> Option<Cause> {
         self.cause
     }
 
-    /// Whether the model has the outputs.
+    /// Whether the outputs follow the requests.
     pub fn is_armed(&self) -> bool {
         matches!(self.stage, Stage::Armed(_))
     }
 
-    /// Whether the stop is over.
+    /// Whether the stop is complete.
     pub fn is_disabled(&self) -> bool {
         self.stage == Stage::Disabled
     }
 
-    /// Gives the outputs to whoever asks from now on: they come up anew. Refused while a trip is latched.
+    /// Arms the rig: outputs follow the requests from now on and ramp up from their safe values. Returns false, and
+    /// changes nothing, while a trip is latched.
     pub fn arm(&mut self) -> bool {
         let free = matches!(self.stage, Stage::Idle | Stage::Armed(_)) && self.cause.is_none();
         if free {
@@ -475,7 +477,7 @@ impl Supervisor {
     /// Narrows the limits of an output.
     ///
     /// # Errors
-    /// Limits that are wider than those in force anywhere, or leave no room for the safe value.
+    /// Limits that are wider than those in force, or that exclude the safe value.
     pub fn narrow(&mut self, i: usize, low: f64, high: f64, slew: f64) -> Result<(), Refused> {
         let now = self.outputs[i];
         if !(low <= now.safe && now.safe <= high) {
@@ -491,7 +493,7 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Stops the rig, in this cycle. The first cause is kept; a graver reaction replaces the one under way.
+    /// Stops the rig in this cycle. The first cause is kept; a more severe reaction replaces the current one.
     pub fn trip(&mut self, cause: Cause) {
         if !self.on(Protection::Report) {
             return;
@@ -506,9 +508,10 @@ impl Supervisor {
         self.cause = self.cause.or(Some(cause));
     }
 
-    /// One cycle: judges what was measured and asked for, and leaves in [`Supervisor::permitted`] what may be sent.
+    /// One cycle: checks measurements and requests, updates [`Supervisor::permitted`], and returns the command to the
+    /// drives.
     ///
-    /// `requests`: one value an output. `seen`: one entry a drive.
+    /// `requests`: one value per output. `seen`: measurements, one entry per drive.
     pub fn judge(&mut self, requests: &[f64], seen: &[Seen]) -> DriveCommand {
         assert_eq!((requests.len(), seen.len()), (self.outputs.len(), self.drives.len()), "outputs and drives");
         if !self.on(Protection::Latch) && matches!(self.stage, Stage::Slewing(_) | Stage::Quick(_)) {
@@ -552,10 +555,10 @@ impl Supervisor {
         }
     }
 
-    /// Trips on what was measured.
+    /// Trips on measurements that are outside the limits of a drive.
     fn watch(&mut self, seen: &[Seen]) {
         for (i, seen) in seen.iter().enumerate() {
-            // Compared so that what is not a number is outside.
+            // Written so that NaN counts as outside.
             let DriveLimits { speed: most, travel: (low, high), .. } = self.drives[i];
             let slow = seen.speed.is_none_or(|speed| speed.abs() <= most);
             if !slow && self.on(Protection::Speed) {
@@ -571,9 +574,9 @@ impl Supervisor {
         }
     }
 
-    /// Torque that takes power out of the shaft cannot make it faster, unless a sign is wrong.
+    /// Trips on a run-away: torque that takes power out of the shaft cannot accelerate it, unless a sign is wrong.
     ///
-    /// The sum of torque times speed over all drives of the shaft does not depend on which way each of them counts.
+    /// The sum of torque times speed over all drives of the shaft does not depend on the sign convention of each drive.
     fn watch_run_away(&mut self, seen: &[Seen]) {
         let power: f64 = (self.outputs.iter().zip(&self.permitted))
             .filter(|(output, _)| output.torque)
@@ -590,7 +593,7 @@ impl Supervisor {
         }
     }
 
-    /// What was asked for, within its limits.
+    /// Limits the requests to range, ramp, slew and power.
     fn follow(&mut self, requests: &[f64], seen: &[Seen], for_cycles: u32) {
         if let Some(i) = self.clamped.iter().position(|cycles| *cycles > self.patience.clamped)
             && self.on(Protection::Clamped)
@@ -606,7 +609,7 @@ impl Supervisor {
                 value = value.clamp(limits.low, limits.high);
             }
             if for_cycles < self.patience.ramp && self.on(Protection::Ramp) {
-                // Of what may act, not of what is asked for: a request beyond its range would come up sooner.
+                // The ramp scales the clamped value, not the request: a request beyond its range would rise sooner.
                 value = limits.safe + (value - limits.safe) * f64::from(for_cycles) / f64::from(self.patience.ramp);
             }
             let most = limits.slew * self.period;
@@ -622,7 +625,7 @@ impl Supervisor {
                 value = most.copysign(value);
             }
             if self.on(Protection::Range) {
-                // Limits may have been narrowed around the last value: the range wins over the slew.
+                // Limits may have been narrowed around the last value: the range takes precedence over the slew.
                 value = value.clamp(limits.low, limits.high);
             }
             self.permitted[i] = value;
@@ -632,13 +635,13 @@ impl Supervisor {
         }
     }
 
-    /// Greatest torque at the speed of the drive of this output, N·m.
+    /// Highest torque at the measured speed of the drive of this output, N·m; none where there is no such limit.
     fn power_limit(&self, limits: OutputLimits, seen: &[Seen]) -> Option<f64> {
         let drive = limits.drive.filter(|_| limits.torque)?;
         Some(self.drives[drive].power / seen[drive].speed?.abs())
     }
 
-    /// Towards the safe values within the slew; says whether all are there.
+    /// Moves outputs towards their safe values at their slew rate; returns whether all have arrived.
     fn slew_to_safe(&mut self) -> bool {
         let mut there = true;
         for (i, limits) in self.outputs.iter().enumerate() {
@@ -652,7 +655,7 @@ impl Supervisor {
         there
     }
 
-    /// All outputs at their safe values.
+    /// Sets all outputs to their safe values.
     fn rest(&mut self) {
         for (i, limits) in self.outputs.iter().enumerate() {
             self.permitted[i] = limits.safe;
@@ -661,7 +664,7 @@ impl Supervisor {
         }
     }
 
-    /// All that the next cycle depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Supervisor::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         let (stage, cycles) = match self.stage {
             Stage::Idle => (0, 0),
@@ -676,8 +679,8 @@ impl Supervisor {
         words.extend(self.clamped.iter().map(|cycles| u64::from(*cycles)));
     }
 
-    /// Takes over what [`Supervisor::save`] gave; limits are not among it. None, and nothing taken over, if it
-    /// does not fit.
+    /// Restores the state that [`Supervisor::save`] wrote; limits are not part of it. Returns None, and changes
+    /// nothing, if the words do not fit.
     pub fn restore(&mut self, words: &mut dyn Iterator<Item = u64>) -> Option<()> {
         let (stage, cycles) = (words.next()?, u32::try_from(words.next()?).ok()?);
         let stage = match stage {
@@ -704,7 +707,7 @@ impl Supervisor {
         Some(())
     }
 
-    /// Whether a protection is there: always, but for a test of the tests.
+    /// Whether a protection is active: always, except in mutation tests.
     #[cfg(not(feature = "mutants"))]
     #[allow(clippy::unused_self)]
     fn on(&self, _: Protection) -> bool {
@@ -717,24 +720,24 @@ impl Supervisor {
     }
 }
 
-/// Whether a protection outside of the supervisor is there: always, but for a test of the tests.
+/// Whether a protection outside of the supervisor is active: always, except in mutation tests.
 #[cfg(not(feature = "mutants"))]
 #[inline(always)]
 pub fn is_present(_: Protection) -> bool {
     true
 }
 
-/// Whether a protection outside of the supervisor is there: all but the one that `FRIC_MUTANT` takes away.
+/// Whether a protection outside of the supervisor is active: all except the one that `FRIC_MUTANT` names.
 #[cfg(feature = "mutants")]
 pub fn is_present(protection: Protection) -> bool {
     static MISSING: std::sync::OnceLock<Option<Protection>> = std::sync::OnceLock::new();
     *MISSING.get_or_init(missing) != Some(protection)
 }
 
-/// The protection that `FRIC_MUTANT` takes away.
+/// The protection that `FRIC_MUTANT` switches off.
 ///
 /// # Panics
-/// If it names none: a test that takes nothing away would prove nothing.
+/// If it names no protection: a test that switches nothing off would prove nothing.
 #[cfg(feature = "mutants")]
 fn missing() -> Option<Protection> {
     let name = std::env::var("FRIC_MUTANT").ok()?;
@@ -752,7 +755,7 @@ mod tests {
     const DRIVE: DriveLimits = DriveLimits { speed: 100.0, travel: (-10.0, 10.0), power: 50.0 };
     const PATIENCE: Timeouts = Timeouts { ramp: 0, clamped: 3, standstill: 5 };
 
-    /// Armed, one output, one drive, 1 ms.
+    /// An armed supervisor of one output and one drive, period 1 ms.
     fn armed(output: OutputLimits, patience: Timeouts) -> Supervisor {
         let mut supervisor = Supervisor::new(&[output], &[DRIVE], patience, 1_000_000).unwrap();
         assert!(supervisor.arm());
@@ -763,7 +766,7 @@ mod tests {
         [Seen { speed: Some(speed), position: Some(0.0) }]
     }
 
-    /// Judges one request at a speed; what is permitted.
+    /// Passes one request at a speed; returns the permitted value.
     fn sent(supervisor: &mut Supervisor, request: f64, speed: f64) -> f64 {
         supervisor.judge(&[request], &at(speed));
         supervisor.permitted()[0]
@@ -852,7 +855,7 @@ mod tests {
             assert!(speed < 100.0, "never noticed");
         }
         assert_eq!(supervisor.cause(), Some(Cause::RunAway(0)));
-        // Torque is on from the first cycle, counts from the second: 2 → 12 rad/s is a tenth of the limit.
+        // Torque acts from the first cycle and counts from the second: 2 → 12 rad/s is a tenth of the limit.
         assert!(speed < 15.0, "noticed at {speed}");
         let mut pushed = armed(FREE, PATIENCE);
         for speed in 0..99 {
@@ -873,7 +876,7 @@ mod tests {
         let mut supervisor = Supervisor::new(&outputs, &[DRIVE, DRIVE], PATIENCE, 1_000_000).unwrap();
         supervisor.arm();
         for speed in 0..50 {
-            // The second drive counts the other way round.
+            // The second drive has the opposite sign convention.
             let seen = [at(f64::from(speed))[0], at(-f64::from(speed))[0]];
             assert_eq!(supervisor.judge(&[0.6, 0.4], &seen), DriveCommand::Follow);
         }
