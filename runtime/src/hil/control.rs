@@ -1,8 +1,8 @@
-//! The part of a cycle that only computes: readings → model → safety → permitted outputs.
+//! The computing part of a cycle: readings → model → safety → permitted outputs.
 //!
-//! In: what was read, how old it is, what went wrong elsewhere, what the operator changed. Out: what is permitted and
-//! what the drives are told. Knows neither clock nor bus nor file, so that a replay of the same inputs gives the same
-//! bits. It allocates in [`Control::new`] only.
+//! In: readings with their ages, causes reported by other parts, changed parameters. Out: permitted outputs and the
+//! drive command. Knows neither clock nor bus nor file, so a replay of the same inputs reproduces every bit. It
+//! allocates only in [`Control::new`].
 
 use super::coupling::{Coupling, Verdict};
 use super::followed::Followed;
@@ -13,115 +13,116 @@ use crate::safety::{Cause, DriveCommand, Protection, Seen, Supervisor, Timeouts,
 use abi::rig::{Kind, Overrun, Rig, Signal, What};
 use abi::{Function, Instance, Slot};
 
-/// A value as it was read.
+/// A value with its age.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Reading {
-    /// SI.
+    /// In SI units.
     pub value: f64,
-    /// Ticks since it came: 0 in this one, [`Reading::NEVER`] not at all.
+    /// Ticks since it arrived: 0 in this tick, [`Reading::NEVER`] if none has arrived.
     pub age: u32,
 }
 
 impl Reading {
-    /// The age of what never came.
+    /// Age of a value that has never arrived.
     pub const NEVER: u32 = u32::MAX;
 }
 
-/// Who asks for the outputs.
+/// Source of the requests for the outputs.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Source {
-    /// Nobody: the rig is not armed.
+    /// No source: the rig is not armed.
     Nobody,
-    /// The start-up, for its tests.
+    /// The start-up, for its checks.
     StartUp,
     /// The model.
     Model,
 }
 
-/// What a cycle is told.
+/// Inputs of one cycle.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Told<'a> {
-    /// Ticks since the cycle before: 1, more after missed ones.
+    /// Ticks since the last cycle: 1, more after missed ticks.
     pub ticks: u32,
-    /// How late after its tick this one began, ns: less than a period.
+    /// Delay of the cycle's start after its tick, ns: less than a period.
     pub late_ns: u32,
     /// One reading for each of [`Control::signals`].
     pub readings: &'a [Reading],
-    /// Who asks.
+    /// Source of the requests.
     pub source: Source,
-    /// What the start-up asks for, one value an output.
+    /// Requests of the start-up, one value per output.
     pub wanted: &'a [f64],
-    /// What went wrong elsewhere.
+    /// Causes reported by other parts.
     pub causes: &'a [Cause],
-    /// Parameters that change now, as one set.
+    /// Parameters that change in this cycle, as one set.
     pub set: &'a [(Slot, f64)],
 }
 
-/// A signal that is read.
+/// State of one signal that is read.
 struct Watched {
     signal: Signal,
-    /// Age in ticks at which it is lost; none: it may be missing.
+    /// Age in ticks at which the signal counts as lost; none: it may be missing.
     timeout: Option<u32>,
-    /// Greatest credible change in one tick, SI; infinite: not judged.
+    /// Greatest plausible change in one tick, SI; infinite: not checked.
     jump: f64,
     last: f64,
-    /// Ticks since `last` came; none: nothing was taken yet.
+    /// Ticks since `last` arrived; none: no value was accepted yet.
     since: Option<u32>,
-    /// Ticks since the newest reading came, taken or not; none: nothing came yet.
+    /// Ticks since the newest reading arrived, accepted or not; none: no reading arrived yet.
     looked: Option<u32>,
-    /// Readings without a break that were not credible.
+    /// Number of successive implausible readings.
     odd: u32,
-    /// It answers SYNC: what comes after the computing of its tick is not one movement with the rest. A device speaks when it
-    /// likes.
+    /// Whether the node answers SYNC: an answer after the computation of its tick does not belong to the same instant
+    /// as the others. A device sends at its own pace.
     answers: bool,
-    /// Cycles without a break in which no answer came in time.
+    /// Number of successive cycles without an answer in time.
     late: u32,
 }
 
-/// Readings in a row that are not credible until the rig stops; the value before holds meanwhile.
+/// Number of successive implausible readings that stops the rig; until then the last accepted value is held.
 const ODD: u32 = 3;
-/// Where what is late is only counted, they are as many as take so long, ns: a simulated drive that waited for a processor
-/// answers many a SYNC at once, and what it tells then is not one movement at the pace of the rig.
+/// The same as a time, for runs that only count overruns, ns: a simulated drive that waited for a processor answers
+/// many SYNCs at once, and its readings are then not one motion at the pace of the rig.
 const ODD_NS: u64 = 1_000_000_000;
-/// Ticks after which a drive's signal is lost where the rig names no time.
+/// Ticks after which a drive's signal counts as lost if the rig names no time-out.
 const TIMEOUT: u32 = 3;
-/// The least such time where what is late is only counted, ns.
+/// Lowest time-out in runs that only count overruns, ns.
 pub const PATIENT_NS: u64 = 60_000_000_000;
-/// How late a drive's speed may be behind its position at least, s.
+/// Lowest assumption for the lag of a drive's speed behind its position, s.
 const SPEED_LATE: f64 = 2e-3;
-/// Ticks over which the angle that a shaft has turned is compared with its speed at their end.
+/// Longest span, in ticks, over which the change of a position is compared with the speed at its end.
 const GAP: u32 = 6;
-/// Torque that could act on a shaft beyond that of its drives, as a multiple of theirs.
+/// Factor by which the torque on a shaft may exceed the torque of its drives.
 const SURPLUS: f64 = 4.0;
 
-/// Position and speed of one drive, of which each says what the other must be.
+/// Position and speed of one drive, which must agree with each other.
 struct Paired {
     speed: usize,
     position: usize,
-    /// Greatest credible difference between position and speed in a tick, rad; infinite: not judged.
+    /// Greatest plausible difference between position and speed in one tick, rad; infinite: not checked.
     most: f64,
-    /// Position when both came last, and the ticks since then.
+    /// Position when both last arrived, and the ticks since then.
     before: Option<(f64, u32)>,
     run: Disagreement,
 }
 
-/// Cycles in a row in which position and speed disagree by more than is credible, in one direction.
+/// Successive cycles in which position and speed disagree implausibly, in one direction.
 ///
-/// When a drive read the shaft is not known exactly: SYNC waits for frames that are on the bus. But what counts was read in its own
-/// period. So the time between two readings, however many periods apart, is off by less than one period, and errors of several
-/// cycles cancel but for that.
+/// The exact time at which a drive reads the shaft is unknown, because SYNC waits for frames that occupy the bus. But
+/// an accepted value was read in its own period. The time between two readings, however many periods apart, is
+/// therefore off by less than one period, and the errors of several cycles cancel except for that one period.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 struct Disagreement {
     cycles: u32,
     ticks: u32,
-    /// What the position turned beyond the speed, rad.
+    /// Excess of the position's change over the integral of the speed, rad.
     angle: f64,
     /// Greatest speed, rad/s.
     fastest: f64,
 }
 
 impl Disagreement {
-    /// One cycle more: so many ticks, what the position turned beyond the speed, the speed, and what is credible in a tick, rad.
+    /// Adds a cycle. `ticks`: its length; `angle`: excess of the position's change over the integral of the speed, rad;
+    /// `most`: plausible difference per tick, rad.
     fn add(&mut self, ticks: u32, angle: f64, speed: f64, most: f64) {
         if angle.abs() <= most * f64::from(ticks) {
             return *self = Disagreement::default();
@@ -135,30 +136,30 @@ impl Disagreement {
         self.fastest = self.fastest.max(speed.abs());
     }
 
-    /// Whether it is more than what a period may have been off.
+    /// Whether the disagreement exceeds the plausible difference plus the timing error of one period.
     fn is_certain(&self, most: f64, period: f64) -> bool {
         self.angle.abs() > most * f64::from(self.ticks) + self.fastest * period
     }
 }
 
-/// What is not in the text of a rig.
+/// Settings that are not part of a rig's text.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Options {
-    /// Time in which outputs come up from their safe values, ns.
+    /// Duration of the ramp in which outputs rise from their safe values, ns.
     pub ramp_ns: u64,
-    /// Time for which an output may be outside its limits without a break, ns.
+    /// Longest unbroken time for which an output may be outside its limits, ns.
     pub clamped_ns: u64,
-    /// From a controlled stop to the quick stop, and from there to disabled, ns.
+    /// Longest time from a controlled stop to the quick stop, and from there to disabled, ns.
     pub standstill_ns: u64,
-    /// Time in which the step that a change of parameters makes in an output is spread, ns.
+    /// Time over which the output step of a parameter change is blended, ns.
     pub blend_ns: u64,
-    /// Missed ticks are counted only: for simulated drives.
+    /// Missed ticks are counted and never stop the rig: for simulated drives.
     pub count_overruns: bool,
-    /// The loop is unstable unless it looks ahead: where it cannot, the rig stops.
+    /// The loop is unstable without the predictor: the rig stops when the predictor is not valid.
     pub needs_look: bool,
-    /// A contact that gives back more energy than it can hold stops the rig; otherwise that is counted.
+    /// A contact that returns more energy than it can store stops the rig; otherwise such cycles are only counted.
     pub energy_stops: bool,
-    /// Dead time and lag of the drives are being measured: those of the rig's text count for nothing.
+    /// The run identifies dead time and lag of the drives, so the values of the rig's text are ignored.
     pub measures: bool,
 }
 
@@ -170,52 +171,52 @@ impl Default for Options {
     }
 }
 
-/// The part of a cycle that only computes.
+/// The computing part of a cycle.
 pub struct Control {
     model: Instance,
-    /// A block like the model's, to try things on.
+    /// A block like the model's, for trial steps.
     shadow: Instance,
     step: f64,
     steps: u64,
     overrun: Overrun,
-    /// Ticks missed and not made good for: each cycle in time makes good for one.
+    /// Missed ticks that are not compensated yet: each cycle in time compensates one.
     behind: u32,
     supervisor: Supervisor,
     coupling: Coupling,
     watched: Vec<Watched>,
-    /// Ticks in a row in which a reading may be not credible.
+    /// Number of successive implausible readings that stops the rig.
     odd: u32,
-    /// For each input: which signal, and the slot it goes to.
+    /// For each input: the index of its signal, and its slot.
     inputs: Vec<(usize, Slot)>,
     /// For each output: the slot of the request.
     outputs: Vec<Slot>,
     stops: Vec<Slot>,
-    /// For each drive: where its speed and position are among the signals.
+    /// For each drive: the indices of its speed and position among the signals.
     seen_at: Vec<(Option<usize>, Option<usize>)>,
     seen: Vec<Seen>,
     paired: Vec<Paired>,
     followed: Vec<Followed>,
-    /// The drives were told to follow in the cycle before.
+    /// The drive command of the last cycle was to follow.
     follows: bool,
     requests: Vec<f64>,
-    /// What a change of parameters left between the old and the new request, and the ticks it still lasts.
+    /// Difference between old and new requests after a change of parameters; the remaining and all ticks of the blend.
     offsets: Vec<f64>,
     blend: (u32, u32),
     regimes: Vec<f64>,
     running: bool,
-    /// The status with which the set of the last cycle was refused, 0 if the model gave no number.
+    /// Status with which the model refused the set of the last cycle; 0 if its values were not finite.
     refused_set: Option<u64>,
 }
 
 impl Control {
-    /// The control part of a rig. `look`: what its `predict` asks for; `bounds`: one entry a node, read from the drives
-    /// where the rig leaves them out.
+    /// The computing part of a rig. `look`: the predictor that `predict` of the rig requires; `bounds`: one entry per
+    /// node, read from the drives, for limits that the rig does not name.
     ///
     /// # Errors
-    /// What refuses the start, in words.
+    /// A message with the reason why the rig must not start.
     ///
     /// # Panics
-    /// If the rig asks for a look ahead and there is none.
+    /// If the rig requires a predictor and none is given, or the other way round.
     pub fn new(
         rig: &Rig,
         model: Instance,
@@ -244,7 +245,7 @@ impl Control {
         let supervisor = Supervisor::new(&outputs, &drives, patience, rig.period_ns)
             .map_err(|refused| watches::refusal(rig, &moving, refused))?;
 
-        // What a drive that holds speed or position gives for it is its own affair: all it has.
+        // A drive that controls speed or position may apply any torque for it, up to its maximum.
         let strongest = |node: &usize| match outputs.iter().find(|o| o.torque && moving[o.drive.unwrap_or(0)] == *node)
         {
             Some(output) => output.low.abs().max(output.high.abs()),
@@ -262,7 +263,7 @@ impl Control {
                 0 => node.moves.then_some(TIMEOUT),
                 ns => Some(u32::try_from(ns / rig.period_ns).unwrap_or(u32::MAX).max(1)),
             };
-            // What is late between this process and itself says nothing of the drives.
+            // Delays between this process and itself say nothing about the drives.
             let timeout = timeout.map(|own| if options.count_overruns { own.max(patient) } else { own });
             let timeout = timeout.filter(|_| needed);
             if let Some(at) = at {
@@ -294,7 +295,8 @@ impl Control {
         let inputs = rig.inputs.iter().map(|input| (watch(input.signal, input.start, input.needed), input.slot));
         let inputs = inputs.collect();
         let seen_at = moving.iter().map(|node| {
-            // A drive described by frames may tell more slowly than the rig reads: without a `timeout` it is never lost.
+            // A drive described by frames may send less often than the rig reads: without `timeout` it never counts as
+            // lost.
             let needed = matches!(rig.nodes[*node].kind, Kind::Cia402(_)) || rig.nodes[*node].timeout_ns > 0;
             let mut measured = |what| watches::told(rig, *node, what).map(|signal| watch(signal, 0.0, needed));
             measured(What::Torque);
@@ -306,7 +308,7 @@ impl Control {
             let ((Some(speed), Some(position)), Kind::Cia402(drive)) = (*at, &rig.nodes[*node].kind) else {
                 return None;
             };
-            // What a drive tells on a grid of its own does not fit from tick to tick.
+            // A drive that refreshes its values on a time grid of its own does not agree from tick to tick.
             let profile = profiles::find(&drive.profile);
             let refreshed = profile.is_some_and(|profile| profile.refresh_ns > 0);
             let late = profile.map_or(0.0, |profile| 2.0 * profile.speed_lag).max(SPEED_LATE);
@@ -358,43 +360,42 @@ impl Control {
         self.watched.iter().map(|watched| watched.signal)
     }
 
-    /// What was asked for, one value an output.
+    /// Requests, one value per output.
     pub fn requests(&self) -> &[f64] {
         &self.requests
     }
 
-    /// What was measured of each drive, as far as it was believed.
+    /// Measured values of each drive, without those that were rejected as implausible.
     pub fn seen(&self) -> &[Seen] {
         &self.seen
     }
 
-    /// What watches over the outputs.
+    /// The safety supervisor.
     pub fn supervisor(&self) -> &Supervisor {
         &self.supervisor
     }
 
-    /// The same, to arm it or narrow its limits between cycles.
+    /// The safety supervisor, to arm it or narrow its limits between cycles.
     pub fn supervisor_mut(&mut self) -> &mut Supervisor {
         &mut self.supervisor
     }
 
-    /// What stands between readings and model.
+    /// Predictor and passivity observers between readings and model.
     pub fn coupling(&self) -> &Coupling {
         &self.coupling
     }
 
-    /// The model as it stands.
+    /// The model in its current state.
     pub fn model(&self) -> &Instance {
         &self.model
     }
 
-    /// Whether the set of the last cycle was refused since the model could not go on with it: with which status, 0 if it
-    /// gave no number.
+    /// Status with which the model refused the set of the last cycle, if it did; 0 if its values were not finite.
     pub fn refused_set(&self) -> Option<u64> {
         self.refused_set
     }
 
-    /// One cycle. Who asks for outputs must have armed the supervisor.
+    /// One cycle. Any source but [`Source::Nobody`] requires an armed supervisor.
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn cycle(&mut self, told: &Told) -> DriveCommand {
         assert_eq!(told.readings.len(), self.watched.len(), "readings");
@@ -420,7 +421,7 @@ impl Control {
         }
         let computes = told.source == Source::Model && self.supervisor.is_armed();
         if !(computes && self.running) {
-            // Nothing is under way that a step could disturb.
+            // The model is not running yet, so no output can jump.
             told.set.iter().for_each(|(slot, value)| self.model.set(*slot, *value));
         }
         match told.source {
@@ -444,9 +445,9 @@ impl Control {
         order
     }
 
-    /// Takes what was read, as far as it is credible; trips on what has been missing or odd for too long.
+    /// Accepts plausible readings; trips on signals that have been missing or implausible for too long.
     fn read(&mut self, readings: &[Reading], ticks: u32, source: Source) {
-        // The start-up counts positions anew as it goes: only what the model reads must be one movement.
+        // The start-up may redefine the origin of positions: plausibility is required only of readings for the model.
         let judged = source == Source::Model && self.running;
         for (i, (watched, reading)) in self.watched.iter_mut().zip(readings).enumerate() {
             watched.since = watched.since.map(|since| since.saturating_add(ticks));
@@ -471,7 +472,7 @@ impl Control {
                 (watched.odd, watched.late) = (0, 0);
                 continue;
             }
-            // An answer that is late in each tick is never believed, and a device may tell no number: both are as good as lost.
+            // An answer that is late in every tick is never accepted, and a device may send NaN: both count as missing.
             let missing = match watched.answers {
                 true if is_present(Protection::Late) => watched.late,
                 true => 0,
@@ -487,8 +488,8 @@ impl Control {
         }
     }
 
-    /// Trips where position and speed of a drive have not agreed for too long: an encoder that stands still, or loses
-    /// counts as it goes.
+    /// Trips where position and speed of a drive have disagreed for too long: an encoder that stands still or loses
+    /// counts.
     fn compare(&mut self, told: &Told) {
         for pair in &mut self.paired {
             let [speed, position] = [pair.speed, pair.position].map(|at| &self.watched[at]);
@@ -516,7 +517,8 @@ impl Control {
         }
     }
 
-    /// Trips where a drive has not done what it was told for too long. Permitted outputs are still those of the cycle before.
+    /// Trips where a drive has not followed its commands for too long. The permitted outputs are still those of the
+    /// last cycle.
     fn compare_commands(&mut self, told: &Told) {
         for followed in &mut self.followed {
             let answer = &self.watched[followed.signal];
@@ -533,7 +535,7 @@ impl Control {
         }
     }
 
-    /// Brings the model to the end of this tick.
+    /// Advances the model to the end of this tick.
     fn advance(&mut self, told: &Told) {
         for (at, slot) in &self.inputs {
             self.model.set(*slot, self.watched[*at].last);
@@ -583,7 +585,7 @@ impl Control {
         }
     }
 
-    /// The model at its t = 0, as [`Instance::start`] does it, with nothing allocated.
+    /// Starts the model at t = 0 like [`Instance::start`], but without allocation.
     fn start(&mut self) -> u64 {
         self.model.set(Slot::TIME, 0.0);
         self.model.set(Slot::COUNT, 0.0);
@@ -604,8 +606,8 @@ impl Control {
         status.max(self.model.call(Function::Outputs))
     }
 
-    /// Takes over a set of parameters, without a step in the outputs: their difference decays. A set with which the
-    /// model cannot go on is refused, and the model goes on without it.
+    /// Changes a set of parameters without a step in the outputs: the difference is blended out. A set with which the
+    /// model cannot continue is refused, and the model continues without it.
     fn change(&mut self, set: &[(Slot, f64)], steps: u64) -> u64 {
         self.shadow.block_mut().copy_from_slice(self.model.block());
         let old = self.shadow.advance(steps);
@@ -628,7 +630,7 @@ impl Control {
         new
     }
 
-    /// All that the next cycle depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Control::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend(self.model.block().iter().map(|x| x.to_bits()));
         words.extend(self.requests.iter().chain(&self.offsets).map(|x| x.to_bits()));
@@ -648,7 +650,7 @@ impl Control {
         self.coupling.save(words);
     }
 
-    /// Takes over what [`Control::save`] gave. None if it does not fit this rig.
+    /// Restores the state that [`Control::save`] wrote. None if it does not fit this rig.
     pub fn restore(&mut self, words: &[u64]) -> Option<()> {
         let mut words = words.iter().copied();
         for x in self.model.block_mut().iter_mut().chain(&mut self.requests).chain(&mut self.offsets) {
@@ -691,7 +693,7 @@ mod tests {
 
     const FRESH: u32 = 0;
 
-    /// A rig under way: readings of position, speed and torque of its one drive.
+    /// A running rig with one drive: readings of its position, speed and torque.
     struct Way {
         control: Control,
         readings: Vec<Reading>,
@@ -717,14 +719,14 @@ mod tests {
             self.readings[at].value = value;
         }
 
-        /// One cycle; the shaft has turned as its speed says, as long as that comes.
+        /// One cycle; the position follows the speed while the speed is plausible. Returns the permitted output.
         fn cycle(&mut self, ticks: u32, set: &[(Slot, f64)]) -> f64 {
             let at = |what| self.control.signals().position(|signal| signal.what == what).unwrap();
             let (speed, position) = (self.readings[at(What::Speed)], at(What::Position));
             if speed.value.abs() < 100.0 {
                 self.readings[position].value += speed.value * 1e-3 * f64::from(ticks);
             }
-            // The drive does what it was told.
+            // The drive applies its commanded torque.
             let torque = at(What::Torque);
             self.readings[torque].value = self.control.supervisor().permitted()[0];
             let (source, wanted, causes) = (Source::Model, &[][..], &[][..]);
@@ -738,7 +740,7 @@ mod tests {
     fn the_model_steps_over_the_coming_period_with_the_newest_readings() {
         let mut way = Way::new(|_| ());
         way.set(What::Speed, 2.0);
-        // A spring of 10 N·m/rad on what is turned: after k periods of 2 rad/s.
+        // A spring of 10 N·m/rad on the angle, which is the integral of 2 rad/s after k periods.
         for k in 1..=5 {
             let torque = way.cycle(1, &[]);
             assert!((torque + 10.0 * 2.0 * 1e-3 * f64::from(k)).abs() < 1e-12, "cycle {k}: {torque}");
@@ -795,7 +797,8 @@ mod tests {
         }
     }
 
-    /// A device of the rig that tells a float at its own pace, with some `timeout` or none, and its readings' place.
+    /// A rig with a device that sends a float at its own pace, with or without a `timeout`; and the index of its
+    /// reading.
     fn with_device(timeout_ns: u64) -> (Control, usize) {
         let (mut rig, model) = rigs::rig();
         let field = Field {
@@ -830,7 +833,8 @@ mod tests {
             let timeout = [0, 15, 40][chance.below(3) as usize];
             let (mut control, at) = with_device(timeout * rigs::PERIOD_NS);
             let (every, wrong) = (1 + chance.below(12), chance.fraction());
-            // Since when it came, and since the last number; the numbers that were none since then.
+            // Ticks since it arrived, and since the last finite value; number of values that were not finite since
+            // then.
             let (mut newest, mut age, mut number, mut since, mut none) = (0.0, Reading::NEVER, 0.0, 0, 0);
             for k in 0..200 {
                 (age, since) = (age.saturating_add(1), since + 1);
@@ -838,12 +842,12 @@ mod tests {
                     let odd = k > 0 && chance.fraction() < wrong;
                     newest =
                         if odd { 1.0 / [0.0, -0.0, f64::NAN][chance.below(3) as usize] } else { chance.fraction() };
-                    // Some come after the computing of the tick before.
+                    // Some arrive after the computation of the tick before.
                     age = if age > 1 { chance.below(2) as u32 } else { 0 };
                     none = if odd { none + 1 } else { 0 };
                     (number, since) = if odd { (number, since) } else { (newest, age) };
                 }
-                // The drive does what it was told.
+                // The drive applies its commanded torque.
                 let torque = control.supervisor().permitted()[0];
                 let value = |signal: Signal| if signal.what == What::Torque { torque } else { 0.0 };
                 let reading = |signal| Reading { value: value(signal), age: 0 };
@@ -897,11 +901,11 @@ mod tests {
         assert!(matches!(way.control.supervisor().cause(), Some(Cause::Implausible(_))));
     }
 
-    /// Greatest acceleration of a shaft, rad/s², its period, s, and what is credible in a tick, rad.
+    /// Greatest acceleration of a shaft, rad/s², its period, s, and the plausible difference per tick, rad.
     const SHAFT: (f64, f64, f64) = (333.0, 1e-3, 333.0 * (1e-3 + SPEED_LATE) * 1e-3);
 
-    /// A shaft that accelerates at random, read at any time of each period; ticks are missed. Its encoder stands still from a
-    /// cycle on; the cycle in which that is found, and the speeds read.
+    /// A shaft with random acceleration, read at random times within each period; some ticks are missed. Its encoder
+    /// stands still from cycle `stands` on. Returns the cycle of the detection, and the speeds read.
     fn read_at_any_time(seed: u64, stands: usize) -> (Option<usize>, Vec<f64>) {
         let (acceleration, period, most) = SHAFT;
         let mut chance = crate::rng::Chance(seed);
@@ -941,7 +945,8 @@ mod tests {
         for seed in 0..2000 {
             let stands = 20 + seed as usize % 100;
             let (cycle, speeds) = read_at_any_time(seed, stands);
-            // Two thirds of the speed are certain after three readings; the first may have come before it stood still.
+            // Two thirds of the speed are certain after three readings; the first may have been taken before the
+            // encoder stood still.
             let fast = speeds.iter().skip(stands).all(|speed| speed.abs() * SHAFT.1 > 2.0 * most);
             let late = cycle.map(|cycle| cycle - stands);
             assert!(!fast || late.is_some_and(|late| late <= 3), "seed {seed}: found after {late:?}");
@@ -980,7 +985,7 @@ mod tests {
             greatest = greatest.max((now - last).abs());
             last = now;
         }
-        // 0.12 N·m of difference spread over ten cycles, beside what the spring itself does.
+        // 0.12 N·m of difference, blended over ten cycles, in addition to the change of the spring itself.
         assert!(greatest < 0.05, "a step of {greatest} N·m");
         assert!((last + 20.0 * 23e-3).abs() < 1e-12, "{last}");
     }

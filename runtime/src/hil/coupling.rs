@@ -1,8 +1,8 @@
-//! What stands between a shaft and a model that plays a contact on it: the look ahead, and a watch on its energy.
+//! The coupling of a model, which plays a contact, to its shaft: predictor and passivity observer.
 //!
-//! In: what was read in a cycle and what was permitted in it. Out: speed and position of the shaft when the command will
-//! act, whether that could be believed, and whether a contact gives back more than it can hold. Knows neither clock nor
-//! bus, so that a replay of the same readings gives the same bits. Allocates when it is made, never later.
+//! In: readings and permitted outputs of a cycle. Out: predicted speed and position of the shaft at the time when the
+//! command will act, whether the prediction is valid, and whether a contact returns more energy than it can store.
+//! Knows neither clock nor bus, so a replay of the same readings reproduces every bit. Allocates only at construction.
 
 use crate::coupling::passivity::{Energy, Sign};
 use crate::coupling::predictor::{Ahead, Wired};
@@ -10,46 +10,46 @@ use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use abi::{Instance, Slot};
 
-/// What was read of one signal: its value, and whether it came in this cycle.
+/// A reading: its value, and whether it arrived in this cycle.
 pub type Read = (f64, bool);
 
-/// What was counted since the model got the outputs.
+/// Counters since the model was connected to the outputs.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Counts {
-    /// Cycles in which the shaft was not as told: the command did not look ahead.
+    /// Cycles in which the shaft deviated from its model, so that the command was not predicted.
     pub unpredicted: u64,
     /// Greatest error of a predicted position, rad.
     pub residual_max: f64,
-    /// Greatest energy given back within 0.1 s, as part of what the contact holds.
+    /// Greatest energy returned within 0.1 s, as a share of the energy that the contact can store.
     pub returned_max: f64,
-    /// Cycles in which more came back than friction gives.
+    /// Cycles in which a contact returned more energy than friction can.
     pub warnings: u64,
 }
 
-/// What the energy of a contact says.
+/// Result of the checks of one cycle.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Verdict {
-    /// Nothing against going on.
+    /// The run may continue.
     Fine,
-    /// The contact drives the shaft.
+    /// The contact drives the shaft: it returns too much energy.
     Drives,
-    /// The shaft is not as told, and without looking ahead the loop is not stable.
+    /// The shaft deviates from its model, and without the predictor the loop is unstable.
     Unpredictable,
 }
 
-/// A contact that a drive plays, as a slow turn shows it.
+/// A contact that a drive plays, characterised by a slow motion.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Contact {
-    /// Its output: an index into the rig's.
+    /// Its output: an index into the rig's outputs.
     pub output: usize,
-    /// The torque that it gives at most, N·m.
+    /// Its greatest torque, N·m.
     pub most: f64,
     /// Its stiffness at rest, N·m/rad.
     pub stiffness: f64,
 }
 
-/// The contacts that drives of a rig play: found by turning the shaft of the model slowly. Where a drive is to look ahead,
-/// only its own. `model`: the control program before its start.
+/// Finds the contacts that drives of a rig play, by turning the shaft of the model slowly. If a drive has a predictor,
+/// only the contact of that drive. `model`: the control program before its start.
 pub fn contacts(rig: &Rig, model: &Instance) -> Vec<Contact> {
     let speeds: Vec<Slot> =
         rig.inputs.iter().filter(|input| input.signal.what == What::Speed).map(|input| input.slot).collect();
@@ -65,25 +65,25 @@ pub fn contacts(rig: &Rig, model: &Instance) -> Vec<Contact> {
     found.collect()
 }
 
-/// The energy of a contact, watched.
+/// The passivity observer of one contact.
 struct Watched {
     energy: Energy,
-    /// Torque and speed of its drive among the readings.
+    /// Indices of its drive's torque and speed among the readings.
     torque: usize,
     speed: usize,
 }
 
-/// What stands between readings and model.
+/// Predictor and passivity observers between readings and model.
 pub struct Coupling {
     period_ns: u64,
     now_ns: u64,
     look: Option<Wired>,
-    /// Position of the shaft among the readings.
+    /// Index of the shaft's position among the readings.
     position: usize,
     contacts: Vec<Watched>,
-    /// Torques of all drives among the readings.
+    /// Indices of all drives' torques among the readings.
     torques: Vec<usize>,
-    /// Without looking ahead the loop is unstable.
+    /// The loop is unstable without the predictor.
     needs_look: bool,
     /// A contact that drives the shaft stops the rig.
     stops: bool,
@@ -91,15 +91,15 @@ pub struct Coupling {
 }
 
 impl Coupling {
-    /// That of a rig. `look`: what its `predict` asks for; `watched`: the readings; `model`: the control program before its
-    /// start. Contacts are found by turning the shaft of the model slowly.
+    /// The coupling of a rig. `look`: the predictor that `predict` of the rig requires; `watched`: the readings;
+    /// `model`: the control program before its start. Contacts are found by turning the shaft of the model slowly.
     pub fn new(rig: &Rig, look: Option<Wired>, watched: &[Signal], model: &Instance) -> Coupling {
         let at = |signal: Signal| watched.iter().position(|other| *other == signal);
         let torques: Vec<usize> =
             (0..rig.nodes.len()).filter_map(|node| at(Signal { node, what: What::Torque })).collect();
         let watch = |contact: Contact| {
             let node = rig.outputs[contact.output].signal.node;
-            // The largest energy that it holds.
+            // Greatest energy that the contact can store.
             let store = 0.5 * contact.most * contact.most / contact.stiffness;
             Some(Watched {
                 energy: Energy::new(store, rig.period_ns as f64 * 1e-9),
@@ -121,33 +121,33 @@ impl Coupling {
         }
     }
 
-    /// What it may stop the rig for: a loop that is unstable unless it looks ahead and cannot; a contact that drives the
-    /// shaft.
+    /// Sets the conditions that stop the rig: an invalid prediction in a loop that needs the predictor; a contact that
+    /// drives the shaft.
     pub fn stops_for(&mut self, needs_look: bool, energy: bool) {
         (self.needs_look, self.stops) = (needs_look, energy);
     }
 
-    /// What was counted.
+    /// Counters since the model was connected.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// The same; none where nothing looks ahead and no contact is played.
+    /// The same counters; none if the rig has neither predictor nor contact.
     pub fn told(&self) -> Option<Counts> {
         (self.look.is_some() || !self.contacts.is_empty()).then_some(self.counts)
     }
 
-    /// Largest energy that the contacts hold, J, in the order of the outputs that play them.
+    /// Greatest energy that each contact can store, J, in the order of the outputs that play them.
     pub fn stores(&self) -> impl Iterator<Item = f64> {
         self.contacts.iter().map(|contact| contact.energy.store())
     }
 
-    /// The drive whose command looks ahead.
+    /// The drive whose command is predicted.
     pub fn looks_ahead(&self) -> Option<usize> {
         self.look.as_ref().map(|wired| wired.node)
     }
 
-    /// The model gets the outputs: what was before is forgotten.
+    /// Restarts when the model is connected to the outputs: the history is discarded.
     pub fn restart(&mut self, permitted: &[f64]) {
         (self.now_ns, self.counts) = (0, Counts::default());
         if let Some(wired) = &mut self.look {
@@ -156,7 +156,7 @@ impl Coupling {
         self.contacts.iter_mut().for_each(|contact| contact.energy.restart());
     }
 
-    /// Goes on by so many ticks to a cycle that began so late. `read`: what was read of each signal.
+    /// One cycle, `ticks` after the last one and begun `late_ns` after its tick. `read`: reading of each signal.
     pub fn read(&mut self, ticks: u32, late_ns: u32, read: impl Fn(usize) -> Read) -> (Option<Ahead>, Verdict) {
         self.now_ns += u64::from(ticks) * self.period_ns;
         let ahead = self.look(self.now_ns + u64::from(late_ns), read(self.position));
@@ -187,14 +187,14 @@ impl Coupling {
         (look.is_valid() || !is_present(Protection::Plain)).then(|| look.ahead())
     }
 
-    /// What was permitted in this cycle, one value an output.
+    /// Records the permitted outputs of this cycle, one value per output.
     pub fn sent(&mut self, permitted: &[f64]) {
         if let Some(wired) = &mut self.look {
             wired.sent(permitted);
         }
     }
 
-    /// All that the next cycle depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Coupling::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.push(self.now_ns);
         if let Some(wired) = &self.look {
@@ -203,7 +203,7 @@ impl Coupling {
         self.contacts.iter().for_each(|contact| contact.energy.save(words));
     }
 
-    /// Takes over what [`Coupling::save`] gave. None if the words do not fit.
+    /// Restores the state that [`Coupling::save`] wrote. None if the words do not fit.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.now_ns = words.next()?;
         if let Some(wired) = &mut self.look {
@@ -213,16 +213,17 @@ impl Coupling {
     }
 }
 
-/// Steps of one slow turn.
+/// Steps of one slow motion.
 const TURN: u32 = 2000;
-/// Turns of growing length until the contact breaks away.
+/// Number of motions, each twice as long as the last, until the contact breaks away.
 const TURNS: u32 = 40;
 
-/// The break-away torque of a contact and its stiffness at rest. None if this output is no contact: at rest it gives no
-/// torque, a small turn either way is answered as by a spring, a long one by a torque that grows no more.
+/// Break-away torque of a contact and its stiffness at rest. None if this output is no contact. A contact has no torque
+/// at rest, answers a small rotation in either direction like a spring, and a long one by a torque that no longer
+/// grows.
 fn turned(rig: &Rig, model: &Instance, speeds: &[Slot], output: Slot) -> Option<(f64, f64)> {
     let (period, steps) = (rig.period_ns as f64 * 1e-9, u64::from(rig.steps.max(1)));
-    // Greatest torque while it is turned, and the torques after the first step and after the last but one.
+    // Greatest torque of a motion, the torque after its first step and that after its last step.
     let turn = |speed: f64, n: u32| {
         let mut model = model.clone();
         speeds.iter().for_each(|slot| model.set(*slot, speed));
@@ -265,7 +266,7 @@ mod tests {
     use crate::testing::rigs;
     use abi::Function;
 
-    /// The rig of one drive, its model a bristle: dz/dt = v − σ0 |v| z / g with g = 0.34 N·m.
+    /// The rig with one drive, its model a bristle: dz/dt = v − σ0 |v| z / g with g = 0.34 N·m.
     fn bristle() -> (Rig, Instance) {
         let (mut rig, _) = rigs::rig();
         let (sigma0, g) = (260.0, 0.34);
@@ -312,7 +313,7 @@ mod tests {
             let mut coupling = Coupling::new(&rig, None, &WATCHED, &model);
             coupling.stops_for(false, stops);
             let mut worst = Verdict::Fine;
-            // 0.3 N·m with the motion for 20 ms at 1 rad/s: 6 mJ, of 0.22 mJ that it holds.
+            // 0.3 N·m in the direction of motion for 20 ms at 1 rad/s: 6 mJ, while the contact can store 0.22 mJ.
             for _ in 0..20 {
                 let (_, verdict) = coupling.read(1, 0, |at| ([1.0, 0.3, 0.0][at], true));
                 if verdict != Verdict::Fine {

@@ -1,7 +1,7 @@
-//! Hardware in the loop: the cycle that joins model, safety, drives and buses.
+//! Hardware in the loop (HIL): the real-time cycle that couples model, safety supervisor, drives and buses.
 //!
-//! In: a rig, its compiled programs, buses, a clock. Out: commands to drives, a log, and why it stopped. Knows neither
-//! the language nor the terminal.
+//! In: a rig, its compiled programs, buses, a clock. Out: commands to drives, a log, and the reason for the stop. Knows
+//! neither the language nor the terminal.
 
 pub mod coupling;
 pub mod standard;

@@ -1,10 +1,10 @@
-//! Cycles that do not end in time, against the watchdog.
+//! Tests of the watchdog against cycles that do not end in time.
 //!
-//! In: a seed: a period, a watchdog, and a moment at which the cycle stands still for a time of the wall. Out: whether the
-//! watchdog acted in its time and never before, only while drives are enabled, and whether the cycle sent nothing but stops after
-//! it. The rig runs in simulated time, the stall and the watchdog's thread in that of the wall. The reference is what the test
-//! reads from the clock around each cycle, and how late its own sleeps end meanwhile. `FRIC_SEED=n` repeats one seed;
-//! `FRIC_RUNS=n` says how many there are.
+//! In: a seed, from which follow a period, a watchdog, and a stall of one cycle in wall-clock time. Out: whether the
+//! watchdog acted in time, never early, and only while drives were enabled, and whether the cycle sent nothing but
+//! stops after that. The rig runs in simulated time; the stall and the watchdog's thread run in wall-clock time. The
+//! reference is the clock, which the test reads around each cycle, and how late its own sleeps end meanwhile.
+//! `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::campaign::quick;
 use super::cycle::{Command, End, Hil};
@@ -23,33 +23,33 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// Seeds in `cargo test`, and threads that share them: each sleeps most of its time.
+/// Seeds in `cargo test`, and threads that share them: each sleeps most of the time.
 const RUNS: u64 = 36;
 const THREADS: usize = 4;
 const MS: u64 = 1_000_000;
-/// What a system takes to wake a thread at most, besides what it takes to wake the test's own, ns.
+/// Longest time that the system takes to wake a thread, in excess of that for the test's own thread, ns.
 const WAKES_NS: u64 = 20 * MS;
 
-/// Where in a cycle it stands still.
+/// The point of a cycle at which it stalls.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Place {
     /// After the sleep to its tick.
     Tick,
     /// After the wait for the answers.
     Answers,
-    /// After the frame of this number.
+    /// After sending the frame with this index.
     Sent(u32),
 }
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Script {
     seed: u64,
     /// Period of the rig, ns.
     period_ns: u64,
-    /// Patience of the watchdog, ns of the wall.
+    /// Time-out of the watchdog, ns of wall-clock time.
     watchdog_ns: u64,
-    /// The first cycle that may stand still, where, and for how long, ns of the wall.
+    /// The first cycle that may stall, the point in it, and the duration, ns of wall-clock time.
     cycle: u64,
     place: Place,
     stall_ns: u64,
@@ -79,17 +79,17 @@ impl Script {
     }
 }
 
-/// What clock, bus and test know of a run.
+/// State shared by the clock, the bus and the test.
 struct Plan {
     script: Script,
     cycle: u64,
     sleeps: u32,
     sends: u32,
-    /// When clock or bus were last used.
+    /// Time of the last use of clock or bus, ns.
     touched_ns: u64,
-    /// The cycle that stood still, begin and end of its stall, and how late a sleep ended meanwhile, ns.
+    /// The stalled cycle, begin and end of its stall, and the greatest lateness of a sleep meanwhile, ns.
     stalled: Option<(u64, u64, u64, u64)>,
-    /// Frames with their times and cycles.
+    /// Sent frames, with their times and cycles.
     sent: Vec<(u64, u64, Frame)>,
 }
 
@@ -113,7 +113,7 @@ impl Plan {
 
 type Shared = Rc<RefCell<Plan>>;
 
-/// Simulated time that may stand still.
+/// A simulated clock whose sleeps may stall.
 struct Late(Simulation, Shared);
 
 impl Clock for Late {
@@ -129,7 +129,7 @@ impl Clock for Late {
     }
 }
 
-/// A bus whose sender may stand still.
+/// A bus whose sender may stall.
 struct Slow(Port, Shared);
 
 impl Bus for Slow {
@@ -153,7 +153,8 @@ impl Bus for Slow {
     }
 }
 
-/// A cycle as the test saw it: when it last used clock or bus, and had ended; whether drives were enabled then.
+/// A cycle as the test observed it: time of its last use of clock or bus, its end, and whether drives were enabled
+/// then.
 #[derive(Clone, Copy)]
 struct Seen {
     touched_ns: u64,
@@ -161,12 +162,12 @@ struct Seen {
     awake: bool,
 }
 
-/// What a run showed.
+/// Outcome of a run.
 #[derive(Clone, Copy, Debug, Default)]
 struct Shown {
-    /// How late after its time the watchdog acted, ns.
+    /// Delay of the watchdog after its time-out, ns.
     late_ns: Option<u64>,
-    /// It had to act; it stood still while no drive was enabled; it was in time.
+    /// The watchdog had to act; the cycle stalled while no drive was enabled; all cycles were in time.
     had_to: bool,
     asleep: bool,
     in_time: bool,
@@ -175,7 +176,7 @@ struct Shown {
 /// Runs a script.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(script: &Script) -> Result<Shown, String> {
     let (mut rig, model, plant) = rigs::pair();
     rig.nodes.iter_mut().for_each(|node| node.timeout_ns = 3 * script.period_ns);
@@ -218,7 +219,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let bites = bites.lock().unwrap().clone();
     let plan = plan.borrow();
     let Some((at, begin_ns, over_ns, late_ns)) = plan.stalled else {
-        // It ended before.
+        // The run ended before the stall.
         return if bites.is_empty() { Ok(Shown::default()) } else { judge_early(&bites, &cycles, script) };
     };
     let mut shown = judge_early(&bites, &cycles, script)?;
@@ -237,12 +238,12 @@ fn run(script: &Script) -> Result<Shown, String> {
     shown.asleep = !before.awake && over_ns > begin_ns + script.watchdog_ns;
     shown.in_time = bites.is_empty() && before.awake;
     if let Some(first) = first {
-        // Where this computer paused by itself, a frame of that cycle may have been on its way.
+        // If the computer itself paused, a frame of that cycle may already have been on its way.
         let during = begin_ns <= first && first <= over_ns;
         let known_ns = cycles.iter().map(|cycle| cycle.end_ns).find(|end_ns| *end_ns > first).unwrap_or(first);
         let from_ns = if during { over_ns } else { known_ns };
         shown.late_ns = during.then(|| first.saturating_sub(before.end_ns + script.watchdog_ns));
-        // SYNC goes on while drives stop, but not before the cycle has told them to.
+        // SYNC continues while drives stop, but not before the cycle has commanded the stop.
         let mut told = false;
         for (at_ns, cycle, frame) in plan.sent.iter().filter(|(at_ns, ..)| *at_ns > first) {
             let set_point = (0x200..0x280).contains(&frame.id());
@@ -268,7 +269,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     Ok(shown)
 }
 
-/// It acts at its time or later, while drives are enabled.
+/// Checks that the watchdog never acted early, and only while drives were enabled.
 fn judge_early(bites: &[u64], cycles: &[Seen], script: &Script) -> Result<Shown, String> {
     for bite in bites {
         let last = cycles.iter().rev().find(|cycle| cycle.end_ns <= *bite);
