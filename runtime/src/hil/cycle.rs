@@ -1,12 +1,12 @@
-//! One rig under way: time, buses, drives, model and safety in one loop.
+//! The real-time cycle of a running rig: clock, buses, drives, model and safety supervisor in one loop.
 //!
-//! In: a rig, its control program, a clock, a bus for each of its buses, what the operator commands. Out: frames, a log,
-//! gauges to look at, and at the end why it ended. Knows neither the language nor the terminal. The same code runs
-//! against real and simulated buses, in real and simulated time.
+//! In: a rig, its control program, a clock, one bus for each bus of the rig, operator commands. Out: frames, a log,
+//! gauges, and finally the reason for the end. Knows neither the language nor the terminal. The same code runs with
+//! real and simulated buses, in real and simulated time.
 //!
-//! One cycle, at its own pace and never in reaction to a frame: SYNC, the answers up to a fixed point of the period, the
-//! computing of [`Control`], the commands, housekeeping. From the moment the drives may move, a cycle does not allocate,
-//! lock or write anything but frames; what it leaves behind goes through queues that never wait.
+//! A cycle is time-triggered and never reacts to a frame: SYNC, answers until a fixed point of the period, computation
+//! in [`Control`], commands, housekeeping. From the moment when drives may move, a cycle neither allocates nor locks
+//! nor writes anything but frames; its records pass through queues that never block.
 
 use super::control::{Control, Reading, Source, Told};
 use super::counts::Counts;
@@ -28,89 +28,90 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Frames of one bus that are taken at once.
+/// Most frames that are taken from one bus at a time.
 const MOST_FRAMES: usize = 64;
-/// Cycles in a row that lose frames until set-points count as at risk.
+/// Number of successive cycles with lost frames after which set-points count as at risk.
 const OVERLOAD: u32 = 3;
-/// Cycles between two states in the log.
+/// Number of cycles between two state messages in the log.
 const STATE_EVERY: u64 = 1000;
-/// Causes that may come in one cycle, beside those of buses and nodes.
+/// Most causes that can occur in one cycle, besides those of buses and nodes.
 const CAUSES: usize = 40;
-/// Time in which drives must lose their torque once they are told to.
+/// Longest time that drives may take to lose their torque after the command to do so, ns.
 const REST_NS: u64 = 1_000_000_000;
 
-/// How a rig is run.
+/// Options of a run.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Options {
-    /// What is not in its text.
+    /// Settings that are not part of the rig's text.
     pub control: control::Options,
-    /// How it is started.
+    /// Options of the start-up.
     pub start: drive::Options,
-    /// Enable and arm as soon as that can be: for simulated drives.
+    /// Enable and arm as soon as possible, without an operator: for simulated drives.
     pub arms_itself: bool,
-    /// Stop when the start-up is through: nothing is armed.
+    /// Stop when the start-up has finished; nothing is armed.
     pub checks_only: bool,
-    /// Refuse drives that have not proved to be simulated ones of ours (vendor, device name, serial number): why. Drives
-    /// described by frames cannot.
+    /// Refuse drives that have not proved to be our simulated ones (by vendor, device name and serial number); the text
+    /// is the reason. Drives described by frames cannot prove it.
     pub only_simulated: Option<String>,
-    /// From SYNC to the computing, ns; none: as the rig's kind of drives needs it.
+    /// Time from SYNC to the computation, ns; none: the value for the rig's kinds of drives.
     pub collect_ns: Option<u64>,
-    /// Time the model runs, ns; none: until somebody stops it.
+    /// Time for which the model runs, ns; none: until an operator stops it.
     pub duration_ns: Option<u64>,
-    /// What `predict` of the rig asks for: [`look_ahead`].
+    /// The predictor that the rig's `predict` requires: [`look_ahead`].
     pub look: Option<Wired>,
 }
 
-/// What the `predict` of a rig asks for, with the times of this loop. `plant`: the program of what was crossed out.
+/// Creates the predictor that the rig's `predict` requires, with the delays of this loop. `plant`: the program of the
+/// part of the model that hardware replaces.
 ///
 /// # Errors
-/// What is missing for it, in words.
+/// A message about what the predictor lacks.
 pub fn look_ahead(rig: &Rig, plant: &Instance) -> Result<Option<Wired>, String> {
     Wired::of(rig, plant, |node| timing::transit_ns(rig, node))
 }
 
-/// How it ended.
+/// How a run ended.
 #[derive(Clone, PartialEq, Debug)]
 pub enum End {
-    /// As asked: the time was over, or somebody stopped it.
+    /// As requested: its time was over, or an operator stopped it.
     Asked,
-    /// It was not started: why.
+    /// The start was refused; the reason.
     Refused(String),
-    /// By safety or a condition of the rig: why.
+    /// The safety supervisor or a condition of the rig stopped it; the reason.
     Stopped(Cause, String),
 }
 
-/// Numbers to look at while the rig is under way: each is written by the cycle and may be read by anybody.
+/// Values for displays while the rig runs: the cycle writes them, any thread may read them.
 #[derive(Debug, Default)]
 pub struct Gauges {
-    /// ns since the start.
+    /// Time since the start, ns.
     pub now_ns: AtomicU64,
-    /// Cycles in which the model ran.
+    /// Number of cycles in which the model ran.
     pub cycles: AtomicU64,
-    /// [`Step`] of the start-up as a number, then [`DriveCommand`] as a number from 100.
+    /// [`Step`] of the start-up as a number, or 100 plus the number of the [`DriveCommand`] once that is a stop.
     pub stage: AtomicU64,
-    /// How late the last cycle began, ns.
+    /// Lateness of the last cycle's start, ns.
     pub late_ns: AtomicU64,
-    /// How late one has begun at most, ns.
+    /// Greatest lateness of a cycle's start, ns.
     pub late_ns_max: AtomicU64,
-    /// Ticks missed.
+    /// Number of missed ticks.
     pub missed: AtomicU64,
-    /// Bytes that are free on the disk of the log; 0 without a log.
+    /// Free space on the disk of the log, bytes; 0 without a log.
     pub log_free: AtomicU64,
-    /// Permitted outputs, then recorded quantities: SI, as bits.
+    /// Permitted outputs, then recorded quantities: SI, as bits of an `f64`.
     pub values: Vec<AtomicU64>,
 }
 
-/// The buses, and what happens on them in a cycle.
+/// The buses, with the record of their events in this cycle.
 struct Wires {
     clock: Box<dyn Clock>,
     buses: Vec<Box<dyn Bus>>,
     watchdog: Option<emergency::Watchdog>,
-    /// The cycle knows that the watchdog has stopped the drives, and commands nothing else.
+    /// The cycle has noticed that the watchdog stopped the drives, and sends nothing but stops.
     acknowledged: bool,
-    /// Words of the frames of this cycle.
+    /// The frames of this cycle, encoded as words.
     frames: Vec<u64>,
-    /// What went wrong since causes were judged last: a frame that is not taken after that counts in the next cycle.
+    /// Causes reported since the last computation; a frame that a bus refuses later counts in the next cycle.
     causes: Vec<Cause>,
     lossy: bool,
     lost: u64,
@@ -119,7 +120,7 @@ struct Wires {
 }
 
 impl Wires {
-    /// Hands a frame to a bus. After the watchdog has stopped the drives nothing leaves until the cycle stops them too.
+    /// Sends a frame. After the watchdog has stopped the drives, nothing is sent until the cycle stops them too.
     fn send(&mut self, bus: usize, frame: Frame) {
         let bitten = self.watchdog.as_ref().is_some_and(emergency::Watchdog::has_bitten);
         if bitten && !self.acknowledged && is_present(Protection::Hushed) {
@@ -146,7 +147,7 @@ impl Wires {
         }
     }
 
-    /// Takes what has come: at most [`MOST_FRAMES`] from each bus.
+    /// Reads the received frames and events: at most [`MOST_FRAMES`] from each bus.
     fn drain(&mut self, fieldbus: &mut Fieldbus) {
         for bus in 0..self.buses.len() {
             for n in 0.. {
@@ -181,24 +182,24 @@ impl Wires {
     }
 }
 
-/// A rig under way.
+/// A running rig.
 pub struct Hil {
-    /// Above the buses: the stop frames are taken back before their descriptors close.
+    /// Declared before the buses: the stop frames must be withdrawn before their descriptors close.
     table: Option<emergency::Table>,
     rig: Rig,
     options: Options,
     wires: Wires,
     fieldbus: Fieldbus,
     model: Instance,
-    /// Once the drives have told their limits.
+    /// Present once the limits of the drives have been read.
     control: Option<Control>,
     log_wanted: Option<(log::Settings, Sections)>,
     log: Option<Log>,
     gauges: Arc<Gauges>,
     commands: Commands,
-    /// Judges sets of parameters; none: none is taken.
+    /// Checks sets of parameters; none: every set is refused.
     judge: Option<Judge>,
-    /// The set that acts in this cycle.
+    /// Number of the operator command whose set acts in this cycle.
     set: Option<u64>,
     due_ns: u64,
     collect_ns: u64,
@@ -209,24 +210,25 @@ pub struct Hil {
     order: DriveCommand,
     overload: u32,
     first_trouble: Option<Trouble>,
-    /// Cycles of the model that are left; none: no end.
+    /// Remaining cycles of the model; none: unlimited.
     left: Option<u64>,
-    /// The time of the model is over: a controlled stop comes with the next cycle.
+    /// The run time of the model is over: a controlled stop follows in the next cycle.
     over: bool,
-    /// Since when the drives have been told to give up their torque.
+    /// Time at which the drives were told to give up their torque, ns.
     resting_ns: Option<u64>,
     counts: Counts,
     misuse: bool,
-    /// The start-up is through, and nothing more was asked for.
+    /// The start-up has finished, and only its checks were requested.
     checked: bool,
     end: Option<End>,
 }
 
 impl Hil {
-    /// A rig that is about to start. `buses`: one for each of the rig's. Also gives the operator's end of the commands.
+    /// A rig before its start. `buses`: one for each bus of the rig. Also returns the operator's end of the command
+    /// queue.
     ///
     /// # Errors
-    /// What the rig asks for that cannot be had, in words.
+    /// A message about a requirement of the rig that cannot be met.
     pub fn new(
         rig: &Rig,
         model: Instance,
@@ -257,7 +259,8 @@ impl Hil {
                 watchdog: None,
                 acknowledged: false,
                 frames: Vec::with_capacity(1 << 14),
-                // Each bus, each node twice, as many foreign frames as there are places for troubles, and a few more.
+                // Room for each bus, two for each node, as many foreign frames as the fieldbus can report, and a few
+                // more.
                 causes: Vec::with_capacity(CAUSES + rig.buses.len() + 2 * rig.nodes.len()),
                 lossy: false,
                 lost: 0,
@@ -292,32 +295,32 @@ impl Hil {
         Ok((hil, operator))
     }
 
-    /// Stops the drives from a thread of its own if cycles stop.
+    /// Adds a watchdog, which stops the drives from its own thread when cycles stop.
     pub fn watched_by(&mut self, watchdog: emergency::Watchdog) {
         self.wires.watchdog = Some(watchdog);
     }
 
-    /// Lets parameters change while the rig runs, as far as this judge allows.
+    /// Permits changes of parameters while the rig runs, as far as this judge accepts them.
     pub fn judged_by(&mut self, judge: Judge) {
         self.judge = Some(judge);
     }
 
-    /// What to look at from elsewhere.
+    /// The gauges, for other threads.
     pub fn gauges(&self) -> Arc<Gauges> {
         self.gauges.clone()
     }
 
-    /// Where the start-up is.
+    /// Current step of the start-up.
     pub fn step(&self) -> Step {
         self.fieldbus.step()
     }
 
-    /// The computing part, once the drives have told their limits.
+    /// The computing part, once the limits of the drives have been read.
     pub fn control(&self) -> Option<&Control> {
         self.control.as_ref()
     }
 
-    /// What watches over the outputs, to narrow its limits.
+    /// The safety supervisor, to narrow its limits.
     pub fn supervisor_mut(&mut self) -> Option<&mut Supervisor> {
         self.control.as_mut().map(Control::supervisor_mut)
     }
@@ -327,55 +330,55 @@ impl Hil {
         &self.fieldbus
     }
 
-    /// What the drives were told in the last cycle.
+    /// The drive command of the last cycle.
     pub fn order(&self) -> DriveCommand {
         self.order
     }
 
-    /// What was measured of each drive, as far as it was believed.
+    /// Measured values of each drive, without those that were rejected as implausible.
     pub fn seen(&self) -> &[Seen] {
         self.control.as_ref().map_or(&[], Control::seen)
     }
 
-    /// From SYNC to the computing, ns.
+    /// Time from SYNC to the computation, ns.
     pub fn collect_ns(&self) -> u64 {
         self.collect_ns
     }
 
-    /// What was counted until now.
+    /// Counters since the start.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// How it ended, once it has.
+    /// How the run ended, once it has.
     pub fn ended(&self) -> Option<&End> {
         self.end.as_ref()
     }
 
-    /// Whether all checks of the start-up have passed, where nothing but them was asked for.
+    /// Whether all checks of the start-up have passed, in a run of checks only.
     pub fn is_checked(&self) -> bool {
         self.checked
     }
 
-    /// Whether it was refused for what only simulated drives bear.
+    /// Whether the start was refused because an option is for simulated drives only.
     pub fn is_misuse(&self) -> bool {
         self.misuse
     }
 
-    /// The cycle before, as its log has it.
+    /// The last cycle, as recorded in its log.
     #[cfg(test)]
     pub(super) fn last(&self) -> &trace::Cycle {
         &self.cycle
     }
 
-    /// The frames of the cycle before, as its log has them.
+    /// The frames of the last cycle, as recorded in its log.
     #[cfg(test)]
     pub(super) fn last_frames(&self) -> &[u64] {
         &self.wires.frames
     }
 
-    /// Hands the stop frames of all buses to [`emergency`], as far as the buses can be written to from anywhere; they are taken
-    /// back when this rig is dropped.
+    /// Registers the stop frames of all buses with [`emergency`], for those buses that permit writes from any thread;
+    /// they are withdrawn when this rig is dropped.
     pub fn prepare_emergency(&mut self) {
         let buses = self.wires.buses.iter().enumerate();
         let ready = buses.flat_map(|(i, bus)| {
@@ -386,7 +389,7 @@ impl Hil {
         self.table = Some(emergency::prepare(ready));
     }
 
-    /// Runs until it ends.
+    /// Runs cycles until the run ends.
     pub fn run(&mut self) -> End {
         loop {
             self.cycle();
@@ -396,7 +399,7 @@ impl Hil {
         }
     }
 
-    /// One cycle, waiting for its tick included.
+    /// One cycle, including the wait for its tick.
     pub fn cycle(&mut self) {
         self.wires.clock.sleep_until(self.due_ns);
         let begin_ns = self.wires.clock.now_ns();
@@ -418,7 +421,7 @@ impl Hil {
         self.wires.drain(&mut self.fieldbus);
         let Hil { fieldbus, wires, .. } = self;
         fieldbus.begin(&mut |bus, frame| wires.send(bus, frame));
-        // A cycle that begins late still waits for its answers, as far as its period has room for them.
+        // A cycle that begins late still waits for its answers, as far as its period leaves room.
         let room_ns = self.due_ns + self.rig.period_ns / 10 * 9;
         let collect_ns = (begin_ns + self.collect_ns).min(room_ns).max(self.due_ns + self.collect_ns);
         wires.clock.sleep_until(collect_ns);
@@ -448,13 +451,13 @@ impl Hil {
         self.due_ns += self.rig.period_ns;
     }
 
-    /// What the operator asked for since the last cycle.
+    /// Handles the operator's commands since the last cycle.
     fn operate(&mut self) {
         self.cycle.arms = false;
         self.cycle.set.clear();
         let now_ns = self.wires.clock.now_ns();
         self.commands.begin(now_ns);
-        // A stop comes first: what was asked for beside it is over.
+        // A stop takes precedence: all commands beside it are refused.
         let stops = self.over || emergency::asked().is_some() | self.commands.takes_stop();
         if stops {
             self.stop();
@@ -486,7 +489,7 @@ impl Hil {
         }
     }
 
-    /// The next set of parameters: one a cycle, so that each is whole or refused by itself.
+    /// Takes the next set of parameters: one per cycle, so that each set is accepted or refused as a whole.
     fn take_set(&mut self) {
         self.set = None;
         let Some(said) = self.commands.next(self.wires.clock.now_ns(), true) else { return };
@@ -508,7 +511,7 @@ impl Hil {
         }
     }
 
-    /// What a gauge shows of the start-up and of a stop.
+    /// Value of the gauge `stage`, for start-up and stop.
     fn stage(&self) -> u64 {
         match self.order {
             DriveCommand::Wait | DriveCommand::Follow => self.fieldbus.step() as u64,
@@ -523,7 +526,7 @@ impl Hil {
         }
     }
 
-    /// What the nodes and buses have said against going on.
+    /// Collects the causes that nodes, buses and the watchdog report.
     fn gather(&mut self) {
         self.overload = if self.wires.lossy { self.overload + 1 } else { 0 };
         if self.overload >= OVERLOAD && is_present(Protection::Overload) {
@@ -539,7 +542,7 @@ impl Hil {
             let cause = match trouble.kind {
                 TroubleKind::ForeignMaster(id) => Cause::Foreign(0, id),
                 TroubleKind::NotFollowing | TroubleKind::Mode(_) | TroubleKind::Wraps => Cause::NotFollowing(node),
-                // A frame that is too short is one that did not come.
+                // A frame that is too short counts as missing.
                 TroubleKind::Short(_) => continue,
                 TroubleKind::Emergency(_)
                 | TroubleKind::Fault
@@ -552,18 +555,18 @@ impl Hil {
         }
     }
 
-    /// Computes, once the drives have told their limits.
+    /// Computes the drive command; [`DriveCommand::Wait`] until the limits of the drives have been read.
     fn compute(&mut self, ticks: u32) -> DriveCommand {
         let step = self.fieldbus.step();
-        // This takes many periods, since memory is mapped and locked. So it is done before a drive waits for SYNC or for our
-        // life sign: the ticks that pass meanwhile are nobody's.
+        // This takes many periods, because memory is mapped and locked. It is therefore done before a drive waits for
+        // SYNC or our heartbeat: the ticks that pass meanwhile affect no drive.
         if self.control.is_none() && step >= Step::Configure && step < Step::Stopped {
             self.begin_control();
         }
         self.take_set();
         let Some(control) = &mut self.control else { return DriveCommand::Wait };
         let cycle = &mut self.cycle;
-        // Before the drives are enabled a bus may be silent: the start-up judges that.
+        // Before the drives are enabled a bus may be silent: the start-up checks that itself.
         if step <= Step::AwaitEnable {
             self.wires.causes.retain(|cause| *cause == Cause::Asked);
         }
@@ -616,14 +619,14 @@ impl Hil {
         order
     }
 
-    /// The drives have told their limits: what computes can be made, and the log begins. Nothing moves yet.
+    /// Creates the computing part from the drives' limits, and begins the log. No drive moves yet.
     fn begin_control(&mut self) {
         let bounds = (0..self.rig.nodes.len()).map(|node| {
             let limits = self.fieldbus.limits(node);
             Bounds { torque: limits.map(|limits| limits.torque), speed: limits.map(|limits| limits.speed) }
         });
         let bounds: Vec<Bounds> = bounds.collect();
-        // A drive described by frames announces nothing, so it proves nothing; a device does not move.
+        // A drive described by frames has no identity and proves nothing; a device does not move.
         let stranger = |node: &usize| match self.fieldbus.status(*node) {
             Some(status) => !status.simulated,
             None => self.rig.nodes[*node].moves,
@@ -661,7 +664,7 @@ impl Hil {
         self.control = Some(control);
     }
 
-    /// Who the drives are, a line each.
+    /// Identities of the drives, one per line.
     fn identities(&self) -> String {
         let line = |node: usize| {
             let status = self.fieldbus.status(node)?;
@@ -678,7 +681,7 @@ impl Hil {
         self.fieldbus.request(Request::Disable);
     }
 
-    /// Commands and orders to the nodes.
+    /// Passes permitted outputs and the drive command to the nodes.
     fn tell(&mut self, order: DriveCommand) {
         let Hil { fieldbus, wires, control, rig, .. } = self;
         let Some(control) = control else { return };
@@ -746,7 +749,7 @@ impl Hil {
         }
     }
 
-    /// The cycle goes to the log.
+    /// Records the cycle in the log.
     fn leave_behind(&mut self) {
         let Some(control) = &self.control else { return };
         let moving = (0..self.rig.nodes.len()).filter(|node| self.rig.nodes[*node].moves);
@@ -768,7 +771,7 @@ impl Hil {
         self.counts.log_dropped = if is_present(Protection::Counted) { log.dropped() } else { 0 };
     }
 
-    /// Ends the run when it is over.
+    /// Ends the run when its start was refused or its stop is complete; notes when the time of the model is over.
     fn go_on(&mut self, now_ns: u64) {
         if let Some(left) = &mut self.left
             && self.cycle.source == Source::Model
@@ -799,16 +802,16 @@ impl Hil {
         }
     }
 
-    /// Why it stopped, in words.
+    /// The reason of a stop as text.
     pub fn explain(&self, cause: Cause) -> String {
         let trouble = self.first_trouble.map(|trouble| self.fieldbus.tell(&trouble));
         super::words::cause(&self.rig, self.model.description(), &self.signals, cause, trouble.as_deref())
     }
 
-    /// Ends the log: what was counted goes into its tail.
+    /// Closes the log; its last section holds the counters.
     ///
     /// # Errors
-    /// What kept it from being written.
+    /// An error of writing the log.
     pub fn finish(mut self) -> io::Result<Option<log::Summary>> {
         let Some(log) = self.log.take() else { return Ok(None) };
         let end = self.end.clone().unwrap_or(End::Asked);

@@ -1,7 +1,8 @@
-//! What watches over each drive of a rig, and what lacks for the rest.
+//! Supervision of each drive of a rig: its limits, and which checks a drive lacks.
 //!
-//! In: a rig, what its drives have told. Out: limits for the supervisor, and in words which watch a drive has not. A drive with a
-//! profile has all of them; one described by frames those for which it tells something and the rig names a limit.
+//! In: a rig, limits read from its drives. Out: limits for the supervisor, and messages about missing checks. A drive
+//! with a profile has all checks; a drive described by frames has those for which it reports a signal and the rig names
+//! a limit.
 
 use crate::realtime::clock::monotonic_ns;
 use crate::safety::{DriveLimits, OutputLimits, Protection, Refused, is_present};
@@ -9,7 +10,7 @@ use abi::Instance;
 use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
 use abi::unit::three_digits;
 
-/// Greatest torque and speed of a drive, where known.
+/// Highest torque and speed of a drive, where known.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Bounds {
     /// N·m
@@ -18,19 +19,19 @@ pub struct Bounds {
     pub speed: Option<f64>,
 }
 
-/// The signal by which a node tells its torque, its speed or its position.
+/// The signal in which a node reports its torque, speed or position.
 pub fn told(rig: &Rig, node: usize, what: What) -> Option<Signal> {
     rig.nodes[node].tells(what).map(|what| Signal { node, what })
 }
 
-/// The signal that tells what a drive makes of a command; none where it has none.
+/// The signal in which a drive reports the quantity that an output commands; none if it reports none.
 pub fn answer(rig: &Rig, output: &Output) -> Option<Signal> {
     let Signal { node, what } = output.signal;
     let asked = rig.nodes[node].asks_for(what).filter(|_| rig.nodes[node].moves)?;
     told(rig, node, asked)
 }
 
-/// Which watches the drives have not, and why: a line for each drive that lacks some.
+/// Checks that drives lack, and why: one line for each such drive.
 pub fn lacking(rig: &Rig) -> Vec<String> {
     let framed = |node: &usize| rig.nodes[*node].moves && matches!(rig.nodes[*node].kind, Kind::Frames(_));
     let line = |node: usize| {
@@ -67,10 +68,11 @@ pub fn lacking(rig: &Rig) -> Vec<String> {
     (0..rig.nodes.len()).filter(framed).map(line).collect()
 }
 
-/// Whether a rig may be started at all.
+/// Checks whether a rig may be started.
 ///
 /// # Errors
-/// A safe value that would move a drive. It is enabled at it, before anybody has armed the rig and any sign was tested.
+/// A safe value that would move a drive: the drive is enabled with it before an operator has armed the rig and before
+/// any sign was checked.
 pub fn may_start(rig: &Rig) -> Result<(), String> {
     let moves = |output: &&Output| output.safe != 0.0 && rig.nodes[output.signal.node].is_moved_by(output.signal.what);
     match rig.outputs.iter().find(moves).filter(|_| is_present(Protection::Idle)) {
@@ -82,10 +84,10 @@ pub fn may_start(rig: &Rig) -> Result<(), String> {
     }
 }
 
-/// Dry steps that are timed.
+/// Number of steps that are timed.
 const STEPS: usize = 1000;
 
-/// What the steps of one period of the control program take on this machine, s: median and greatest of 1,000.
+/// Computing time of the control program for one period on this machine, s: median and maximum of 1,000.
 pub fn step_time(rig: &Rig, control: &Instance) -> (f64, f64) {
     let steps = u64::from(rig.steps.max(1));
     let mut control = control.clone();
@@ -102,7 +104,7 @@ pub fn step_time(rig: &Rig, control: &Instance) -> (f64, f64) {
     (seconds(times[STEPS / 2]), seconds(times[STEPS - 1]))
 }
 
-/// Why this computer is too slow for a rig, in words; none if it is not.
+/// A message if this computer is too slow for a rig.
 pub fn too_slow(rig: &Rig, control: &Instance) -> Option<String> {
     let (median, period) = (step_time(rig, control).0, rig.period_ns as f64 * 1e-9);
     let ms = |seconds: f64| three_digits(1e3 * seconds);
@@ -112,7 +114,7 @@ pub fn too_slow(rig: &Rig, control: &Instance) -> Option<String> {
     })
 }
 
-/// Greatest torque and speed of a node: as the rig says, else as the drive says.
+/// Highest torque and speed of a node: from the rig, otherwise as read from the drive.
 pub fn bounds_of(rig: &Rig, node: usize, bounds: &[Bounds]) -> Bounds {
     let read = bounds.get(node).copied().unwrap_or_default();
     match &rig.nodes[node].kind {
@@ -123,10 +125,10 @@ pub fn bounds_of(rig: &Rig, node: usize, bounds: &[Bounds]) -> Bounds {
     }
 }
 
-/// What supervises a drive.
+/// Limits of one drive for the supervisor.
 ///
 /// # Errors
-/// A limit that neither the rig nor the drive names, in words.
+/// A message about a limit that neither the rig nor the drive names.
 pub fn drive_limits(rig: &Rig, node: usize, bounds: &[Bounds]) -> Result<DriveLimits, String> {
     let name = &rig.nodes[node].name;
     let Kind::Cia402(drive) = &rig.nodes[node].kind else {
@@ -149,7 +151,7 @@ pub fn drive_limits(rig: &Rig, node: usize, bounds: &[Bounds]) -> Result<DriveLi
     Ok(DriveLimits { speed, travel, power: drive.max_power.unwrap_or(torque * speed) })
 }
 
-/// Limits of an output: those of the rig, within those of the drive.
+/// Limits of an output: those of the rig, restricted to those of the drive.
 pub fn output_limits(rig: &Rig, output: &Output, moving: &[usize], bounds: &[Bounds]) -> Result<OutputLimits, String> {
     let Output { signal, low, high, slew, safe, .. } = *output;
     let drive = moving.iter().position(|node| *node == signal.node);
@@ -174,7 +176,7 @@ pub fn output_limits(rig: &Rig, output: &Output, moving: &[usize], bounds: &[Bou
     Ok(OutputLimits { low, high, slew, safe, drive, torque })
 }
 
-/// Why the limits of a rig cannot be kept, in words.
+/// The message for limits that the supervisor refuses.
 pub fn refusal(rig: &Rig, moving: &[usize], refused: Refused) -> String {
     let output = |i: usize| {
         let node: &str = &rig.nodes[rig.outputs[i].signal.node].name;
@@ -205,7 +207,7 @@ mod tests {
     use abi::rig::{Field, Format, Message, Within};
     use abi::unit::Unit;
 
-    /// Periods around what a step takes here, whatever else this computer does.
+    /// The periods scale with the measured step time, so the load of this computer does not matter.
     #[test]
     fn a_computer_that_is_too_slow_is_refused() {
         let (rig, control) = rigs::rig();
@@ -239,7 +241,7 @@ mod tests {
         Message { name: name.into(), id, extended: false, length: 4, send, period_ns: 0, fields: vec![field] }
     }
 
-    /// The spring, its drive described by frames: torque in, and these signals back.
+    /// The spring model with a drive described by frames: a torque command, and the given signals as answers.
     fn framed(tells: &[(&str, &str)], within: Within) -> (Rig, Instance) {
         let (mut rig, model) = rigs::rig();
         let mut messages = vec![message("command", "N·m", 0x205, true)];
@@ -253,7 +255,8 @@ mod tests {
     const ALL: [(&str, &str); 3] = [("omega", "rpm"), ("angle", "deg"), ("torque", "N·m")];
     const WITHIN: Within = Within { max_speed: Some(10.0), travel: Some((-1.0, 1.0)), max_power: Some(2.0) };
 
-    /// What stops it; `now` gives speed, position and torque of each tick from what was permitted in the one before.
+    /// The cause of the stop and its tick; `now` returns speed, position and torque of each tick from the output
+    /// permitted in the tick before.
     fn stopped(mut now: impl FnMut(u32, f64) -> [f64; 3]) -> Option<(Cause, u32)> {
         let (rig, model) = framed(&ALL, WITHIN);
         let options = Options { ramp_ns: 0, ..Options::default() };
@@ -278,13 +281,13 @@ mod tests {
 
     #[test]
     fn a_drive_described_by_frames_is_watched_by_what_it_tells() {
-        // The spring: −10 N·m/rad on what the speed has turned.
+        // The spring: −10 N·m/rad times the integrated speed.
         assert_eq!(stopped(|_, sent| [0.1, 0.0, sent]), None);
         assert_eq!(stopped(|k, sent| [if k < 5 { 0.0 } else { -10.1 }, 0.0, sent]), Some((Cause::Speed(0, -10.1), 5)));
         assert_eq!(stopped(|k, sent| [0.0, if k < 5 { 0.0 } else { 1.1 }, sent]), Some((Cause::Travel(0, 1.1), 5)));
         let away = stopped(|k, sent| [f64::from(k) * 0.1, 0.0, sent]);
         assert!(matches!(away, Some((Cause::RunAway(0), k)) if k < 15), "{away:?}");
-        // It tells no torque of what it was asked for: 0.4 N·m is a tenth of its range and four units beyond.
+        // The drive reports no torque although one is commanded: 0.4 N·m is a tenth of its range, plus four units.
         let idle = stopped(|_, _| [0.5, 0.0, 0.0]);
         assert!(matches!(idle, Some((Cause::NotFollowing(0), k)) if k < 60), "{idle:?}");
     }
@@ -307,7 +310,7 @@ mod tests {
         }
         let free = said(&ALL, Within::default());
         assert!(free.contains("speed (give `speed_max`)") && free.contains("travel (give `travel`)"), "{free}");
-        // Which of two speeds is the drive's own, only its name can say.
+        // Of two speeds, the one named `speed` is the drive's own.
         assert!(said(&[("a", "rpm"), ("b", "rpm")], WITHIN).contains("speed (it tells no speed)"));
         assert!(!said(&[("a", "rpm"), ("speed", "rpm")], WITHIN).contains("speed (it tells no speed)"));
         assert_eq!(lacking(&rigs::pair().0), Vec::<String>::new());
