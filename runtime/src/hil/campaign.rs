@@ -1,8 +1,8 @@
-//! The fault campaign: one test for each fault on the list, in simulated time, each with the time in which the rig must
-//! have reacted. The [fault space](super::faults) is generated; these are examples with names.
+//! The fault campaign: one named test for each fault on the list, in simulated time, each with a bound on the reaction
+//! time. The [fault space](super::faults) generates further combinations.
 //!
-//! In every test, in every cycle: no command beyond its limit, no torque on the shaft beyond that of its drive. At the end
-//! of every stop: no drive under torque.
+//! Every test checks in every cycle that no command exceeds its limit and that no drive's torque on the shaft exceeds
+//! that of the drive. After every stop no drive is under torque.
 
 use super::control;
 use super::cycle::{Command, End, Hil, Operator, Options, look_ahead};
@@ -22,24 +22,24 @@ use abi::{Instance, Slot};
 use std::os::unix::fs::OpenOptionsExt;
 
 const MS: u64 = 1_000_000;
-/// Bound on everything that follows a trip: the slew, the quick stop, torque off.
+/// Bound on everything that follows a trip: slew, quick stop, torque off.
 const STOP_NS: u64 = 2_100 * MS;
 
-/// A rig that is about to fail.
+/// A rig to which a fault is applied.
 struct Stand {
     hil: Hil,
     operator: Operator,
     world: World,
     rig: Rig,
-    /// The supervisor's cause, as it was first seen.
+    /// The supervisor's cause and the time when it was first seen.
     cause: Option<(Cause, u64)>,
-    /// What was permitted last.
+    /// The last permitted outputs.
     last: [f64; 2],
-    /// Greatest power of each drive, W.
+    /// Highest power of each drive, W.
     power: f64,
 }
 
-/// A quick start, for tests of what comes after it.
+/// Options for a quick start, for tests of later phases.
 pub(super) fn quick() -> Options {
     let start = drive::Options {
         listen_ns: 5 * MS,
@@ -79,7 +79,7 @@ impl Stand {
         Stand { hil, operator, world, rig, cause: None, last: [0.0; 2], power }
     }
 
-    /// Armed and under way for 300 ms.
+    /// A rig that has been armed and has run for 300 ms.
     fn armed(change: impl FnOnce(&mut Rig, &mut Instance)) -> Stand {
         let mut stand = Stand::new(quick(), 1, change);
         stand.reach(Step::Armed);
@@ -103,7 +103,7 @@ impl Stand {
         }
     }
 
-    /// One cycle, and what must hold in every one.
+    /// One cycle, with the checks that hold in every cycle.
     fn cycle(&mut self) {
         self.hil.cycle();
         let now = self.now();
@@ -125,7 +125,7 @@ impl Stand {
         }
         for (node, most) in [(0, 1.0), (1, 2.0)] {
             let torque = self.world.bench().shaft(node).torque;
-            // One step of the drive's torque, and its lag, lie between a command and the shaft.
+            // Between a command and the shaft lie one quantisation step of the torque, and its lag.
             assert!(torque.abs() <= most * 1.01 + 0.01, "{torque} N·m at {node}, {now} ns, {:?}", self.cause);
         }
     }
@@ -143,7 +143,7 @@ impl Stand {
         now
     }
 
-    /// Goes on until the rig has stopped by itself: the cause, and how long after `since` it was seen.
+    /// Runs until the rig has stopped by itself: the cause, and the time from `since` until it was seen, ns.
     fn stops(&mut self, since: u64) -> (Cause, u64) {
         let limit = since + 2 * STOP_NS;
         while self.hil.ended().is_none() {
@@ -157,7 +157,7 @@ impl Stand {
         (cause, at - since)
     }
 
-    /// Goes on until it ends.
+    /// Runs until the end.
     fn ends(&mut self) -> End {
         let limit = self.now() + 60_000 * MS;
         loop {
@@ -169,7 +169,7 @@ impl Stand {
         }
     }
 
-    /// Both drives are without torque, and stay so.
+    /// Checks that neither drive's power stage is on.
     fn at_rest(&mut self) {
         for node in 0..2 {
             let mut bench = self.world.bench();
@@ -178,7 +178,7 @@ impl Stand {
         }
     }
 
-    /// Goes on for a time, in which nothing may stop it.
+    /// Runs for a time in which nothing may stop the rig.
     fn goes_on(&mut self, ns: u64) {
         let until = self.now() + ns;
         while self.now() < until {
@@ -188,7 +188,7 @@ impl Stand {
     }
 }
 
-/// Parameters of the control program: amplitude, damping, time from which it gives no number.
+/// Sets a parameter of the control program: 0 amplitude, 1 damping, 2 time from which its output is NaN.
 fn param(model: &mut Instance, i: usize, value: f64) {
     let slot = model.description().layout.params.slot(i);
     model.set(slot, value);
@@ -227,7 +227,7 @@ fn row_3_a_torque_beyond_its_limit() {
     let mut stand = Stand::new(quick(), 1, |_, model| param(model, 0, 9.0));
     stand.reach(Step::Armed);
     let since = stand.now();
-    // The sine passes 2 N·m after 36 ms and comes back after 464 ms.
+    // The sine exceeds 2 N·m from 36 ms to 464 ms.
     assert_eq!(within(stand.stops(since), 200 * MS), Cause::Clamped(0));
     let counts = stand.hil.counts();
     assert!(counts.clamped[0] >= 150, "{:?}", counts.clamped);
@@ -297,7 +297,8 @@ fn row_4_too_fast_too_far() {
 fn row_4_a_drive_whose_torque_goes_the_wrong_way() {
     let mut stand = Stand::armed(|_, _| ());
     let since = stand.effect(0, Effect::TorqueScale(-1.0), None);
-    // What brakes pushes from now on: the speed that 0.05 N·m·s/rad lets grow e-fold in 0.24 s gains 20 rad/s.
+    // The former brake accelerates from now on: 0.05 N·m·s/rad makes the speed grow e-fold in 0.24 s, by 20 rad/s in
+    // all.
     let cause = within(stand.stops(since), 3_000 * MS);
     assert!(matches!(cause, Cause::RunAway(_) | Cause::Speed(..)), "{cause:?}");
 }
@@ -338,7 +339,7 @@ fn row_7_nobody_acknowledges_and_a_queue_that_is_full() {
     assert!(matches!(within(stand.trips(now), 4 * MS), Cause::Bus(0) | Cause::Lost(_)));
 }
 
-/// Every frame that the rig sends while it is under way: SYNC, set-points, its heartbeat.
+/// Every frame that a running rig sends: SYNC, set-points, its heartbeat.
 const SENT: [u32; 4] = [0x080, 0x203, 0x204, 0x77F];
 
 #[test]
@@ -347,11 +348,11 @@ fn row_7_a_queue_that_is_full_for_one_frame() {
         let mut stand = Stand::armed(|_, _| ());
         let now = stand.now();
         stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Full).id(id).from(now));
-        // The heartbeat goes out each other period and a half.
+        // The heartbeat is sent every one and a half periods.
         let cause = within(stand.trips(now), if id == 0x77F { 6 * MS } else { 2 * MS });
         assert_eq!(cause, Cause::Bus(0), "{id:03X}");
     }
-    // One frame that is not taken, while the rig stops already, is not a reason to forget the stop.
+    // A single refused frame while the rig already stops must not cancel the stop.
     let mut stand = Stand::armed(|_, _| ());
     let now = stand.now();
     stand.world.bus(0).plant(MASTER, Fault::new(FaultKind::Full).id(0x204).from(now).times(1));
@@ -379,14 +380,14 @@ fn row_14_commands_that_are_lost_on_the_way() {
             "{:?}",
             stand.cause
         );
-        // It hears neither the stop; without our life sign it stops by itself.
+        // The drive does not receive the stop either; without our heartbeat it stops by itself.
         stand.stops(stand.now());
     }
 }
 
 #[test]
 fn row_14_set_points_that_stay_away_from_a_drive_that_stands() {
-    // No torque is asked for, so that nothing but the deadline can tell.
+    // No torque is requested, so only the deadline can reveal the loss.
     for id in [0x203, 0x204] {
         let mut stand = Stand::armed(|_, model| param(model, 0, 0.0));
         let now = stand.now();
@@ -400,7 +401,7 @@ fn row_14_set_points_that_stay_away_from_a_drive_that_stands() {
 #[test]
 fn row_14_a_drive_that_hears_neither_set_points_nor_the_stop() {
     for (kind, id) in [FaultKind::Drop, FaultKind::Full].into_iter().flat_map(|kind| [(kind, 0x203), (kind, 0x204)]) {
-        // Without a deadline of its own it goes on with its last torque: the stop takes the way of its set-points.
+        // Without a deadline of its own the drive keeps its last torque: the stop uses the path of the set-points.
         let mut stand = Stand::new(quick(), 1, |_, model| param(model, 0, 1.5));
         (0..2).for_each(|node| stand.world.bench().drive(node).unwrap().without_deadlines());
         stand.reach(Step::Armed);
@@ -546,7 +547,7 @@ fn row_13_what_is_wrong_with_a_drive_is_found_before_arming() {
         stand.at_rest();
     }
     let mut wrong = Stand::new(slow, 1, |rig, _| cia402(rig, 0).rated_torque = 5.0);
-    // The bench was made of the same rig: it is the drive that has another rated torque.
+    // The simulated plant was built from the same rig, so the drive's rated torque is changed instead.
     wrong.world.bench().drive(0).unwrap().objects().set(crate::canopen::Object(0x6076, 0), 4000);
     assert!(matches!(wrong.ends(), End::Refused(why) if why.contains("load")));
 }
@@ -561,15 +562,15 @@ fn row_14_a_mode_that_is_not_the_one_asked_for() {
 
 #[test]
 fn row_15_encoders() {
-    // So many counts that the position passes the end of its 32 bits.
+    // Enough counts for the position to overflow its 32 bits.
     let mut wraps = Stand::new(quick(), 3, |_, model| param(model, 1, 0.0));
     wraps.reach(Step::Armed);
     wraps.goes_on(300 * MS);
-    // A glitch of a quarter turn in one answer is not believed.
+    // A glitch of a quarter turn in one answer is rejected.
     let mut glitch = Stand::armed(|_, _| ());
     glitch.effect(1, Effect::EncoderGlitch(65_536), Some(MS));
     glitch.goes_on(50 * MS);
-    // One that stays is no glitch.
+    // A lasting jump is no glitch.
     let mut jump = Stand::armed(|_, _| ());
     let since = jump.effect(1, Effect::EncoderLost(65_536), None);
     let cause = within(jump.stops(since), 5 * MS);
@@ -595,8 +596,8 @@ fn row_16_a_data_word_that_is_wrong() {
         stand.goes_on(300 * MS);
         let now = stand.now();
         stand.world.bus(0).plant(BENCH, Fault::new(FaultKind::Corrupt).id(id).from(now).times(1));
-        // One bit of one answer: what is believed of a speed is never further off than 3 N·m on four times the shaft
-        // could turn it in a tick; a status word may say that the drive has stopped.
+        // One wrong bit in one answer: the accepted speed is never further off than the change that 3 N·m times four
+        // can cause on the shaft in one tick; a wrong status word may say that the drive has stopped.
         for _ in 0..100 {
             if stand.hil.ended().is_some() {
                 break;
@@ -612,7 +613,7 @@ fn row_16_a_data_word_that_is_wrong() {
         assert!(stand.cause.is_none_or(|(cause, _)| known(&cause)), "{:03X}, seed {seed}: {:?}", id, stand.cause);
         assert!(stand.cause.is_none_or(|(_, at)| at - now <= 10 * MS), "{:?}", stand.cause);
     }
-    // A bit that is always wrong: 64 rad/s too many do not come from turning.
+    // A permanently wrong reading: 64 rad/s too many cannot come from an acceleration.
     let mut stand = Stand::armed(|_, _| ());
     let since = stand.effect(0, Effect::SpeedScale(30.0), None);
     let cause = within(stand.stops(since), 5 * MS);
@@ -624,7 +625,7 @@ fn row_17_and_18_a_process_that_is_frozen_or_gone() {
     for node in 0..2 {
         let stand = Stand::armed(|_, _| ());
         let now = stand.now();
-        // No cycle any more: the drives must notice by themselves.
+        // No further cycles: the drives must notice by themselves.
         stand.world.simulation().run_to(now + 60 * MS);
         let mut bench = stand.world.bench();
         let state = bench.drive(node).unwrap().state();
@@ -643,7 +644,7 @@ fn row_19_parameters_while_it_runs() {
         stand.goes_on(MS);
     }
     stand.operator.push(Command::Set(Set::new(&[(amplitude, f64::NAN)]).unwrap()));
-    // From now on the model would give no number.
+    // The model would become NaN from now on.
     stand.operator.push(Command::Set(Set::new(&[(end, 0.0)]).unwrap()));
     stand.goes_on(20 * MS);
     assert_eq!(stand.hil.counts().refused_sets, 2);
@@ -693,7 +694,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("log");
     assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
-    // A reader that never reads: the first write beyond the pipe's room waits for ever.
+    // A reader that never reads: the first write beyond the pipe's capacity blocks for ever.
     let mut options = std::fs::OpenOptions::new();
     let reader = options.read(true).custom_flags(libc::O_NONBLOCK).open(&path).unwrap();
     let log = Settings { sink: Sink::File(path, Limits::default()), cycles_per_block: 100, patient: false };
@@ -707,7 +708,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
     let dropped = stand.hil.counts().log_dropped;
     assert!(dropped >= 100, "{dropped} messages dropped in 100 cycles");
     assert_eq!(stand.hil.counts().missed, 0);
-    // Nobody at the other end: the file is broken, and that is said at the end.
+    // Without a reader the file is broken, and the end must report it.
     drop(reader);
     stand.goes_on(100 * MS);
     assert!(stand.operator.push(Command::Stop));
@@ -718,7 +719,7 @@ fn row_21_a_log_whose_disk_hangs_and_then_fails() {
     assert!(stand.hil.finish().is_err(), "the log is not whole");
 }
 
-/// The bristle, its load so late; looking ahead or not.
+/// The bristle model with a delayed load, with or without the predictor.
 fn late_bristle(delay: f64, predict: bool, swing: f64) -> (Rig, Instance, Instance) {
     let (mut rig, mut model, plant) = rigs::bristle();
     rig.nodes[0].delay = delay;
@@ -743,7 +744,7 @@ fn row_23_more_energy_comes_back_than_a_contact_can_hold() {
         let coupling = stand.hil.counts().coupling.unwrap();
         assert!(coupling.warnings > 0 && coupling.returned_max > 1.0, "{coupling:?}");
     }
-    // In time, the same contact gives back what it holds, having no damping, and no more.
+    // Without delay, and without damping, the same contact returns the energy that it stores and no more.
     let mut healthy = Stand::of(late_bristle(0.8e-3, true, 0.4), quick(), 1, None);
     healthy.reach(Step::Armed);
     healthy.goes_on(2_000 * MS);
@@ -760,7 +761,7 @@ fn row_23_a_shaft_that_is_not_as_told() {
         let mut stand = Stand::of(late_bristle(2e-3, true, 0.4), options, 1, None);
         stand.reach(Step::Armed);
         stand.goes_on(300 * MS);
-        // 5 mrad in one tick: the encoder may jump so far, the shaft cannot.
+        // 5 mrad in one tick: an encoder can jump so far, the shaft cannot.
         let since = stand.effect(0, Effect::EncoderLost(200), None);
         if needs_look {
             assert_eq!(within(stand.stops(since), 100 * MS), Cause::Unpredictable);
@@ -784,7 +785,7 @@ fn nothing_moves_again_without_the_operator() {
 }
 
 impl Stand {
-    /// As [`Stand::stops`] where the drives cannot be told: the cause alone.
+    /// Like [`Stand::stops`], for drives that cannot receive commands: waits for the trip only.
     fn trips(&mut self, since: u64) -> (Cause, u64) {
         while self.cause.is_none() {
             self.cycle();
@@ -805,18 +806,18 @@ impl Stand {
     }
 }
 
-/// Protections that generators alone hold.
+/// Protections that only the generated tests cover.
 #[cfg(feature = "mutants")]
 const ELSEWHERE: [&str; 11] =
     ["patient", "recorded", "reused", "unhurried", "loop", "bites", "hushed", "life", "counted", "late", "overload"];
 
-/// Each protection taken away makes the tests above fail: so they would notice if it were broken.
+/// Mutation test: without any one protection a test above must fail.
 #[cfg(feature = "mutants")]
 #[test]
 fn mutants_are_caught() {
     use std::io::{BufRead, BufReader};
     use std::process::Stdio;
-    // Ends with the first test that fails: without a latch or a report others would not end at all.
+    // Kills the tests at the first failure: without a latch or a report others would never end.
     let passes = |mutant: Option<&str>| {
         let mut tests = std::process::Command::new(std::env::current_exe().unwrap());
         tests.args(["hil::campaign::row", "hil::campaign::nothing", "hil::control", "hil::followed", "hil::emergency"]);

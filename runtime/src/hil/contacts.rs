@@ -1,9 +1,9 @@
-//! Contacts that a drive plays, on shafts that are as their inertia and torques say, or are not.
+//! Generated tests of contacts that a drive plays, on shafts that agree with the rig's inertia and torques, or do not.
 //!
-//! In: a seed: a contact, a shaft, delays, and something that hits, holds or misleads the shaft. Out: whether the rig noticed in
-//! time that the shaft is not as told, and that the contact gives back more energy than it holds. The reference is the shaft of
-//! the simulation itself: its equations, which the test wrote, and the energy, which is a state beside them. `FRIC_SEED=n`
-//! repeats one seed; `FRIC_RUNS=n` says how many there are.
+//! In: a seed, from which follow a contact, a shaft, delays, and a disturbance of the shaft. Out: whether the rig
+//! noticed in time that the shaft deviates from its model, and that the contact returns more energy than it can store.
+//! The reference is the simulated shaft itself: its equations, which the test defines, and its energy, which is an
+//! additional state. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::campaign::quick;
 use super::cycle::{End, Hil, look_ahead};
@@ -23,44 +23,45 @@ use std::f64::consts::TAU;
 
 /// Seeds in `cargo test`.
 const RUNS: u64 = 80;
-/// Steps of the shaft, ns.
+/// Step of the simulated shaft, ns.
 const STEP_NS: u64 = 100_000;
 const MS: u64 = 1_000_000;
-/// How long the model has the outputs, ns.
+/// Time for which the model drives the outputs, ns.
 const RUN_NS: u64 = 700 * MS;
-/// Time from which energies are summed, and in which they must be noticed, ns.
+/// Window in which energies are summed, and within which an excess must be noticed, ns.
 const WINDOW_NS: u64 = 100 * MS;
-/// How much later or earlier a reversal may be told than it is, ns: a small torque is within one step for as long.
+/// Possible shift of a measured reversal against the true one, ns: a small torque stays within one quantisation step
+/// for as long.
 const TOLD_NS: u64 = 30 * MS;
-/// How long a blow takes, s.
+/// Duration of a blow, s.
 const BLOW: f64 = 2e-4;
-/// Counts of the encoder in one tick that torques do not explain, from which on that must be noticed.
+/// Unexplained change of the encoder in one tick above which the rig must notice it, counts.
 const MANY: f64 = 20.0;
-/// Factor between the energy that must be noticed and that which must not stop a rig, around what docs/prediction.md says; and the
-/// part of the store that steps of torque and speed may make.
+/// Factor between the energy that must be noticed and the limits of docs/prediction.md, and between these and the
+/// energy that must not stop a rig; and the share of the store that quantisation of torque and speed may cause.
 const BAND: f64 = 1.6;
 const STEPS: f64 = 0.4;
 
-/// What happens to a shaft.
+/// Disturbance of a shaft.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Event {
     Nothing,
-    /// A blow changes its speed by so much, rad/s.
+    /// A blow changes the speed by this much, rad/s.
     Blow(f64),
-    /// A brake that nobody told seizes it.
+    /// A brake unknown to the rig seizes the shaft.
     Seized,
-    /// Its encoder loses so many counts.
+    /// The encoder loses this many counts.
     Lost(i64),
 }
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Script {
     seed: u64,
-    /// Moment of inertia as it is and as the rig says, kg·m².
+    /// True moment of inertia and that of the rig's text, kg·m².
     inertia: f64,
     told: f64,
-    /// Friction of the bearings, which nobody tells, N·m·s/rad.
+    /// Bearing friction, which the rig does not know, N·m·s/rad.
     bearings: f64,
     /// Stiffness of the contact at rest, N·m/rad; its break-away torque, N·m; its damping, N·m·s/rad.
     stiffness: f64,
@@ -69,14 +70,14 @@ struct Script {
     /// Amplitude of the servo, N·m, and its frequency, Hz.
     swing: f64,
     hertz: f64,
-    /// Of the load, s.
+    /// Dead time and lag of the load, s.
     delay: f64,
     lag: f64,
     predicts: bool,
     needs_look: bool,
     energy_stops: bool,
     event: Event,
-    /// From arming to the event, ns.
+    /// Time from arming to the event, ns.
     after: u64,
 }
 
@@ -163,7 +164,7 @@ impl Script {
         rig.inputs.iter_mut().enumerate().for_each(|(k, input)| input.slot = inside.inputs.slot(k));
         rig.outputs.iter_mut().enumerate().for_each(|(k, output)| output.slot = inside.outputs.slot(k));
         rig.record[0].slot = inside.outputs.slot(2);
-        // The servo first; position and speed at each drive.
+        // The servo comes first; each drive reads position and speed.
         rig.plant.applied.iter_mut().enumerate().for_each(|(k, (_, slot))| *slot = outside.inputs.slot(k));
         rig.plant.seen.iter_mut().enumerate().for_each(|(k, (_, slot))| *slot = outside.outputs.slot(k % 2));
         rig.predict = self.predicts.then_some(0);
@@ -171,18 +172,18 @@ impl Script {
         (rig, control, plant)
     }
 
-    /// The largest energy that the contact holds, J.
+    /// Greatest energy that the contact can store, J.
     fn store(&self) -> f64 {
         0.5 * self.most * self.most / self.stiffness
     }
 }
 
-/// Energies of the true torque and speed, in units of the store, since the model got the outputs.
+/// Energies from the true torque and speed, in units of the store, since the model drives the outputs.
 #[derive(Default)]
 struct Energies {
-    /// Time, and what was absorbed in that tick.
+    /// Time, and energy absorbed in that tick.
     ticks: VecDeque<(u64, f64)>,
-    /// When the other torque changed its sign.
+    /// Times at which the other torque changed its sign.
     reversals: VecDeque<u64>,
     other: f64,
     begun: Option<f64>,
@@ -196,7 +197,7 @@ impl Energies {
         self.ticks.push_back((now_ns, absorbed - self.absorbed));
         self.absorbed = absorbed;
         self.highest = self.highest.max(absorbed);
-        // Within a step of the torque its sign is not told.
+        // Within one quantisation step the sign of a torque is unknown.
         if other.abs() > 4e-3 {
             if other * self.other < 0.0 {
                 self.reversals.push_back(now_ns);
@@ -212,7 +213,7 @@ impl Energies {
         self.ticks.iter().map(|(_, work)| (-work).max(0.0)).sum()
     }
 
-    /// How closely a rig can sum them that reads torque and speed once a tick: the greatest of one tick.
+    /// Accuracy of the sum in a rig that reads torque and speed once per tick: the greatest energy of one tick.
     fn resolution(&self) -> f64 {
         self.ticks.iter().map(|(_, work)| work.abs()).fold(STEPS, f64::max)
     }
@@ -221,13 +222,13 @@ impl Energies {
         self.highest - self.absorbed
     }
 
-    /// What reversals of the last so many ns allow.
+    /// Energy that the reversals of the last `ns` permit.
     fn allowed(&self, now_ns: u64, ns: u64) -> f64 {
         1.5 * self.reversals.iter().filter(|at| **at + ns > now_ns).count() as f64
     }
 }
 
-/// What a run showed.
+/// Outcome of a run.
 #[derive(Clone, Copy, Debug, Default)]
 struct Shown {
     warned: bool,
@@ -240,9 +241,9 @@ struct Shown {
 /// Runs a script.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(script: &Script) -> Result<Shown, String> {
-    // The start takes the same time whatever happens later: a first one shows how long.
+    // The start-up takes the same time in both runs, so a first run measures it.
     let armed_ns = {
         let (mut hil, world, _) = started(&Script { event: Event::Nothing, ..*script }, f64::INFINITY);
         while hil.ended().is_none() && hil.counts().cycles == 0 {
@@ -266,7 +267,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     let mut shown = Shown::default();
     let mut energies = Energies::default();
     let (mut unpredicted, mut warnings) = (0, VecDeque::from([(0u64, 0u64)]));
-    // Deadlines of what must be noticed.
+    // Deadlines for the reactions.
     let (mut must_look, mut must_warn, mut must_stop) = (None, None, None);
     let mut speed = 0.0f64;
     let mut before_event = None;
@@ -284,7 +285,7 @@ fn run(script: &Script) -> Result<Shown, String> {
             (plant.get(plant.description().layout.states.slot(2)), bench.shaft(1).torque)
         };
 
-        // The shaft.
+        // Predictor: the shaft.
         let looked = counts.unpredicted > unpredicted;
         if looked {
             let (got, read) = (control.model().get(speed_slot), hil.seen()[0].speed.unwrap_or(f64::NAN));
@@ -299,12 +300,12 @@ fn run(script: &Script) -> Result<Shown, String> {
             let by = match script.event {
                 Event::Nothing => 0.0,
                 Event::Blow(by) => by.abs() * period as f64 * 1e-9 / count,
-                // In the first tick it loses more than a third of its speed.
+                // In its first tick the shaft loses more than a third of its speed.
                 Event::Seized => 0.35 * speed.abs() * period as f64 * 1e-9 / count,
                 Event::Lost(counts) => counts.unsigned_abs() as f64,
             };
             if by > MANY && as_told && tripped.is_none() {
-                // The tick in which it happens, and three.
+                // The tick of the event, and three more.
                 must_look = Some(now_ns + 4 * period);
             }
         }
@@ -323,7 +324,7 @@ fn run(script: &Script) -> Result<Shown, String> {
             return Err(format!("at {now_ns} ns it does not look ahead, and the shaft is as told"));
         }
 
-        // The energy.
+        // Passivity observer: the energy.
         let store = script.store();
         energies.note(now_ns, absorbed / store, other);
         let (returned, fall, coarse) = (energies.returned(), energies.fall(), energies.resolution());
@@ -359,7 +360,7 @@ fn run(script: &Script) -> Result<Shown, String> {
             return Err(format!("{returned:.2} came back, {fall:.2} fell, and it goes on"));
         }
         if tripped.is_some() {
-            // What was due to be noticed has stopped it.
+            // The pending event has stopped the rig.
             shown.unpredicted |= must_look.is_some();
             shown.needed |= must_look.is_some() && tripped == Some(Cause::Unpredictable);
             shown.warned |= must_warn.is_some();
@@ -373,7 +374,7 @@ fn run(script: &Script) -> Result<Shown, String> {
     Ok(shown)
 }
 
-/// The rig of a script, about to start.
+/// The rig of a script before its start.
 fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
     let (rig, control, plant) = script.build(at);
     let mut options = quick();
@@ -388,7 +389,7 @@ fn started(script: &Script, at: f64) -> (Hil, World, Rig) {
     (hil, world, rig)
 }
 
-/// A script made plainer, as long as it fails.
+/// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
     let (mut best, mut how) = (*script, why);
     'again: loop {

@@ -1,41 +1,41 @@
-//! What a rig counts while it runs.
+//! Counters of a running rig.
 
 use super::coupling;
 use crate::realtime::histogram::Histogram;
 
-/// What was counted.
+/// Counters since the start.
 #[derive(Clone, Default)]
 pub struct Counts {
     /// Cycles in which the model ran.
     pub cycles: u64,
-    /// Cycles of all kinds.
+    /// All cycles.
     pub all: u64,
-    /// Times a cycle began a period late or more.
+    /// Cycles that began at least one period late.
     pub overruns: u64,
     /// Ticks missed by them.
     pub missed: u64,
-    /// Readings of drives that a model's cycle had to hold.
+    /// Readings of drives that were held from an earlier tick in a cycle of the model.
     pub stale: u64,
     /// Frames lost before they were read.
     pub lost_frames: u64,
-    /// Frames that a bus did not take.
+    /// Frames that a bus refused to send.
     pub refused_frames: u64,
     /// Error frames, and warnings of buses.
     pub bus_errors: u64,
     /// Outputs clamped by range, slew, power.
     pub clamped: [u64; 3],
-    /// Cycles the log dropped.
+    /// Messages that the log dropped.
     pub log_dropped: u64,
-    /// Sets of parameters that were refused.
+    /// Refused sets of parameters.
     pub refused_sets: u64,
-    /// Looking ahead, and energy of the contacts; none: the rig has neither.
+    /// Predictor and passivity observers; none: the rig has neither.
     pub coupling: Option<coupling::Counts>,
-    /// How late cycles began.
+    /// Lateness of the starts of cycles.
     pub late: Histogram,
-    /// From the begin of a cycle to the last answer read.
+    /// Time from the start of a cycle to its last answer.
     pub receive: Histogram,
-    /// Model and safety.
+    /// Time of model and safety.
     pub compute: Histogram,
-    /// Commands out.
+    /// Time of sending commands.
     pub send: Histogram,
 }
