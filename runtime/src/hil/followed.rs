@@ -1,67 +1,69 @@
-//! Whether a drive does what it was told: its reading of the commanded quantity, compared with the commands sent to it.
+//! Checks that a drive follows its commands: compares its reading of the commanded quantity with the commands sent to
+//! it.
 //!
 //! In: permitted commands, readings. Out: whether a drive has not followed for too long. Knows neither bus nor model.
 //!
-//! The commands of the last ticks, taken together, bound what a first-order lag after any dead time up to the drive's own
-//! can have reached: its output stays between two envelopes. Each is the extreme command of the window, or the envelope
-//! of the tick before as far as it has decayed towards that:
+//! The method is a reachable-set bound. The commands of the last ticks bound the output of a first-order lag after any
+//! dead time up to that of the drive: the output stays between two envelopes. Each envelope is the extreme command of
+//! the window, or the previous envelope after it has decayed towards that command:
 //!
 //!   high(k) = max(u, high(k−1) + s·(u − high(k−1)))     u = greatest command of the window
 //!   s       = T / (T + τ)  ≤  1 − e^(−T/τ)              never faster than the lag itself
 //!
-//! A reading outside of the envelopes by more than a tolerance is one that no command explains.
+//! No command explains a reading that lies outside of the envelopes by more than a tolerance.
 
 use super::watches;
 use crate::drive::profiles;
 use crate::safety::{OutputLimits, Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, What};
 
-/// Dead time beyond the drive's own for which a command may be under way, s: a late cycle, a busy bus.
+/// Dead time beyond that of the drive for which a command may be under way, s: a late cycle, a busy bus.
 const SLACK: f64 = 1e-3;
-/// Dead time and lag that a drive may have which are being measured, s.
+/// Assumed dead time and lag of a drive while these are being identified, s.
 const UNKNOWN: f64 = 20e-3;
-/// How much slower than told the lag of a drive may be.
+/// Factor by which the lag of a drive may exceed that of the rig's text.
 const SLOWER: f64 = 1.5;
-/// Tolerance of a torque, as part of the rated torque: offset and noise of a drive's own measurement.
+/// Tolerance of a torque, as a share of the rated torque: offset and noise of a drive's own measurement.
 const TORQUE_PART: f64 = 0.03;
-/// Ticks without a break outside of the envelopes after which a torque is not followed.
+/// Unbroken number of ticks outside of the envelopes after which a torque is not followed.
 const TORQUE_TICKS: u32 = 5;
-/// Time constant that a loop for speed or position may have, s, and the time it may need for a large step, ns: what the
-/// drive and its load make of a set-point is not in the text of a rig.
+/// Time constant allowed for a speed or position controller, s, and the time allowed for a large step, ns: the response
+/// of a drive and its load to a set-point is not part of a rig's text.
 const LOOP: f64 = 0.1;
 const LOOP_NS: u64 = 1_000_000_000;
-/// Tolerance of a speed or a position, as part of half the range of its command.
+/// Tolerance of a speed or a position, as a share of half the range of its command.
 const LOOP_PART: f64 = 0.1;
-/// Longest time for which a command may be under way, s: the window is looked through in each cycle.
+/// Longest time for which a command may be under way, s: every cycle scans the whole window.
 const MOST_DEAD: f64 = 0.25;
-/// Most ticks that an envelope is carried over at once: after so many it has decayed, whatever the lag.
+/// Most ticks by which an envelope is advanced at once: after so many it has decayed, whatever the lag.
 const MOST_TICKS: u32 = 1000;
 
-/// The watch of one drive.
+/// State of the check of one drive.
 pub struct Followed {
-    /// Index of its node.
+    /// Index of the drive's node.
     pub node: usize,
-    /// Its command among the outputs.
+    /// Index of its command among the outputs.
     pub output: usize,
-    /// Its answer among the signals.
+    /// Index of its answer among the signals.
     pub signal: usize,
-    /// It is judged in the start-up too.
+    /// Whether it is also checked during the start-up.
     early: bool,
-    /// Commands of the last ticks, and where the next one goes.
+    /// Ring buffer of the last commands, and the index for the next one.
     window: Vec<f64>,
     at: usize,
-    /// How far an envelope decays in a tick.
+    /// Share by which an envelope decays in one tick.
     share: f64,
     low: f64,
     high: f64,
     tolerance: f64,
     patience: u32,
-    /// Ticks without a break outside of the envelopes.
+    /// Unbroken number of ticks outside of the envelopes.
     outside: u32,
 }
 
 impl Followed {
-    /// The watch of an output whose answer is at this place among the signals. `measures`: its times are not known yet.
+    /// The check of an output whose answer has this index among the signals. `measures`: dead time and lag are not
+    /// known yet. None if the drive reports no such quantity.
     pub fn new(rig: &Rig, output: usize, signal: usize, limits: &OutputLimits, measures: bool) -> Option<Followed> {
         let (commanded, at) = (rig.outputs[output].signal, watches::answer(rig, &rig.outputs[output])?);
         let node = &rig.nodes[at.node];
@@ -78,15 +80,15 @@ impl Followed {
                     Mode::Speed => LOOP_PART * half + 4.0 * drive.speed_unit,
                     Mode::Position => LOOP_PART * half + 4.0 * drive.count,
                 };
-                // A drive with a grid of its own takes a command up to one grid late, and tells up to one grid late; one that
-                // waits for SYNC takes it with the next one.
+                // A drive with a time grid of its own accepts a command up to one grid period late, and reports up to
+                // one grid period late; a drive that waits for SYNC accepts it with the next one.
                 let waits = if drive.at_sync { period } else { 0.0 };
                 (tolerance, waits + 2.0 * profile.refresh_ns as f64 * 1e-9)
             }
             Kind::Frames(messages) => {
                 let What::Field(message, field) = at.what else { return None };
                 let message = &messages[message];
-                // What it tells may be as old as its frames are apart.
+                // Its reading may be as old as the interval between its frames.
                 let apart_ns = if message.period_ns > 0 { message.period_ns } else { node.timeout_ns };
                 (LOOP_PART * half + 4.0 * message.fields[field].scale.abs(), apart_ns as f64 * 1e-9)
             }
@@ -111,24 +113,24 @@ impl Followed {
         })
     }
 
-    /// The same, with so many ticks at least.
+    /// The same check, but with a patience of at least this many ticks.
     pub fn patient(self, least: u32) -> Followed {
         Followed { patience: self.patience.max(least), ..self }
     }
 
-    /// Whether it is judged while the start-up asks for the outputs.
+    /// Whether it is also checked while the start-up requests the outputs.
     pub fn is_early(&self) -> bool {
         self.early
     }
 
-    /// Nothing was commanded yet, and this is what it tells.
+    /// Resets the check while nothing is commanded: `told` is the reading, `idle` the value sent.
     pub fn rest(&mut self, told: f64, idle: f64) {
         self.window.fill(idle);
         (self.low, self.high, self.outside) = (told.min(idle), told.max(idle), 0);
     }
 
-    /// So many ticks have passed with this command. True: what the drive told in this tick, if it did, has been outside of
-    /// the envelopes for too long.
+    /// Advances by `ticks` with the command `sent`. Returns true if the reading of this tick, where there is one, has
+    /// been outside of the envelopes for too long.
     pub fn judge(&mut self, ticks: u32, sent: f64, told: Option<f64>) -> bool {
         for _ in 0..ticks.min(MOST_TICKS) {
             self.window[self.at] = sent;
@@ -148,13 +150,13 @@ impl Followed {
         self.outside >= self.patience && is_present(Protection::Followed) && is_present(watches)
     }
 
-    /// All that the next cycle depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Followed::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend(self.window.iter().chain([&self.low, &self.high]).map(|x| x.to_bits()));
         words.extend([self.at as u64, self.outside.into()]);
     }
 
-    /// Takes over what [`Followed::save`] gave. None if it does not fit.
+    /// Restores the state that [`Followed::save`] wrote. None if it does not fit.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         for x in self.window.iter_mut().chain([&mut self.low, &mut self.high]) {
             *x = f64::from_bits(words.next()?);
@@ -183,9 +185,10 @@ mod tests {
         Followed::new(&rig, 0, 0, &limits, false).unwrap()
     }
 
-    /// A drive that gets the commands until tick `lost` and keeps the last one from then on; each acts from its tick plus
-    /// the dead time on (ms), through a lag (ms), and the torque is told in steps of 4 mN·m at each tick. The tick in which
-    /// the watch trips, and the first tick from which on what is told was further than 0.3 N·m from what was sent.
+    /// Simulates a drive that receives the commands until tick `lost` and keeps the last one from then on. Each command
+    /// acts after the dead time (ms), through a lag (ms); the torque is reported in steps of 4 mN·m in each tick.
+    /// Returns the tick in which the check trips, and the first tick of the interval in which the reading differs from
+    /// the command by more than 0.3 N·m.
     fn run(
         watch: &mut Followed,
         (dead, lag): (f64, f64),
@@ -240,7 +243,7 @@ mod tests {
             let mut random = Chance(seed);
             let (dead, lag) = (random.between(0.0, 6.0), random.between(0.0, 3.0));
             let lost = 100 + random.below(100) as u32;
-            // It stays where it was; the command goes to one end.
+            // The drive keeps its value while the command moves to one end of the range.
             let end = if random.below(2) == 0 { -1.0 } else { 1.0 };
             let mut before = steps(random);
             let command = |k: u32| if k < lost { before(k) } else { end };

@@ -1,4 +1,4 @@
-//! Counts what this thread asks of the heap, in tests of this crate and of the rig (tests/hil.rs).
+//! Counts the heap allocations of the current thread, for tests of this crate and of the rig (tests/hil.rs).
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -9,15 +9,15 @@ thread_local! {
     static ASKED: Cell<u64> = const { Cell::new(0) };
 }
 
-// SAFETY: every call goes to the system's allocator as it came.
+// SAFETY: every call is passed unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         let _ = ASKED.try_with(|asked| asked.set(asked.get() + 1));
-        // SAFETY: as the caller promised.
+        // SAFETY: the caller's promise holds for the system's allocator too.
         unsafe { System.alloc(layout) }
     }
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promised.
+        // SAFETY: the caller's promise holds for the system's allocator too.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -25,7 +25,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static HEAP: Counting = Counting;
 
-/// Pieces asked for by this thread until now.
+/// Number of allocations of this thread since its start.
 pub fn asked() -> u64 {
     ASKED.with(Cell::get)
 }

@@ -1,8 +1,8 @@
-//! What must hold at every tick of every run, whatever fails.
+//! Invariants: properties that hold at every tick of every run, whatever fails.
 //!
-//! In: a rig under way, the frames it has sent, the truth about drives and shaft. Out: the first property that is broken.
-//! The truth comes from the simulated bench and from the wire; of the rig itself only what it claims is believed: the step
-//! of its start-up, its order, its cause, the permitted outputs.
+//! In: a running rig, the frames it has sent, the true state of drives and shaft. Out: the first violated property. The
+//! truth comes from the simulated plant and from the bus; the rig itself is trusted only for its claims: the step of
+//! its start-up, its drive command, its cause, the permitted outputs.
 
 use super::rigs::{FRAME_COMMAND, Made};
 use super::space::{Ill, MS, Script, What};
@@ -18,106 +18,107 @@ use crate::safety::{DriveCommand, Reaction};
 use abi::rig::{Kind, Mode, Rig};
 use std::collections::VecDeque;
 
-/// Ticks over which outputs come up from their safe values.
+/// Ticks of the ramp in which outputs rise from their safe values.
 pub const RAMP: u64 = 10;
-/// Time for which an output may be outside its limits without a break.
+/// Longest unbroken time for which an output may be outside its limits.
 pub const CLAMPED_NS: u64 = 60 * MS;
-/// From a controlled stop to the quick stop, and from there to disabled, at most.
+/// Longest time from a controlled stop to the quick stop, and from there to disabled.
 pub const STANDSTILL_NS: u64 = 200 * MS;
-/// Time in which a drive that does not follow its permitted torque must have led to a stop, beyond delay and lag.
+/// Time within which a drive that does not follow its permitted torque must have caused a stop, beyond delay and lag.
 const FOLLOW_NS: u64 = 30 * MS;
-/// The same for a drive that follows a speed or a position by itself.
+/// The same for a drive that controls a speed or a position itself.
 const SLOW_FOLLOW_NS: u64 = 1_300 * MS;
-/// Time in which a speed or an angle beyond its limit must have led to a stop: what is lost or not believed is held meanwhile.
+/// Time within which a speed or angle beyond its limit must have caused a stop: missing or implausible readings are
+/// held meanwhile.
 const BEYOND_NS: u64 = 10 * MS;
-/// Ticks for which a reading may be held, and some for its way.
+/// Ticks for which a reading may be held, plus some for its transport.
 const SEEN: usize = 8;
-/// Cycles in a row in which frames may be lost: in the last one they have led to a stop.
+/// Number of successive cycles with lost frames that must have caused a stop.
 const LOSSY: u32 = 3;
-/// What a brake of the drive itself leaves.
+/// Time in which a drive's own brake may leave some torque.
 const BRAKE_NS: u64 = 5 * MS;
-/// A drive that keeps an old set-point gives it once it is enabled, until it has not followed for five ticks: these, the way
-/// there and back, and its lag.
+/// A drive that keeps an old set-point applies it once it is enabled, until it has not followed for five ticks: those
+/// ticks, the transport in both directions, and its lag.
 const KEPT_NS: u64 = 15 * MS;
-/// The time after which a drive misses its set-points, and a slack for a late cycle.
+/// Time after which a drive must notice missing set-points, with a margin for a late cycle.
 const DEADLINE_NS: u64 = 25 * MS;
-/// After the time-outs of a controlled stop: the drives' own time-out, their reaction, their lag.
+/// Time beyond the time-outs of a controlled stop: the drives' own time-out, their reaction, their lag.
 const OFF_NS: u64 = 80 * MS;
 
-/// A property.
+/// A property that a run can violate.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Broken {
-    /// A torque on the wire is beyond its limit.
+    /// A torque on the bus exceeds its limit.
     WireLimit,
-    /// A torque on the shaft is beyond its limit.
+    /// A torque on the shaft exceeds its limit.
     ShaftLimit,
-    /// A command is not within its limits or changes faster than its slew, or is not a number.
+    /// A command is outside its limits, exceeds its slew, or is not finite.
     Permitted,
-    /// More power than permitted.
+    /// A drive's power exceeds its limit.
     Power,
-    /// Outputs do not come up from their safe values.
+    /// Outputs do not ramp up from their safe values.
     Ramp,
-    /// A drive does something else than what is permitted, and no stop is under way.
+    /// A drive does not apply the permitted value, and no stop is under way.
     Follow,
     /// Torque before arming.
     BeforeArm,
-    /// Torque after the bound of a stop, or more of it during the stop.
+    /// Torque after the time bound of a stop, or increasing torque during the stop.
     AfterStop,
-    /// A frame that the bus refused did not stop the rig in the cycle after it.
+    /// A frame that the bus refused did not stop the rig in the next cycle.
     Refused,
-    /// A drive stays enabled although no set-point reaches it.
+    /// A drive stays enabled although no set-points reach it.
     Deadline,
-    /// A tick missed in every cycle, more than the rig bears, and no stop is under way.
+    /// More successive cycles missed a tick than the rig permits, and no stop is under way.
     Overrun,
-    /// A position on the wire lies the other way round.
+    /// A position on the bus lies on the wrong side because its counts overflowed.
     Wrapped,
-    /// A drive that is not simulated got what only simulated ones may have.
+    /// A drive that is not simulated was enabled under options for simulated drives only.
     Permission,
-    /// The rig goes by a speed that the shaft does not have, and no stop is under way.
+    /// The rig uses a speed that the shaft does not have, and no stop is under way.
     Blind,
-    /// Motion again after a stop without the operator.
+    /// Motion after a stop without the operator.
     Latch,
-    /// Too fast, and no stop is under way.
+    /// The speed is beyond its limit, and no stop is under way.
     Speed,
-    /// Too far, and no stop is under way.
+    /// The position is beyond its limit, and no stop is under way.
     Travel,
-    /// Faster and faster against the torque, and no stop is under way.
+    /// The shaft accelerates against its torque, and no stop is under way.
     RunAway,
-    /// A request outside its limits for too long, and no stop is under way.
+    /// A request was outside its limits for too long, and no stop is under way.
     Clamped,
-    /// The model gives no number, and no stop is under way.
+    /// The model's request is not finite, and no stop is under way.
     NoNumber,
     /// Limits were widened.
     Widened,
-    /// A set of parameters was taken in part, or vanished.
+    /// A set of parameters was accepted in part, or vanished.
     Set,
-    /// The same readings give other outputs.
+    /// A replay of the same readings computes other outputs.
     Replay,
-    /// A cycle asked something of the heap.
+    /// A cycle allocated on the heap.
     Heap,
     /// A stop without a reason.
     Needless,
-    /// It never ends.
+    /// The run does not end.
     Endless,
-    /// A reading is believed that is further off than the shaft can be.
+    /// The rig accepts a reading that is further off than the shaft can be.
     Jump,
-    /// Such readings three times in a row, and no quick stop is under way.
+    /// Three successive implausible readings, and no quick stop is under way.
     Odd,
-    /// A reading is believed that is no number.
+    /// The rig accepts a reading that is not finite.
     Infinite,
-    /// A drive's position turns otherwise than its speed says, and no quick stop is under way.
+    /// Position and speed of a drive disagree, and no quick stop is under way.
     Agree,
-    /// A frame came that only another master sends, and no quick stop is under way.
+    /// A frame arrived that only another master sends, and no quick stop is under way.
     Foreign,
-    /// Frames were lost in three cycles in a row, and no stop is under way.
+    /// Frames were lost in three successive cycles, and no stop is under way.
     Overload,
-    /// A drive shows that it does not follow, and no stop is under way.
+    /// A drive reports that it does not follow, and no stop is under way.
     Shown,
-    /// Our own code has failed.
+    /// Our own code panicked.
     Panic,
 }
 
-/// How a run has failed.
+/// The violation that a run found.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Violation {
     pub broken: Broken,
@@ -125,76 +126,76 @@ pub struct Violation {
     pub text: String,
 }
 
-/// What a node does about one output.
+/// State of the checks of one output.
 struct Watched {
     node: usize,
     /// None: described by frames.
     mode: Option<Mode>,
-    /// Greatest command, and greatest torque whatever it follows.
+    /// Highest command, and highest torque in any mode.
     most: f64,
     torque: f64,
     slew: f64,
     power: f64,
-    /// One step on the wire, SI.
+    /// One quantisation step on the bus, SI.
     step: f64,
-    /// From a command to its whole effect, ns.
+    /// Time from a command to its full effect, ns.
     window_ns: u64,
     /// Permitted values with their times, the newest last.
     history: VecDeque<(u64, f64)>,
     last: f64,
-    /// Since when the drive does something else.
+    /// Time since which the drive deviates from the permitted values.
     astray_ns: Option<u64>,
     clamped_ns: Option<u64>,
-    /// When its drive last braked by itself.
+    /// Time at which its drive last braked by itself.
     braked_ns: u64,
-    /// Since when it has torque before arming.
+    /// Time since which it has torque before arming.
     loose_ns: Option<u64>,
-    /// When its last set-point was on the wire.
+    /// Time at which its last set-point was on the bus.
     heard_ns: u64,
-    /// The position that its drive tells.
+    /// The position that its drive reports, counts.
     counts: i32,
-    /// Its set-points may be wrong in spite of their checksum.
+    /// A fault may corrupt its set-points under a valid checksum.
     garbled: bool,
     /// It may keep an old set-point.
     keeps: bool,
-    /// A drive that hears nobody, or whose command cannot be heard back: nothing on the bus stops it.
+    /// A drive that receives nothing, or whose commands have no read-back: nothing on the bus stops it.
     deaf: bool,
 }
 
-/// Judges one program's run.
+/// Checks the run of one program.
 pub struct Judge {
     watched: Vec<Watched>,
     travel: f64,
     speed: f64,
-    /// The shaft when it was armed, rad.
+    /// Position of the shaft at arming, rad.
     origin: Option<f64>,
     fast_ns: Option<u64>,
     far_ns: Option<u64>,
-    /// Least speed since torque began to brake the shaft.
+    /// Lowest speed since torque began to brake the shaft.
     least: f64,
     astray_power_ns: Option<u64>,
     before: Step,
     /// Cycles since arming.
     armed: Option<u64>,
     pushed_ns: u64,
-    /// The first cause, and when it was seen.
+    /// Time at which the first cause was seen.
     tripped_ns: Option<u64>,
     ordered: bool,
     /// Cycles since the bus refused a frame.
     refused: Option<u32>,
-    /// Cycles in a row that missed a tick.
+    /// Number of successive cycles that missed a tick.
     behind: u32,
     hold: u32,
     far: bool,
     /// True speeds of the shaft, the newest last.
     speeds: VecDeque<f64>,
     blind_ns: Option<u64>,
-    /// What a drive tells may be wrong.
+    /// A fault may falsify a drive's readings.
     lies: bool,
-    /// Our end of a bus may be cut off for good.
+    /// A fault may cut off our end of a bus for good.
     cut: bool,
     told: Vec<Told>,
-    /// Cycles in a row in which a bus has said that frames were lost.
+    /// Number of successive cycles in which a bus reported lost frames.
     lossy: u32,
 }
 
@@ -212,7 +213,7 @@ impl Judge {
             let unheard = |what: What| match what {
                 What::Frame(_, FRAME_COMMAND, _) | What::Short(_) | What::Unplugged(_) | What::Alone(_) => true,
                 What::Down(_) | What::Babble(_) | What::Frozen(_) => true,
-                // Frames that fail again and again take their node off the bus.
+                // A node whose frames fail again and again goes bus-off.
                 What::Frame(_, _, Ill::Disturbed) => true,
                 What::Frame(..) | What::Node(..) | What::Foreign(..) | What::Overrun(..) | What::NoNumber(..) => false,
             };
@@ -267,7 +268,7 @@ impl Judge {
         }
     }
 
-    /// A frame that was on the wire.
+    /// Notes a frame that was on the bus.
     pub fn heard(&mut self, rig: &Rig, bus: usize, frame: &Frame, stamp_ns: u64) {
         for watched in &mut self.watched {
             let node = &rig.nodes[watched.node];
@@ -280,12 +281,12 @@ impl Judge {
         }
     }
 
-    /// When the rig first said that it stops.
+    /// Time at which the rig first reported that it stops.
     pub fn tripped_ns(&self) -> Option<u64> {
         self.tripped_ns
     }
 
-    /// One tick, with the frames of its cycle.
+    /// Checks one tick, with the frames of its cycle.
     pub fn tick(&mut self, hil: &Hil, world: &World, rig: &Rig, traffic: &Traffic) -> Result<(), Violation> {
         let sent = &traffic.sent;
         let now_ns = world.simulation().now_ns();
@@ -343,7 +344,7 @@ impl Judge {
         self.judge_rest(world, now_ns)
     }
 
-    /// What has come from the buses, and what is made of it.
+    /// Checks the rig's reactions to the received traffic.
     fn judge_traffic(&mut self, hil: &Hil, rig: &Rig, traffic: &Traffic, now_ns: u64) -> Result<(), (Broken, String)> {
         let quick = matches!(hil.order(), DriveCommand::QuickStop | DriveCommand::Disable);
         let stops = self.tripped_ns.is_some();
@@ -370,7 +371,7 @@ impl Judge {
         Ok(())
     }
 
-    /// What is believed of the shaft is what it did a moment ago.
+    /// Checks that the accepted speed is one that the shaft had a moment ago.
     fn judge_sight(&mut self, hil: &Hil, world: &World, now_ns: u64, moves: bool) -> Result<(), (Broken, String)> {
         self.speeds.push_back(world.bench().shaft(0).speed);
         if self.speeds.len() > SEEN {
@@ -390,7 +391,7 @@ impl Judge {
         Ok(())
     }
 
-    /// What was handed to the buses.
+    /// Checks the frames that were handed to the buses.
     fn judge_wire(&self, rig: &Rig, sent: &[(usize, Frame, bool)], step: Step) -> Result<(), (Broken, String)> {
         for (bus, frame, _) in sent {
             for watched in &self.watched {
@@ -422,7 +423,7 @@ impl Judge {
         Ok(())
     }
 
-    /// A position on the wire, from where the shaft is, lies on the side where it is permitted.
+    /// Checks that a position on the bus, relative to the shaft, lies on the permitted side.
     fn judge_way(&self, watched: &Watched, rig: &Rig, bus: usize, frame: &Frame) -> Result<(), (Broken, String)> {
         let node = &rig.nodes[watched.node];
         let (Kind::Cia402(drive), Some(Mode::Position), true) = (&node.kind, watched.mode, self.far) else {
@@ -437,7 +438,7 @@ impl Judge {
         }
         let bytes: [u8; 4] = frame.data()[2..6].try_into().expect("a position has four bytes");
         let target = i32::from_le_bytes(bytes);
-        // As a drive takes it that does not count round.
+        // Interpreted as by a drive whose counts do not wrap.
         let way = (f64::from(target) - f64::from(watched.counts)) * drive.count;
         // The shaft turns by less than this while the command is under way.
         if way.abs() > 100.0 && way.signum() != watched.last.signum() && watched.last != 0.0 {
@@ -446,7 +447,7 @@ impl Judge {
         Ok(())
     }
 
-    /// What the drives do.
+    /// Checks the drives' torques and states.
     fn judge_drives(&mut self, world: &World, now_ns: u64, step: Step, moves: bool) -> Result<(), (Broken, String)> {
         let mut bench = world.bench();
         for watched in &mut self.watched {
@@ -464,13 +465,14 @@ impl Judge {
             if brakes {
                 watched.braked_ns = now_ns;
             }
-            // A test of signs, or a ramp of the drive itself, ends with what its lag leaves.
+            // After a sign check or the drive's own ramp, its lag leaves some torque for a while.
             let quiet = self.armed.is_none() && now_ns > self.pushed_ns.max(watched.braked_ns) + 20 * MS;
-            // What a frame says wrongly under a right checksum acts until the drive has told of it, and as far as that is seen.
+            // A wrong value under a valid checksum acts until the drive's reading reveals it, within the resolution of
+            // the check.
             let room = if watched.garbled { watched.room() } else { watched.step };
             let loose = quiet && watched.mode == Some(Mode::Torque) && torque.abs() > room;
             watched.loose_ns = if loose { watched.loose_ns.or(Some(now_ns)) } else { None };
-            // A brake of the drive itself may end between two looks.
+            // A drive's own brake may end between two checks.
             let patience_ns = match (watched.garbled, watched.keeps) {
                 (true, _) => FOLLOW_NS,
                 (false, true) => KEPT_NS,
@@ -506,10 +508,10 @@ impl Judge {
         Ok(())
     }
 
-    /// What the shaft does.
+    /// Checks speed, angle and run-away of the true shaft.
     fn judge_shaft(&mut self, world: &World, now_ns: u64, moves: bool) -> Result<(), (Broken, String)> {
         let bench = world.bench();
-        // The first node is a drive that tells its speed; both turn with one shaft.
+        // The first node is a drive that reports its speed; both drives share one shaft.
         let shaft = bench.shaft(0);
         let since = |is: bool, since: Option<u64>| if is && moves { since.or(Some(now_ns)) } else { None };
         self.fast_ns = since(shaft.speed.abs() > 1.05 * self.speed + 0.2, self.fast_ns);
@@ -535,12 +537,12 @@ impl Judge {
         Ok(())
     }
 
-    /// Once the program has ended and the time-outs of the drives have passed.
+    /// Checks the drives after the program has ended and the time-outs of the drives have passed.
     pub fn judge_gone(&self, world: &World, now_ns: u64) -> Result<(), Violation> {
         self.judge_powerless(world, now_ns)
     }
 
-    /// Once the bound of a stop has passed.
+    /// Checks the drives after the time bound of a stop.
     pub fn judge_rest(&self, world: &World, now_ns: u64) -> Result<(), Violation> {
         let bound_ns = 2 * STANDSTILL_NS + OFF_NS;
         if self.tripped_ns.is_none_or(|since| now_ns <= since + bound_ns) {
@@ -555,8 +557,9 @@ impl Judge {
         for watched in self.watched.iter().filter(|watched| !watched.deaf) {
             let Some(drive) = bench.drive(watched.node) else { continue };
             let (torque, state) = (drive.torque(), drive.state());
-            // A drive described by frames that hears nobody pushes for ever; against it a quick stop does not come to its end, or leaves some torque for a moment.
-            // So does one that hears nobody at all: it brakes on its own ramp, for as long as that takes.
+            // A drive described by frames that receives nothing pushes for ever; against it a quick stop may not
+            // finish, or leave some torque for a moment. The same holds for any drive that receives nothing: it brakes
+            // on its own ramp, for as long as that takes.
             if (pushed || self.cut) && state != State::Enabled {
                 continue;
             }
@@ -569,7 +572,7 @@ impl Judge {
     }
 }
 
-/// Whether a fault may cut a bus for good: no frame of ours arrives any more, whichever it is.
+/// Whether a fault may cut off a bus for good, so that no frame of ours arrives any more.
 fn cuts(what: What) -> bool {
     match what {
         What::Short(_) | What::Unplugged(_) | What::Alone(_) | What::Down(_) | What::Babble(_) => true,
@@ -578,7 +581,7 @@ fn cuts(what: What) -> bool {
     }
 }
 
-/// Whether a fault makes a drive tell what is not so.
+/// Whether a fault falsifies a drive's readings.
 fn lies(what: What) -> bool {
     match what {
         What::Node(_, effect) => matches!(
@@ -603,12 +606,12 @@ impl Watched {
         self.history.push_back((now_ns, permitted));
     }
 
-    /// How far a torque may be from what is permitted without being noticed, N·m.
+    /// Deviation of a torque from its permitted value that may remain unnoticed, N·m.
     fn room(&self) -> f64 {
         0.02 * self.most + 50.0 * self.step
     }
 
-    /// Least and greatest value permitted while a command could have acted.
+    /// Lowest and highest permitted value of the time from which a command can still act.
     fn lately(&self, now_ns: u64) -> (f64, f64) {
         let window_ns = match self.mode {
             Some(Mode::Torque) | None => self.window_ns,
@@ -624,7 +627,8 @@ impl Watched {
         bounds
     }
 
-    /// `cycles`: since arming, while the drives follow. `reaction`: of the cause, once there is one.
+    /// Checks a permitted value. `cycles`: since arming, while the drives follow. `reaction`: that of the cause, once
+    /// there is one.
     fn judge_permitted(
         &self,
         value: f64,
@@ -639,7 +643,7 @@ impl Watched {
         }
         let Some(cycles) = cycles else { return Ok(()) };
         let step = slew * period_ns as f64 * 1e-9 * (1.0 + 1e-9);
-        // A shaft that gets faster takes torque away at once: the power wins over the slew.
+        // When a shaft accelerates, its torque is reduced at once: the power limit takes precedence over the slew.
         let weak = value.abs() < last.abs() && (value * speed).abs() >= power * (1.0 - 1e-9);
         if (value - last).abs() > step && !weak {
             return Err((Broken::Permitted, format!("from {last} to {value}, {step} are permitted")));

@@ -1,8 +1,9 @@
-//! Drives that follow a speed or a position by themselves, watched for longer than the runs of the fault space.
+//! Generated tests of drives that control a speed or a position themselves, over longer times than the runs of the
+//! fault space.
 //!
-//! In: a seed: a drive, a command, and what keeps the shaft from following it. Out: whether a stop was under way within a second
-//! after no command of late explained the shaft any more, and none before. The reference is the true shaft, and the commands
-//! that were permitted. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` says how many there are.
+//! In: a seed, from which follow a drive, a command, and a fault that keeps the shaft from following. Out: whether a
+//! stop began within a second after no recent command explained the shaft any more, and not before. The reference is
+//! the true shaft and the permitted commands. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::rigs::{Made, PLAIN, Sort};
 use super::run::behaviour;
@@ -22,43 +23,44 @@ use std::collections::VecDeque;
 /// Seeds in `cargo test`.
 const RUNS: u64 = 40;
 const STEP_NS: u64 = 200_000;
-/// From the fault to the end of a run, ns.
+/// Time from the fault to the end of a run, ns.
 const RUN_NS: u64 = 3_500 * MS;
-/// What a loop with a time constant of 0.1 s has done of a step after this time is all but a fiftieth, s.
+/// Settling time of a loop with a time constant of 0.1 s to within a fiftieth of a step, s.
 const SETTLES: f64 = 0.4;
-/// How long a shaft may be where no command explains it, ns; and some ticks for the way of its reading.
+/// Longest time for which no command may explain the shaft, ns; and some ticks for the transport of its reading.
 const PATIENCE_NS: u64 = 1_000 * MS;
 const WAY_NS: u64 = 20 * MS;
-/// Part of half the range of a command that a shaft may be away, and a part that is left to steps and settling.
+/// Permitted deviation of a shaft as a share of half the range of a command, and an additional share for quantisation
+/// and settling.
 const PART: f64 = 0.1;
 const MARGIN: f64 = 0.05;
-/// The node that follows.
+/// The node that controls speed or position.
 const SERVO: usize = 1;
 
-/// What is wrong.
+/// The fault.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Ill {
     Nothing,
-    /// Its set-points come, and are always the same.
+    /// Set-points arrive, but always the same one.
     Stale,
-    /// They do not come, and it has no deadline for them.
+    /// Set-points do not arrive, and the drive has no deadline for them.
     Lost,
-    /// It gives so much of its torque.
+    /// The drive applies only this share of its torque.
     Weak(f64),
-    /// It tells so many times its speed or its angle.
+    /// The drive reports its speed or angle scaled by this factor.
     Tells(f64),
 }
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Script {
     seed: u64,
     rig: Made,
-    /// Of the servo, s.
+    /// Dead time and lag of the servo, s.
     delay: f64,
     lag: f64,
     ill: Ill,
-    /// From arming to the fault, ns.
+    /// Time from arming to the fault, ns.
     after: u64,
 }
 
@@ -92,16 +94,16 @@ impl Script {
     }
 }
 
-/// Commands and what the shaft was, the newest last.
+/// Recent commands, the newest last.
 struct Stepper {
     commands: VecDeque<f64>,
-    /// Ticks of a command that may be under way, and of one that a slow loop may still follow.
+    /// Number of ticks for which a command may be under way, and for which a slow loop may still follow it.
     way: usize,
     slow: usize,
 }
 
 impl Stepper {
-    /// How far a value lies outside the commands of the last ticks.
+    /// Distance of a value from the range of the commands of the last ticks.
     fn outside(&self, ticks: usize, value: f64) -> f64 {
         let last = self.commands.iter().rev().take(ticks);
         let (low, high) = last.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), u| (low.min(*u), high.max(*u)));
@@ -109,10 +111,11 @@ impl Stepper {
     }
 }
 
-/// Runs a script: from where no command explained the shaft to the stop, ns, if it had to stop; or nothing.
+/// Runs a script: the time from the moment when no command explained the shaft to the stop, ns; none if no stop was
+/// due.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(script: &Script) -> Result<Option<u64>, String> {
     let (rig, control, plant) = script.build();
     let mut bench = Bench::with(&rig, Some(plant), script.seed, |_| behaviour())?.in_steps_of(STEP_NS);
@@ -203,7 +206,7 @@ fn plant_fault(script: &Script, world: &World, now_ns: u64) {
     }
 }
 
-/// A script made plainer, as long as it fails.
+/// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
     let (mut best, mut how) = (*script, why);
     'again: loop {

@@ -1,9 +1,10 @@
-//! The fault space: generated rigs with generated faults, and properties that hold at every tick of each run.
+//! The fault space: generated rigs with generated faults (property-based fault injection), and properties that hold at
+//! every tick of each run.
 //!
-//! One seed is one run, deterministic in simulated time. A failure shrinks to a script that is printed as a test.
+//! One seed is one run, deterministic in simulated time. A failure is shrunk to a script that is printed as a test.
 //!
-//! `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` says how many there are, from `FRIC_FIRST=n` on; `FRIC_PAIRS=all` runs all
-//! combinations of two faults; with `FRIC_COUNT=1` failures are counted by property and the runs go on.
+//! `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number, from `FRIC_FIRST=n` on; `FRIC_PAIRS=all` runs all
+//! combinations of two faults; with `FRIC_COUNT=1` failures are counted by property and the runs continue.
 
 mod rigs;
 mod space;
@@ -22,17 +23,17 @@ use std::collections::BTreeMap;
 
 /// Seeds in `cargo test`.
 const RUNS: u64 = 200;
-/// Each so many-th combination of two faults in `cargo test`.
+/// `cargo test` runs every 40th combination of two faults.
 const STRIDE: usize = 40;
 
-/// Runs a script of faults; panics with the script as a test if a property is broken.
+/// Runs a script of faults; panics with the script as a test if a property is violated.
 fn holds(script: &Script) {
     if let Err(violation) = run::run(script) {
         panic!("{}", told(script, violation));
     }
 }
 
-/// A failure, shrunk, as a text that can be pasted.
+/// Shrinks a failure and formats it as text that can be pasted.
 fn told(script: &Script, violation: Violation) -> String {
     let (least, how) = shrink::shrink(script, violation, |script| run::run(script).map(drop));
     let Violation { broken, at_ns, text } = how;
@@ -43,7 +44,7 @@ fn number(name: &str) -> Option<u64> {
     std::env::var(name).ok().and_then(|text| text.parse().ok())
 }
 
-/// Runs scripts; stops at the first failure, or counts them.
+/// Runs scripts; stops at the first failure, or counts failures.
 fn all(scripts: impl Iterator<Item = Script>) {
     let counts_only = number("FRIC_COUNT").is_some();
     let mut failed: BTreeMap<String, Vec<u64>> = BTreeMap::new();
@@ -86,7 +87,7 @@ fn random_faults_break_no_property() {
     all((first..first + runs).map(Script::of));
 }
 
-/// All faults of a small rig's frames, in one phase and for ever: as pairs.
+/// All pairs of faults in a small rig's frames, in one phase and for ever.
 fn pairs(phase: Phase) -> Vec<[Fault; 2]> {
     let (frames, often) = space::frames(Sort::One);
     let whole = matches!(phase, Phase::StartUp | Phase::Enabling);
@@ -129,8 +130,8 @@ fn the_same_seed_gives_the_same_bits() {
     }
 }
 
-/// Protections that generators of their own hold: what a process does that ends or stands still, what its disk does, what
-/// takes longer than a run of the fault space, and shafts and contacts that are not as told.
+/// Protections that other generators cover: processes that end or stall, failing disks, reactions that take longer than
+/// a run of the fault space, and shafts and contacts that deviate from their model.
 #[cfg(feature = "mutants")]
 const OUTSIDE: [(&str, &str); 10] = [
     ("table", "hil::endings"),
@@ -145,7 +146,7 @@ const OUTSIDE: [(&str, &str); 10] = [
     ("life", "hil::kills"),
 ];
 
-/// Each protection taken away makes its generator fail. `FRIC_ONLY=name` tries one alone.
+/// Mutation test: without any one protection its generator must fail. `FRIC_ONLY=name` tests a single protection.
 #[cfg(feature = "mutants")]
 #[test]
 fn mutants_are_caught_by_the_fault_space() {

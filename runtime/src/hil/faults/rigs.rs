@@ -1,6 +1,6 @@
-//! The rigs of the fault space: small, with the periods, drives and limits of real ones.
+//! The rigs of the fault space: small, with the periods, drives and limits of real rigs.
 //!
-//! In: a few numbers. Out: a rig with its control and its plant program, all written by hand.
+//! In: a few numbers. Out: a rig with its control program and its plant program, all written by hand.
 
 use crate::hil::live::Judge;
 use crate::testing::models::{Model, View};
@@ -17,26 +17,26 @@ use std::f64::consts::TAU;
 pub const INERTIA: f64 = 0.012;
 /// Friction of the shaft's bearings, N·m·s/rad.
 const BEARINGS: f64 = 0.01;
-/// More than 32 bits of counts, rad.
+/// An angle of more than 32 bits of counts, rad.
 const FAR: f64 = 60_000.0;
-/// Time after arming in which the model asks for nothing, s.
+/// Time after arming in which the model requests zero, s.
 pub const REST: f64 = 0.02;
-/// Command and answer of the drive that is described by frames.
+/// COB-IDs of command and answer of the drive that is described by frames.
 pub const FRAME_COMMAND: u32 = 0x321;
 pub const FRAME_ANSWER: u32 = 0x322;
 
-/// Which drives a rig has. The last one moves the shaft, the first one brakes it.
+/// Drives of a rig. The last drive moves the shaft, the first one brakes it.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Sort {
-    /// One drive, torque.
+    /// One torque drive.
     One,
-    /// Two drives, torque.
+    /// Two torque drives.
     Pair,
-    /// Two drives with torque, each on a bus of its own.
+    /// Two torque drives, each on a bus of its own.
     TwoBuses,
-    /// The servo follows a speed, the load gives torque.
+    /// The servo controls a speed, the load a torque.
     SpeedServo,
-    /// The servo follows a position, the load gives torque.
+    /// The servo controls a position, the load a torque.
     PositionServo,
     /// The servo is described by frames, the load is a CiA 402 drive.
     FramesServo,
@@ -47,45 +47,45 @@ impl Sort {
         [Sort::Pair, Sort::One, Sort::TwoBuses, Sort::SpeedServo, Sort::PositionServo, Sort::FramesServo];
 }
 
-/// One rig as numbers.
+/// Parameters of one rig.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Made {
     pub sort: Sort,
     /// Amplitude of the command that moves the shaft, as a share of its limit; above 1 it is clamped.
     pub swing: f64,
-    /// Its frequency, Hz.
+    /// Frequency of that command, Hz.
     pub hertz: f64,
-    /// What the load does: torque per speed, N·m·s/rad.
+    /// Damping by the load, N·m·s/rad.
     pub damping: f64,
-    /// Rated torque of the drives, N·m: a thousandth is one step on the wire.
+    /// Rated torque of the drives, N·m; a thousandth is one quantisation step on the bus.
     pub rated: f64,
-    /// Greatest torque of each drive, N·m.
+    /// Highest torque of each drive, N·m.
     pub most: f64,
-    /// Greatest change of a torque, N·m/s; 0: any.
+    /// Slew limit of a torque, N·m/s; 0: none.
     pub slew: f64,
-    /// Greatest speed, rad/s.
+    /// Highest speed, rad/s.
     pub speed: f64,
-    /// Permitted angle either way, rad; 0: any.
+    /// Permitted angle in either direction, rad; 0: any.
     pub travel: f64,
-    /// Greatest power of each drive, W; 0: greatest torque times greatest speed.
+    /// Highest power of each drive, W; 0: highest torque times highest speed.
     pub power: f64,
-    /// Missed ticks in a row that are borne.
+    /// Number of missed ticks that the rig tolerates.
     pub hold: u32,
     /// Commands act with the next SYNC.
     pub at_sync: bool,
-    /// The model asks for its whole amplitude in the first cycle.
+    /// The model requests its full amplitude in the first cycle.
     pub eager: bool,
-    /// Value of the outputs on any stop, as a share of their limit: other than 0 it may not start.
+    /// Safe value of the outputs, as a share of their limit; other than 0 the rig must not start.
     pub safe: f64,
-    /// A position is asked for that is further away than 32 bits of counts can tell.
+    /// The model requests a position further away than 32 bits of counts can express.
     pub far: bool,
-    /// Time of the model at which it gives no number, s; 0: never.
+    /// Time of the model from which its output is NaN, s; 0: never.
     pub no_number: f64,
-    /// The drive described by frames tells its speed as a float.
+    /// The drive described by frames reports its speed as a float.
     pub float: bool,
 }
 
-/// The rig that stands for all others.
+/// The reference rig: others are simplified towards it.
 pub const PLAIN: Made = Made {
     sort: Sort::Pair,
     swing: 0.8,
@@ -106,11 +106,11 @@ pub const PLAIN: Made = Made {
     float: false,
 };
 
-/// Parameters of the control program that a set changes: the second is always the first plus 1.
+/// Indices of the control program's parameters that a set changes: the second value must be the first plus 1.
 pub const TWINS: [usize; 2] = [5, 6];
 
 impl Made {
-    /// Greatest command of a node, either way: torque, speed or position.
+    /// Highest command of a node in either direction: torque, speed or position.
     fn limit(&self, mode: Mode) -> f64 {
         match mode {
             Mode::Torque => self.most,
@@ -120,7 +120,8 @@ impl Made {
         }
     }
 
-    /// Amplitude of the command that moves the shaft: a drive needs half of its torque for what it follows by itself.
+    /// Amplitude of the command that moves the shaft: for a controlled speed or position a drive needs half of its
+    /// torque.
     fn amplitude(&self, mode: Mode) -> f64 {
         if self.far && mode == Mode::Position {
             return 0.9 * FAR;
@@ -150,7 +151,7 @@ impl Made {
         let outputs = (0..modes.len()).map(|node| {
             let mode = modes[node].unwrap_or(Mode::Torque);
             let most = self.limit(mode);
-            // A slew is given in N·m/s; other commands reach their limit as soon as the torque would.
+            // A slew is given in N·m/s; other commands reach their limit in the same time as the torque would.
             let slew = if self.slew > 0.0 { self.slew * most / self.most } else { f64::INFINITY };
             let (signal, slot) = (signal(node, told(node)), inside.outputs.slot(node));
             Output { signal, slot, low: -most, high: most, slew, safe: self.safe * most }
@@ -211,11 +212,11 @@ impl Made {
             at_sync: self.at_sync,
             ..drive
         });
-        // What acts with the next SYNC is a period late at least.
+        // A command that acts with the next SYNC is at least one period late.
         Node { bus, kind, delay: if self.at_sync { 1.8e-3 } else { made.delay }, ..made }
     }
 
-    /// The last node swings once its rest is over, the others damp the shaft.
+    /// The last node swings after its rest, the other one damps the shaft.
     fn control(&self, modes: &[Option<Mode>]) -> Instance {
         let last = modes.len() - 1;
         let position = modes[last] == Some(Mode::Position);
@@ -225,7 +226,7 @@ impl Made {
         let swing = move |view: &View| {
             let t = (view.t() - view.p(4)).max(0.0);
             let phase = TAU * view.p(1) * t;
-            // A position begins without a step in its speed.
+            // A position starts without a step in its speed.
             let wave = match (position, eager) {
                 (true, _) => (1.0 - phase.cos()) / 2.0,
                 (false, true) => phase.cos(),
@@ -258,7 +259,7 @@ impl Made {
     }
 }
 
-/// What must hold of the parameters that a set changes: the second is the first plus 1.
+/// Condition on the parameters that a set changes: the second is the first plus 1.
 pub fn judge(control: &Instance) -> Judge {
     let program = Model::new("judge")
         .param(0.0)
@@ -289,7 +290,7 @@ pub fn commanded(mode: Mode) -> What {
     }
 }
 
-/// A shaft on which so many torques act.
+/// A shaft on which this many torques act.
 fn plant(torques: usize) -> Instance {
     Model::new("Shaft")
         .inputs(torques as u32)
@@ -309,7 +310,7 @@ fn plant(torques: usize) -> Instance {
         .build()
 }
 
-/// A drive that takes a torque and tells a speed, each in a frame.
+/// A drive that receives a torque and reports a speed, each in a frame.
 fn described(float: bool) -> Kind {
     let format = |bits| if float && bits == 32 { Format::Float32 } else { Format::Signed };
     let field = |name: &str, bits, unit: &str| Field {

@@ -1,6 +1,7 @@
-//! One script run in simulated time: start, rest, motion, a change of parameters, stop, and where asked for another program.
+//! Runs one script in simulated time: start, rest, motion, a change of parameters, stop, and optionally a second
+//! program.
 //!
-//! In: a [`Script`]. Out: what it went through, or the first property it broke.
+//! In: a [`Script`]. Out: a summary of the run, or the first property it violated.
 
 use super::invariants::{Broken, CLAMPED_NS, Judge, RAMP, STANDSTILL_NS, Violation};
 use super::rigs::TWINS;
@@ -32,47 +33,47 @@ use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
 
-/// Steps of the shaft, ns: it is a rigid body, and drives follow their lag exactly whatever the step.
+/// Step of the simulated shaft, ns: it is a rigid body, and drives follow their lag exactly for any step.
 const STEP_NS: u64 = 100_000;
-/// How long each phase lasts, ns.
+/// Durations of the phases, ns.
 const MOVING_NS: u64 = 110 * MS;
 const CHANGE_NS: u64 = 30 * MS;
-/// A start takes no longer.
+/// Longest duration of a start, ns.
 const START_NS: u64 = 60_000 * MS;
-/// From a stop to the end of the program, and what comes after it.
+/// Longest time from a stop to the end of the program, and the time observed after it, ns.
 const END_NS: u64 = 3_000 * MS;
 const AFTER_NS: u64 = 120 * MS;
 
-/// What a run went through.
+/// Summary of a run.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Passed {
-    /// How often each phase began, in the order of [`Phase::ALL`].
+    /// Number of times that each phase began, in the order of [`Phase::ALL`].
     pub phases: [u32; Phase::ALL.len()],
-    /// Cycles judged.
+    /// Checked cycles.
     pub cycles: u64,
     /// The cause of the first stop.
     pub cause: Option<Cause>,
-    /// A hash of all that was permitted and of the torques.
+    /// A hash of all permitted outputs and torques.
     pub hash: u64,
 }
 
-/// A script under way.
+/// A running script.
 struct Run<'a> {
     script: &'a Script,
     rig: Rig,
     made: (abi::Instance, abi::Instance),
     world: World,
     traffic: Rc<RefCell<Traffic>>,
-    /// Listen on each bus, and never send.
+    /// Ports that listen on each bus and never send.
     witnesses: Vec<Port>,
-    /// Times from and until which no cycle comes, and for how long at a time, ns.
+    /// Intervals without cycles: begin, end, and the length of each pause, ns.
     frozen: Vec<(u64, u64, u64)>,
     foreign: Vec<(u64, usize, u32)>,
     down: Vec<(u64, usize)>,
     others: Vec<Port>,
     passed: Passed,
     words: Vec<u64>,
-    /// The second program is under way.
+    /// The second program is running.
     second: bool,
 }
 
@@ -104,7 +105,7 @@ fn options(script: &Script) -> Options {
     Options { control, start, arms_itself: true, only_simulated, ..Options::default() }
 }
 
-/// A drive that is not one of ours, as far as it says.
+/// Makes the first drive claim another identity than that of our simulated drives.
 fn imitate(objects: &mut ObjectDictionary, only: Only) {
     match only {
         Only::OtherName => {
@@ -114,7 +115,7 @@ fn imitate(objects: &mut ObjectDictionary, only: Only) {
     }
 }
 
-/// Drives that boot fast: their times are not what is looked at here.
+/// Drives that boot fast, because their times are not under test.
 pub fn behaviour() -> Behaviour {
     let times = Times { switch_on_ns: MS, enable_ns: 5 * MS, disable_ns: 2 * MS, start_ns: MS };
     Behaviour { boot_ns: 5 * MS, times, ..Behaviour::default() }
@@ -162,7 +163,7 @@ impl<'a> Run<'a> {
         Ok(self.passed)
     }
 
-    /// One program from its start to its end.
+    /// Runs one program from its start to its end.
     fn program(&mut self, again: bool) -> Result<(), Violation> {
         let buses = (0..self.rig.buses.len()).map(|bus| {
             let port = self.world.bus(bus).port(MASTER);
@@ -183,7 +184,7 @@ impl<'a> Run<'a> {
         let mut program = Program { hil, operator, judge, rig: &rig, replay, checks, said, patience: 0, twin: 0.0 };
         self.enter(if again { Phase::Again } else { Phase::StartUp });
         self.go(&mut program, again)?;
-        // The process is gone: what is still under torque has its own time-out left.
+        // The process has ended: a drive that still has torque is stopped by its own time-out.
         let Program { hil, judge, .. } = program;
         let gone_ns = self.now();
         drop(hil);
@@ -243,7 +244,7 @@ impl<'a> Run<'a> {
         if long { Err(self.broken(Broken::Endless, format!("{} ms", limit / MS))) } else { Ok(()) }
     }
 
-    /// Goes on for a time, unless a stop begins.
+    /// Continues for a time, unless a stop begins.
     fn lasts(&mut self, program: &mut Program, ns: u64) -> Result<(), Violation> {
         let until = self.now() + ns;
         while self.now() < until && program.hil.ended().is_none() && program.judge.tripped_ns().is_none() {
@@ -252,7 +253,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// To the end of a program that stops or has been told to.
+    /// Continues to the end of a program that stops.
     fn end(&mut self, program: &mut Program) -> Result<(), Violation> {
         let begun = self.now();
         while program.hil.ended().is_none() {
@@ -262,7 +263,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// A stop needs a reason: some fault, or a rig that asks for too much.
+    /// Checks that a stop has a reason: a fault, or a rig that requests too much.
     fn needless(&self, program: &Program) -> Result<(), Violation> {
         let made = &self.script.rig;
         let asks =
@@ -283,7 +284,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Limits that are wider than those in force must be refused.
+    /// Checks that limits wider than those in force are refused.
     fn narrow(&mut self, program: &mut Program) -> Result<(), Violation> {
         let Some(supervisor) = program.hil.supervisor_mut() else { return Ok(()) };
         let limits = supervisor.outputs()[0];
@@ -293,7 +294,8 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Hands over sets of parameters, each of two values that belong together; one of two that do not, and one from long ago.
+    /// Submits sets of parameters: several with two consistent values each, one with inconsistent values, and one that
+    /// is too old.
     fn change(&mut self, program: &mut Program) {
         let Some(control) = program.hil.control() else { return };
         let slots = TWINS.map(|i| control.model().description().layout.params.slot(i));
@@ -306,7 +308,7 @@ impl<'a> Run<'a> {
         program.said.extend([torn, old].into_iter().flatten().map(|ticket| (ticket, None)));
         for k in 1..=self.script.sets {
             let value = f64::from(k);
-            // Without a place it is refused at once, and that is said.
+            // Without a free place a set is refused at once, with an error.
             if let Ok(ticket) = program.operator.say(set(value, value + 1.0)) {
                 program.said.push((ticket, Some(value)));
             }
@@ -314,7 +316,7 @@ impl<'a> Run<'a> {
         program.patience = program.said.len() as u32 + 3;
     }
 
-    /// A phase begins: its faults are planted.
+    /// Begins a phase and plants its faults.
     fn enter(&mut self, phase: Phase) {
         let at = Phase::ALL.iter().position(|other| *other == phase).expect("all phases are listed");
         self.passed.phases[at] += 1;
@@ -357,7 +359,7 @@ impl<'a> Run<'a> {
                 self.world.bus(bus).plant(MASTER, planted.from(from).until(until));
             }
             What::NoNumber(node, which) => {
-                // 1/0 is infinite, and 0/0 no number.
+                // 1/0 is infinite, and 0/0 is NaN.
                 let effect = Effect::Value(1, 0, f64::from(which) / 0.0);
                 let lasts_ns = (fault.lasts != EVER).then_some(fault.lasts);
                 self.world.bench().hook(Hook { node, effect, start: Start::At(from), lasts_ns });
@@ -365,7 +367,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// What is due outside the buses' own faults.
+    /// Applies the faults that the buses and drives do not apply themselves.
     fn disturb(&mut self) {
         let now = self.now();
         let due = |at: u64| at <= now;
@@ -379,7 +381,7 @@ impl<'a> Run<'a> {
                 0x080 => &[],
                 _ => &[0x06, 0, 0x40, 1, 0, 0, 0, 0],
             };
-            // On a bus that is down nobody hears it either.
+            // On a bus that is down nobody receives it either.
             let _ = port.send(Frame::new(id, data));
             self.others.push(port);
         }
@@ -392,7 +394,7 @@ impl<'a> Run<'a> {
     fn cycle(&mut self, program: &mut Program) -> Result<(), Violation> {
         self.disturb();
         if self.is_strange() && program.hil.step() <= Step::Identity {
-            // A reset takes back what it says of itself.
+            // A reset restores the drive's identity.
             imitate(self.world.bench().drive(0).unwrap().objects(), self.script.only);
         }
         self.traffic.borrow_mut().clear();
@@ -400,7 +402,7 @@ impl<'a> Run<'a> {
         let asked = super::heap::asked();
         program.hil.cycle();
         let asked = super::heap::asked() - asked;
-        // A simulated drive that boots makes its dictionary anew.
+        // A simulated drive that boots allocates its dictionary anew.
         let mut bench = self.world.bench();
         let mut drives = (0..self.rig.nodes.len()).filter_map(|node| Some(bench.drive(node)?.node().state()));
         let boots = drives.any(|state| state == NmtState::BootUp);
@@ -423,7 +425,7 @@ impl<'a> Run<'a> {
         self.replay(program)
     }
 
-    /// Whether the first drive says that it is another one.
+    /// Whether the first drive claims another identity.
     fn is_strange(&self) -> bool {
         match self.script.only {
             Only::Any | Only::Simulated => false,
@@ -432,7 +434,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// What only simulated drives may have is given to no other.
+    /// Checks that no drive is enabled under options for simulated drives only, unless it has proved to be simulated.
     fn judge_permission(&self, program: &Program) -> Result<(), Violation> {
         let framed = self.script.rig.sort == super::rigs::Sort::FramesServo && self.script.only != Only::Any;
         if (framed || self.is_strange()) && program.hil.step() > Step::AwaitEnable && program.hil.step() < Step::Stopped
@@ -453,7 +455,8 @@ impl<'a> Run<'a> {
         self.passed.cause = self.passed.cause.or(control.supervisor().cause());
     }
 
-    /// A set is whole or refused, is answered in time, and the last one that was taken acts.
+    /// Checks that a set is accepted as a whole or refused, that it is answered in time, and that the last accepted one
+    /// acts.
     fn judge_sets(&self, program: &mut Program) -> Result<(), Violation> {
         let stops = program.judge.tripped_ns().is_some() || program.hil.ended().is_some();
         let Some(control) = program.hil.control() else { return Ok(()) };
@@ -489,7 +492,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// What the log of this cycle would hold goes through the same code once more.
+    /// Replays the log message of this cycle through a second instance of the same code.
     fn replay(&mut self, program: &mut Program) -> Result<(), Violation> {
         if program.hil.control().is_none() {
             return Ok(());
@@ -522,21 +525,21 @@ struct Program<'a> {
     judge: Judge,
     rig: &'a Rig,
     replay: Option<Replay<'a>>,
-    /// What must hold of parameters.
+    /// Conditions on the parameters.
     checks: live::Judge,
-    /// Sets without an answer: the value of one that fits.
+    /// Sets without an answer; the value of each set that must be accepted.
     said: Vec<(Ticket, Option<f64>)>,
-    /// Cycles in which they must be answered.
+    /// Cycles within which they must be answered.
     patience: u32,
-    /// The set that acts.
+    /// Value of the set that acts.
     twin: f64,
 }
 
-/// Whether a rig must bear a fault without a stop: one answer that is lost or doubled.
+/// Whether a rig must tolerate a fault without a stop: one answer that is lost or doubled.
 fn harmless(fault: &Fault) -> bool {
     let answer = |id: u32| (0x180..0x200).contains(&id) || (0x280..0x300).contains(&id);
     match fault.what {
-        // What is doubled makes those after it late: twice.
+        // A doubled frame delays the next ones: twice as long is tolerated.
         What::Frame(_, id, Ill::Doubled) => answer(id) && fault.lasts <= 2 * MS,
         What::Frame(_, id, Ill::Lost | Ill::Refused) => answer(id) && fault.lasts <= MS,
         _ => false,

@@ -1,11 +1,11 @@
-//! What the generator has found, shrunk and kept by name.
+//! Failures that the generator has found, shrunk, as named regression tests.
 
 use super::holds;
 use super::rigs::{Made, PLAIN, Sort::*};
 use super::space::{EVER, Fault, Ill::*, MS, Phase::*, Script, What::*};
 use crate::drive::Effect;
 
-/// A set-point that the bus refuses was forgotten: found with seed 16.
+/// A set-point that the bus refused was forgotten; seed 16.
 #[test]
 fn a_set_point_that_is_refused() {
     for id in [0x203, 0x204] {
@@ -14,7 +14,7 @@ fn a_set_point_that_is_refused() {
     }
 }
 
-/// A set-point that is lost on the way was never noticed: found with seed 384.
+/// A set-point that was lost on the bus was never noticed; seed 384.
 #[test]
 fn a_set_point_that_is_lost() {
     for id in [0x203, 0x204] {
@@ -23,7 +23,7 @@ fn a_set_point_that_is_lost() {
     }
 }
 
-/// A stop takes the way of the set-points: found with seeds 51 and 128.
+/// A stop uses the path of the set-points; seeds 51 and 128.
 #[test]
 fn stop_frames_that_do_not_arrive() {
     for ill in [Lost, Refused, Stale] {
@@ -32,25 +32,25 @@ fn stop_frames_that_do_not_arrive() {
     }
 }
 
-/// A limit between two steps of the wire was rounded up: found with seed 256.
+/// A limit between two quantisation steps was rounded up; seed 256.
 #[test]
 fn a_limit_between_two_steps_of_the_wire() {
     holds(&Script { rig: Made { swing: 2.5, rated: 3.0, most: 0.2, ..PLAIN }, ..Script::plain(Pair) });
 }
 
-/// A request beyond its range came up faster than the ramp: found with seed 93.
+/// A request beyond its range rose faster than the ramp; seed 93.
 #[test]
 fn a_request_beyond_its_range_that_comes_up() {
     holds(&Script { rig: Made { swing: 3.1, eager: true, ..PLAIN }, ..Script::plain(Pair) });
 }
 
-/// A drive described by frames had its safe value from the first cycle on: found with seed 23.
+/// A drive described by frames received its safe value from the first cycle on; seed 23.
 #[test]
 fn a_safe_value_that_moves_a_drive_described_by_frames() {
     holds(&Script { rig: Made { sort: FramesServo, safe: 0.36, ..PLAIN }, ..Script::plain(FramesServo) });
 }
 
-/// Answers that came late in each tick were never believed and never missed: found with seed 1701.
+/// Answers that were late in each tick were never accepted and never counted as missing; seed 1701.
 #[test]
 fn answers_that_are_late_in_each_tick() {
     for (id, ill) in [(0x183, Late(700_000)), (0x080, Swapped)] {
@@ -59,7 +59,7 @@ fn answers_that_are_late_in_each_tick() {
     }
 }
 
-/// A drive that brakes the wrong way round did not lose its torque: it took no set-points any more. Found with seed 834.
+/// A drive that braked in the wrong direction kept its torque, because it accepted no set-points any more; seed 834.
 #[test]
 fn a_quick_stop_that_does_not_end() {
     let wrong = Fault { what: Node(0, Effect::TorqueScale(-1.0)), phase: Moving, after: 0, lasts: EVER };
@@ -67,13 +67,14 @@ fn a_quick_stop_that_does_not_end() {
     holds(&Script { faults: vec![wrong, unplugged], ..Script::plain(Pair) });
 }
 
-/// More sets at once than a cycle had room for vanished: found with seed 0.
+/// Sets beyond the number that a cycle could hold vanished; seed 0.
 #[test]
 fn many_sets_of_parameters_at_once() {
     holds(&Script { sets: 40, ..Script::plain(Pair) });
 }
 
-/// A drive that takes no set-points keeps an old one, and gives it until it is seen not to follow: found with seed 21824.
+/// A drive that accepts no set-points keeps an old one, and applies it until the rig notices that it does not follow;
+/// seed 21824.
 #[test]
 fn an_old_set_point_at_the_next_start() {
     for node in [0, 1] {
@@ -82,8 +83,8 @@ fn an_old_set_point_at_the_next_start() {
     }
 }
 
-/// A drive that turned the shaft for another one's test of signs, whose encoder stood still, did so for a minute: found with
-/// seed 13685.
+/// A drive kept turning the shaft for a minute, for the sign check of another drive whose encoder stood still; seed
+/// 13685.
 #[test]
 fn an_encoder_that_stands_still_while_another_drive_turns_it() {
     for sort in [SpeedServo, PositionServo] {
@@ -92,21 +93,21 @@ fn an_encoder_that_stands_still_while_another_drive_turns_it() {
     }
 }
 
-/// Small torques by wrong frames before arming, below what a watch can see: found with seed 10000.
+/// Small torques from corrupted frames before arming, below the resolution of the check; seed 10000.
 #[test]
 fn set_points_that_are_wrong_from_the_start() {
     let fault = Fault { what: Frame(0, 0x203, Corrupted), phase: StartUp, after: 0, lasts: EVER };
     holds(&Script { seed: 10_000, tested: true, faults: vec![fault], ..Script::plain(Pair) });
 }
 
-/// Where drives wait for SYNC, that itself waits in each other tick for our heartbeat: the shaft is read a little late and a little
-/// early in turn. Position and speed seemed to disagree: found with seed 94031.
+/// Where drives wait for SYNC, and SYNC waits in every other tick for our heartbeat, the shaft is read late and early
+/// in turn, so that position and speed seemed to disagree; seed 94031.
 #[test]
 fn a_shaft_that_is_read_late_and_early_in_turn() {
     holds(&Script { rig: Made { swing: 0.9683128397509957, at_sync: true, ..PLAIN }, ..Script::plain(Pair) });
 }
 
-/// A device that tells no number kept the last one for ever where the rig names no time-out for it.
+/// A device that sends NaN kept its last value for ever, if the rig named no time-out for it.
 #[test]
 fn a_speed_that_is_no_number() {
     for which in [-1, 0, 1] {

@@ -1,15 +1,16 @@
-//! A failing script made smaller: fewer faults, shorter, in a simpler phase, on a plainer rig.
+//! Shrinks a failing script: fewer faults, shorter, in a simpler phase, on a simpler rig (delta debugging: Zeller,
+//! Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
 //!
-//! In: a script and what it violates. Out: a script that violates the same, of which nothing can be left out.
+//! In: a script and its violation. Out: a script with the same violation that no further simplification preserves.
 
 use super::invariants::{Broken, Violation};
 use super::rigs::{Made, PLAIN, Sort};
 use super::space::{EVER, Fault, Ill, MS, Only, Phase, Script, What};
 
-/// Scripts that are tried at most.
+/// Most scripts that are tried.
 const MOST: usize = 400;
 
-/// Shrinks a script that breaks a property; gives the least one found, and how it fails.
+/// Shrinks a script that violates a property; returns the smallest script found and its violation.
 pub fn shrink(
     script: &Script,
     first: Violation,
@@ -36,7 +37,7 @@ pub fn shrink(
     (best, how)
 }
 
-/// Scripts that are simpler in one respect, the boldest first.
+/// Scripts that are simpler in one respect, the largest simplification first.
 fn simpler(script: &Script) -> Vec<Script> {
     let mut all = Vec::new();
     let with = |change: &dyn Fn(&mut Script)| {
@@ -83,7 +84,7 @@ fn simpler(script: &Script) -> Vec<Script> {
     all
 }
 
-/// Whether a rig of this sort has all that fails.
+/// Whether a rig of this sort has everything that the faults refer to.
 fn fits(faults: &[Fault], sort: Sort) -> bool {
     let (frames, _) = super::space::frames(sort);
     faults.iter().all(|fault| match fault.what {
@@ -117,7 +118,7 @@ fn simpler_fault(fault: &Fault) -> Vec<Fault> {
             }
         }
     }
-    // Short before long; what stays for ever is simpler than an odd time.
+    // A short time is simpler than a long one, and a permanent fault is simpler than an odd time.
     for lasts in [MS, 3 * MS, 10 * MS, 40 * MS, EVER] {
         if lasts < fault.lasts || lasts == EVER && fault.lasts > 40 * MS && fault.lasts != EVER {
             all.push(Fault { lasts, ..*fault });

@@ -1,8 +1,8 @@
-//! What passes our end of the buses in a cycle, and what the drives tell by it.
+//! Records the traffic at our end of the buses in a cycle, and the readings that drives report in it.
 //!
-//! In: frames as they are handed over, what the rig believes of the shaft. Out: which frames were sent and which came, what
-//! each drive tells, and the property that a reading breaks. Frames are decoded here once more: how the rig reads them is what
-//! is judged.
+//! In: frames as they are handed over, and the values that the rig accepted. Out: frames sent and received, the
+//! readings of each drive, and the property that a reading violates. Frames are decoded here a second time,
+//! independently, because the rig's decoding is under test.
 
 use super::invariants::Broken;
 use super::rigs::{FRAME_ANSWER, INERTIA, Made};
@@ -13,35 +13,36 @@ use abi::rig::{Kind, Mode, Node, Rig};
 use std::cell::RefCell;
 use std::rc::Rc;
 
-/// SYNC.
+/// COB-ID of SYNC.
 const SYNC: u32 = 0x080;
-/// Readings in a row that may be further off than the shaft can be.
+/// Number of successive readings that may be implausible.
 const ODD: u32 = 3;
-/// Torque that may act on the shaft beyond that of its drives, as a multiple of theirs.
+/// Factor by which the torque on the shaft may exceed that of its drives.
 const SURPLUS: f64 = 4.0;
-/// How late a drive's speed may be behind its position, s.
+/// Possible lag of a drive's speed behind its position, s.
 const SPEED_LATE: f64 = 2e-3;
-/// Cycles in a row in which a drive that is enabled may show that it does not follow: in the next one it has led to a stop.
+/// Number of successive cycles in which an enabled drive may report that it does not follow; the next one must have
+/// caused a stop.
 const SHOWN: u32 = 5;
 
-/// What passed our end of the buses in a cycle.
+/// Traffic at our end of the buses in one cycle.
 pub struct Traffic {
-    /// Frames handed to a bus: the bus, the frame, and whether the bus took it.
+    /// Frames handed to a bus: the bus, the frame, and whether the bus accepted it.
     pub sent: Vec<(usize, Frame, bool)>,
-    /// Frames that came: the bus, the frame, and whether it came after the SYNC of this cycle.
+    /// Received frames: the bus, the frame, and whether it arrived after the SYNC of this cycle.
     pub came: Vec<(usize, Frame, bool)>,
-    /// A bus has said that frames were lost.
+    /// A bus has reported lost frames.
     pub lost: bool,
 }
 
 impl Traffic {
-    /// With room for all that a cycle takes.
+    /// Empty, with enough capacity for a cycle.
     pub fn new() -> Rc<RefCell<Traffic>> {
         let room = || Vec::with_capacity(1 << 10);
         Rc::new(RefCell::new(Traffic { sent: room(), came: room(), lost: false }))
     }
 
-    /// A cycle begins.
+    /// Clears the record at the start of a cycle.
     pub fn clear(&mut self) {
         self.sent.clear();
         self.came.clear();
@@ -49,7 +50,7 @@ impl Traffic {
     }
 }
 
-/// Our end of a bus, which remembers what passes.
+/// Our end of a bus, which records the traffic.
 pub struct Tap {
     pub port: Port,
     pub bus: usize,
@@ -83,8 +84,8 @@ impl Bus for Tap {
     }
 }
 
-/// Whether only another master, or a node that the rig does not name, can have sent a frame of this bus: our own do not come
-/// back to us.
+/// Whether a frame received on this bus can only come from another master, or from a node that the rig does not name:
+/// our own frames are not received back.
 pub fn is_foreign(rig: &Rig, bus: usize, frame: &Frame) -> bool {
     let named = |id: u32| {
         let on_bus = rig.nodes.iter().filter(|node| node.bus == bus);
@@ -94,32 +95,32 @@ pub fn is_foreign(rig: &Rig, bus: usize, frame: &Frame) -> bool {
     };
     let node = frame.id() & 0x7F;
     match frame.id() & 0x780 {
-        // Network management, SYNC.
+        // NMT, SYNC.
         0x000 | 0x080 if node == 0 => true,
-        // Set-points, requests for objects.
+        // Set-points, SDO requests.
         0x200 | 0x300 | 0x400 | 0x500 | 0x600 => named(node),
-        // A heartbeat.
+        // Heartbeat.
         0x700 => !named(node),
         _ => false,
     }
 }
 
-/// A number that comes again and again, and what the rig believes of it.
+/// A periodic reading, and the value that the rig accepts for it.
 #[derive(Default)]
 struct Line {
-    /// As it came last, SI.
+    /// Last received value, SI.
     told: f64,
-    /// It came in this cycle, in answer to SYNC.
+    /// It arrived in this cycle, in answer to SYNC.
     fresh: bool,
-    /// The same, and it was credible.
+    /// It arrived in this cycle and was plausible.
     taken: bool,
-    /// Greatest credible change in a tick; infinite: not judged.
+    /// Greatest plausible change in one tick; infinite: not checked.
     reach: f64,
-    /// Some steps of the number, SI.
+    /// Tolerance of some quantisation steps, SI.
     room: f64,
-    /// What is believed, and the ticks since it came; none before it is judged.
+    /// Accepted value, and ticks since it arrived; none before the first check.
     believed: Option<(f64, u32)>,
-    /// Readings in a row that are not credible.
+    /// Number of successive implausible readings.
     odd: u32,
 }
 
@@ -129,7 +130,7 @@ impl Line {
         self.fresh |= fresh;
     }
 
-    /// One cycle of the model. `quick`: the drives are told to stop at once.
+    /// Checks one cycle of the model. `quick`: the drives are told to stop at once.
     fn judge(&mut self, believed: f64, ticks: u32, quick: bool) -> Result<(), (Broken, String)> {
         self.taken = false;
         if !believed.is_finite() {
@@ -149,7 +150,7 @@ impl Line {
         self.taken = self.told.is_finite() && way <= self.reach * f64::from(since) * (1.0 + 1e-9) + self.room;
         if self.taken {
             self.odd = 0;
-            // At the edge the rig may hold what it had.
+            // At the edge of the plausible range the rig may hold the previous value.
             self.believed = Some((believed, if believed == before { since } else { 0 }));
         } else {
             self.odd += 1;
@@ -165,7 +166,7 @@ impl Line {
     }
 }
 
-/// Cycles in a row in which a position turns otherwise than the speed beside it says, in one direction.
+/// Successive cycles in which a position disagrees with the drive's speed, in one direction.
 #[derive(Default)]
 struct Apart {
     before: Option<f64>,
@@ -175,33 +176,33 @@ struct Apart {
     fastest: f64,
 }
 
-/// What a drive tells.
+/// Readings of one drive.
 pub struct Told {
     node: usize,
     bus: usize,
     /// Its node id; none: described by frames.
     id: Option<u32>,
-    /// It is described by frames, and tells its speed as a float.
+    /// It is described by frames and reports its speed as a float.
     float: bool,
     mode: i8,
     word: u16,
-    /// The mode that it shows, once it has told a change after arming.
+    /// The reported mode of operation, if the drive has reported a change after arming.
     shown: Option<i8>,
     speed: Line,
     position: Line,
-    /// Counts as they came last, how far they have turned, and where that begins, rad.
+    /// Last received counts, the accumulated counts, and their origin, rad.
     counts: Option<i32>,
     turned: i64,
     base: f64,
     apart: Apart,
-    /// Credible difference between position and speed, rad/s.
+    /// Plausible difference between position and speed, rad/s.
     credible: f64,
-    /// Cycles in a row in which it does not follow.
+    /// Number of successive cycles in which the drive does not follow.
     strays: u32,
 }
 
 impl Told {
-    /// What each drive of a rig tells, before the first cycle.
+    /// The drives of a rig before the first cycle.
     pub fn all(rig: &Rig, made: &Made) -> Vec<Told> {
         let period = rig.period_ns as f64 * 1e-9;
         let acceleration = made.most * rig.nodes.len() as f64 / INERTIA;
@@ -240,7 +241,7 @@ impl Told {
         rig.nodes.iter().enumerate().map(told).collect()
     }
 
-    /// Takes the frames of a cycle.
+    /// Decodes the frames of a cycle.
     pub fn take(&mut self, rig: &Rig, came: &[(usize, Frame, bool)]) {
         (self.speed.fresh, self.position.fresh) = (false, false);
         for (_, frame, fresh) in came.iter().filter(|(bus, ..)| *bus == self.bus) {
@@ -263,7 +264,7 @@ impl Told {
                     let Some(number) = four(0) else { continue };
                     let number = if self.float { f32::from_bits(number as u32).into() } else { f64::from(number) };
                     self.speed.tell(number * 1e-3, *fresh);
-                    // A number in between: the next one that is none is the first.
+                    // A finite value in between: the next NaN counts as the first.
                     self.speed.odd = if number.is_finite() { 0 } else { self.speed.odd };
                 }
                 _ => {}
@@ -271,8 +272,8 @@ impl Told {
         }
     }
 
-    /// One cycle of the model, up to the one that stops the rig. `first`: it is the first one; `time`: ticks and their period, s;
-    /// `stops`, `quick`: a stop is under way, and it is a quick one.
+    /// Checks one cycle of the model, up to the cycle that stops the rig. `first`: the first cycle; `time`: ticks and
+    /// their period, s; `stops`, `quick`: a stop is under way, and it is a quick stop.
     pub fn judge(
         &mut self,
         first: bool,
@@ -282,11 +283,11 @@ impl Told {
     ) -> Result<(), (Broken, String)> {
         let node = self.node;
         if first {
-            // The start-up has read it.
+            // The start-up has checked the mode.
             self.shown = None;
         }
         if let (true, true, Some(position)) = (first, self.position.fresh, seen.position) {
-            // Counts from where the rig counts, which takes any reading in this cycle.
+            // Takes over the rig's origin of the position; the rig accepts any reading in this cycle.
             self.base += position - self.position.told;
             self.position.told = position;
         }
@@ -320,7 +321,7 @@ impl Told {
         *fastest = fastest.max(speed.told.abs());
         let span = period * f64::from(ticks);
         let beyond = position.told - from - speed.told * span;
-        // When within a period the shaft was read is not known: over three ticks that makes a third of the speed.
+        // The time of a reading within its period is unknown: over three ticks that amounts to a third of the speed.
         let apart = beyond.abs() > 1.05 * (self.credible * span + *fastest * period / 3.0);
         *cycles = match apart {
             true if *cycles > 0 && *positive == (beyond > 0.0) => *cycles + 1,
