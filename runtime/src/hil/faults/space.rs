@@ -1,7 +1,7 @@
-//! The space of faults: which frame, what happens to it, in which phase, for how long, together with which others.
+//! The space of faults: which frame or node, which fault, in which phase, for how long, and in which combination.
 //!
-//! In: a seed, or two faults of an exhaustive list. Out: a [`Script`], which says all of one run. Its text is Rust: it can
-//! be pasted into `scripts.rs` as a test.
+//! In: a seed, or two faults of an exhaustive list. Out: a [`Script`], which determines one run completely. Its
+//! `Display` text is Rust: it can be pasted into `scripts.rs` as a test.
 
 use super::rigs::{FRAME_ANSWER, FRAME_COMMAND, Made, PLAIN, Sort};
 use crate::drive::Effect;
@@ -10,38 +10,38 @@ use crate::rng::Chance;
 use std::fmt;
 
 pub const MS: u64 = 1_000_000;
-/// A fault that stays.
+/// Duration of a permanent fault.
 pub const EVER: u64 = u64::MAX;
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Script {
-    /// Of the buses' chance and of the encoders.
+    /// Seed of the buses' random faults and of the encoders.
     pub seed: u64,
     pub rig: Made,
-    /// Time-outs and signs of the drives are tested in the start-up.
+    /// The start-up checks time-outs and signs of the drives.
     pub tested: bool,
-    /// A second program takes the rig over after the stop.
+    /// A second program takes over the rig after the stop.
     pub again: bool,
-    /// Sets of parameters that are handed over at once.
+    /// Number of sets of parameters that are submitted at once.
     pub sets: u32,
-    /// It is started as for simulated drives only.
+    /// Whether it is started with options for simulated drives only.
     pub only: Only,
     pub faults: Vec<Fault>,
 }
 
-/// Whether a rig is started with what only simulated drives may have.
+/// Whether a rig is started with options for simulated drives only, and which identity its first drive claims.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Only {
-    /// No.
+    /// Without such options.
     Any,
-    /// Yes, and its drives are simulated.
+    /// With such options, and its drives are simulated.
     Simulated,
-    /// Yes, and its first drive says another vendor.
+    /// With such options, and its first drive claims another vendor.
     OtherVendor,
-    /// Yes, and its first drive says another name.
+    /// With such options, and its first drive claims another name.
     OtherName,
-    /// Yes, and another device answers for its first drive when the second program starts.
+    /// With such options, and another device answers for its first drive when the second program starts.
     OtherLater,
 }
 
@@ -50,54 +50,54 @@ pub enum Only {
 pub struct Fault {
     pub what: What,
     pub phase: Phase,
-    /// From the begin of the phase to the fault, ns.
+    /// Time from the begin of the phase to the fault, ns.
     pub after: u64,
-    /// How long, ns; [`EVER`].
+    /// Duration, ns; [`EVER`] if permanent.
     pub lasts: u64,
 }
 
-/// When.
+/// The phase in which a fault begins.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Phase {
-    /// Before the drives are asked anything.
+    /// Before any request to the drives.
     StartUp,
     /// SYNC has begun, the drives are about to be enabled.
     Enabling,
     /// Armed, at zero command.
     Rest,
-    /// Armed, under way.
+    /// Armed, in motion.
     Moving,
-    /// A set of parameters has just been handed over.
+    /// A set of parameters has just been submitted.
     Change,
-    /// A stop has just been asked for.
+    /// A stop has just been requested.
     Stopping,
     /// Another program has just taken over the buses.
     Again,
 }
 
 impl Phase {
-    /// The simplest first.
+    /// All phases, the simplest first.
     pub const ALL: [Phase; 7] =
         [Phase::Moving, Phase::Rest, Phase::Change, Phase::Stopping, Phase::StartUp, Phase::Enabling, Phase::Again];
 }
 
-/// What happens to a frame.
+/// Fault of a frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Ill {
-    /// The queue of its sender does not take it.
+    /// The queue of its sender refuses it.
     Refused,
-    /// It never reaches the line.
+    /// It never reaches the bus.
     Lost,
-    /// It comes so much later, ns.
+    /// It is delayed by this time, ns.
     Late(u64),
     Doubled,
-    /// It comes after the frame that follows it.
+    /// It arrives after the frame that follows it.
     Swapped,
-    /// One bit of it is wrong, and the checksum agrees.
+    /// One bit is wrong, under a valid checksum.
     Corrupted,
-    /// Its data are those of the first one that was struck.
+    /// Its data are those of the first frame hit by the fault.
     Stale,
-    /// Disturbed on the line: error frames, and the frame again.
+    /// It is disturbed on the bus: error frames, and a retransmission.
     Disturbed,
 }
 
@@ -114,34 +114,34 @@ impl Ill {
     ];
 }
 
-/// Who or what fails.
+/// The part that fails.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum What {
     /// Frames with this identifier, on this bus.
     Frame(usize, u32, Ill),
     /// A node of the rig.
     Node(usize, Effect),
-    /// The two wires of a bus touch.
+    /// Short circuit of the two wires of a bus.
     Short(usize),
-    /// Our plug is out of a bus.
+    /// Our connector is unplugged from a bus.
     Unplugged(usize),
-    /// The plug of the drives is out of a bus.
+    /// The drives' connector is unplugged from a bus.
     Alone(usize),
-    /// Our interface goes down and stays so.
+    /// Our interface goes down and stays down.
     Down(usize),
-    /// A node sends the most urgent frame without a pause.
+    /// A node sends the frame of highest priority without a pause ("babbling idiot").
     Babble(usize),
-    /// Somebody else sends this frame, once.
+    /// A foreign node sends this frame once.
     Foreign(usize, u32),
-    /// No cycle for so long, ns, again and again as long as it lasts.
+    /// Cycles pause for this time, ns, again and again for the duration of the fault.
     Frozen(u64),
-    /// Our queue of a bus loses so many percent of what comes.
+    /// Our queue of a bus loses this percentage of the received frames.
     Overrun(usize, u8),
-    /// A node that is described by frames tells no number: −1, 1 infinite, 0 none at all.
+    /// A node described by frames sends a value that is not finite: −1 and 1 for infinities, 0 for NaN.
     NoNumber(usize, i8),
 }
 
-/// All frames of a rig by bus and identifier, those of each cycle first; the number of these comes second.
+/// All frames of a rig by bus and identifier, those of each cycle first; and the number of frames of each cycle.
 pub fn frames(sort: Sort) -> (Vec<(usize, u32)>, usize) {
     let drives: &[(usize, u32)] = match sort {
         Sort::One | Sort::FramesServo => &[(0, 3)],
@@ -156,7 +156,7 @@ pub fn frames(sort: Sort) -> (Vec<(usize, u32)>, usize) {
         seldom.extend([0x380, 0x080, 0x600, 0x580].map(|base| (bus, base + node)));
     }
     for bus in 0..buses {
-        // SYNC, our heartbeat; network management.
+        // SYNC, our heartbeat; NMT.
         steady.extend([(bus, 0x080), (bus, 0x77F)]);
         seldom.push((bus, 0x000));
     }
@@ -168,7 +168,7 @@ pub fn frames(sort: Sort) -> (Vec<(usize, u32)>, usize) {
     (steady, often)
 }
 
-/// Who sends a frame.
+/// Name of the node that sends a frame.
 pub fn sender(id: u32) -> &'static str {
     match id {
         0x000 | 0x080 | 0x77F | 0x200..=0x27F | 0x600..=0x67F | FRAME_COMMAND => MASTER,
@@ -177,7 +177,7 @@ pub fn sender(id: u32) -> &'static str {
 }
 
 impl Script {
-    /// The plain rig without a fault.
+    /// The reference rig without a fault.
     pub fn plain(sort: Sort) -> Script {
         let rig = Made { sort, ..PLAIN };
         Script { seed: 1, rig, tested: false, again: false, sets: 1, only: Only::Any, faults: Vec::new() }
@@ -190,13 +190,13 @@ impl Script {
         let tested = chance.below(8) == 0;
         let count = [1, 1, 1, 2, 2, 3][chance.below(6) as usize];
         let mut faults: Vec<Fault> = (0..count).map(|_| fault(&mut chance, rig.sort)).collect();
-        // A torque of the wrong sign shows where it may brake: slowly enough for its speed not to be the limit.
+        // The wrong sign of a torque shows only where the torque may brake, at a speed below the speed limit.
         if faults.iter().any(|fault| matches!(fault.what, What::Node(_, Effect::TorqueScale(_))))
             && chance.below(2) == 0
         {
             (rig.speed, rig.damping, rig.eager) = (chance.between(20.0, 60.0), 0.1, true);
         }
-        // Ticks that are missed again and again, fewer at a time than the rig bears.
+        // Repeated missed ticks, fewer at a time than the rig tolerates.
         if let Some(fault) = faults.iter_mut().find(|fault| matches!(fault.what, What::Frozen(_)))
             && chance.below(2) == 0
         {
@@ -213,7 +213,7 @@ impl Script {
             _ => Only::Any,
         };
         let again = again || only == Only::OtherLater;
-        // Drawn last, so that the seeds before these faults came keep most of what they gave.
+        // Drawn last, so that older seeds keep most of their parameters.
         rig.float = rig.sort == Sort::FramesServo && chance.below(2) == 0;
         let bus = if rig.sort == Sort::TwoBuses { chance.below(2) as usize } else { 0 };
         match chance.below(16) {
@@ -229,7 +229,7 @@ fn pick<T: Copy>(chance: &mut Chance, from: &[T]) -> T {
     from[chance.below(from.len() as u64) as usize]
 }
 
-/// Half of them plain, so that what is found does not hide in an odd rig.
+/// Half of the rigs are the reference rig, so that a failure does not depend on an unusual rig.
 fn rig(chance: &mut Chance) -> Made {
     let sort = Sort::ALL[[0, 0, 0, 1, 2, 3, 4, 5][chance.below(8) as usize]];
     let mut made = Made { sort, ..PLAIN };
@@ -239,7 +239,7 @@ fn rig(chance: &mut Chance) -> Made {
         return made;
     }
     made.damping = chance.between(-0.01, 0.1);
-    // Most limits lie between two steps of the wire.
+    // Most limits lie between two quantisation steps.
     (made.rated, made.most) = pick(chance, &[(4.0, 2.0), (3.0, 1.0), (3.0, 0.2), (0.7, 0.5), (10.0, 7.77)]);
     made.slew = pick(chance, &[0.0, 0.0, 20.0, 100.0, 1000.0]);
     made.hold = pick(chance, &[0, 1, 2, 3]);
@@ -259,7 +259,7 @@ fn rig(chance: &mut Chance) -> Made {
 }
 
 fn fault(chance: &mut Chance, sort: Sort) -> Fault {
-    // Motion is where most can happen.
+    // Motion has a higher weight, because most can happen in it.
     let phase = if chance.below(4) == 0 { Phase::Moving } else { pick(chance, &Phase::ALL) };
     let what = match chance.below(16) {
         0..=10 => frame_fault(chance, sort, phase),
@@ -330,7 +330,7 @@ fn bus_fault(chance: &mut Chance, sort: Sort) -> What {
         3 => What::Down(bus),
         4 => What::Babble(bus),
         5 => {
-            // To the drive of this bus: set-points of each number, a request for an object.
+            // To the drive of this bus: set-points of each PDO number, an SDO request.
             let node = 3 + bus as u32;
             let to_drive = [0x200, 0x300, 0x400, 0x500, 0x600].map(|base| base + node);
             What::Foreign(bus, pick(chance, &[&[0x080, 0x000, 0x77E][..], &to_drive].concat()))
@@ -343,7 +343,7 @@ fn bus_fault(chance: &mut Chance, sort: Sort) -> What {
 }
 
 impl fmt::Display for Script {
-    /// As a test that can be pasted into `scripts.rs`.
+    /// The script as a test that can be pasted into `scripts.rs`.
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(f, "#[test]\nfn found_with_seed_{}() {{", self.seed)?;
         let faults: Vec<String> = self.faults.iter().map(ToString::to_string).collect();
@@ -358,7 +358,7 @@ impl fmt::Display for Script {
 }
 
 impl fmt::Display for Made {
-    /// Only what differs from the plain rig.
+    /// Only the fields that differ from the reference rig.
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let mut parts = Vec::new();
         if self.sort != PLAIN.sort {
