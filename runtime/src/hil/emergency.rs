@@ -1,9 +1,10 @@
-//! Stop frames that are sent when nothing else works any more: by a thread of its own, by a panic, by a signal.
+//! Emergency stop frames, for the case that the cycle fails: sent by the watchdog's thread, after a panic, or in a
+//! signal handler.
 //!
-//! In: frames made ready beforehand by their buses. Out: write(2), and nothing else, so that it is right in a signal
-//! handler too, on a stack of its own. Knows no drive.
+//! In: frames that their buses have encoded beforehand. Out: write(2) and nothing else, so that sending is
+//! async-signal-safe, on a stack of its own. Knows no drive.
 //!
-//! There is one rig in a process, hence one table.
+//! There is one rig in a process, hence one table of frames.
 
 use crate::can::Prepared;
 use crate::realtime::clock::{Clock, Monotonic};
@@ -14,18 +15,18 @@ use std::sync::atomic::{AtomicBool, AtomicI32, AtomicPtr, AtomicU32, AtomicU64, 
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// The table in force. It is never freed: a handler may be reading it.
+/// The active table. It is never freed, because a handler may be reading it.
 static TABLE: AtomicPtr<Vec<Prepared>> = AtomicPtr::new(std::ptr::null_mut());
-/// Number of the signal that asked for a stop, 0 for none.
+/// Number of the signal that requested a stop; 0 for none.
 static ASKED: AtomicI32 = AtomicI32::new(0);
-/// How often the table was sent.
+/// Number of times that the table was sent.
 static SENT: AtomicU32 = AtomicU32::new(0);
 
-/// How many threads and handlers are sending the table.
+/// Number of threads and handlers that are sending the table.
 static SENDING: AtomicU32 = AtomicU32::new(0);
 
-/// A table in force, until this is dropped. The buses that made its frames must outlive it: their descriptors are in it, and
-/// after them the same numbers may belong to any file.
+/// An active table, until this is dropped. The buses that made its frames must outlive it: it holds their descriptors,
+/// and after them the same numbers may belong to any file.
 #[derive(Debug)]
 pub struct Table(*mut Vec<Prepared>);
 
@@ -34,23 +35,24 @@ impl Drop for Table {
         if !is_present(Protection::Table) {
             return;
         }
-        // Another one may be in force already.
+        // Another table may be active already.
         let _ = TABLE.compare_exchange(self.0, std::ptr::null_mut(), Ordering::SeqCst, Ordering::SeqCst);
-        // Somebody who has just read it writes a few frames and is done, or ends the process.
+        // A sender that has just read the pointer writes a few frames and finishes, or ends the process.
         while SENDING.load(Ordering::SeqCst) > 0 {
             std::thread::yield_now();
         }
     }
 }
 
-/// Puts a table in force.
+/// Activates a table of frames.
 pub fn prepare(frames: Vec<Prepared>) -> Table {
     let table = Box::into_raw(Box::new(frames));
     TABLE.store(table, Ordering::SeqCst);
     Table(table)
 }
 
-/// Sends the table, three times: a frame may be lost. Only write(2): safe wherever a rig may end.
+/// Sends the table three times, because a frame may be lost. Calls only write(2), so it is safe in any thread or
+/// handler.
 pub fn send() {
     SENDING.fetch_add(1, Ordering::SeqCst);
     let table = TABLE.load(Ordering::SeqCst);
@@ -64,44 +66,46 @@ pub fn send() {
     SENDING.fetch_sub(1, Ordering::SeqCst);
 }
 
-/// How often the table was sent in this process.
+/// Number of times that the table was sent in this process.
 pub fn sent() -> u32 {
     SENT.load(Ordering::Relaxed)
 }
 
-/// The signal that asked for a stop: SIGINT, SIGTERM, SIGHUP. The cycle ends the run; a second one ends the process.
+/// The signal that requested a stop: SIGINT, SIGTERM or SIGHUP. The cycle then ends the run; a second signal ends the
+/// process.
 pub fn asked() -> Option<i32> {
     Some(ASKED.load(Ordering::Relaxed)).filter(|signal| *signal != 0)
 }
 
-/// Bytes of the stack on which handlers run.
+/// Size of the stack on which handlers run, bytes.
 const STACK: usize = 64 * 1024;
 
-/// Gives the handlers of the calling thread a stack of their own: a cycle that has used up its stack has none left for them.
-/// It is never given back, since a handler may be running on it.
+/// Gives the handlers of the calling thread a stack of their own: a cycle that has overflowed its stack leaves no room
+/// for them. The stack is never freed, because a handler may be running on it.
 ///
 /// # Errors
-/// If the system does not take it.
+/// If the system refuses it.
 pub fn own_stack() -> std::io::Result<()> {
     let stack = Box::leak(vec![0u8; STACK].into_boxed_slice());
     let stack = libc::stack_t { ss_sp: stack.as_mut_ptr().cast(), ss_flags: 0, ss_size: STACK };
-    // SAFETY: the stack is valid for ever and nobody else's; the old one is not asked for.
+    // SAFETY: the stack is valid for ever and has no other user; the old stack is not queried.
     match unsafe { libc::sigaltstack(&stack, std::ptr::null_mut()) } {
         0 => Ok(()),
         _ => Err(std::io::Error::last_os_error()),
     }
 }
 
-/// From now on the table is sent before the process dies of a panic or a fault, and requests to stop are kept. To be called by
-/// the thread that runs the cycle: a fault of it is handled on a stack of its own.
+/// Installs the handlers: from now on the table is sent before the process dies of a panic or a fault, and requests to
+/// stop are noted. Must be called by the thread that runs the cycle, because a fault of that thread is handled on a
+/// stack of its own.
 ///
 /// # Panics
-/// If the system has no such stack: a rig without handlers would not be what its documentation says.
+/// If the system provides no such stack: a rig without handlers would not match its documentation.
 pub fn guard() {
     let stack = own_stack();
     assert!(stack.is_ok(), "no stack for signal handlers: {stack:?}");
     let handler = |signal: libc::c_int, handler: extern "C" fn(libc::c_int)| {
-        // SAFETY: the action is whole, and both handlers below use only what may be used in a handler.
+        // SAFETY: the action is completely initialised, and both handlers below call only async-signal-safe functions.
         unsafe {
             let mut action: libc::sigaction = std::mem::zeroed();
             action.sa_sigaction = handler as *const () as usize;
@@ -131,14 +135,14 @@ extern "C" fn ask(signal: libc::c_int) {
 
 extern "C" fn die(signal: libc::c_int) {
     send();
-    // SAFETY: both may be called in a handler; the default action ends the process with its proper status.
+    // SAFETY: both calls are async-signal-safe; the default action ends the process with its proper status.
     unsafe {
         libc::signal(signal, libc::SIG_DFL);
         libc::raise(signal);
     }
 }
 
-/// Watches that cycles end in time.
+/// Watchdog: checks in a thread of its own that cycles end in time.
 pub struct Watchdog {
     shared: Arc<Shared>,
     clock: Monotonic,
@@ -147,44 +151,45 @@ pub struct Watchdog {
 
 #[derive(Default)]
 struct Shared {
-    /// When the last cycle ended, ns; 0 before the first.
+    /// Time at which the last cycle ended, ns; 0 before the first.
     beat_ns: AtomicU64,
-    /// It has sent the table; the cycle must not send anything but stop frames any more.
+    /// It has acted; from now on the cycle must send nothing but stop frames.
     bitten: AtomicBool,
-    /// It watches: drives are enabled.
+    /// It is active, because drives are enabled.
     awake: AtomicBool,
     over: AtomicBool,
 }
 
-/// What a watchdog does at a moment.
+/// Decision of the watchdog at some moment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Look {
-    /// Its patience is over.
+    /// Its time-out has passed: it acts.
     Bites,
-    /// Nothing, for so many ns.
+    /// It waits for this time, ns.
     Waits(u64),
 }
 
-/// What it does at `now_ns`, if the last beat was then. `bitten_ns`: the beat after which it has bitten already.
+/// Decision at `now_ns`; `beat_ns`: end of the last cycle; `bitten_ns`: the beat after which the watchdog has already
+/// acted.
 fn look(now_ns: u64, beat_ns: u64, awake: bool, bitten_ns: u64, patience_ns: u64) -> Look {
     let left = (beat_ns + patience_ns).saturating_sub(now_ns);
     match left {
         0 if awake && beat_ns > 0 && beat_ns != bitten_ns => Look::Bites,
-        // No beat that comes later can have an end before this.
+        // A later beat cannot time out before this.
         0 => Look::Waits(patience_ns),
         left => Look::Waits(left),
     }
 }
 
-/// Priority of the watchdog's thread: above the cycle's, which may hang.
+/// Priority of the watchdog's thread: above that of the cycle, which may hang.
 const PRIORITY: i32 = 90;
 
 impl Watchdog {
-    /// Watches with this patience, from the first [`Watchdog::beat`] on. `stop` is called as soon as the last beat is so long
-    /// ago, and again after every late one.
+    /// A watchdog with this time-out, active from the first [`Watchdog::beat`] on. `stop` is called as soon as the last
+    /// beat is that old, and again after every later beat that times out.
     ///
     /// # Errors
-    /// If the system gives no thread.
+    /// If the system provides no thread.
     pub fn new(patience: Duration, stop: impl Fn() + Send + 'static) -> std::io::Result<Watchdog> {
         let shared = Arc::new(Shared::default());
         let (watching, clock) = (shared.clone(), Monotonic::new());
@@ -210,18 +215,18 @@ impl Watchdog {
         Ok(Watchdog { shared, clock, thread: Some(thread) })
     }
 
-    /// A cycle has ended. False if the watchdog has stopped the drives: nothing may be sent but stop frames.
+    /// Notes the end of a cycle. Returns false if the watchdog has acted: nothing but stop frames may be sent then.
     pub fn beat(&self) -> bool {
         self.shared.beat_ns.store(self.clock.now_ns().max(1), Ordering::Release);
         !self.shared.bitten.load(Ordering::Acquire)
     }
 
-    /// Whether it has stopped the drives: to be asked immediately before anything is sent.
+    /// Whether the watchdog has acted: must be checked immediately before anything is sent.
     pub fn has_bitten(&self) -> bool {
         self.shared.bitten.load(Ordering::Acquire)
     }
 
-    /// Whether it watches: only while drives are enabled.
+    /// Activates or deactivates the watchdog; it is active only while drives are enabled.
     pub fn watch(&self, awake: bool) {
         self.shared.awake.store(awake, Ordering::Release);
     }
@@ -288,7 +293,7 @@ mod tests {
         drop(table);
     }
 
-    /// A rig that is replaced closes its buses, and another file gets the number of their descriptor.
+    /// A rig that is replaced closes its buses, and another file receives the number of their descriptor.
     #[test]
     fn a_table_is_taken_back_before_its_descriptors_close() {
         let _serial = TESTS.lock();
@@ -296,7 +301,7 @@ mod tests {
         let path = |name: &str| folder.path().join(name);
         let bus = File::create(path("bus")).unwrap();
         let number = bus.as_raw_fd();
-        // As the fields of a rig: the table goes first.
+        // In the order of a rig's fields: the table is dropped first.
         let rig = (prepare(vec![Prepared::new(number, b"stop;")]), bus);
         drop(rig);
         let mut others = Vec::new();
@@ -308,7 +313,7 @@ mod tests {
         for entry in std::fs::read_dir(folder.path()).unwrap() {
             assert_eq!(std::fs::read(entry.unwrap().path()).unwrap(), b"", "stop frames in somebody's file");
         }
-        // The next rig's table is not taken back with the first one's.
+        // Dropping the first table must not withdraw the next rig's table.
         let (mut reader, writer) = std::io::pipe().unwrap();
         let first = prepare(Vec::new());
         let second = prepare(vec![Prepared::new(writer.as_raw_fd(), b"stop;")]);
@@ -325,7 +330,7 @@ mod tests {
         let patience = 5_000_000;
         for beat in 1..50_000u64 {
             let beat_ns = beat * 997;
-            // However it was woken before, it looks again no later than this beat's end, and bites then.
+            // Whenever it was woken before, it checks again no later than the time-out of this beat, and acts then.
             for woken_ns in [beat_ns, beat_ns + 1, beat_ns + patience / 3, beat_ns + patience - 1] {
                 let Look::Waits(ns) = look(woken_ns, beat_ns, true, 0, patience) else { panic!("too early: {beat}") };
                 assert_eq!(woken_ns + ns, beat_ns + patience);
@@ -342,7 +347,7 @@ mod tests {
         assert_eq!(look(patience, 0, true, 0, patience), Look::Waits(patience), "before the first beat");
     }
 
-    /// A cycle that calls itself for ever; `FRIC_OVERFLOW` names where its stop frames go.
+    /// An endless recursion of the cycle; `FRIC_OVERFLOW` names the file for its stop frames.
     #[test]
     fn a_stack_that_overflows_sends_the_stop_frames() {
         #[inline(never)]
@@ -353,7 +358,7 @@ mod tests {
         if let Some(path) = std::env::var_os("FRIC_OVERFLOW") {
             let file = File::create(path).unwrap();
             let _table = prepare(vec![Prepared::new(file.as_raw_fd(), b"stop;")]);
-            // A thread whose own handler stack is not the one that the language gave it.
+            // A thread whose handler stack is not the one that Rust's runtime installed.
             guard();
             println!("{}", deeper(0));
             return;

@@ -1,8 +1,8 @@
-//! How a process may end: signals and panics at random moments and depths of the stack, against real descriptors.
+//! Generated tests of a process's end: signals and panics at random moments and stack depths, with real descriptors.
 //!
-//! The fault space cannot hold what signal handlers do, since there is one process for all of its runs. Here each seed is a
-//! process of its own. In: a seed. Out: whether the stop frames of the rig that is under way were written, and into nothing
-//! but its buses. `FRIC_SEED=n` repeats one; `FRIC_RUNS=n` says how many there are.
+//! The fault space cannot test signal handlers, because one process executes all of its runs. Here each seed is a
+//! process of its own. In: a seed. Out: whether the stop frames of the running rig were written, and to nothing but its
+//! buses. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::emergency::{guard, prepare};
 use crate::can::Prepared;
@@ -17,42 +17,42 @@ use std::path::Path;
 const RUNS: u64 = 40;
 /// Stack of the thread that ends, bytes.
 const STACK: usize = 256 * 1024;
-/// Stack of a thread that the system keeps for itself, bytes.
+/// Part of a thread's stack that the system reserves, bytes.
 const KEPT: usize = 8 * 1024;
-/// Most files that are opened after a bus was closed: one of them gets its number.
+/// Number of files that are opened after a bus was closed: one of them receives its descriptor number.
 const OTHERS: usize = 40;
 
-/// What ends the process.
+/// Kind of the end.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum How {
-    /// A fault, sent to itself.
+    /// A fault signal, sent to itself.
     Signal(i32),
     /// A second request to stop.
     Twice(i32, i32),
     Panic,
-    /// A write to where there is nothing.
+    /// A write to an unmapped address.
     Write,
-    /// It calls itself until its stack is used up.
+    /// An endless recursion.
     Overflow,
 }
 
-/// When.
+/// Moment of the end.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum When {
-    /// A rig is under way.
+    /// A rig is running.
     Running,
-    /// The rig before was replaced, and its buses are closed.
+    /// The rig was replaced, and its buses are closed.
     Replaced,
-    /// A rig was replaced, and the next one has its buses open but no stop frames yet.
+    /// The rig was replaced, and the next one has opened its buses but has no stop frames yet.
     Between,
 }
 
-/// One ending.
+/// Parameters of one end.
 #[derive(Clone, PartialEq, Debug)]
 struct Ending {
     how: How,
     when: When,
-    /// Bytes of the stack that are left.
+    /// Free stack at that moment, bytes.
     left: usize,
     /// The stop frames of each bus.
     frames: Vec<Vec<u8>>,
@@ -71,7 +71,7 @@ impl Ending {
             _ => How::Overflow,
         };
         let when = [When::Running, When::Running, When::Replaced, When::Between][chance.below(4) as usize];
-        // Mostly next to the end of the stack.
+        // Mostly near the end of the stack.
         let left = if chance.below(4) == 0 { STACK } else { chance.below(16 * 1024) as usize };
         let frame = |chance: &mut Chance| (0..1 + chance.below(16)).map(|_| chance.number() as u8).collect();
         let frames = (0..1 + chance.below(4)).map(|_| frame(&mut chance)).collect();
@@ -82,7 +82,7 @@ impl Ending {
 /// Ends the process.
 fn end(how: How) {
     let raise = |signal| {
-        // SAFETY: a signal to this thread, for which there is a handler.
+        // SAFETY: sends a signal to this thread, for which a handler is installed.
         unsafe { libc::raise(signal) };
     };
     match how {
@@ -92,13 +92,13 @@ fn end(how: How) {
             raise(second);
         }
         How::Panic => panic!("the cycle has failed"),
-        // SAFETY: it is not: that is the fault that is looked for.
+        // SAFETY: the write is unsound on purpose: its fault is under test.
         How::Write => unsafe { std::ptr::without_provenance_mut::<u8>(black_box(8)).write_volatile(1) },
         How::Overflow => drop(black_box(deeper(0, 0, How::Overflow))),
     }
 }
 
-/// Goes deeper until the stack is down at `floor`, then ends the process.
+/// Recurses until the stack has grown down to `floor`, then ends the process.
 #[inline(never)]
 fn deeper(n: u64, floor: usize, how: How) -> u64 {
     let more = black_box([n; 16]);
@@ -109,7 +109,7 @@ fn deeper(n: u64, floor: usize, how: How) -> u64 {
     deeper(n + 1, floor, how) + black_box(more)[15]
 }
 
-/// What the child does: it ends in the middle.
+/// Body of the child process, which ends within.
 fn child(ending: &Ending, folder: &Path) {
     let open = |name: String| File::create(folder.join(name)).expect("a file in a folder of the test");
     let ready = |buses: &[File]| {
@@ -135,7 +135,7 @@ fn child(ending: &Ending, folder: &Path) {
 /// Runs a seed in a process of its own.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(seed: u64) -> Result<(), String> {
     let ending = Ending::of(seed);
     let folder = tempfile::tempdir().unwrap();
@@ -158,7 +158,7 @@ fn run(seed: u64) -> Result<(), String> {
         found += usize::from(frame.is_some());
         match wanted {
             None if !bytes.is_empty() => return fail(format!("{} bytes in `{name}`", bytes.len())),
-            // A panic that uses up the stack ends by a signal: the frames are sent by both.
+            // A panic that exhausts the stack ends by a signal: both send the frames.
             Some(frame) if bytes.len() < 3 * frame.len() || bytes.chunks(frame.len()).any(|chunk| chunk != frame) => {
                 return fail(format!("{bytes:02x?} in `{name}` in place of three times {frame:02x?}"));
             }
@@ -175,7 +175,7 @@ fn however_a_process_ends_its_stop_frames_reach_its_buses_and_nothing_else() {
         let folder = std::env::var_os("FRIC_FOLDER").expect("where its files lie");
         let thread = std::thread::Builder::new().stack_size(STACK);
         let ends = thread.spawn(move || child(&Ending::of(seed), Path::new(&folder))).unwrap().join();
-        // A panic ends the thread only.
+        // A panic ends only the thread.
         assert!(ends.is_ok(), "the cycle has failed");
         return;
     }

@@ -1,9 +1,9 @@
-//! Processes that are killed while their rig is under way, and the time-outs of the drives.
+//! Generated tests of the drives' own time-outs: processes that are killed while their rig runs.
 //!
-//! In: a seed: a rig, its watchdog, which drives have a deadline for set-points, and a moment. Out: whether each drive has left
-//! "operation enabled" within its time-out after the process was gone, and has no torque soon after. The rig runs in a process of
-//! its own, at the pace of the wall; the drives live in the test's, which sees their true torque. `FRIC_SEED=n` repeats one seed;
-//! `FRIC_RUNS=n` says how many there are.
+//! In: a seed, from which follow a rig, its watchdog, which drives have a deadline for set-points, and a moment. Out:
+//! whether each drive left "operation enabled" within its time-out after the process was gone, and lost its torque soon
+//! after. The rig runs in a process of its own, in wall-clock time; the drives are simulated in the test's process,
+//! which sees their true torque. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::campaign::quick;
 use super::cycle::Hil;
@@ -27,31 +27,31 @@ use std::sync::atomic::{AtomicU64, Ordering};
 const RUNS: u64 = 12;
 const THREADS: usize = 4;
 const MS: u64 = 1_000_000;
-/// What a busy computer takes to pass a frame on at most, besides the greatest pause of the test's own loop, ns.
+/// Longest delay of a frame on a busy computer, in excess of the greatest pause of the test's own loop, ns.
 const SLACK_NS: u64 = 15 * MS;
-/// From the time-out to the end of the drive's own brake, ns.
+/// Time from the time-out to the end of the drive's own braking, ns.
 const BRAKE_NS: u64 = 150 * MS;
-/// A start takes no longer, ns.
+/// Longest duration of a start, ns.
 const START_NS: u64 = 20_000 * MS;
-/// Torque below which there is none, N·m: one step on the wire.
+/// Torque that counts as zero, N·m: one quantisation step.
 const NONE: f64 = 4e-3;
 
-/// When the process is killed.
+/// Moment at which the process is killed.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Moment {
-    /// So long after it has reached its bus, ns.
+    /// This time after it has connected to its bus, ns.
     Starting(u64),
-    /// So long after there is torque on the shaft, ns.
+    /// This time after the first torque on the shaft, ns.
     Moving(u64),
 }
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, Copy, PartialEq, Debug)]
 struct Script {
     seed: u64,
     period_ns: u64,
     watchdog_ns: u64,
-    /// Which drives notice by themselves that set-points stay away.
+    /// Which drives detect missing set-points by themselves.
     deadlines: [bool; 2],
     moment: Moment,
 }
@@ -80,7 +80,7 @@ impl Script {
     }
 }
 
-/// What the child does: it runs the rig until it is killed.
+/// Body of the child process: runs the rig until it is killed.
 fn child(script: &Script, port: u16) {
     let (rig, model, _) = script.build();
     let world = Simulation::real_time();
@@ -88,7 +88,7 @@ fn child(script: &Script, port: u16) {
     let options = can::Options { bit_rate: Some(1_000_000), ..can::Options::default() };
     let bus = socketcand::Client::open("127.0.0.1", port, "can0", &options, clock).unwrap();
     let mut options = quick();
-    // Nobody promises this computer's time.
+    // This computer guarantees no processor time.
     options.control.count_overruns = true;
     options.start.missed = 0.5;
     let (mut hil, _) = Hil::new(&rig, model, Box::new(world), vec![Box::new(bus)], options, None).unwrap();
@@ -96,21 +96,21 @@ fn child(script: &Script, port: u16) {
     panic!("it ended by itself: {end:?}");
 }
 
-/// What a run showed.
+/// Outcome of a run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Shown {
-    /// It did not come to its moment: this computer was too busy.
+    /// The moment was not reached, because this computer was too busy.
     Nothing,
     /// No drive was enabled when the process was killed.
     Idle,
-    /// From the end of the process until no drive was enabled, as part of their time-out.
+    /// Time from the end of the process until no drive was enabled, as a share of the time-out.
     Stopped(f64),
 }
 
 /// Runs a script.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(script: &Script) -> Result<Shown, String> {
     let (rig, _, plant) = script.build();
     let world = Simulation::real_time();
@@ -170,7 +170,7 @@ fn run(script: &Script) -> Result<Shown, String> {
             }
             continue;
         };
-        // A pause of this loop is one of the drives.
+        // A pause of this loop also pauses the drives.
         longest_ns = longest_ns.max(now_ns - last_ns);
         last_ns = now_ns;
         let bound_ns = gone_ns + timeout_ns + SLACK_NS + 2 * longest_ns;

@@ -1,9 +1,10 @@
-//! Parameters that change while a rig runs: what is typed becomes a set, and a set is judged by the conditions of a start.
+//! Changes of parameters while a rig runs: typed text becomes a set, and the conditions of a start are checked for the
+//! set.
 //!
-//! In: what the compiler says of the parameters ([`Live`]) with the program that computes the numbers of all conditions.
-//! Out: whether the rig would start with the values that a set leads to, and if not, in the words of a start. Judging
-//! allocates nothing, so that the cycle itself does it, with the values that the model has at that moment: however many
-//! sets wait, none is judged by values that another one changes.
+//! In: the compiler's description of the parameters ([`Live`]), and the program that computes the numbers of all
+//! conditions. Out: whether the rig would start with the values that a set leads to; if not, the message of such a
+//! start. Judging allocates nothing, so that the cycle itself can do it, with the model's values at that moment: of
+//! several waiting sets, none is judged by values that another one changes later.
 
 use crate::safety::{Protection, is_present};
 use abi::description::Guard;
@@ -12,12 +13,12 @@ use abi::unit::{NoQuantity, Unit, quantity, three_digits};
 use abi::{Function, Instance, Slot};
 use std::sync::Arc;
 
-/// Parameters that can be changed at once.
+/// Most parameters that can change in one set.
 pub const SET_MOST: usize = 64;
-/// At most so many broken conditions of a refused set are reported.
+/// Most violated conditions that are reported for a refused set.
 pub const TOLD: usize = 3;
 
-/// New values of parameters, SI, which act as one.
+/// New values of parameters, SI, which take effect together.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Set {
     slots: [(Slot, f64); SET_MOST],
@@ -38,16 +39,16 @@ impl Set {
     }
 }
 
-/// Why a set is refused.
+/// Reason to refuse a set.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Objection {
-    /// A slot that is not one of a parameter that may change.
+    /// The slot is not that of a parameter that may change.
     NotLive(Slot),
-    /// A value is no finite number.
+    /// A value is not finite.
     NotFinite(Slot),
-    /// Conditions do not hold: their indices with their numbers, and how many there are.
+    /// Violated conditions: the indices and numbers of the first ones, and how many there are.
     Broken([(u32, [f64; NUMBERS]); TOLD], u32),
-    /// The model could not go on: its status, 0 if it gave no number.
+    /// The model could not continue: its status, 0 if its values were not finite.
     Model(u64),
 }
 
@@ -60,8 +61,8 @@ pub struct Judge {
 }
 
 impl Judge {
-    /// `program`: computes the numbers of all conditions from parameters, as its `Outputs`, if there are any; `control`:
-    /// the program whose parameters change.
+    /// A judge. `program`: its `Outputs` compute the numbers of all conditions from the parameters, if there are
+    /// conditions; `control`: the program whose parameters change.
     ///
     /// # Errors
     /// A message, if the conditions and the two programs do not belong together.
@@ -76,7 +77,7 @@ impl Judge {
         }
     }
 
-    /// What is known of the parameters.
+    /// Description of the parameters.
     pub fn live(&self) -> &Live {
         &self.live
     }
@@ -84,7 +85,7 @@ impl Judge {
     /// Judges a set. `present`: the block of the control program.
     ///
     /// # Errors
-    /// What a start with the same values would refuse.
+    /// The objection of a start with the same values.
     pub fn judge(&mut self, present: &[f64], set: &[(Slot, f64)]) -> Result<(), Objection> {
         for (control, judge) in self.live.places() {
             self.program.set(judge, present[control.index()]);
@@ -99,10 +100,10 @@ impl Judge {
         self.conditions()
     }
 
-    /// Whether everything that a start checks of values holds for those in the block of the control program.
+    /// Checks that the values in the block of the control program satisfy all conditions of a start.
     ///
     /// # Errors
-    /// What does not.
+    /// The violated conditions.
     pub fn holds(&mut self, present: &[f64]) -> Result<(), Objection> {
         self.judge(present, &[])
     }
@@ -116,7 +117,7 @@ impl Judge {
         }
         let (mut broken, mut count) = ([(0, [0.0; NUMBERS]); TOLD], 0);
         let mut stage = u8::MAX;
-        // A start ends with the first stage that fails.
+        // A start reports only its first stage with a violated condition.
         for (k, check) in self.live.checks.iter().enumerate() {
             let numbers = check.numbers(self.program.block());
             if check.stage() > stage || check.holds(numbers) {
@@ -133,7 +134,7 @@ impl Judge {
         if count == 0 { Ok(()) } else { Err(Objection::Broken(broken, count)) }
     }
 
-    /// Codes of what a set breaks, each once, as a start reports them.
+    /// Error codes of the violated conditions, each once, as a start reports them.
     pub fn codes(&self, objection: &Objection) -> Vec<&'static str> {
         let Objection::Broken(broken, count) = objection else { return Vec::new() };
         let mut codes: Vec<&str> =
@@ -143,7 +144,7 @@ impl Judge {
         codes
     }
 
-    /// Why a set is refused, in words.
+    /// The message for a refused set.
     pub fn words(&self, objection: &Objection) -> String {
         let path = |slot: Slot| {
             let here = |place: &Place| matches!(place, Place::Live(control, _) if *control == slot);
@@ -174,10 +175,10 @@ impl Judge {
         }
     }
 
-    /// Reads `fr.Fs = 2 N, fr.Fc = 1.5 N`: one set.
+    /// Parses `fr.Fs = 2 N, fr.Fc = 1.5 N` into one set.
     ///
     /// # Errors
-    /// What is wrong with it, with the code that a start gives it where it has one.
+    /// A message, with the error code of a start where there is one.
     pub fn read(&self, text: &str) -> Result<Set, String> {
         let mut values: Vec<(Slot, f64)> = Vec::new();
         for one in text.split(',') {
@@ -215,7 +216,7 @@ impl Judge {
     }
 }
 
-/// The value in SI of a number with a unit, for a parameter of another unit of the same kind.
+/// Converts a number with a unit to SI, for a parameter with another unit of the same dimension.
 fn in_unit(path: &str, unit: &Unit, text: &str) -> Result<f64, String> {
     let (number, given) = quantity(text).map_err(|why| match why {
         NoQuantity::Number(_) => format!("`{path}` is set to a number with its unit: {why}"),
@@ -232,7 +233,7 @@ fn in_unit(path: &str, unit: &Unit, text: &str) -> Result<f64, String> {
     })
 }
 
-/// Edit distance of two names: insertions, deletions and changes of a character.
+/// Levenshtein distance of two names: insertions, deletions and substitutions of a character.
 fn distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();

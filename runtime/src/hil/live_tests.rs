@@ -1,5 +1,5 @@
-//! Commands and sets of parameters as many at once as somebody likes: each is answered once, and after each cycle
-//! everything holds that a start checks.
+//! Tests of arbitrarily many commands and sets of parameters at once: each is answered exactly once, and after each
+//! cycle all conditions of a start hold.
 
 use super::campaign::quick;
 use super::control;
@@ -28,7 +28,7 @@ impl Stand {
         let (rig, model, plant) = rigs::pair();
         let look = look_ahead(&rig, &plant).unwrap();
         let mut options = Options { arms_itself, look, ..quick() };
-        // A command may stay at its limit as long as on a rig.
+        // A command may stay at its limit as long as on a real rig.
         options.control.clamped_ns = control::Options::default().clamped_ns;
         let judge = rigs::judge(&model);
         let slots = [0, 1, 2].map(|i| model.description().layout.params.slot(i));
@@ -57,7 +57,7 @@ impl Stand {
     }
 }
 
-/// `FRIC_RUNS` says how many; `FRIC_SEED` names one.
+/// `FRIC_RUNS` sets the number of seeds; `FRIC_SEED` repeats one.
 #[test]
 fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_taken() {
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
@@ -72,7 +72,7 @@ fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_tak
         let mut open: Vec<(Ticket, Command)> = Vec::new();
         let mut shadow: Option<[f64; 3]> = None;
         for _ in 0..40 {
-            // Bursts that overfill the queue.
+            // Bursts that overflow the queue.
             let burst = [0, 0, 1, 3, 90][chance.below(5) as usize];
             for _ in 0..burst {
                 let command = match 1 + chance.below(11) {
@@ -131,7 +131,7 @@ fn whatever_is_said_however_fast_is_answered_once_and_the_model_has_what_was_tak
                 assert!((0.0..=1.0).contains(&swing) && damping > 0.0 && swing >= 2.0 * damping, "seed {seed}");
             }
         }
-        // Nothing more is said: everything that waits is answered.
+        // No further commands: every waiting command is answered.
         for _ in 0..=PLACES {
             stand.hil.cycle();
             open.retain(|(ticket, _)| stand.operator.answer(*ticket).is_none());
@@ -153,7 +153,7 @@ fn a_stop_acts_at_once_however_much_waits() {
     stand.hil.cycle();
     let cause = stand.hil.control().unwrap().supervisor().cause();
     assert_eq!(cause, Some(crate::safety::Cause::Asked));
-    // As a command it needs no place either.
+    // As an ordinary command it needs no place either.
     let mut other = Stand::new(true);
     other.reach(Step::Armed);
     let set = other.set(&[(0, 0.5)]);
@@ -169,7 +169,7 @@ fn what_was_asked_for_long_ago_is_refused_but_a_stop() {
     let mut stand = Stand::new(false);
     stand.reach(Step::AwaitEnable);
     let old = Stamp::Rig(0);
-    // The rig is not late: the command was.
+    // The rig is not late; the command is too old.
     while stand.world.clock().now_ns() < 1_100 * MS {
         stand.hil.cycle();
     }
