@@ -1,8 +1,8 @@
-//! Logs on disks that stall, fill up, fail and recover, while a rig runs.
+//! Generated tests of logs on disks that stall, fill up, fail and recover while a rig runs.
 //!
-//! In: a seed. Out: whether cycles went on, whether each message is in the files or counted as missing, whether what is in them
-//! replays to the bit, and whether the end says so. The reference is what the test itself noted in each cycle. `FRIC_SEED=n`
-//! repeats one seed; `FRIC_RUNS=n` says how many there are.
+//! In: a seed. Out: whether cycles continued, whether each message is in the files or counted as missing, whether the
+//! files replay to the bit, and whether the end reports losses. The reference is what the test itself noted in each
+//! cycle. `FRIC_SEED=n` repeats one seed; `FRIC_RUNS=n` sets their number.
 
 use super::campaign::quick;
 use super::control::Control;
@@ -21,40 +21,41 @@ use std::time::Duration;
 
 /// Seeds in `cargo test`.
 const RUNS: u64 = 60;
-/// Wall-clock time without a cycle after which a cycle waits for the disk, which waits for it.
+/// Wall-clock time without a cycle after which the test assumes a deadlock: the cycle waits for the disk, which waits
+/// for a cycle.
 const STUCK: Duration = Duration::from_secs(3);
-/// Cycles from one state to the next in a log.
+/// Number of cycles between two state messages in a log.
 const STATE_EVERY: u64 = 1000;
 
-/// What a disk does from one of its writes on.
+/// Fault of a disk, from one of its writes on.
 #[derive(Clone, Copy, PartialEq, Debug)]
 enum Ill {
-    /// It takes no byte before so many cycles have passed.
+    /// It accepts no byte until this many cycles have passed.
     Stalls(u64),
-    /// It takes a part of each write only, or is interrupted: so many times.
+    /// It accepts only a part of each write, or is interrupted; this many times.
     Halting(u64),
-    /// So many writes fail, after some of their bytes.
+    /// This many writes fail, after some of their bytes.
     Fails(u64),
-    /// It takes so many bytes more.
+    /// It accepts this many more bytes.
     Full(u64),
-    /// Others have filled it, for so many looks.
+    /// Other files have filled it, for this many queries of its free space.
     Filled(u64),
-    /// So many new files cannot be opened.
+    /// This many new files cannot be opened.
     Sealed(u64),
 }
 
-/// One run.
+/// Parameters of one run.
 #[derive(Clone, PartialEq, Debug)]
 struct Script {
     seed: u64,
-    /// From which write on what happens, in order.
+    /// Faults, each with the write from which it acts, in order.
     ills: Vec<(u64, Ill)>,
-    /// Words of the queue.
+    /// Capacity of the queue, in words.
     queue: usize,
     cycles_per_block: u32,
-    /// Bytes of a file.
+    /// Size of a file, bytes.
     part: u64,
-    /// Cycles of the model until it is told to stop; the model gives no number instead.
+    /// Cycles of the model until the stop; whether the model's output becomes NaN instead.
     cycles: u64,
     fails: bool,
 }
@@ -85,12 +86,12 @@ impl Script {
     }
 }
 
-/// What disk and test tell each other.
+/// State shared by the disk and the test.
 #[derive(Default)]
 struct Shared {
-    /// Cycles that have passed; all of them once the run is over.
+    /// Number of cycles that have passed; the maximum once the run is over.
     cycles: u64,
-    /// Writes until now.
+    /// Number of writes.
     writes: u64,
     ills: Vec<(u64, Ill)>,
     /// The disk has waited in vain for a cycle.
@@ -109,7 +110,7 @@ impl Faulty {
         passed.notify_all();
     }
 
-    /// What is wrong now, of this kind.
+    /// The fault of this kind that acts now, if any; `change` updates it.
     fn wrong(&self, is: impl Fn(Ill) -> bool, change: impl FnOnce(&mut Ill)) -> Option<Ill> {
         let mut shared = self.0.0.lock().unwrap();
         let writes = shared.writes;
@@ -124,7 +125,7 @@ impl Faulty {
     }
 
     fn stall(&self) {
-        // The head is written by the cycle itself, before a drive is enabled.
+        // The cycle itself writes the head, before a drive is enabled.
         if std::thread::current().name() != Some("fric log") {
             return;
         }
@@ -224,7 +225,7 @@ impl Write for Part {
     }
 }
 
-/// What became of a run's messages.
+/// Outcome of a run's messages.
 #[derive(Clone, Copy, Debug, Default)]
 struct Fate {
     written: u64,
@@ -237,7 +238,7 @@ struct Fate {
 /// Runs a script in simulated time.
 ///
 /// # Errors
-/// What is not as promised.
+/// A violated property.
 fn run(script: &Script) -> Result<Fate, String> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.friclog");
@@ -283,7 +284,7 @@ fn run(script: &Script) -> Result<Fate, String> {
         return Err("a cycle waits for the disk".into());
     }
     if let Some(End::Refused(why)) = &end {
-        // Its head was not taken: that is said before anything moves.
+        // Its head was not written: this must be reported before anything moves.
         let said = why.contains("the log cannot be written") && truth.is_empty();
         return if said { Ok(Fate::default()) } else { Err(format!("refused: {why}")) };
     }
@@ -291,7 +292,7 @@ fn run(script: &Script) -> Result<Fate, String> {
         return Err(format!("it ended with {end:?}, {missed} ticks missed"));
     }
 
-    // The file against what was noted.
+    // Compares the file with the noted messages.
     let mut reader = Reader::open(&path)?;
     let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
     let mut replay = Replay::new(&rig, Control::new(&rig, model, None, &bounds, options)?);
@@ -328,7 +329,7 @@ fn run(script: &Script) -> Result<Fate, String> {
         Err(error) => {
             let said = error.to_string();
             let number = said.strip_suffix(" messages are not in it").and_then(|said| said.rsplit("; ").next());
-            // What was handed over last may be under way when the cycle counts.
+            // The last messages may still be under way when the cycle counts.
             let number = number.and_then(|number| number.parse().ok()).ok_or(said)?;
             (counted.max(number), number)
         }
@@ -339,7 +340,7 @@ fn run(script: &Script) -> Result<Fate, String> {
     Ok(fate)
 }
 
-/// A script made smaller, as long as it fails.
+/// Simplifies a failing script while it still fails.
 fn shrunk(script: &Script, why: String) -> (Script, String) {
     let (mut best, mut how) = (script.clone(), why);
     'again: loop {

@@ -1,7 +1,7 @@
-//! What a rig's drives and shaft are like: dead time, lag, inertia, measured by small torque pulses.
+//! System identification of a rig's drives and shaft: dead time, lag and inertia, from small torque pulses.
 //!
-//! In: a rig. Out: a program that pulses one torque drive after the other in place of the model, and from the course of
-//! torque and speed the numbers that the rig's text should hold. Knows neither buses nor drives: it is run as any model.
+//! In: a rig. Out: a program that pulses one torque drive after the other in place of the model, and, from the recorded
+//! torque and speed, the numbers for the rig's text. Knows neither buses nor drives: it runs like any model.
 
 use abi::description::{Kind as QuantityKind, Layout, Quantity};
 use abi::rig::{Kind, Mode, Output, Rig, Signal, What};
@@ -12,51 +12,51 @@ use std::sync::Arc;
 
 /// Pulses of each drive, alternating in sign.
 const PULSES: u64 = 12;
-/// Length of a pulse, s.
+/// Duration of a pulse, s.
 const PULSE: f64 = 0.02;
 /// Rest before the next drive, s.
 const REST: f64 = 0.1;
-/// Height of a pulse as part of the output's limit.
+/// Height of a pulse as a share of the output's limit.
 const PART: f64 = 0.3;
-/// Steps into which a period is divided to follow the torque.
+/// Steps per period in the simulation of the torque.
 const SUBSTEPS: usize = 50;
 
 /// The program and the rig it runs on: the same nodes, without stop conditions.
 pub struct Identification {
-    /// As given, with the outputs of this program.
+    /// The given rig, with the outputs of this program.
     pub rig: Rig,
-    /// Gives the pulses.
+    /// The program that generates the pulses.
     pub program: Instance,
-    /// Time it takes, ns.
+    /// Run time, ns.
     pub duration_ns: u64,
     drives: Vec<usize>,
 }
 
-/// One cycle of a measurement.
+/// Recording of one cycle, one value per drive.
 #[derive(Clone, Debug, Default)]
 pub struct Row {
-    /// What was permitted of each output, N·m.
+    /// Permitted torque, N·m.
     pub told: Vec<f64>,
-    /// Torque that each drive says it applies at SYNC, N·m.
+    /// Torque that each drive reports for SYNC, N·m.
     pub torque: Vec<f64>,
     /// Speed at SYNC, rad/s.
     pub speed: Vec<f64>,
 }
 
-/// What was found of one drive.
+/// Identified values of one drive.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Found {
     /// Index into the rig's nodes.
     pub node: usize,
-    /// From the reading of the shaft, at SYNC, to the first effect of the command that answers it, s: the `delay` of the
-    /// rig's text.
+    /// Dead time from the reading of the shaft, at SYNC, to the first effect of the command that answers it, s: the
+    /// `delay` of the rig's text.
     pub delay: f64,
-    /// Time constant of the torque, s. Below about half a period hardly one value of the torque lies on its rise: then lag
-    /// and delay are told apart only as far as the resolution of the torque allows.
+    /// Time constant of the torque, s. Below about half a period hardly one sample lies on the rise of the torque; lag
+    /// and delay can then be separated only as far as the resolution of the torque permits.
     pub lag: f64,
-    /// What the best fit leaves unexplained, rms, N·m.
+    /// Residual of the best fit, rms, N·m.
     pub residual: f64,
-    /// Inertia of all that turns, kg·m²; none if it hardly moved.
+    /// Moment of inertia of all rotating parts, kg·m²; none if the shaft hardly moved.
     pub inertia: Option<f64>,
 }
 
@@ -64,7 +64,7 @@ impl Identification {
     /// Pulses for the torque drives of a rig.
     ///
     /// # Errors
-    /// If it has none.
+    /// If the rig has no torque drive.
     pub fn new(rig: &Rig) -> Result<Identification, String> {
         let torque = |node: &usize| match &rig.nodes[*node].kind {
             Kind::Cia402(drive) => drive.mode == Mode::Torque && rig.nodes[*node].moves,
@@ -121,16 +121,16 @@ impl Identification {
         Ok(Identification { rig, program, duration_ns, drives })
     }
 
-    /// The drives that are pulsed, in order, as indices into the rig's nodes.
+    /// The pulsed drives in order, as indices into the rig's nodes.
     pub fn drives(&self) -> &[usize] {
         &self.drives
     }
 
-    /// What the rows say of each drive.
+    /// Evaluates a recording, drive by drive.
     pub fn evaluate(&self, rows: &[Row]) -> Vec<Found> {
         let period = self.rig.period_ns as f64 * 1e-9;
         let rest = (REST / period) as usize;
-        // From the last cycle before its first pulse: whatever came before, it was told nothing by then.
+        // From the last cycle before its first pulse on: before that, the command of this drive was 0.
         let part = |i: usize| {
             let pulsed = |row: &Row| row.told[i] != 0.0;
             let first = rows.iter().position(pulsed).unwrap_or(0).saturating_sub(1);
@@ -148,11 +148,11 @@ impl Identification {
     }
 }
 
-/// Torque after dead time and lag at each SYNC, against what was measured: rms.
+/// Rms difference between the measured torque and the commands after dead time and lag, at each SYNC.
 fn misfit(told: &[f64], torque: &[f64], period: f64, delayed: f64, lag: f64) -> f64 {
     let h = period / SUBSTEPS as f64;
     let x = h / lag.max(1e-9);
-    // The exponential of one substep by its Padé approximation, good to x³/12.
+    // The exponential of one substep by its (1, 1) Padé approximant, accurate to x³/12.
     let rest = ((1.0 - x / 2.0) / (1.0 + x / 2.0)).max(0.0);
     let shift = (delayed / h).round() as usize;
     let (mut q, mut sum) = (0.0, 0.0);
@@ -167,7 +167,7 @@ fn misfit(told: &[f64], torque: &[f64], period: f64, delayed: f64, lag: f64) -> 
     (sum / told.len() as f64).sqrt()
 }
 
-/// Dead time and lag that explain the torque best: a coarse grid, then a fine one around its best point.
+/// Dead time, lag and residual of the best fit: a coarse grid, then a fine one around its best point.
 fn dead_time_and_lag(told: &[f64], torque: &[f64], period: f64) -> (f64, f64, f64) {
     let best = |delays: &[f64], lags: &[f64]| {
         let pairs = delays.iter().flat_map(|delay| lags.iter().map(move |lag| (*delay, *lag)));
@@ -182,7 +182,7 @@ fn dead_time_and_lag(told: &[f64], torque: &[f64], period: f64) -> (f64, f64, f6
     best(&around(delay), &around(lag))
 }
 
-/// Δω = (∫T dt − friction · sgn ω · t) / J by least squares.
+/// Fits Δω = (∫T dt − friction · sgn ω · t) / J by least squares; returns J.
 fn inertia(torque: &[f64], speed: &[f64], period: f64) -> Option<f64> {
     let (mut qq, mut qs, mut ss, mut qd, mut sd) = (0.0, 0.0, 0.0, 0.0, 0.0);
     for k in 1..torque.len() {
@@ -198,13 +198,13 @@ fn inertia(torque: &[f64], speed: &[f64], period: f64) -> Option<f64> {
     (per_inertia.is_finite() && per_inertia > 0.0 && fastest > 0.0).then(|| 1.0 / per_inertia)
 }
 
-/// As a program: outputs that pulse, one drive after the other.
+/// The pulses as a program: one drive after the other.
 struct Pulses {
     layout: Layout,
     heights: Vec<f64>,
-    /// Ticks of a pulse.
+    /// Duration of a pulse, ticks.
     pulse: u64,
-    /// Ticks of a drive.
+    /// Duration of a drive's pulses and rest, ticks.
     each: u64,
 }
 
@@ -233,7 +233,7 @@ impl Interpret for Pulses {
     }
 }
 
-/// Runs a rig to its end and keeps a row a cycle while the program runs.
+/// Runs a rig to its end, and records one row per cycle while the program runs.
 pub fn rows(hil: &mut super::cycle::Hil, asked: &Identification) -> Vec<Row> {
     let mut rows = Vec::new();
     loop {

@@ -1,9 +1,9 @@
-//! How an operator is heard by a rig under way, and answered.
+//! Commands of an operator to a running rig, and their answers.
 //!
-//! In: commands of all holders of the [`Operator`], from any thread. Out: for each of them exactly one [`Answer`]. A stop
-//! is a flag and never waits behind other commands; everything else waits in a queue of [`PLACES`] places, is refused at
-//! once where that is full, and by the cycle where it is older than [`OLD_NS`]. The cycle's side neither waits nor
-//! allocates: no more commands are under way than answers have places.
+//! In: commands from all holders of the [`Operator`], in any thread. Out: exactly one [`Answer`] for each command. A
+//! stop is a flag and never waits for other commands. Every other command waits in a queue of [`PLACES`] places; it is
+//! refused at once if the queue is full, and by the cycle if it is older than [`OLD_NS`]. The cycle's side neither
+//! blocks nor allocates, because no more commands can be open than there are places for answers.
 
 use super::live::{Objection, Set};
 use super::words;
@@ -15,35 +15,35 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-/// Commands that may be under way at once.
+/// Most commands that can be open at once.
 pub const PLACES: usize = 64;
-/// Age from which a command is refused, ns: what somebody asked for so long ago may be no longer what he wants. At least
-/// two periods, so that a slow rig can be commanded at all.
+/// Age from which a command is refused, ns, because the operator may have changed his mind. At least two periods, so
+/// that a slow rig can be commanded at all.
 pub const OLD_NS: u64 = 1_000_000_000;
 
-/// Why `reset` is refused at any time, in words.
+/// Reason why `reset` is always refused.
 pub const NO_RESET: &str = "a stop is final: the rig ends as soon as its drives are at rest. Start it again, so that drives \
                             are identified and tested anew";
 
-/// How often a thread that waits for an answer looks for it.
+/// Polling interval of a thread that waits for an answer.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// What an operator may ask for while the rig is under way.
+/// Commands of an operator to a running rig.
 #[derive(Clone, Copy, PartialEq, Debug)]
 #[allow(clippy::large_enum_variant, reason = "a box would be freed in a cycle")]
 pub enum Command {
-    /// Power on, at zero command.
+    /// Enable the drives, at zero command.
     Enable,
-    /// The outputs to the model.
+    /// Connect the outputs to the model.
     Arm,
-    /// A controlled stop.
+    /// Controlled stop.
     Stop,
     /// New values of parameters, as one set.
     Set(Set),
 }
 
 impl Command {
-    /// As an operator says it.
+    /// The command's name as an operator types it.
     pub fn name(&self) -> &'static str {
         match self {
             Command::Enable => "enable",
@@ -54,36 +54,36 @@ impl Command {
     }
 }
 
-/// What became of a command.
+/// Result of a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Answer {
-    /// It acts from this cycle on.
+    /// It takes effect in this cycle.
     Taken,
     /// It has no effect.
     Refused(Why),
 }
 
-/// Why a command has no effect.
+/// Reason to refuse a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Why {
-    /// It waited so long, ns.
+    /// It waited for this time, ns.
     Old(u64),
-    /// It has no place in this stage, as a gauge shows it.
+    /// It is not permitted in this stage; the value of the gauge `stage`.
     NotNow(u64),
-    /// The rig was told to stop.
+    /// The rig is stopping.
     Stopping,
-    /// Nothing says which parameters may change.
+    /// No judge decides which parameters may change.
     Unjudged,
-    /// A set that is not whole, or that a start would refuse.
+    /// A set that contains an error, or with which a start would be refused.
     Set(Objection),
-    /// So many commands wait that there is no place for it.
+    /// The queue is full.
     Full,
     /// The rig has ended.
     Ended,
 }
 
 impl Why {
-    /// In words; of a set its judge has better ones.
+    /// The reason as text; for a set, its judge has a better one.
     pub fn words(&self) -> String {
         match self {
             Why::Old(ns) => format!("it is {:.1} s old: say it again", *ns as f64 * 1e-9),
@@ -97,23 +97,23 @@ impl Why {
     }
 }
 
-/// When a command was given.
+/// Time at which a command was given.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Stamp {
-    /// By the time of the rig, as its last cycle told it, ns.
+    /// Time of the rig at its last cycle, ns.
     Rig(u64),
-    /// By the machine's monotonic clock, ns.
+    /// Time of the machine's monotonic clock, ns.
     Wall(u64),
 }
 
 impl Stamp {
-    /// Now by the machine's monotonic clock.
+    /// The current time of the machine's monotonic clock.
     pub fn wall() -> Stamp {
         Stamp::Wall(monotonic_ns())
     }
 }
 
-/// A command on its way.
+/// A command in the queue.
 #[derive(Clone, Copy)]
 pub(super) struct Said {
     pub number: u64,
@@ -121,48 +121,48 @@ pub(super) struct Said {
     pub command: Command,
 }
 
-/// What is known to both sides at once.
+/// State shared by both sides.
 #[derive(Default)]
 struct Shared {
     stop: AtomicBool,
     now_ns: AtomicU64,
 }
 
-/// Stops a rig from any thread, whatever else waits.
+/// Stops a rig from any thread, regardless of waiting commands.
 #[derive(Clone)]
 pub struct Stopper(Arc<Shared>);
 
 impl Stopper {
-    /// A controlled stop with the next cycle.
+    /// Requests a controlled stop in the next cycle.
     pub fn stop(&self) {
         self.0.stop.store(true, Ordering::Relaxed);
     }
 }
 
-/// Where an operator's commands go in, and answers come out.
+/// The operator's side: sends commands and receives answers.
 pub struct Operator {
     commands: Sender<Said>,
     answers: Receiver<(u64, Answer)>,
     shared: Arc<Shared>,
-    /// Answers that nobody has asked for yet, the oldest first.
+    /// Answers that have not been fetched yet, the oldest first.
     known: VecDeque<(u64, Answer)>,
     next: u64,
-    /// Commands without an answer.
+    /// Number of commands without an answer.
     open: usize,
     wall: bool,
 }
 
-/// A command that will be answered.
+/// Identifies a command whose answer is due.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Ticket(u64);
 
 impl Operator {
-    /// Commands are as old as the machine's clock says, rather than that of the rig.
+    /// Measures the age of commands by the machine's clock instead of the rig's.
     pub fn by_the_wall(self) -> Operator {
         Operator { wall: true, ..self }
     }
 
-    /// Stops the rig without this operator.
+    /// A handle that stops the rig without this operator.
     pub fn stopper(&self) -> Stopper {
         Stopper(self.shared.clone())
     }
@@ -170,7 +170,7 @@ impl Operator {
     /// Gives a command, now.
     ///
     /// # Errors
-    /// If it cannot wait: there is no place, or no rig any more.
+    /// If the queue is full or the rig has ended.
     pub fn say(&mut self, command: Command) -> Result<Ticket, Why> {
         let stamp = match self.wall {
             true => Stamp::wall(),
@@ -179,7 +179,7 @@ impl Operator {
         self.say_at(command, stamp)
     }
 
-    /// Gives a command that somebody gave then.
+    /// Gives a command with the time at which it was given.
     ///
     /// # Errors
     /// As [`Operator::say`].
@@ -200,13 +200,13 @@ impl Operator {
         Ok(Ticket(number))
     }
 
-    /// Gives a command and forgets it; false if it cannot wait.
+    /// Gives a command and discards its answer; false if the queue is full or the rig has ended.
     pub fn push(&mut self, command: Command) -> bool {
         self.say(command).is_ok()
     }
 
-    /// What became of a command; none while no cycle has looked at it. Each answer is given once; of more than
-    /// [`PLACES`] that nobody asks for the oldest are forgotten.
+    /// The answer to a command; none while no cycle has handled it. Each answer is returned once; if more than
+    /// [`PLACES`] are not fetched, the oldest are discarded.
     pub fn answer(&mut self, ticket: Ticket) -> Option<Answer> {
         let ended = self.commands.is_abandoned();
         self.listen();
@@ -216,7 +216,7 @@ impl Operator {
         }
     }
 
-    /// Gives a command and waits until it is answered: for a thread of its own, never the cycle's.
+    /// Gives a command and waits for its answer: for a thread of its own, never for that of the cycle.
     pub fn wait(&mut self, command: Command) -> Answer {
         let ticket = match self.say(command) {
             Ok(ticket) => ticket,
@@ -253,7 +253,7 @@ pub(super) struct Commands {
     old_ns: u64,
 }
 
-/// Both sides, for a rig of this period.
+/// Creates both sides, for a rig of this period.
 pub(super) fn commands(period_ns: u64) -> (Operator, Commands) {
     let (commands, said) = queue(PLACES);
     let (answers, answered) = queue(PLACES);
@@ -265,17 +265,18 @@ pub(super) fn commands(period_ns: u64) -> (Operator, Commands) {
 }
 
 impl Commands {
-    /// A cycle begins.
+    /// Notes the time of a cycle.
     pub fn begin(&mut self, now_ns: u64) {
         self.shared.now_ns.store(now_ns, Ordering::Relaxed);
     }
 
-    /// Whether a stop has been asked for since the last time.
+    /// Whether a stop has been requested since the last call.
     pub fn takes_stop(&mut self) -> bool {
         self.shared.stop.swap(false, Ordering::Relaxed)
     }
 
-    /// The next command if it is, or is not, a set; what is too old is answered on the way.
+    /// The next command, if it is a set (`set`) or another command (`!set`); commands that are too old are refused on
+    /// the way.
     pub fn next(&mut self, now_ns: u64, set: bool) -> Option<Said> {
         while let Some(said) = self.queue.first() {
             if matches!(said.command, Command::Set(_)) != set {

@@ -1,7 +1,8 @@
-//! A rig without hardware: its buses, drives and devices in the process.
+//! A rig without hardware: buses, drives and devices simulated within the process.
 //!
-//! In: a rig and the program of what was crossed out. Out: the clock and the buses that a [`Hil`](super::cycle::Hil)
-//! runs on, and the bench behind them, to look into and to make fail. In simulated time all of it is deterministic.
+//! In: a rig and the program of the part that hardware replaces. Out: the clock and the buses for a
+//! [`Hil`](super::cycle::Hil), and the simulated nodes, for inspection and fault injection. In simulated time
+//! everything is deterministic.
 
 use crate::can::sim::{Actor, Port, SimBus, Simulation};
 use crate::can::{Bus, Received};
@@ -12,19 +13,19 @@ use abi::rig::{Kind, Mode, Node, Rig};
 use std::cell::{RefCell, RefMut};
 use std::rc::Rc;
 
-/// Bit rate of a simulated bus where the rig names none.
+/// Bit rate of a simulated bus if the rig names none.
 const BIT_RATE: u32 = 1_000_000;
 
-/// Time of a simulated rig.
+/// Clock of a simulated rig.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Pace {
-    /// As fast as it computes.
+    /// Simulated time, as fast as the computation.
     Fast,
-    /// That of the machine.
+    /// Wall-clock time.
     Wall,
 }
 
-/// What is behind the buses of a simulated rig.
+/// The simulated side of a rig's buses.
 pub struct World {
     simulation: Simulation,
     buses: Vec<SimBus>,
@@ -34,22 +35,22 @@ pub struct World {
 
 /// The name of our own node on a simulated bus.
 pub const MASTER: &str = "fric";
-/// The name of the node that all drives and devices of a bus share.
+/// The name of the node that stands for all drives and devices of a bus.
 pub const BENCH: &str = "bench";
 
 impl World {
-    /// The buses of a rig with all its nodes on them. `seed`: for all that is random.
+    /// The buses of a rig with all its nodes. `seed`: for all random numbers.
     ///
     /// # Errors
-    /// A drive of which no simulation is known, in words.
+    /// A message about a drive for which there is no simulation.
     pub fn new(rig: &Rig, plant: Option<Instance>, pace: Pace, seed: u64) -> Result<World, String> {
         World::around(rig, Bench::new(rig, plant, seed)?, pace, seed)
     }
 
-    /// The same with a bench made elsewhere.
+    /// The same with an existing [`Bench`].
     ///
     /// # Errors
-    /// None of its own.
+    /// Does not fail at present.
     pub fn around(rig: &Rig, bench: Bench, pace: Pace, seed: u64) -> Result<World, String> {
         let simulation = match pace {
             Pace::Fast => Simulation::new(),
@@ -65,17 +66,17 @@ impl World {
         Ok(World { simulation, buses, masters, bench })
     }
 
-    /// Its time.
+    /// The clock of the simulation.
     pub fn clock(&self) -> Box<dyn Clock> {
         Box::new(self.simulation.clone())
     }
 
-    /// Our end of its buses; nothing the second time.
+    /// Our ends of the buses; empty at the second call.
     pub fn masters(&mut self) -> Vec<Box<dyn Bus>> {
         std::mem::take(&mut self.masters)
     }
 
-    /// A bus, to plant faults in it.
+    /// A bus, for fault injection.
     pub fn bus(&self, i: usize) -> &SimBus {
         &self.buses[i]
     }
@@ -85,13 +86,13 @@ impl World {
         self.bench.borrow_mut()
     }
 
-    /// The simulation, to let others act in it.
+    /// The simulation, to add further actors.
     pub fn simulation(&self) -> &Simulation {
         &self.simulation
     }
 }
 
-/// The bench on its buses.
+/// The simulated nodes with their ports.
 struct Nodes {
     ports: Vec<Port>,
     bench: Rc<RefCell<Bench>>,
@@ -103,7 +104,7 @@ impl Actor for Nodes {
         for bus in 0..self.ports.len() {
             while let Some(received) = self.ports[bus].receive() {
                 if let Received::Frame(frame, _) = received {
-                    // A drive whose queue is full loses what it had to say.
+                    // A drive loses the frames for which its queue has no room.
                     bench.receive(bus, &frame, now_ns, &mut |bus, frame| _ = self.ports[bus].send(frame));
                 }
             }
@@ -113,8 +114,8 @@ impl Actor for Nodes {
     }
 }
 
-/// Whether one drive holds speed or position while another gives torque: a simulated one would not let the other push the
-/// shaft.
+/// Whether one drive controls speed or position while another controls torque: a simulated drive of the first kind
+/// would not let the other one move the shaft.
 pub fn holds_and_pushes(rig: &Rig) -> bool {
     let pushes = |node: &Node| match &node.kind {
         Kind::Cia402(drive) => node.moves.then_some(drive.mode == Mode::Torque),

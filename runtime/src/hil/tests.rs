@@ -1,4 +1,4 @@
-//! A whole rig in simulated time: start, run, stop, log and replay.
+//! Tests of a whole rig in simulated time: start, run, stop, log and replay.
 
 use super::control::Control;
 use super::cycle::{End, Hil, Options, look_ahead};
@@ -20,13 +20,13 @@ fn options(seconds: f64) -> Options {
 
 type Made = (Rig, Instance, Instance);
 
-/// The pair of drives, the load looking ahead.
+/// The pair of drives, with a predictor for the load.
 fn looking_ahead() -> Made {
     let (rig, control, plant) = rigs::pair();
     (Rig { predict: Some(0), ..rig }, control, plant)
 }
 
-/// Runs the pair of drives for a time; leaves a log.
+/// Runs the pair of drives for a time, with an optional log.
 fn run(seconds: f64, log: Option<&Path>) -> (End, Hil, World) {
     run_of(rigs::pair(), seconds, log)
 }
@@ -87,7 +87,7 @@ fn a_log_replays_to_the_bit_and_names_what_differs() {
     assert_eq!(summary.dropped, 0);
     let cycles = replay(&path, |_| ()).unwrap();
     assert!(cycles > 3000 && cycles <= all, "{cycles} of {all}");
-    // One bit of one reading, in one cycle.
+    // Flips one bit of one reading in one cycle.
     let flipped = replay(&path, |message| {
         if message.kind == trace::CYCLE && message.words[0] == 2500 {
             message.words[6] ^= 1 << 40;
@@ -105,12 +105,12 @@ fn a_rig_that_looks_ahead_replays_to_the_bit_from_any_state_of_its_log() {
     assert_eq!(end, End::Asked);
     let coupling = hil.counts().coupling.unwrap();
     assert_eq!(coupling.unpredicted, 0, "{coupling:?}");
-    // What it predicts is off by some counts of the encoder.
+    // The prediction error is a few counts of the encoder.
     assert!(coupling.residual_max < 20.0 * 2.4e-5, "{coupling:?}");
     hil.finish().unwrap();
     let cycles = replay_of(looking_ahead(), &path, |_| ()).unwrap();
     assert!(cycles > 3000, "{cycles}");
-    // The beginning is lost: it goes on from the next state, that of the observer included.
+    // The beginning is lost: the replay continues from the next state, which includes the observer.
     let (rig, model, plant) = looking_ahead();
     let mut reader = Reader::open(&path).unwrap();
     let (bounds, options) = trace::settings_from_bytes(reader.head.get("settings").unwrap()).unwrap();
@@ -122,7 +122,7 @@ fn a_rig_that_looks_ahead_replays_to_the_bit_from_any_state_of_its_log() {
         }
     }
     assert!(late.found().cycles > 1000, "{:?}", late.found());
-    // Without the look ahead it is another rig.
+    // Without the predictor it is another rig.
     let plain = replay(&path, |_| ());
     assert!(plain.is_err(), "{plain:?}");
 }

@@ -1,4 +1,4 @@
-//! What a cycle leaves behind, as words: written by the cycle, read by replays and exports.
+//! The record of a cycle as words: written by the cycle, read by replays and exports.
 //!
 //! In: the numbers of a cycle. Out: messages of a log, and the numbers again. Writing allocates nothing once its buffer
 //! has grown.
@@ -14,48 +14,48 @@ pub use crate::record::log::{CYCLE, STATE};
 /// Kind of message: frames of a cycle.
 pub const FRAMES: u32 = 3;
 
-/// One cycle.
+/// The record of one cycle.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Cycle {
     /// Its number, from 0.
     pub k: u64,
-    /// When its tick was due, ns since the start.
+    /// Time of its tick, ns since the start.
     pub due_ns: u64,
-    /// How late it began, ns.
+    /// Delay of its start, ns.
     pub late_ns: u32,
-    /// Receiving, computing and sending, ns.
+    /// Durations of receiving, computing and sending, ns.
     pub phases_ns: [u32; 3],
-    /// Ticks since the cycle before.
+    /// Ticks since the last cycle.
     pub ticks: u32,
-    /// Who asked for outputs.
+    /// Source of the requests.
     pub source: Source,
-    /// What the drives were told.
+    /// The drive command.
     pub order: DriveCommand,
-    /// The outputs were given to whoever asks, just before this cycle.
+    /// The supervisor was armed just before this cycle.
     pub arms: bool,
-    /// Where the start-up was.
+    /// Step of the start-up.
     pub step: u8,
     /// Status word of each drive that moves.
     pub statuses: Vec<u16>,
-    /// What was read.
+    /// Readings.
     pub readings: Vec<Reading>,
-    /// What the start-up asked for; empty if it did not ask.
+    /// Requests of the start-up; empty if it requests nothing.
     pub wanted: Vec<f64>,
-    /// What was asked for.
+    /// Requests.
     pub requests: Vec<f64>,
-    /// What was permitted.
+    /// Permitted outputs.
     pub permitted: Vec<f64>,
-    /// Why it is not the same.
+    /// Reasons why these differ.
     pub clamps: Vec<Clamps>,
-    /// What went wrong elsewhere.
+    /// Causes reported by other parts.
     pub causes: Vec<Cause>,
     /// Parameters that changed.
     pub set: Vec<(Slot, f64)>,
-    /// What the rig records besides, SI.
+    /// Additional quantities that the rig records, SI.
     pub recorded: Vec<f64>,
 }
 
-/// How many of each a rig has: what the words of a cycle do not say.
+/// Lengths of the lists of a cycle, which its words do not contain.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Shape {
     /// Signals that are read.
@@ -69,7 +69,7 @@ pub struct Shape {
 }
 
 impl Shape {
-    /// That of a rig.
+    /// The shape of a rig.
     pub fn of(rig: &Rig, control: &Control) -> Shape {
         Shape {
             signals: control.signals().len(),
@@ -88,7 +88,7 @@ fn source_number(source: Source) -> u64 {
     }
 }
 
-/// An order as a number.
+/// A drive command as a number.
 pub(super) fn order_number(order: DriveCommand) -> u64 {
     match order {
         DriveCommand::Wait => 0,
@@ -98,7 +98,7 @@ pub(super) fn order_number(order: DriveCommand) -> u64 {
     }
 }
 
-/// Numbers of `bits` bits each, as many to a word as fit.
+/// Packs numbers of `bits` bits each, as many into a word as fit.
 fn pack(words: &mut Vec<u64>, bits: u32, numbers: impl Iterator<Item = u64>) {
     let each = (64 / bits) as usize;
     for (i, number) in numbers.enumerate() {
@@ -110,7 +110,7 @@ fn pack(words: &mut Vec<u64>, bits: u32, numbers: impl Iterator<Item = u64>) {
 }
 
 impl Cycle {
-    /// An empty one of this shape, to be filled again and again.
+    /// An empty record of this shape, to be filled again and again.
     pub fn new(shape: Shape) -> Cycle {
         Cycle {
             k: 0,
@@ -134,7 +134,7 @@ impl Cycle {
         }
     }
 
-    /// As words, appended.
+    /// Appends the record as words.
     #[cfg_attr(rtsan, sanitize(realtime = "nonblocking"))]
     pub fn write(&self, words: &mut Vec<u64>) {
         let [receive, compute, send] = self.phases_ns.map(u64::from);
@@ -157,7 +157,7 @@ impl Cycle {
         words.extend(self.set.iter().flat_map(|(slot, value)| [u64::from(slot.0), value.to_bits()]));
     }
 
-    /// From words. None if they are not those of a cycle of this shape.
+    /// Decodes words. None if they are not those of a cycle of this shape.
     pub fn read(shape: Shape, words: &[u64]) -> Option<Cycle> {
         let mut words = words.iter().copied();
         let mut next = || words.next();
@@ -237,14 +237,14 @@ pub struct Passed {
     pub stamp_ns: u64,
     /// Index of the bus.
     pub bus: u8,
-    /// From us, not to us.
+    /// Sent by us, not received.
     pub sent: bool,
-    /// What passed.
+    /// The frame.
     pub frame: Frame,
 }
 
 impl Passed {
-    /// As three words, appended.
+    /// Appends the frame as three words.
     pub fn write(&self, words: &mut Vec<u64>) {
         let frame = self.frame;
         let flags = u64::from(frame.is_extended()) | u64::from(frame.is_remote()) << 1 | u64::from(self.sent) << 2;
@@ -258,7 +258,7 @@ impl Passed {
         ]);
     }
 
-    /// All frames of a message. None if they are none.
+    /// Decodes all frames of a message. None if the words are not frames.
     pub fn read(words: &[u64]) -> Option<Vec<Passed>> {
         let (all, rest) = words.as_chunks::<3>();
         let one = |[stamp_ns, head, data]: &[u64; 3]| {
@@ -279,7 +279,7 @@ impl Passed {
     }
 }
 
-/// The state before cycle `k`: its number, a hash, the words of [`Control::save`].
+/// Appends the state before cycle `k`: its number, a hash, the words of [`Control::save`].
 pub fn write_state(k: u64, control: &Control, words: &mut Vec<u64>) {
     let start = words.len();
     words.extend([k, 0]);
@@ -287,18 +287,18 @@ pub fn write_state(k: u64, control: &Control, words: &mut Vec<u64>) {
     words[start + 1] = hash(&words[start + 2..]);
 }
 
-/// How late after its own tick a cycle began: lateness counts from the first tick it missed.
+/// Delay of a cycle's start after its own tick; `late_ns` counts from the first tick that was missed.
 pub fn within_tick(late_ns: u32, ticks: u32, period_ns: u64) -> u32 {
     let missed_ns = u64::from(ticks.saturating_sub(1)) * period_ns;
     u64::from(late_ns).saturating_sub(missed_ns).min(period_ns - 1) as u32
 }
 
-/// A hash of words, the same on every machine: FNV-1a over them.
+/// A hash of words that is the same on every machine: FNV-1a, word by word.
 pub fn hash(words: &[u64]) -> u64 {
     words.iter().fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// What a replay needs of the drives and of the options, as bytes for the head of a log.
+/// Encodes the settings that a replay needs, limits of the drives and options, for the head of a log.
 pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
     let number = |value: Option<f64>| value.unwrap_or(f64::NAN).to_bits();
     let Options { ramp_ns, clamped_ns, standstill_ns, blend_ns, count_overruns, needs_look, energy_stops, measures } =
@@ -312,7 +312,7 @@ pub fn settings_to_bytes(bounds: &[Bounds], options: &Options) -> Vec<u8> {
     words.iter().flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// The other way round.
+/// Decodes the bytes of [`settings_to_bytes`].
 pub fn settings_from_bytes(bytes: &[u8]) -> Option<(Vec<Bounds>, Options)> {
     let (words, rest) = bytes.as_chunks::<8>();
     let words: Vec<u64> = words.iter().map(|word| u64::from_le_bytes(*word)).collect();
@@ -360,7 +360,7 @@ mod tests {
             set: vec![(Slot(17), 0.3)],
             recorded: vec![1e-300, 2.0, 3.0],
         };
-        // A cycle finds its place ready.
+        // A cycle finds its buffer allocated.
         let mut words = Vec::with_capacity(1 << 14);
         cycle.write(&mut words);
         assert_eq!(Cycle::read(shape, &words), Some(cycle));

@@ -1,4 +1,4 @@
-//! What a rig has to say, in words.
+//! Messages of a rig as text.
 
 use super::counts::Counts;
 use crate::drive::Step;
@@ -25,7 +25,7 @@ pub fn signal(rig: &Rig, signal: Signal) -> String {
     format!("{}.{name}", node.name)
 }
 
-/// Why a rig stopped. `trouble`: what a node said of itself, if that was the beginning.
+/// The reason for a stop. `trouble`: the message of a node, if that was the first cause.
 pub fn cause(rig: &Rig, model: &Description, signals: &[Signal], cause: Cause, trouble: Option<&str>) -> String {
     let output = |i: usize| signal(rig, rig.outputs[i].signal);
     let drive = |i: usize| {
@@ -84,7 +84,7 @@ pub fn stage(number: u64) -> String {
     }
 }
 
-/// What was counted, a line for each group.
+/// Counters as text, one line per group.
 pub fn counts(counts: &Counts) -> String {
     let mut out = String::new();
     let micro = |ns: u64| ns as f64 * 1e-3;
