@@ -1,90 +1,90 @@
-//! A log again: the same readings through the same code, and every output compared to the bit.
+//! Replay of a log: passes the same readings through the same code and compares every output to the bit.
 //!
-//! In: the messages of a log, and the rig's programs compiled anew. Out: how many cycles agree, or the first cycle and
-//! number that do not. Knows neither bus nor clock.
+//! In: the messages of a log, and the rig's programs, compiled again. Out: the number of cycles that agree, or the
+//! first cycle and number that differ. Knows neither bus nor clock.
 
 use super::control::{Control, Told};
 use super::trace::{self, Cycle, Shape};
 use crate::record::log::{LOST, Message};
 use abi::rig::Rig;
 
-/// What a replay found.
+/// Result of a replay.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct Replayed {
     /// Cycles computed and compared.
     pub cycles: u64,
     /// States compared.
     pub states: u64,
-    /// Cycles that could not be computed, since the log lacks what was before them.
+    /// Cycles that could not be computed, because the log lacks the cycles before them.
     pub skipped: u64,
-    /// Messages that the log lost when it was written.
+    /// Messages that were lost when the log was written.
     pub lost: u64,
 }
 
 /// The first number that differs.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Difference {
-    /// Cycle.
+    /// Number of the cycle.
     pub k: u64,
-    /// Which number.
+    /// The number that differs.
     pub what: What,
-    /// As recorded.
+    /// Recorded value.
     pub recorded: f64,
-    /// As computed now.
+    /// Computed value.
     pub computed: f64,
 }
 
-/// Which number of a cycle.
+/// A number of a cycle.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum What {
-    /// What was asked for of this output.
+    /// The request for this output.
     Request(usize),
-    /// What was permitted of this output.
+    /// The permitted value of this output.
     Permitted(usize),
-    /// Why this output was not what was asked for, as bits.
+    /// The clamps of this output, as bits.
     Clamps(usize),
-    /// What the drives were told, as a number.
+    /// The drive command, as a number.
     Order,
-    /// What the rig records besides.
+    /// This recorded quantity.
     Recorded(usize),
-    /// The state of model and safety: hashes do not agree.
+    /// The state of model and safety, compared by its hash.
     State,
 }
 
-/// Why a replay ended early.
+/// Reason for an early end of a replay.
 #[derive(Clone, PartialEq, Debug)]
 pub enum Stopped {
     /// A number differs.
     Differs(Difference),
-    /// A message is not one of this rig.
+    /// A message does not belong to this rig.
     Unreadable {
-        /// Cycle that was to come.
+        /// The cycle that was due.
         k: u64,
     },
 }
 
-/// A replay under way.
+/// A running replay.
 pub struct Replay<'a> {
     rig: &'a Rig,
     control: Control,
     shape: Shape,
-    /// Cycle to come; none while what was before it is missing.
+    /// The next cycle; none while an earlier one is missing.
     next: Option<u64>,
     found: Replayed,
     words: Vec<u64>,
 }
 
 impl<'a> Replay<'a> {
-    /// Begins where `control` stands: at cycle 0.
+    /// Begins at cycle 0, in the state of `control`.
     pub fn new(rig: &'a Rig, control: Control) -> Replay<'a> {
         let shape = Shape::of(rig, &control);
         Replay { rig, control, shape, next: Some(0), found: Replayed::default(), words: Vec::new() }
     }
 
-    /// Goes on with a message.
+    /// Processes a message.
     ///
     /// # Errors
-    /// The first number that differs, or a message that is not of this rig.
+    /// The first number that differs, or a message that does not belong to this rig.
     pub fn message(&mut self, message: &Message) -> Result<(), Stopped> {
         match message.kind {
             LOST => {
@@ -98,7 +98,7 @@ impl<'a> Replay<'a> {
         }
     }
 
-    /// What was found until now.
+    /// The result so far.
     pub fn found(&self) -> &Replayed {
         &self.found
     }

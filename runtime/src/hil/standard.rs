@@ -1,9 +1,9 @@
-//! A standard set of motions for a contact that a drive plays: the contact by itself beside the one that is read in steps,
-//! computed once a period and applied late.
+//! Standard experiments for a contact that a drive plays: compares the ideal contact with the one that is sampled,
+//! computed once per period and applied after a delay.
 //!
-//! In: a rig, its control program, the program of what was crossed out. Out: figures of each contact. The shaft is rigid.
-//! What pulls it is exact, so that the figures are those of the contact alone; a look ahead is told of it where the rig has
-//! another drive that pulls.
+//! In: a rig, its control program, the program of the part that hardware replaces. Out: figures of each contact. The
+//! shaft is rigid. The external torque is exact, so that the figures are those of the contact alone; a predictor knows
+//! that torque if the rig has another drive that applies it.
 
 use super::coupling::{Contact, contacts};
 use crate::coupling::lag::Lag;
@@ -11,50 +11,50 @@ use crate::coupling::predictor::{self, Lookahead, Torque};
 use abi::rig::{Kind, Rig, What};
 use abi::{Instance, Slot};
 
-/// Fine steps in a period.
+/// Fine steps per period.
 const FINE: u64 = 20;
 
-/// A figure of the contact by itself, and the same as the rig plays it.
+/// A figure of the ideal contact, and of the contact as the rig plays it.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Pair {
-    /// By itself.
+    /// The ideal contact.
     pub own: f64,
-    /// On the rig.
+    /// The contact on the rig.
     pub played: f64,
 }
 
-/// How one contact fares.
+/// Figures of one contact.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Figures {
     /// The drive that plays it: an index into the rig's nodes.
     pub node: usize,
-    /// The torque at which a slow turn breaks it away, N·m: the measure of the errors below.
+    /// Break-away torque in a slow motion, N·m: the unit of the errors below.
     pub holds: f64,
-    /// Torque of a slow ramp at which it has slid ten times as far as it gives before it breaks away, N·m.
+    /// Torque of a slow ramp at which the contact has slid ten times its presliding displacement, N·m.
     pub break_away: Pair,
-    /// Ripple of the speed, peak to peak, under half of `holds`, rad/s: what the rig has and the contact has not is a limit
-    /// cycle of the rig's.
+    /// Peak-to-peak ripple of the speed under half of `holds`, rad/s: an excess of the rig over the ideal contact is a
+    /// limit cycle of the rig.
     pub ripple: Pair,
-    /// Area of the loop of torque over angle under 0.8 `holds`, 1 Hz, J.
+    /// Area of the hysteresis loop of torque over angle under 0.8 `holds` at 1 Hz, J.
     pub loop_area: Pair,
-    /// Times it slips within 20 s, pulled by a spring that winds up to `holds` in 5 s.
+    /// Number of slips within 20 s, under a spring whose torque grows to `holds` within 5 s.
     pub slips: Pair,
-    /// Error of the torque meanwhile, rms, as part of `holds`.
+    /// Rms error of the torque in that experiment, as a share of `holds`.
     pub stick_slip_error: f64,
-    /// Greatest error of F(v) while it is turned to and fro in 2 s, above half of the greatest speed, as part of `holds`.
-    /// Nothing looks ahead then: a shaft that is held is not free.
+    /// Greatest error of F(v) in an oscillation with a period of 2 s, above half of the greatest speed, as a share of
+    /// `holds`. Without a predictor, because a shaft with a prescribed speed is not free.
     pub curve_error: f64,
 }
 
-/// What moves the shaft.
+/// Excitation of the shaft.
 enum Motion<'a> {
-    /// A torque by time and angle, N·m.
+    /// A torque as a function of time and angle, N·m.
     Pulled(&'a dyn Fn(f64, f64) -> f64),
-    /// A speed by time, rad/s, whatever it takes.
+    /// A prescribed speed as a function of time, rad/s.
     Turned(&'a dyn Fn(f64) -> f64),
 }
 
-/// The shaft at the end of a period, and the mean torque of the contact in it, against a positive speed.
+/// State of the shaft at the end of a period, and the mean torque of the contact in it, which opposes a positive speed.
 #[derive(Clone, Copy)]
 struct Row {
     x: f64,
@@ -62,7 +62,7 @@ struct Row {
     torque: f64,
 }
 
-/// All contacts that drives of a rig play. None of them where the crossed-out part shows no inertia.
+/// Figures of all contacts that drives of a rig play. Empty if the plant has no known inertia.
 pub fn standard(rig: &Rig, model: &Instance, plant: &Instance) -> Vec<Figures> {
     let Some(inertia) = rig.plant.inertia else { return Vec::new() };
     let stands = contacts(rig, model).into_iter().map(|contact| Stand { rig, model, plant, inertia, contact });
@@ -78,12 +78,12 @@ struct Stand<'a> {
 }
 
 impl Stand<'_> {
-    /// None if the program gives up on a motion.
+    /// None if the program fails in an experiment.
     #[allow(clippy::disallowed_methods, reason = "figures to be shown: they decide nothing that runs")]
     fn figures(&self) -> Option<Figures> {
         let Contact { output, most: holds, stiffness } = self.contact;
         let turn = 2.0 * std::f64::consts::PI;
-        // About the angle at which it breaks away.
+        // The approximate break-away angle.
         let angle = holds / stiffness;
         let both =
             |seconds: f64, motion: &Motion| Some([self.run(false, seconds, motion)?, self.run(true, seconds, motion)?]);
@@ -114,7 +114,7 @@ impl Stand<'_> {
         };
         let loop_area = pair(&runs, &area);
 
-        // A spring that makes a slip take two seconds.
+        // A spring whose slip takes two seconds.
         let spring = self.inertia * (0.25 * turn).powi(2);
         let pace = holds / (5.0 * spring);
         let runs = both(20.0, &Motion::Pulled(&|t, x| spring * (pace * t - x)))?;
@@ -140,18 +140,19 @@ impl Stand<'_> {
         Some(Figures { node, holds, break_away, ripple, loop_area, slips, stick_slip_error, curve_error })
     }
 
-    /// The slots that read this of the shaft.
+    /// The slots that read this quantity of the shaft.
     fn slots(&self, what: What) -> Vec<Slot> {
         self.rig.inputs.iter().filter(|input| input.signal.what == what).map(|input| input.slot).collect()
     }
 
-    /// One run from rest, a row a period. `played`: by the drive; else by the contact itself. None if the program gives up.
+    /// One experiment from rest, one row per period. `played`: by the drive instead of the ideal contact. None if the
+    /// program fails.
     fn run(&self, played: bool, seconds: f64, motion: &Motion) -> Option<Vec<Row>> {
         let Stand { rig, plant, inertia, .. } = self;
         let output = &rig.outputs[self.contact.output];
         let node = &rig.nodes[output.signal.node];
         let Kind::Cia402(drive) = &node.kind else { return None };
-        // The contact acts against the motion: which way its drive turns the shaft is the plant's to say.
+        // The contact opposes the motion; the plant determines the direction in which its drive turns the shaft.
         let sign = predictor::sign(rig, plant, output.signal, output.signal.node);
         let period = rig.period_ns as f64 * 1e-9;
         let dead_ns = (node.delay * 1e9).round() as u64 + if drive.at_sync { rig.period_ns } else { 0 };
@@ -161,7 +162,7 @@ impl Stand<'_> {
         let fine = period / FINE as f64;
         (model.start(if played { period / steps as f64 } else { fine }) == 0).then_some(())?;
         let mut applied = Lag::new(node.lag);
-        // A shaft whose speed is held is not free: there is nothing to look ahead for.
+        // A shaft with a prescribed speed is not free, so there is nothing to predict.
         let free = matches!(motion, Motion::Pulled(_));
         let looks = played && free && rig.predict == Some(output.signal.node);
         let other = |other: &abi::rig::Output| other.signal.what == What::Torque && other.signal != output.signal;
@@ -230,8 +231,8 @@ mod tests {
     use super::*;
     use crate::testing::rigs;
 
-    /// A bristle of 20 N·m/rad that slips at 0.34 N·m on a shaft of 0.012 kg·m²: played 0.8 ms late it is nearly itself,
-    /// played 30 ms late it chatters by itself.
+    /// A bristle of 20 N·m/rad that slips at 0.34 N·m on a shaft of 0.012 kg·m²: played with a delay of 0.8 ms it is
+    /// nearly ideal, with 30 ms it oscillates.
     #[test]
     fn a_late_contact_shows_in_the_figures() {
         let (mut rig, model, plant) = rigs::bristle();
