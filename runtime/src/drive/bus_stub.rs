@@ -1,4 +1,5 @@
-//! A bench on simulated buses: each node at a port of its own, so that its frames compete for the bus as real ones do.
+//! The simulated nodes on simulated buses: each node has a port of its own, so that its frames compete for the bus as
+//! real ones do.
 
 use crate::can::sim::{Actor, Port, SimBus, Simulation};
 use crate::can::{Bus, Received};
@@ -7,8 +8,8 @@ use abi::rig::Rig;
 use std::cell::RefCell;
 use std::rc::Rc;
 
-/// Puts the nodes of a rig on its simulated buses, under their own names. `buses`: in the order of the rig. The bench
-/// can still be looked into, and made to fail, between events.
+/// Connects the nodes of a rig to its simulated buses, under their own names. `buses`: in the order of the rig. Between
+/// events the nodes remain accessible for inspection and fault injection.
 pub fn attend(simulation: &Simulation, buses: &[SimBus], rig: &Rig, bench: Bench) -> Rc<RefCell<Bench>> {
     let ports = rig.nodes.iter().map(|node| buses[node.bus].port(&node.name)).collect();
     let bench = Rc::new(RefCell::new(bench));
@@ -28,7 +29,7 @@ impl Actor for Nodes {
         for node in 0..ports.len() {
             while let Some(received) = ports[node].receive() {
                 if let Received::Frame(frame, _) = received {
-                    // A node whose queue is full loses what it had to say.
+                    // A node loses the frames for which its queue has no room.
                     bench.hear(node, &frame, now_ns, &mut |from, frame| _ = ports[from].send(frame));
                 }
             }

@@ -1,7 +1,7 @@
-//! One CiA 402 drive, as its master sees it.
+//! The axis: one CiA 402 drive from the master's point of view.
 //!
-//! In: its frames, SYNCs, permitted commands. Out: its signals, the frames that configure and command it, what it did
-//! that it wasn't told to. The order of the start-up, which concerns all drives of a rig, is [`super::fieldbus`]'s.
+//! In: its frames, SYNCs, permitted commands. Out: its signals, the frames that configure and command it, reports of
+//! unexpected behaviour. The sequence of the start-up, which concerns all drives of a rig, is in [`super::fieldbus`].
 
 use super::profiles::{self, Life, Path, Profile};
 use super::state::{Goal, State, control, status, towards};
@@ -22,33 +22,34 @@ const MODE: Object = Object(0x6060, 0);
 const MODE_SHOWN: Object = Object(0x6061, 0);
 const ERROR: Object = Object(0x603F, 0);
 
-/// How often a drive tells its state.
+/// Period of a drive's heartbeat.
 pub const HEARTBEAT_MS: u64 = 20;
-/// Least time after which a heartbeat is missing: two and a half of them. A rig whose `watchdog` is slower has its time.
+/// Shortest time after which a heartbeat counts as missing: two and a half periods. A longer `watchdog` of the rig
+/// takes precedence.
 const HEARTBEAT_LATE_NS: u64 = 50_000_000;
 /// Longest wait for an answer to an SDO request.
 const SDO_NS: u64 = 500_000_000;
-/// Ticks with "follows the command" off after which a drive is said not to follow.
+/// Ticks without the bit "drive follows the command" after which the drive is reported as not following.
 const NOT_FOLLOWING: u32 = 5;
 
-/// What a rig gives to a drive beyond its own arguments.
+/// Settings of the rig for a drive, beyond the drive's own arguments.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Setting {
     /// Our node id.
     pub master: u8,
     /// Period of SYNC.
     pub period_ns: u64,
-    /// Time after which the drive shall notice that we are gone.
+    /// Time after which the drive must detect that we are gone.
     pub watchdog_ns: u64,
-    /// Greatest change of its command per second, SI.
+    /// Slew limit of its command, SI per second.
     pub slew: f64,
-    /// Value of its command on any stop, SI.
+    /// Safe value of its command, SI.
     pub safe: f64,
-    /// Greatest command either way, SI; inf where the rig names none.
+    /// Highest command in either direction, SI; infinite if the rig names none.
     pub most: f64,
 }
 
-/// Limits of a drive: the rig's, or its own where the rig names none. SI.
+/// Limits of a drive: those of the rig, or the drive's own where the rig names none. SI.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Limits {
     /// N·m.
@@ -59,38 +60,38 @@ pub struct Limits {
     pub power: f64,
 }
 
-/// What is known of a drive.
+/// Status of a drive.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Status {
-    /// By its status word.
+    /// State according to its status word.
     pub state: State,
     /// The status word.
     pub word: u16,
-    /// By its heartbeat.
+    /// NMT state according to its heartbeat.
     pub nmt: NmtState,
-    /// The mode it was given.
+    /// The mode of operation it was given.
     pub mode: i8,
-    /// The mode it shows.
+    /// The mode of operation it displays (object 6061).
     pub mode_shown: Option<i8>,
-    /// It follows commands.
+    /// Whether it follows commands.
     pub following: bool,
-    /// Last error code it told, 0 for none.
+    /// Last error code it reported; 0 for none.
     pub error_code: u16,
     /// Vendor, product, revision, serial number.
     pub identity: [Option<u32>; 4],
-    /// Time after which it notices that we are gone, ms, and how.
+    /// Time after which it detects that we are gone, ms, and the mechanism.
     pub timeout: Option<(u32, Life)>,
-    /// What the time-out test measured, ns.
+    /// Time measured by the time-out test, ns.
     pub timeout_measured_ns: Option<u64>,
-    /// Time after which it misses set-points, ms; none where it has no object 1400:5.
+    /// Time after which it detects missing set-points, ms; none if it has no object 1400:5.
     pub deadline_ms: Option<u32>,
-    /// It has proved that it is one of our own simulated drives.
+    /// Whether it has proved to be one of our own simulated drives.
     pub simulated: bool,
-    /// Answers of an earlier SYNC, or doubled ones.
+    /// Number of answers to an earlier SYNC, and of doubled answers.
     pub surplus: u64,
 }
 
-/// One PDO of the drive, and when it came.
+/// One PDO of the drive, with its time and age.
 #[derive(Clone, Debug)]
 struct Answer {
     pdo: Pdo,
@@ -98,7 +99,7 @@ struct Answer {
     age: u32,
 }
 
-/// One signal in an answer.
+/// Position of one signal in an answer.
 #[derive(Clone, Copy, Debug)]
 struct Place {
     answer: usize,
@@ -112,7 +113,7 @@ impl Place {
     }
 }
 
-/// A drive.
+/// State of a drive.
 #[derive(Clone, Debug)]
 pub struct Drive {
     config: Cia402,
@@ -143,18 +144,18 @@ pub struct Drive {
     counter: Counter,
     mode_shown: Option<i8>,
     error_code: u16,
-    /// Where the state machine is to be led.
+    /// Target of the state machine.
     goal: Goal,
-    /// The fault bit alternates while this is set: an operator has asked for it.
+    /// While set, the fault reset bit alternates, because an operator has requested it.
     resets: bool,
     ticks: u32,
     command: f64,
     not_following: u32,
-    /// The last command had no place in the 32 bits of a position.
+    /// The last position command does not fit into its 32 bits.
     wraps: bool,
     guard_due_ns: u64,
     surplus: u64,
-    /// When our life sign stopped, for the time-out test.
+    /// Measured time from the end of our heartbeat to the drive's reaction, for the time-out test.
     pub(super) timeout_measured_ns: Option<u64>,
 }
 
@@ -167,7 +168,7 @@ fn mapped((object, bits): (Object, u8)) -> Mapped {
 }
 
 impl Drive {
-    /// A drive of a rig.
+    /// The axis of a drive of a rig.
     pub fn new(config: &Cia402, profile: &'static Profile, setting: Setting) -> Result<Drive, String> {
         let (path, what) = match config.mode {
             Mode::Torque => (profile.torque, "torque"),
@@ -261,7 +262,7 @@ impl Drive {
         wanted.clamp(self.profile.timeout_ms.0, self.profile.timeout_ms.1)
     }
 
-    /// Time after which it misses set-points, ms: that of our life sign.
+    /// Deadline for set-points, ms: equal to that for our heartbeat.
     fn deadline_ms(&self) -> i64 {
         self.setting.watchdog_ns.div_ceil(1_000_000).clamp(1, 65_535) as i64
     }
@@ -301,7 +302,7 @@ impl Drive {
             let compare = |(object, value, bits): (Object, u32, u32)| Entry::Compare(object, value.into(), bits.into());
             list.extend(pdo.read_back().into_iter().map(compare));
         }
-        // The drive notices that its set-points stay away although our life sign comes.
+        // The drive detects missing set-points even while our heartbeat arrives.
         let (deadline, ms) = (Object(self.command_pdo.communication(), 5), self.deadline_ms());
         if is_present(Protection::Deadline) {
             list.push(Entry::WriteOr(deadline, ms, 2, 2));
@@ -309,7 +310,7 @@ impl Drive {
             list.push(Entry::Read(deadline, Type::U16, Keep::Deadline));
         }
         if self.profile.fixed.is_none() {
-            // Mode shown and error code, sent when they change: where a drive has a third PDO.
+            // Mode display and error code, sent on change, for drives with a third PDO.
             let map = [Mapped { object: MODE_SHOWN, bits: 8 }, Mapped { object: ERROR, bits: 16 }];
             let writes = Pdo::new(Direction::Transmit, 3, self.config.node, 255, &map).configuration();
             let count = writes.len();
@@ -317,8 +318,8 @@ impl Drive {
                 list.push(Entry::WriteOr(object, value.into(), size, count - 1 - i));
             }
         }
-        // A drive that watches our heartbeat leaves its communication as it is when it misses it, so that it can still
-        // be read; where that can't be chosen it falls back to pre-operational.
+        // A drive that misses our heartbeat keeps its communication state, so that it can still be read. If the drive
+        // offers no such choice, it falls back to pre-operational.
         list.push(Entry::WriteOr(Object(0x1029, 1), 1, 1, 0));
         if self.profile.life.contains(&Life::Heartbeat) {
             let consumer = Object(0x1016, 1);
@@ -340,10 +341,11 @@ impl Drive {
             Entry::Judge(Question::Timeout(Watching::Guarding)),
             Entry::Skip(1),
             Entry::Judge(Question::Timeout(Watching::Nothing)),
-            // When it misses us: quick stop.
+            // Reaction to our loss: quick stop.
             number(Object(0x6007, 0), 3, 2),
             Entry::Compare(Object(0x6007, 0), 3, 0xFFFF),
-            // A quick stop ends without torque: options 5 to 8 would let a late command enable it again.
+            // After a quick stop the drive must be without torque: options 5 to 8 would permit a late command to enable
+            // it again.
             Entry::WriteOr(Object(0x605A, 0), 2, 2, 0),
             Entry::Read(Object(0x605A, 0), Type::I16, Keep::QuickStop),
             Entry::Judge(Question::QuickStop),
@@ -357,11 +359,11 @@ impl Drive {
         Ok(list)
     }
 
-    /// What depends on the mode, once it is chosen.
+    /// Entries that depend on the mode of operation, once it has been chosen.
     fn mode_list(&self) -> Result<Vec<Entry>, Why> {
         let mut list = Vec::with_capacity(8);
         if self.mode == 4 {
-            // A hidden rate limiter: the rig's own slope limit, or none.
+            // The drive's own rate limiter: set to the slew limit of the rig, or disabled.
             let slope = (self.setting.slew / self.torque.step).min(f64::from(u32::MAX)) as i64;
             list.push(Entry::Write(Object(0x6087, 0), slope, 4));
             list.push(Entry::Compare(Object(0x6087, 0), slope, 0xFFFF_FFFF));
@@ -393,7 +395,7 @@ impl Drive {
         self.limits
     }
 
-    /// Forgets all that was configured: before a reset of communication.
+    /// Discards all knowledge of the configuration, before a reset of communication.
     pub(super) fn forget(&mut self) {
         self.identity.rewind();
         self.configuration.rewind();
@@ -408,12 +410,12 @@ impl Drive {
         }
     }
 
-    /// Whether it has booted since it was told to reset.
+    /// Whether it has booted since the last reset command.
     pub(super) fn has_booted(&self) -> bool {
         self.booted
     }
 
-    /// Takes a frame of its bus. What it did by itself goes to `tell`.
+    /// Receives a frame of its bus. Unexpected behaviour is reported to `tell`.
     pub(super) fn receive(&mut self, frame: &Frame, stamp_ns: u64, tell: &mut dyn FnMut(TroubleKind), send: Send) {
         if frame.is_extended() {
             return;
@@ -483,7 +485,7 @@ impl Drive {
         }
     }
 
-    /// By its status word; "not ready" before one has come or where it makes no sense.
+    /// State according to its status word; "not ready" before the first one and for invalid ones.
     pub fn state(&self) -> State {
         self.word.and_then(State::of).unwrap_or(State::NotReady)
     }
@@ -492,7 +494,7 @@ impl Drive {
         self.mode_shown == Some(self.mode)
     }
 
-    /// Whether commands act: enabled, in the mode it was given, and in a cyclic mode with bit 12 set.
+    /// Whether commands act: it is enabled, in the mode it was given, and in a cyclic mode with bit 12 set.
     pub fn following(&self) -> bool {
         let cyclic = self.mode >= 8;
         let follows = self.word.unwrap_or(0) & status::FOLLOWS != 0;
@@ -505,7 +507,7 @@ impl Drive {
         is(Keep::Vendor, vendor.into()) && is(Keep::Serial, serial.into()) && is(Keep::Name, 1)
     }
 
-    /// All that is known of it.
+    /// Its complete status.
     pub fn status(&self) -> Status {
         let identity = [Keep::Vendor, Keep::Product, Keep::Revision, Keep::Serial];
         let timeout = match self.watching {
@@ -530,7 +532,7 @@ impl Drive {
         }
     }
 
-    /// A signal of it; nothing if it has no such signal.
+    /// A signal of the drive; none if it has no such signal.
     pub fn reading(&self, what: What) -> Option<Reading> {
         let at = |place: Option<Place>, value: f64| {
             place.map(|place| {
@@ -550,17 +552,17 @@ impl Drive {
         }
     }
 
-    /// Whether each answer has come since the last SYNC but one.
+    /// Whether each answer has arrived since the last SYNC but one.
     pub(super) fn answered(&self) -> bool {
         self.answers.iter().all(|answer| answer.age <= 1)
     }
 
-    /// The age of its oldest answer, ticks.
+    /// Age of its oldest answer, ticks.
     pub fn age(&self) -> u32 {
         self.answers.iter().map(|answer| answer.age).max().unwrap_or(Reading::NEVER)
     }
 
-    /// A SYNC goes out: everything is a tick older.
+    /// Begins a tick with a new SYNC: all answers age by one tick.
     pub(super) fn begin(&mut self) {
         for answer in &mut self.answers {
             answer.age = answer.age.saturating_add(1);
@@ -568,7 +570,7 @@ impl Drive {
         self.ticks = self.ticks.wrapping_add(1);
     }
 
-    /// Whether it has torque although it was told to stop, and is not on the way.
+    /// Whether it still has torque although it was told to stop, and has not begun to.
     pub(super) fn disobeys(&self) -> bool {
         match self.goal {
             Goal::Enabled => false,
@@ -577,28 +579,28 @@ impl Drive {
         }
     }
 
-    /// Whether its torque is to be off.
+    /// Whether its goal is to be without torque.
     pub(super) fn is_to_be_off(&self) -> bool {
         self.goal == Goal::Off
     }
 
-    /// The command for the next `end`, SI.
+    /// Sets the command for the next `end`, SI.
     pub fn command(&mut self, value: f64) {
         self.command = value;
     }
 
-    /// Leads the state machine elsewhere. `resets`: an operator has asked to reset a fault.
+    /// Sets the goal of the state machine. `resets`: an operator has requested a fault reset.
     pub(super) fn aim(&mut self, goal: Goal, resets: bool) {
         (self.goal, self.resets) = (goal, resets);
     }
 
-    /// Makes its position the origin.
+    /// Makes its present position the origin.
     pub(super) fn rest(&mut self) {
         self.counter.rest();
         self.command = 0.0;
     }
 
-    /// Notes what only time shows.
+    /// Reports conditions that only time reveals: missing heartbeats, and a drive that does not follow.
     pub(super) fn watch(&mut self, now_ns: u64, tell: &mut dyn FnMut(TroubleKind)) {
         let late_ns = self.setting.watchdog_ns.max(HEARTBEAT_LATE_NS);
         if self.watching == Some(Watching::Heartbeat)
@@ -627,7 +629,7 @@ impl Drive {
         }
     }
 
-    /// The process data for a control word and a command.
+    /// The PDO with a control word and a command.
     fn process_data(&self, word: u16, command: f64) -> Frame {
         let mut data = [0; 8];
         data[..2].copy_from_slice(&word.to_le_bytes());
@@ -640,7 +642,7 @@ impl Drive {
         Frame::new(self.command_pdo.cob_id, &data[..length])
     }
 
-    /// Sends the control word towards the goal with the command, zero where it is not enabled.
+    /// Sends the control word towards the goal, with the command; with the idle value if the drive is not enabled.
     pub(super) fn send_command(&mut self, send: Send) {
         let word = towards(self.goal, self.state(), self.resets && self.ticks % 16 < 8);
         let idle = match self.config.mode {
@@ -657,12 +659,12 @@ impl Drive {
         send(self.process_data(word, command));
     }
 
-    /// The frames of a quick stop, and of taking the torque off.
+    /// The frames for a quick stop and for disabling the voltage.
     pub(super) fn stop_frames(&self) -> [Frame; 2] {
         [control::QUICK_STOP, control::DISABLE_VOLTAGE].map(|word| self.process_data(word, self.setting.safe))
     }
 
-    /// Asks for its state if it lives by guard requests.
+    /// Sends a guard request, if the drive is monitored by node guarding.
     pub(super) fn guard(&mut self, now_ns: u64, send: Send) {
         if self.watching == Some(Watching::Guarding) && now_ns >= self.guard_due_ns {
             self.guard_due_ns = now_ns + u64::from(self.timeout_wanted_ms().div_ceil(3).max(1)) * 1_000_000;
@@ -670,7 +672,7 @@ impl Drive {
         }
     }
 
-    /// One step of finding out what it is. The time of SDO runs here too.
+    /// One step of the identification. Also polls the SDO client for time-outs.
     pub(super) fn identify(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
         self.client.poll(now_ns, send);
         match self.identity.work(&mut self.client, now_ns, send) {
@@ -716,7 +718,7 @@ impl Drive {
         Ok(())
     }
 
-    /// One step of telling it how to communicate.
+    /// One step of the configuration.
     pub(super) fn configure(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
         self.client.poll(now_ns, send);
         match self.configuration.work(&mut self.client, now_ns, send) {
@@ -728,7 +730,7 @@ impl Drive {
             Progress::Refused(why) => Err(why),
             Progress::Asks(Question::Timeout(Watching::Nothing)) => Err(Why::NoTimeout),
             Progress::Asks(Question::Timeout(watching)) => {
-                // From now on it lives by our life sign, and we by its.
+                // From now on the drive monitors us, and we monitor the drive.
                 (self.watching, self.heard_ns) = (Some(watching), Some(now_ns));
                 Ok(false)
             }
@@ -742,7 +744,7 @@ impl Drive {
         }
     }
 
-    /// One step of giving it its mode; it is read again until it is shown.
+    /// One step of setting the mode of operation; the mode display is read repeatedly until it agrees.
     pub(super) fn give_mode(&mut self, now_ns: u64, send: Send) -> Result<bool, Why> {
         self.client.poll(now_ns, send);
         match self.mode_script.work(&mut self.client, now_ns, send) {
@@ -759,12 +761,12 @@ impl Drive {
         }
     }
 
-    /// What it says when its mode never came.
+    /// The refusal if its mode display never agreed.
     pub(super) fn wrong_mode(&self) -> Why {
         Why::Mode { wanted: self.mode, shown: self.mode_shown.unwrap_or(0) }
     }
 
-    /// What it says when it never was enabled.
+    /// The refusal if it was never enabled.
     pub(super) fn not_enabled(&self) -> Why {
         match self.state() {
             State::Enabled => self.wrong_mode(),
@@ -772,17 +774,17 @@ impl Drive {
         }
     }
 
-    /// Its state by heartbeat.
+    /// Its NMT state according to its heartbeat.
     pub fn nmt(&self) -> NmtState {
         self.nmt
     }
 
-    /// How it watches us, once configured.
+    /// The mechanism by which it monitors us, once configured.
     pub(super) fn watching(&self) -> Option<Watching> {
         self.watching
     }
 
-    /// Greatest command that the rig lets through, SI.
+    /// Highest command that the rig permits, SI.
     pub(super) fn most(&self) -> f64 {
         let own = match self.config.mode {
             Mode::Torque => self.limits.torque,
@@ -798,7 +800,7 @@ impl Drive {
     }
 }
 
-/// A period as a number from 1 to 255 times a power of ten, seconds.
+/// A period as an integer from 1 to 255 times a power of ten, in seconds (object 60C2).
 fn interpolation(period_ns: u64) -> Option<(i64, i64)> {
     let (mut value, mut exponent) = (period_ns, -9);
     while value > 255 {
@@ -807,7 +809,7 @@ fn interpolation(period_ns: u64) -> Option<(i64, i64)> {
         }
         (value, exponent) = (value / 10, exponent + 1);
     }
-    // As most drives write it: milliseconds where it is some.
+    // In milliseconds where that is exact, as most drives write it.
     while value.is_multiple_of(10) && exponent < -3 {
         (value, exponent) = (value / 10, exponent + 1);
     }

@@ -1,4 +1,4 @@
-//! A node that speaks in described frames: transducers, switches, boxes without a drive profile.
+//! A node that communicates in described frames: transducers, switches, devices without a drive profile.
 //!
 //! In: its frames, commands. Out: its signals, the frames to send.
 
@@ -8,7 +8,7 @@ use crate::canopen::Send;
 use crate::drive::faults::{Reading, TroubleKind};
 use abi::rig::Message;
 
-/// Longest time between two frames of ours where nobody names one.
+/// Longest interval between two frames of ours if the text names none.
 const PERIOD_NS: u64 = 100_000_000;
 
 /// One message with its values.
@@ -16,15 +16,15 @@ const PERIOD_NS: u64 = 100_000_000;
 struct Line {
     message: Message,
     values: Vec<Reading>,
-    /// Values on any stop, SI.
+    /// Safe values, SI.
     safe: Vec<f64>,
-    /// What was sent last.
+    /// Data of the last frame sent.
     sent: [u8; 8],
     due_ns: u64,
     fresh: bool,
 }
 
-/// A device.
+/// State of a device.
 #[derive(Clone, Debug)]
 pub struct Device {
     lines: Vec<Line>,
@@ -37,8 +37,8 @@ fn frame(message: &Message, data: &[u8; 8]) -> Frame {
 }
 
 impl Device {
-    /// A device of a rig. `moves`: it is a drive, and hears from us each tick. `safe`: its safe values, by message and
-    /// field.
+    /// A device of a rig. `moves`: it is a drive, to which we send in each tick. `safe`: its safe values, by message
+    /// and field.
     pub fn new(messages: &[Message], moves: bool, safe: &[(usize, usize, f64)]) -> Result<Device, String> {
         for message in messages {
             if message.length > 8 || message.id >= if message.extended { 1 << 29 } else { 0x800 } {
@@ -60,7 +60,7 @@ impl Device {
             for &(_, field, value) in safe.iter().filter(|(message, ..)| *message == at) {
                 safe_values[field] = value;
             }
-            // A drive hears from us each tick from the first one on: nothing but its safe values.
+            // We send to a drive in each tick, from the first one on: its safe values at first.
             let begins = if moves && message.send { safe_values.clone() } else { Vec::new() };
             let start = |(k, field): (usize, &abi::rig::Field)| begins.get(k).copied().unwrap_or(field.start);
             Line {
@@ -80,7 +80,7 @@ impl Device {
         self.lines.iter().any(|line| line.message.id == frame.id() && line.message.extended == frame.is_extended())
     }
 
-    /// Takes a frame of its bus.
+    /// Receives a frame of its bus.
     pub(super) fn receive(&mut self, frame: &Frame, stamp_ns: u64, tell: &mut dyn FnMut(TroubleKind)) {
         for line in &mut self.lines {
             let message = &line.message;
@@ -91,7 +91,7 @@ impl Device {
                 tell(TroubleKind::Short(frame.id()));
             }
             for field in 0..message.fields.len() {
-                // A field that is not in this frame keeps its value and grows old.
+                // A field that this frame does not contain keeps its value and ages.
                 if let Some(value) = frames::read(message, field, frame.data()) {
                     line.values[field] = Reading { value, stamp_ns, age: 0 };
                 }
@@ -99,29 +99,29 @@ impl Device {
         }
     }
 
-    /// A signal of it.
+    /// A signal of the device.
     pub fn reading(&self, message: usize, field: usize) -> Option<Reading> {
         self.lines.get(message)?.values.get(field).copied()
     }
 
-    /// A safe value of it.
+    /// A safe value of the device.
     pub(super) fn safe(&self, message: usize, field: usize) -> f64 {
         self.lines.get(message).and_then(|line| line.safe.get(field)).copied().unwrap_or(0.0)
     }
 
-    /// Everything is a tick older.
+    /// Begins a tick: all readings age by one tick.
     pub(super) fn begin(&mut self) {
         for reading in self.lines.iter_mut().flat_map(|line| &mut line.values) {
             reading.age = reading.age.saturating_add(1);
         }
     }
 
-    /// The value of a signal that is sent, SI.
+    /// Sets the value of a signal that is sent, SI.
     pub fn command(&mut self, message: usize, field: usize, value: f64) {
         self.lines[message].values[field].value = value;
     }
 
-    /// To the safe values.
+    /// Sets all sent signals to their safe values.
     pub(super) fn rest(&mut self) {
         for line in self.lines.iter_mut().filter(|line| line.message.send) {
             for (reading, safe) in line.values.iter_mut().zip(&line.safe) {
@@ -130,7 +130,7 @@ impl Device {
         }
     }
 
-    /// Sends what has changed or is due; a drive hears from us each tick.
+    /// Sends messages that have changed or are due; to a drive in each tick.
     pub(super) fn send_commands(&mut self, now_ns: u64, send: Send) {
         for line in self.lines.iter_mut().filter(|line| line.message.send) {
             let mut data = [0; 8];

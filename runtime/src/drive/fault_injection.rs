@@ -1,84 +1,84 @@
-//! What can go wrong with a simulated node, and when.
+//! Fault injection: faults of simulated nodes, and the times at which they act.
 //!
-//! In: `load fault 0x2310 at 3 s`, `panel.enable = 0 at 5 s`, `servo encoder frozen when servo.speed > 10 rad/s for
-//! 20 ms`. Out: a [`Hook`].
+//! In: `load fault 0x2310 at 3 s`, `panel.enable = 0 at 5 s`, `servo encoder frozen when servo.speed > 10 rad/s for 20
+//! ms`. Out: a [`Hook`].
 
 use abi::rig::{Kind, Rig, Signal, What};
 use abi::unit::Unit;
 
-/// What goes wrong.
+/// Fault of a simulated node.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Effect {
-    /// It sends an emergency; its end takes it back.
+    /// It sends an emergency message, and withdraws it at the end of the fault.
     Emergency(u16),
-    /// Its state machine goes to "fault"; reset is refused until the end.
+    /// Its state machine enters "fault"; a reset is refused until the end of the fault.
     Fault(u16),
     /// It leaves "operational".
     PreOperational,
-    /// Power off and on.
+    /// Its power goes off and on.
     Reset,
-    /// It keeps working, without a heartbeat.
+    /// It continues without a heartbeat.
     NoHeartbeat,
-    /// It shows another mode than it has.
+    /// It displays another mode of operation than it has.
     ModeShown(i8),
-    /// Its position stands.
+    /// Its position reading freezes.
     EncoderFrozen,
-    /// Its position jumps by so many counts, and back at the end.
+    /// Its position reading jumps by this many counts, and back at the end of the fault.
     EncoderGlitch(i64),
-    /// So many counts are lost for good.
+    /// It loses this many counts for good.
     EncoderLost(i64),
-    /// Factor on the angle it counts.
+    /// Factor on the angle it reports.
     EncoderScale(f64),
-    /// Factor on the speed it tells.
+    /// Factor on the speed it reports.
     SpeedScale(f64),
-    /// Factor on the torque it tells.
+    /// Factor on the torque it reports.
     TorqueToldScale(f64),
-    /// Factor on the torque it makes: −1 swaps the sign.
+    /// Factor on the torque it applies: −1 inverts the sign.
     TorqueScale(f64),
-    /// Its process data come later by so many ns.
+    /// Its process data are delayed by this time, ns.
     AnswersLate(u64),
-    /// Its process data don't come.
+    /// It sends no process data.
     NoAnswers,
-    /// It takes no new target.
+    /// It ignores new targets.
     IgnoresCommands,
-    /// Torque off by wire.
+    /// Safe torque off by wire.
     SafeTorqueOff,
-    /// It neither hears nor speaks; its torque stays.
+    /// It neither receives nor sends; its torque stays.
     Silent,
-    /// A signal of a device: message, field, value, SI.
+    /// A fixed value for a signal of a device: message, field, value, SI.
     Value(usize, usize, f64),
 }
 
-/// When it begins.
+/// Begin of a fault.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Start {
-    /// At this time.
+    /// At this time, ns.
     At(u64),
-    /// As soon as a true signal of the shaft (torque, speed, position of a drive, SI) lies above or below a level.
+    /// As soon as a true signal of the shaft (torque, speed, position of a drive, SI) is above or below a level.
     When {
-        /// Which.
+        /// The signal.
         signal: Signal,
         /// Above, or below.
         above: bool,
-        /// SI.
+        /// The level, SI.
         level: f64,
     },
 }
 
-/// Something that goes wrong at some time.
+/// A fault with its begin and duration.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Hook {
     /// The node, an index into the rig's nodes.
     pub node: usize,
-    /// What.
+    /// The fault.
     pub effect: Effect,
-    /// When.
+    /// Its begin.
     pub start: Start,
-    /// How long, ns; for ever where none.
+    /// Its duration, ns; none: permanent.
     pub lasts_ns: Option<u64>,
 }
 
-/// The words of all effects, for messages and help.
+/// Syntax of all faults, for messages and help.
 pub const WORDS: &[&str] = &[
     "emergency CODE",
     "fault CODE",
@@ -100,7 +100,7 @@ pub const WORDS: &[&str] = &[
     "silent",
 ];
 
-/// Reads a hook for a rig. The error says what is wrong and what would be right.
+/// Parses a fault for a rig. The error names the mistake and the correct form.
 pub fn read(text: &str, rig: &Rig) -> Result<Hook, String> {
     let form = "it reads as `load fault 0x2310 at 3 s` or `panel.enable = 0 at 5 s`, with `when load.speed > 10 rad/s` \
                 instead of the time, and `for 20 ms` at its end";
@@ -176,7 +176,7 @@ fn condition_of(text: &str, rig: &Rig) -> Result<Start, String> {
     Ok(Start::When { signal, above, level: quantity(text[at + 1..].trim(), None)? })
 }
 
-/// A number with its unit, SI; without one, in `unit`.
+/// A number with its unit, in SI; without a unit, in `unit`.
 fn quantity(text: &str, unit: Option<&Unit>) -> Result<f64, String> {
     let (number, given) = text.split_once(' ').unwrap_or((text, ""));
     let number: f64 = number.parse().map_err(|_| format!("`{number}` is no number"))?;

@@ -1,4 +1,4 @@
-//! What nodes tell, and what can be wrong with them, as values that carry no text.
+//! Readings of nodes and their faults, as values without text.
 
 use super::state::State;
 use crate::canopen::sdo::Failure;
@@ -9,59 +9,59 @@ use std::fmt;
 /// A signal as it was last received.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Reading {
-    /// SI.
+    /// In SI units.
     pub value: f64,
-    /// When the frame came that carried it.
+    /// Time at which its frame arrived.
     pub stamp_ns: u64,
-    /// Ticks since then; [`Reading::NEVER`] if it never came.
+    /// Ticks since then; [`Reading::NEVER`] if it has never arrived.
     pub age: u32,
 }
 
 impl Reading {
-    /// Age of a signal that never came.
+    /// Age of a signal that has never arrived.
     pub const NEVER: u32 = u32::MAX;
 
-    /// A signal that has not come yet.
+    /// A signal that has not arrived yet.
     pub fn none(value: f64) -> Reading {
         Reading { value, stamp_ns: 0, age: Reading::NEVER }
     }
 }
 
-/// Something a node did that the supervisor must know.
+/// An event of a node that the supervisor must know.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Trouble {
-    /// The node (index into the rig's nodes); none: somebody foreign.
+    /// The node (index into the rig's nodes); none: a foreign participant.
     pub node: Option<usize>,
-    /// What.
+    /// Kind of the event.
     pub kind: TroubleKind,
-    /// When it was noticed.
+    /// Time at which it was noticed.
     pub stamp_ns: u64,
 }
 
-/// What can happen.
+/// Kind of an event.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum TroubleKind {
-    /// It sent an emergency.
+    /// The node sent an emergency message.
     Emergency(Emergency),
     /// Its status word shows a fault.
     Fault,
-    /// It left "operation enabled" without being told to.
+    /// It left "operation enabled" without a command.
     Left(State),
-    /// No heartbeat in time.
+    /// Its heartbeat is missing.
     HeartbeatLost,
     /// It booted: it was reset or lost its power.
     BootUp,
     /// Its heartbeat shows another state than "operational".
     Nmt(NmtState),
-    /// It shows another mode than the one it was given.
+    /// It displays another mode of operation than the one it was given.
     Mode(i8),
     /// It is enabled but does not follow commands.
     NotFollowing,
-    /// A position command has no place in the 32 bits of its number.
+    /// A position command does not fit into its 32 bits.
     Wraps,
-    /// A frame of it is shorter than agreed.
+    /// A frame is shorter than configured.
     Short(u32),
-    /// A frame that only a master sends and that we didn't: its identifier.
+    /// A frame arrived that only a master sends, and that we did not send: its identifier.
     ForeignMaster(u32),
 }
 
@@ -97,80 +97,80 @@ fn stranger(f: &mut fmt::Formatter, id: u32) -> fmt::Result {
     )
 }
 
-/// Why a rig may not start.
+/// Refusal to start a rig.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Refusal {
-    /// The node (index into the rig's nodes), if it is one's fault.
+    /// The node (index into the rig's nodes) that causes it, if any.
     pub node: Option<usize>,
-    /// Why.
+    /// The reason.
     pub why: Why,
 }
 
-/// Why.
+/// Reason of a refusal.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Why {
-    /// Somebody else speaks as a master does: identifier of the frame.
+    /// Another participant acts as a master: identifier of its frame.
     ForeignMaster(u32),
     /// No boot-up message or heartbeat after a reset.
     Silent,
     /// An object could not be read or written.
     Sdo {
-        /// Which.
+        /// The object.
         object: Object,
         /// Whether it was being written.
         write: bool,
-        /// What came of it.
+        /// The failure of the transfer.
         failure: Failure,
     },
-    /// An object holds something else than was written.
+    /// An object holds another value than was written.
     ReadBack {
-        /// Which.
+        /// The object.
         object: Object,
-        /// What was written.
+        /// Written value.
         wanted: i64,
-        /// What it holds.
+        /// Value read back.
         found: i64,
     },
-    /// Object 1000 is none of the profile.
+    /// Object 1000 does not match the profile.
     DeviceType(u32),
     /// Rated torque, N·m: of the drive, of the rig.
     RatedTorque(f64, f64),
     /// Neither the rig nor the drive names this limit.
     NoLimit(&'static str),
-    /// The drive can't follow this signal: object 6502.
+    /// The drive does not support a mode for this signal: object 6502.
     NoMode(u32),
-    /// The period can't be told in object 60C2.
+    /// The period cannot be expressed in object 60C2.
     Period(u64),
-    /// No means to notice that we are gone.
+    /// The drive has no mechanism to detect that we are gone.
     NoTimeout,
-    /// It didn't become operational.
+    /// It did not become operational.
     NotOperational(NmtState),
-    /// TPDOs missed, of how many.
+    /// Missing TPDOs, and number of TPDOs expected.
     Missed(u32, u32),
-    /// The mode it shows instead of the one it was given.
+    /// It displays another mode of operation than the one it was given.
     Mode {
-        /// Given.
+        /// Given mode.
         wanted: i8,
-        /// Shown.
+        /// Displayed mode.
         shown: i8,
     },
-    /// It stays in this state instead of going to "operation enabled".
+    /// It stays in this state instead of entering "operation enabled"; its error code.
     NotEnabled(State, u16),
-    /// It went on when our life sign stopped; ms waited.
+    /// It did not stop when our heartbeat stopped; time waited, ms.
     TimeoutIgnored(u64),
-    /// It didn't move at this torque, N·m, or at this command.
+    /// It did not move at this torque, N·m, or at this command.
     Stuck(f64),
-    /// Something else was to turn it, and its position did not change by this angle, rad.
+    /// Its position did not change by this angle, rad, while it was to be turned from outside.
     NotTurned(f64),
-    /// It moved the other way.
+    /// It moved in the wrong direction.
     WrongSign,
-    /// It turned further or faster than the test allows: rad, rad/s.
+    /// It turned further or faster than the check permits: rad, rad/s.
     Ran(f64, f64),
-    /// Position says that it turned by the first angle, its speed says by the second, rad.
+    /// Its position turned by the first angle, the integral of its speed is the second, rad.
     Scale(f64, f64),
-    /// The torque it reports against the torque it was told, N·m.
+    /// Integrals of the commanded and of the reported torque, N·m·s.
     Torque(f64, f64),
-    /// A fault during start-up.
+    /// A fault during the start-up.
     Trouble(TroubleKind),
 }
 

@@ -1,8 +1,8 @@
-//! All nodes of a rig on all its buses: the order in which they are started, commanded, watched and stopped.
+//! All nodes of a rig on all its buses: the sequence of their start-up, commands, supervision and stop.
 //!
-//! In: received frames with their stamps; once a tick [`Fieldbus::begin`], the permitted commands,
-//! [`Fieldbus::end`]; what the operator asks for. Out: frames, signals, the step of the start-up or why it was refused,
-//! troubles. Allocates while it is made and while the drives are configured, never from [`Step::Sync`] on.
+//! In: received frames with their timestamps; once per tick [`Fieldbus::begin`], the permitted commands, and
+//! [`Fieldbus::end`]; requests of the operator. Out: frames, signals, the step of the start-up or the reason of its
+//! refusal, troubles. Allocates at construction and while drives are configured, never from [`Step::Sync`] on.
 
 use super::Send;
 use super::device::Device;
@@ -19,18 +19,18 @@ use crate::safety::{Protection, is_present};
 use abi::rig::{Kind, Mode, Rig, Signal, What};
 use std::fmt;
 
-/// How a rig is started.
+/// Options of the start-up.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Options {
-    /// How long the buses are listened to for another master.
+    /// Time for which the buses are monitored for another master.
     pub listen_ns: u64,
-    /// How long SYNC must be answered before anything else.
+    /// Time for which SYNC must be answered before the start-up continues.
     pub steady_ns: u64,
-    /// Share of answers that may miss while it must be steady.
+    /// Permitted share of missing answers in that time.
     pub missed: f64,
-    /// The first motion.
+    /// Kind of the polarity check.
     pub sign_test: SignTest,
-    /// Whether drives must be seen to stop when our life sign does.
+    /// Whether each drive must prove that it stops when our heartbeat stops.
     pub timeout_test: bool,
     /// The drives are simulated, whatever their transport.
     pub simulated: bool,
@@ -49,45 +49,45 @@ impl Default for Options {
     }
 }
 
-/// Where the start-up is.
+/// Step of the start-up.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Step {
-    /// Is the bus ours alone?
+    /// Checks that there is no other master on the bus.
     Listen,
-    /// Reset of communication, boot-up of each drive.
+    /// Resets the communication, and waits for the boot-up of each drive.
     Reset,
-    /// Who is there?
+    /// Identifies the drives.
     Identity,
-    /// PDOs, heartbeats, time-outs: written and read back.
+    /// Writes PDOs, heartbeats and time-outs, and reads them back.
     Configure,
-    /// To "operational".
+    /// Starts the nodes: "operational".
     Start,
-    /// SYNC, answered in time.
+    /// Sends SYNC, and checks that it is answered in time.
     Sync,
-    /// The mode is given and shown.
+    /// Sets the mode of operation and checks its display.
     Mode,
     /// Waits for the operator's [`Request::Enable`].
     AwaitEnable,
-    /// To "operation enabled", at zero.
+    /// Leads the drives to "operation enabled", at zero command.
     Enable,
-    /// Our life sign stops; the drives must stop too.
+    /// Time-out test: our heartbeat stops, so the drives must stop too.
     TimeoutTest,
-    /// Enabled once more.
+    /// Enables the drives again.
     Reenable,
-    /// The first motion.
+    /// Polarity check.
     SignTest,
     /// Waits for the operator's [`Request::Arm`].
     AwaitArm,
     /// Commands act.
     Armed,
-    /// Stopped, for good: a start makes a new [`Fieldbus`], which identifies and tests the drives anew.
+    /// Stopped for good: a restart creates a new [`Fieldbus`], which identifies and checks the drives anew.
     Stopped,
-    /// Refused, for good.
+    /// Refused for good.
     Refused,
 }
 
 impl Step {
-    /// All of them, in the order in which a start-up takes them.
+    /// All steps, in the order of the start-up.
     pub const ALL: [Step; 16] = [
         Step::Listen,
         Step::Reset,
@@ -131,16 +131,16 @@ impl fmt::Display for Step {
     }
 }
 
-/// What an operator, or the supervisor, asks for.
+/// Request of an operator or of the supervisor.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Request {
-    /// From [`Step::AwaitEnable`].
+    /// Permitted in [`Step::AwaitEnable`].
     Enable,
-    /// From [`Step::AwaitArm`].
+    /// Permitted in [`Step::AwaitArm`].
     Arm,
-    /// Stop on the drives' ramps; always.
+    /// Stop on the drives' ramps; always permitted.
     QuickStop,
-    /// Torque off; always.
+    /// Torque off; always permitted.
     Disable,
 }
 
@@ -150,10 +150,10 @@ enum Node {
     Device(Device),
 }
 
-/// Most troubles that wait to be read.
+/// Most troubles that can wait to be read.
 const TROUBLES: usize = 32;
 
-/// Longest times of the steps, ns.
+/// Longest durations of the steps, ns.
 const BOOT_NS: u64 = 5_000_000_000;
 const IDENTITY_NS: u64 = 10_000_000_000;
 const CONFIGURE_NS: u64 = 20_000_000_000;
@@ -162,13 +162,13 @@ const MODE_NS: u64 = 1_000_000_000;
 const ENABLE_NS: u64 = 5_000_000_000;
 /// Angle by which a shaft is turned from outside, rad.
 const BY_HAND: f64 = 0.2;
-/// Time in which a drive must show that it obeys a stop, ns: then our life sign ends, and it stops by its own time-out.
+/// Time within which a drive must obey a stop, ns; after that our heartbeat ends, and its own time-out stops it.
 const OBEYS_NS: u64 = 20_000_000;
-/// Interval between network-management commands to such a drive, ns.
+/// Interval between NMT commands to such a drive, ns.
 const INSISTS_NS: u64 = 10_000_000;
-/// Time in which a drive that has turned a shaft for a test brings it back, ns.
+/// Time for a drive to turn the shaft back after it has turned it for a check, ns.
 const RETURN_NS: u64 = 500_000_000;
-/// How long our life sign goes on at rest before it stops.
+/// Time at zero command before our heartbeat stops.
 const CALM_NS: u64 = 50_000_000;
 
 /// All nodes of a rig.
@@ -188,23 +188,23 @@ pub struct Fieldbus {
     period_ns: u64,
     heartbeat_ns: u64,
     heartbeat_due_ns: u64,
-    /// Our life sign is stopped on purpose, since when.
+    /// Time since which our heartbeat has been stopped on purpose.
     silent_since_ns: Option<u64>,
-    /// SYNC is sent.
+    /// Whether SYNC is sent.
     running: bool,
     step: Step,
-    /// Since when the step lasts; none before its first tick.
+    /// Time at which the step began; none before its first tick.
     since_ns: Option<u64>,
     refusal: Option<Refusal>,
-    /// Nodes done with the step.
+    /// Nodes that have completed the step.
     done: Vec<bool>,
     missed: Vec<u32>,
     answers: u32,
-    /// The drive under test; the drive that turns it where it can't turn by itself.
+    /// The drive under check, and the drive that turns the shaft if the first one cannot.
     push: Option<(usize, Push, Option<usize>)>,
-    /// Until then, from the begin of the step, the shaft comes back from a test.
+    /// Time, from the begin of the step, until which the shaft returns from a check.
     returns_ns: u64,
-    /// Since when a drive that has torque has been told to give it up.
+    /// Time at which a drive with torque was told to give it up.
     off_since_ns: Option<u64>,
     wanted: Vec<f64>,
     troubles: [Option<Trouble>; TROUBLES],
@@ -212,7 +212,7 @@ pub struct Fieldbus {
 }
 
 impl Fieldbus {
-    /// The buses of a rig, before anything was sent. The error says what the rig asks for that can't be had.
+    /// The buses of a rig, before any frame is sent. The error is a message about a requirement that cannot be met.
     pub fn new(rig: &Rig, options: Options) -> Result<Fieldbus, String> {
         let used = |id: u8| rig.nodes.iter().any(|node| matches!(&node.kind, Kind::Cia402(drive) if drive.node == id));
         let master = (1..=127).rev().find(|id| !used(*id)).ok_or("all 127 node ids are taken: none is left for us")?;
@@ -283,7 +283,7 @@ impl Fieldbus {
             troubles: [None; TROUBLES],
             lost_troubles: 0,
         };
-        // The drive under test first, the one that emulates last.
+        // The drive under test first, the emulating drive last.
         let mut order: Vec<usize> = (0..fieldbus.nodes.len()).collect();
         order.sort_by_key(|node| rig.predict == Some(*node));
         for node in order {
@@ -301,29 +301,29 @@ impl Fieldbus {
             }
         }
         for bus in (0..rig.buses.len()).filter(|bus| fieldbus.canopen[*bus]) {
-            // A drive that acts with SYNC would wait for one that a dead loop never sends.
+            // A drive that acts on SYNC would wait for one that a failed cycle never sends.
             fieldbus.stop_frames[bus].push(service::sync(None));
             fieldbus.off_frames[bus].push(service::sync(None));
         }
         Ok(fieldbus)
     }
 
-    /// Where the start-up is.
+    /// Current step of the start-up.
     pub fn step(&self) -> Step {
         self.step
     }
 
-    /// Why it was refused.
+    /// Reason of the refusal.
     pub fn refusal(&self) -> Option<&Refusal> {
         self.refusal.as_ref()
     }
 
-    /// A refusal in words, with the name of its node.
+    /// A refusal as text, with the name of its node.
     pub fn explain(&self, refusal: &Refusal) -> String {
         self.named(refusal.node, &refusal.why)
     }
 
-    /// A trouble in words, with the name of its node.
+    /// A trouble as text, with the name of its node.
     pub fn tell(&self, trouble: &Trouble) -> String {
         self.named(trouble.node, &trouble.kind)
     }
@@ -338,24 +338,24 @@ impl Fieldbus {
         }
     }
 
-    /// The next trouble nobody has read, oldest first.
+    /// Takes the oldest trouble that has not been read.
     pub fn trouble(&mut self) -> Option<Trouble> {
         let first = self.troubles[0].take();
         self.troubles.rotate_left(1);
         first
     }
 
-    /// Troubles dropped because nobody read them.
+    /// Number of troubles dropped because they were not read.
     pub fn lost_troubles(&self) -> u64 {
         self.lost_troubles
     }
 
-    /// The frames that stop all drives of a bus on their ramps, made beforehand.
+    /// The frames that stop all drives of a bus on their ramps, prepared in advance.
     pub fn stop_frames(&self, bus: usize) -> &[Frame] {
         &self.stop_frames[bus]
     }
 
-    /// The frames that take the torque off all drives of a bus, made beforehand.
+    /// The frames that disable the torque of all drives of a bus, prepared in advance.
     pub fn off_frames(&self, bus: usize) -> &[Frame] {
         &self.off_frames[bus]
     }
@@ -363,7 +363,7 @@ impl Fieldbus {
     /// A signal of the rig.
     ///
     /// # Panics
-    /// If the rig has no such signal: a mistake of the caller.
+    /// If the rig has no such signal: an error of the caller.
     pub fn reading(&self, signal: Signal) -> Reading {
         let reading = match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), what) => drive.reading(what),
@@ -373,7 +373,7 @@ impl Fieldbus {
         reading.unwrap_or_else(|| panic!("`{}` has no signal {:?}", self.names[signal.node], signal.what))
     }
 
-    /// Whether a node tells this signal.
+    /// Whether a node has this signal.
     pub fn has(&self, signal: Signal) -> bool {
         match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), what) => drive.reading(what).is_some(),
@@ -382,7 +382,7 @@ impl Fieldbus {
         }
     }
 
-    /// Gives a command for the next [`end`](Fieldbus::end), SI. It must have passed the supervisor.
+    /// Sets a command for the next [`end`](Fieldbus::end), SI. The supervisor must have permitted it.
     pub fn command(&mut self, signal: Signal, value: f64) {
         match (&mut self.nodes[signal.node], signal.what) {
             (Node::Drive(drive), _) => drive.command(value),
@@ -391,8 +391,8 @@ impl Fieldbus {
         }
     }
 
-    /// What the start-up itself wants this command to be, SI: it takes the way of all commands. Once armed, 0 or the
-    /// safe value.
+    /// The start-up's own request for this command, SI: it passes the supervisor like every other command. Once armed,
+    /// 0 or the safe value.
     pub fn wanted(&self, signal: Signal) -> f64 {
         match (&self.nodes[signal.node], signal.what) {
             (Node::Drive(_), _) => self.wanted[signal.node],
@@ -401,7 +401,7 @@ impl Fieldbus {
         }
     }
 
-    /// What is known of a drive; nothing for a device.
+    /// Status of a drive; none for a device.
     pub fn status(&self, node: usize) -> Option<Status> {
         match &self.nodes[node] {
             Node::Drive(drive) => Some(drive.status()),
@@ -409,7 +409,7 @@ impl Fieldbus {
         }
     }
 
-    /// The limits of a drive, zero before it was identified; nothing for a device.
+    /// Limits of a drive, zero before it is identified; none for a device.
     pub fn limits(&self, node: usize) -> Option<Limits> {
         match &self.nodes[node] {
             Node::Drive(drive) => Some(drive.limits()),
@@ -424,7 +424,7 @@ impl Fieldbus {
         }
     }
 
-    /// Takes a frame of a bus.
+    /// Receives a frame of a bus.
     pub fn receive(&mut self, bus: usize, frame: &Frame, stamp_ns: u64, send: Send) {
         let mut owned = false;
         for at in 0..self.nodes.len() {
@@ -453,7 +453,7 @@ impl Fieldbus {
         }
     }
 
-    /// Whether only another master can have sent it: our own frames don't come back.
+    /// Whether only another master can have sent this frame: our own frames are not received back.
     fn foreign(&self, bus: usize, frame: &Frame) -> bool {
         let ours = |id: u8| {
             let on_bus = self.nodes.iter().zip(&self.places).filter(|(_, place)| **place == bus);
@@ -467,10 +467,10 @@ impl Fieldbus {
         }
     }
 
-    /// A trouble at this step: it refuses the start, is expected, or is the supervisor's to judge.
+    /// Handles a trouble according to the step: it refuses the start, is expected, or is left to the supervisor.
     fn note(&mut self, node: Option<usize>, kind: TroubleKind, stamp_ns: u64) {
         let foreign = matches!(kind, TroubleKind::ForeignMaster(_));
-        // What a drive says while it is being reset, enabled or tested is its answer, no trouble.
+        // A drive's report while it is reset, enabled or tested is an expected answer.
         let answer = matches!(kind, TroubleKind::Emergency(_) | TroubleKind::Fault | TroubleKind::Left(_));
         match self.step {
             Step::Listen => {
@@ -507,7 +507,7 @@ impl Fieldbus {
         }
     }
 
-    /// What is asked for, if it can be had at this step.
+    /// Executes a request; false if this step does not permit it.
     pub fn request(&mut self, request: Request) -> bool {
         match (request, self.step) {
             (Request::Enable, Step::AwaitEnable) => {
@@ -532,12 +532,12 @@ impl Fieldbus {
         true
     }
 
-    /// Whether all drives are without torque.
+    /// Whether no drive can have torque.
     pub fn at_rest(&self) -> bool {
         self.nodes.iter().filter_map(drive_of).all(|drive| !drive.state().powered())
     }
 
-    /// A tick begins: SYNC goes out, and everything known is a tick older.
+    /// Begins a tick: sends SYNC, and ages all readings by one tick.
     pub fn begin(&mut self, send: Send) {
         for node in &mut self.nodes {
             match node {
@@ -552,7 +552,7 @@ impl Fieldbus {
         }
     }
 
-    /// A tick ends: commands go out, then our life sign, then what the start-up has to say.
+    /// Ends a tick: sends commands, then our heartbeat, then the frames of the start-up.
     pub fn end(&mut self, now_ns: u64, send: Send) {
         for at in 0..self.nodes.len() {
             let mut found = [None; 2];
@@ -580,7 +580,7 @@ impl Fieldbus {
         self.start(now_ns, send);
     }
 
-    /// Our heartbeat and guard requests, unless a test holds them back.
+    /// Sends our heartbeat and guard requests, unless a test suppresses them.
     fn live(&mut self, now_ns: u64, send: Send) {
         let alive = self.step > Step::Reset && self.silent_since_ns.is_none();
         if !alive {
@@ -599,7 +599,7 @@ impl Fieldbus {
         }
     }
 
-    /// Does something with each drive that isn't done; true once all are.
+    /// Works on each drive that has not completed the step; returns true once all have.
     fn each(
         &mut self,
         send: Send,
@@ -622,7 +622,7 @@ impl Fieldbus {
         self.nodes.iter().zip(&self.done).all(|(node, done)| *done || drive_of(node).is_none())
     }
 
-    /// Refuses for the first drive that isn't done, if the step has lasted too long.
+    /// Refuses the first drive that has not completed the step, if the step has taken too long.
     fn within(&mut self, limit_ns: u64, lasted_ns: u64, why: impl Fn(&Drive) -> Why) {
         if lasted_ns < limit_ns || self.step == Step::Refused {
             return;
@@ -636,7 +636,7 @@ impl Fieldbus {
         }
     }
 
-    /// One move of the start-up.
+    /// Advances the start-up by one tick.
     fn start(&mut self, now_ns: u64, send: Send) {
         let first = self.since_ns.is_none();
         let lasted_ns = now_ns - *self.since_ns.get_or_insert(now_ns);
@@ -644,8 +644,8 @@ impl Fieldbus {
             Step::Listen if lasted_ns >= self.options.listen_ns => self.go(Step::Reset),
             Step::Listen => {}
             Step::Reset => {
-                // Once more after a second: a drive may have been booting. Never in the cycle after the first, which may come
-                // a little early: who has just booted would boot anew.
+                // Repeated every second, because a drive may have been booting. Never in the cycle after the first one,
+                // which may come slightly early: a drive that has just booted would boot again.
                 let again = first || (lasted_ns >= 1_000_000_000 && lasted_ns % 1_000_000_000 < self.period_ns);
                 let all = self.each(send, |drive, send| {
                     if first {
@@ -704,7 +704,7 @@ impl Fieldbus {
     }
 
     fn count_answers(&mut self, lasted_ns: u64) {
-        // The first answers may miss: the drives have only just been started.
+        // The first answers may be missing, because the drives have just been started.
         if lasted_ns < 5 * self.period_ns {
             return;
         }
@@ -722,8 +722,8 @@ impl Fieldbus {
         }
     }
 
-    /// A drive that does not obey a stop may not hear us: nothing reaches it, or only its set-points do not. It is told by
-    /// network management, and our life sign ends: its own time-out, which the start-up has tested, stops it.
+    /// Handles a drive that does not obey a stop: either no frame reaches it, or its set-points alone do not. The stop is
+    /// commanded by NMT, and our heartbeat ends: the drive's own time-out, which the start-up has tested, stops it.
     fn insist(&mut self, now_ns: u64, lasted_ns: u64, send: Send) {
         if lasted_ns < OBEYS_NS || !is_present(Protection::Silence) {
             return;
@@ -733,8 +733,8 @@ impl Fieldbus {
             if !drive.disobeys() {
                 continue;
             }
-            // In "pre-operational" it takes no set-point, so none that takes its torque off either: a quick stop that does not
-            // end, since the shaft is fast or its sign is wrong, ends with a reset.
+            // In "pre-operational" it accepts no set-points, and so none that disable the torque. A quick stop that
+            // does not finish, because the shaft is too fast or a sign is wrong, is ended by a reset.
             let resets = drive.is_to_be_off();
             if resets && now_ns - *self.off_since_ns.get_or_insert(now_ns) < OBEYS_NS {
                 continue;
@@ -751,7 +751,7 @@ impl Fieldbus {
     fn enable(&mut self, lasted_ns: u64, send: Send) {
         let again = self.step == Step::Reenable;
         if again && lasted_ns < CALM_NS {
-            // Time for what the drives say about the test to have come.
+            // Time for the drives' reports about the test to arrive.
             return;
         }
         self.aim(Goal::Enabled, true);
@@ -769,7 +769,7 @@ impl Fieldbus {
         self.within(ENABLE_NS, lasted_ns, Drive::not_enabled);
     }
 
-    /// Stops our life sign at zero command, and waits for each drive to leave "operation enabled".
+    /// Stops our heartbeat at zero command, and waits for each drive to leave "operation enabled".
     fn test_timeouts(&mut self, now_ns: u64, lasted_ns: u64, send: Send) {
         if lasted_ns < CALM_NS {
             return;
@@ -780,7 +780,7 @@ impl Fieldbus {
         let all = self.each(send, |drive, _| {
             if drive.state() != State::Enabled || drive.nmt() != NmtState::Operational {
                 drive.timeout_measured_ns.get_or_insert(waited);
-                // It must not be led back by the next command.
+                // The next command must not enable it again.
                 drive.aim(Goal::Off, false);
                 return Ok(true);
             }
@@ -810,7 +810,7 @@ impl Fieldbus {
         }
     }
 
-    /// One drive after the other.
+    /// Polarity check, one drive after the other.
     fn test_signs(&mut self, lasted_ns: u64) {
         let by_hand = self.options.sign_test == SignTest::ByHand;
         let turning = |drive: &Drive| match drive.config().mode {
@@ -822,17 +822,17 @@ impl Fieldbus {
             let Some(at) = next else {
                 return self.moved();
             };
-            // A drive that holds the shaft brings it back from the test before.
+            // A drive that controls speed or position returns the shaft from the previous check.
             if lasted_ns < self.returns_ns {
                 return;
             }
             let drive = drive_of(&self.nodes[at]).expect("found as one");
             if drive.reading(What::Position).is_none() {
-                // Nothing to compare with: the direction of a drive without a position is the operator's to check.
+                // Without a position there is nothing to compare: the operator must check the direction of this drive.
                 self.done[at] = true;
                 return;
             }
-            // A torque can't turn a shaft whose speed or position another drive holds: that one turns it.
+            // A torque cannot turn a shaft whose speed or position another drive controls, so that drive turns it.
             let holds =
                 |at: &usize| drive_of(&self.nodes[*at]).is_some_and(|drive| drive.config().mode != Mode::Torque);
             let holder = (0..self.nodes.len()).find(holds).filter(|_| drive.config().mode == Mode::Torque && !by_hand);
@@ -841,7 +841,7 @@ impl Fieldbus {
                 bounds.angle = BY_HAND.max(bounds.angle);
             }
             let patience = match holder.and_then(|holder| drive_of(&self.nodes[holder])) {
-                // Three times as long as the turn takes at the commanded speed.
+                // Three times as long as the rotation takes at the commanded speed.
                 Some(holder) if holder.config().mode == Mode::Speed => PATIENCE + 3.0 * bounds.angle / turning(holder),
                 Some(_) => 2.0 * PATIENCE,
                 None => PATIENCE_BY_HAND,
@@ -869,7 +869,7 @@ impl Fieldbus {
         }
     }
 
-    /// The motions of the start-up are over: angles count from here.
+    /// Ends the motions of the start-up: angles count from here.
     fn moved(&mut self) {
         for drive in self.nodes.iter_mut().filter_map(drive_of_mut) {
             drive.rest();
@@ -878,13 +878,13 @@ impl Fieldbus {
     }
 }
 
-/// What a drive says.
+/// The readings of a drive for the polarity check.
 fn sample(drive: &Drive) -> Sample {
     let value = |what| drive.reading(what).map(|reading| reading.value);
     Sample { position: value(What::Position).unwrap_or(0.0), speed: value(What::Speed), torque: value(What::Torque) }
 }
 
-/// What the first motion of a drive may use.
+/// Limits of a drive's polarity check.
 fn bounds(drive: &Drive) -> Bounds {
     let (config, limits) = (drive.config(), drive.limits());
     let command = match config.mode {

@@ -1,25 +1,26 @@
 //! Signals in frames that are described field by field, by hand or by a DBC file.
 //!
-//! In: a [`Field`] and the data of a frame. Out: its value, SI, and back. Source of the numbering of bits: the DBC
+//! In: a [`Field`] and the data of a frame. Out: its value, SI, and the reverse. Source of the bit numbering: the DBC
 //! format, little-endian ("Intel") and big-endian ("Motorola").
 
 use super::units::beyond;
 use crate::safety::{Protection, is_present};
 use abi::rig::{Field, Format, Message};
 
-/// Where the k-th bit of a field lies, k counted from its least significant one: byte, and bit in the byte.
+/// Position of the k-th bit of a field, counted from its least significant bit: byte, and bit within the byte.
 fn place(field: &Field, k: u16) -> (usize, u16) {
     if !field.big_endian {
         let bit = field.start_bit + k;
         return ((bit / 8).into(), bit % 8);
     }
-    // A big-endian field starts at its most significant bit and goes down in a byte, then to the top of the next one.
+    // A big-endian field starts at its most significant bit and continues downwards in a byte, then at the top of the
+    // next byte.
     let from_start = field.bits - 1 - k;
     let linear = (field.start_bit / 8) * 8 + (7 - field.start_bit % 8) + from_start;
     ((linear / 8).into(), 7 - linear % 8)
 }
 
-/// The bits of a field, least significant first; nothing if the frame is too short for it.
+/// The raw bits of a field; none if the frame is too short for it.
 fn raw(field: &Field, data: &[u8]) -> Option<u64> {
     let mut raw = 0;
     for k in 0..field.bits {
@@ -29,10 +30,10 @@ fn raw(field: &Field, data: &[u8]) -> Option<u64> {
     Some(raw)
 }
 
-/// Whether a field is in this frame: its switch, if it has one, is there and says so.
+/// Whether a frame contains a field: its multiplexer, if it has one, is present and has the right value.
 fn present(message: &Message, field: usize, data: &[u8]) -> bool {
     let mut at = field;
-    // A switch may hang on another one; no chain is longer than the message.
+    // A multiplexer may itself be multiplexed; no chain is longer than the message.
     for _ in 0..=message.fields.len() {
         let Some((switch, value)) = message.fields[at].multiplexed else { return true };
         if raw(&message.fields[switch], data) != Some(value) {
@@ -43,8 +44,8 @@ fn present(message: &Message, field: usize, data: &[u8]) -> bool {
     false
 }
 
-/// The value of a field, SI; nothing if the frame is too short, or if the field is not in it (multiplexing). A float may be
-/// infinite or no number.
+/// The value of a field, SI; none if the frame is too short or does not contain the field (multiplexing). A float may
+/// be infinite or NaN.
 pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
     if !present(message, field, data) {
         return None;
@@ -63,14 +64,14 @@ pub fn read(message: &Message, field: usize, data: &[u8]) -> Option<f64> {
     Some(number * field.scale + field.offset)
 }
 
-/// Puts a value, SI, into the data of a frame: rounded towards zero, so that what travels is never greater than what was
-/// permitted, and clamped to what the bits can hold. Where the steps leave 0 out, by their offset, the nearest step to 0 may
-/// be greater than a value between them.
+/// Encodes a value, SI, into the data of a frame. It is rounded towards zero, so that the encoded value never exceeds
+/// the permitted one, and clamped to the range of the bits. If an offset makes 0 unrepresentable, the step nearest to 0
+/// may exceed a value between steps.
 pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
     let steps = (value - field.offset) / field.scale;
     let unused = 64 - u32::from(field.bits);
     let raw = match field.format {
-        // A cast of a float clamps, and makes 0 of what is no number.
+        // A cast of a float saturates, and converts NaN to 0.
         Format::Unsigned => (whole(field, steps, value) as u64).min(u64::MAX >> unused),
         Format::Signed => (whole(field, steps, value) as i64).clamp(i64::MIN >> unused, i64::MAX >> unused) as u64,
         Format::Float32 => u64::from(single(field, steps, value).to_bits()),
@@ -84,20 +85,21 @@ pub fn write(field: &Field, value: f64, data: &mut [u8; 8]) {
     }
 }
 
-/// The value of so many steps, SI, and whether it is greater than the permitted one.
+/// Whether the value of this many steps exceeds the permitted value, SI.
 fn is_beyond(field: &Field, steps: f64, value: f64) -> bool {
     let size = value.abs() + field.offset.abs();
     beyond(steps * field.scale + field.offset, value, size) && is_present(Protection::Rounding)
 }
 
-/// The nearest whole number of steps, or its neighbour towards 0 SI where it is greater than the value and the neighbour is not.
+/// The nearest integer number of steps, or its neighbour towards 0 SI if the nearest exceeds the value and the
+/// neighbour does not.
 fn whole(field: &Field, steps: f64, value: f64) -> f64 {
     let nearest = steps.round();
     let towards = nearest - (value * field.scale).signum();
     if is_beyond(field, nearest, value) && !is_beyond(field, towards, value) { towards } else { nearest }
 }
 
-/// The same with the steps that 32 bits of a float have.
+/// The same for the steps of a 32-bit float.
 fn single(field: &Field, steps: f64, value: f64) -> f32 {
     let nearest = steps as f32;
     let towards = if value * field.scale > 0.0 { nearest.next_down() } else { nearest.next_up() };
@@ -105,15 +107,15 @@ fn single(field: &Field, steps: f64, value: f64) -> f32 {
     if moves { towards } else { nearest }
 }
 
-/// Puts the values of all fields, SI, into the data of a frame: of those that share bits, the ones whose switch has their
-/// value. Bits of no field become 0.
+/// Encodes the values of all fields, SI, into the data of a frame. Of fields that share bits, those are encoded whose
+/// multiplexer has their value. Bits outside of all fields become 0.
 pub fn fill(message: &Message, value: impl Fn(usize) -> f64, data: &mut [u8; 8]) {
     *data = [0; 8];
     let switches = |field: usize| {
         let above = |at: &usize| message.fields[*at].multiplexed.map(|(switch, _)| switch);
         std::iter::successors(Some(field), above).take(message.fields.len() + 1).count()
     };
-    // Switches before what they switch.
+    // Multiplexers before their fields.
     for depth in 1..=message.fields.len() {
         let mut deeper = false;
         for (k, field) in message.fields.iter().enumerate() {
@@ -210,7 +212,7 @@ mod tests {
             let most = 2f64.powi(i32::from(bits.min(16)) - 1) - 1.0;
             let sign = if format == Format::Unsigned { field.scale.signum() } else { 1.0 };
             let share = random.between(if format == Format::Unsigned { 0.0 } else { -1.0 }, 1.0);
-            // Offsets by whole steps: 0 is one of the values that can travel.
+            // Offsets by whole steps, so that 0 is representable.
             field.offset =
                 if format == Format::Unsigned { 0.0 } else { field.scale * f64::from(random.below(5) as u32) };
             let value = share * sign * (most - 8.0) * field.scale.abs();
@@ -242,7 +244,7 @@ mod tests {
     fn what_shares_bits_is_written_where_the_switch_says() {
         let byte = |k: u16| field(8 * k, 8, false, Format::Unsigned);
         let mut message = message(vec![byte(2), byte(1), byte(2), byte(0), byte(3)]);
-        // Field 3 switches 0 and 1; 1 switches 2 and 4.
+        // Field 3 multiplexes 0 and 1; field 1 multiplexes 2 and 4.
         message.fields[0].multiplexed = Some((3, 0));
         message.fields[1].multiplexed = Some((3, 1));
         message.fields[2].multiplexed = Some((1, 7));
@@ -256,7 +258,7 @@ mod tests {
         assert_eq!(filled([5.0, 7.0, 6.0, 1.0, 9.0]), [1, 7, 6, 0, 0, 0, 0, 0]);
         assert_eq!(filled([5.0, 8.0, 6.0, 1.0, 9.0]), [1, 8, 0, 9, 0, 0, 0, 0]);
         assert_eq!(filled([5.0, 8.0, 6.0, 2.0, 9.0]), [2, 0, 0, 0, 0, 0, 0, 0]);
-        // What hangs on a switch that is not there is not there.
+        // A field whose multiplexer is absent is absent too.
         assert_eq!(read(&message, 2, &[0, 7, 6, 0]), None);
         assert_eq!(read(&message, 2, &[1, 7, 6, 0]), Some(6.0));
     }
@@ -270,7 +272,7 @@ mod tests {
         assert_eq!(read(&two, 1, &[2]), None);
     }
 
-    /// What to make of it is decided where readings are judged, once.
+    /// The plausibility check of readings handles NaN and infinity, in one place.
     #[test]
     fn a_float_that_is_no_number_is_told_as_it_is() {
         let told = |number: f32| value(field(0, 32, false, Format::Float32), &number.to_bits().to_le_bytes()).unwrap();

@@ -1,8 +1,8 @@
-//! Drives: what is known of their kinds, how a rig talks to them, and how they are simulated.
+//! Drives: profiles of their kinds, the communication of a rig with them, and their simulation.
 //!
-//! In: a [`abi::rig::Rig`], frames, the time, permitted commands in SI. Out: frames, signals in SI with their age, and
-//! what went wrong. A [`Fieldbus`] is the rig's side of all buses, a [`Bench`] the other side: simulated drives and
-//! devices on one shaft. Neither waits, and neither decides what to do about a fault: that is the supervisor's.
+//! In: a [`abi::rig::Rig`], frames, the time, permitted commands in SI. Out: frames, signals in SI with their ages, and
+//! reports of faults. A [`Fieldbus`] is the rig's side of all buses, a [`Bench`] the other side: simulated drives and
+//! devices on one shaft. Neither blocks, and neither decides how to react to a fault: the supervisor does.
 
 pub mod profiles;
 pub mod state;
@@ -28,7 +28,7 @@ pub use crate::drive::faults::{Reading, Refusal, Trouble, TroubleKind, Why};
 pub use crate::drive::simulated_plant::{Bench, Shaft};
 pub use fieldbus::{Fieldbus, Options, Request, Step};
 
-/// Takes the frames that go out: the bus (an index into [`abi::rig::Rig::buses`]) and the frame.
+/// Callback that sends a frame: the bus (an index into [`abi::rig::Rig::buses`]) and the frame.
 pub type Send<'a> = &'a mut dyn FnMut(usize, crate::can::Frame);
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
-//! What is known of kinds of drives, as data.
+//! Profiles: properties of the supported kinds of drives, as data.
 //!
-//! The numbers come from the makers' manuals, except where a comment calls one an assumption. What a rig says goes
-//! before what stands here.
+//! The numbers come from the makers' manuals, except where a comment calls one an assumption. The text of a rig takes
+//! precedence.
 
 use crate::canopen::Object;
 
-/// How a drive is reached.
+/// Fieldbus of a drive.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Transport {
     /// CANopen, CiA 301.
@@ -14,64 +14,65 @@ pub enum Transport {
     DeviceNet,
 }
 
-/// How a drive learns that we are gone.
+/// Mechanism by which a drive detects that we are gone.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Life {
-    /// It watches our heartbeat: object 1016.
+    /// It monitors our heartbeat: object 1016.
     Heartbeat,
     /// It waits for guard requests: objects 100C and 100D.
     Guarding,
 }
 
-/// How the drives that this program simulates say who they are: vendor 0, which no maker has, this device name (object 1008),
-/// and this serial number (1018:4), "fric" in ASCII. What only simulated drives bear is granted to nobody else.
+/// Identity of this program's simulated drives: vendor 0, which no maker has, this device name (object 1008), and this
+/// serial number (1018:4), "fric" in ASCII. Options for simulated drives only are granted to no other drive.
 pub const SIMULATED: (u32, &str, u32) = (0, "fric simulated", 0x6672_6963);
 
-/// One signal of a drive: where it is commanded, where it is read.
+/// One signal of a drive: the objects of its command and of its actual value.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Path {
-    /// The object that takes the command, and its bits.
+    /// The object of the command, and its bits.
     pub target: (Object, u8),
-    /// The object that tells what is, and its bits.
+    /// The object of the actual value, and its bits.
     pub actual: (Object, u8),
-    /// Modes in which the drive follows it, the best one first; each with its bit in object 6502.
+    /// Modes of operation in which the drive follows the command, the best one first; each with its bit in object 6502.
     pub modes: &'static [(i8, u8)],
 }
 
 /// A kind of drive.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Profile {
-    /// As a rig names it.
+    /// Its name in a rig.
     pub name: &'static str,
-    /// How it is reached.
+    /// Its fieldbus.
     pub transport: Transport,
     /// Lower word of object 1000.
     pub device: u16,
     /// Upper word of object 1000, for simulation: bit 0 frequency converter, bit 1 servo.
     pub sort: u16,
-    /// Number that stands for rated torque.
+    /// Number that represents the rated torque.
     pub full_torque: i64,
-    /// Torque.
+    /// Torque signal.
     pub torque: Option<Path>,
-    /// Speed.
+    /// Speed signal.
     pub speed: Option<Path>,
-    /// Position.
+    /// Position signal.
     pub position: Option<Path>,
-    /// How it notices that we are gone, the best way first.
+    /// Mechanisms to detect that we are gone, the best one first.
     pub life: &'static [Life],
-    /// Least and greatest time after which it can notice, ms.
+    /// Shortest and longest time for that, ms.
     pub timeout_ms: (u32, u32),
-    /// RPDO and TPDO with its control word, target, status word and actual value where they can't be mapped anew.
+    /// Numbers of the RPDO and TPDO with control word, target, status word and actual value, if these cannot be
+    /// remapped.
     pub fixed: Option<(u8, u8)>,
-    /// It takes commands and renews its answers only so often, ns; 0: at once.
+    /// Interval at which it accepts commands and refreshes its answers, ns; 0: immediately.
     pub refresh_ns: u64,
-    /// Time constant of the filter behind its speed, s: an assumption where a maker is silent.
+    /// Time constant of the filter of its speed, s: an assumption if the maker does not specify it.
     pub speed_lag: f64,
-    /// Its own error codes.
+    /// Manufacturer-specific error codes.
     pub errors: &'static [(u16, &'static str)],
 }
 
-/// Any servo that follows CiA 402.
+/// Any servo that conforms to CiA 402.
 pub const CIA402: Profile = Profile {
     name: "cia402",
     transport: Transport::CanOpen,
@@ -90,7 +91,7 @@ pub const CIA402: Profile = Profile {
 };
 
 /// A frequency converter of the FC 302 kind with its CANopen option: velocity mode in rpm, and a time-out that only
-/// node guarding feeds. Its torque mode speaks the maker's own profile and is not offered.
+/// node guarding resets. Its torque mode uses the maker's own profile and is not supported.
 pub const FC302: Profile = Profile {
     name: "fc302",
     transport: Transport::CanOpen,
@@ -102,19 +103,19 @@ pub const FC302: Profile = Profile {
     position: None,
     life: &[Life::Guarding],
     timeout_ms: (100, 65_535),
-    // RPDO2: control word and 6042. That TPDO2 holds the status word and 6044 is an assumption.
+    // RPDO2: control word and 6042. TPDO2 with the status word and 6044 is an assumption.
     fixed: Some((2, 2)),
     refresh_ns: 2_000_000,
     speed_lag: 2e-3,
     errors: &[(0xFF10, "control word time-out")],
 };
 
-/// A frequency converter of the FC 280 kind. Its control word lies at 2690 and its status word at 2643, both with the
-/// bits of the maker's own profile, so only `predict` and simulation know it.
+/// A frequency converter of the FC 280 kind. Its control word is object 2690 and its status word 2643, both with the
+/// bits of the maker's own profile, so only `predict` and the simulation support it.
 pub const FC280: Profile = Profile { name: "fc280", transport: Transport::CanOpen, ..FC302 };
 
-/// A converter of the VLT 5000 FLUX kind on DeviceNet: 0x4000 is 100 %, everything is renewed each 2 ms, and its own
-/// time-out takes at least a second, so that a rig needs a watchdog relay besides.
+/// A converter of the VLT 5000 FLUX kind on DeviceNet: 0x4000 is 100 %, all values are refreshed every 2 ms, and its
+/// own time-out is at least one second, so that a rig also needs a watchdog relay.
 pub const VLT5000: Profile = Profile {
     name: "vlt5000",
     transport: Transport::DeviceNet,
@@ -127,7 +128,7 @@ pub const VLT5000: Profile = Profile {
     ..CIA402
 };
 
-/// All of them.
+/// All profiles.
 pub const ALL: &[&Profile] = &[&CIA402, &FC302, &FC280, &VLT5000];
 
 /// The profile of this name.
@@ -136,7 +137,7 @@ pub fn find(name: &str) -> Option<&'static Profile> {
 }
 
 impl Profile {
-    /// What an error code means: the maker's own words, or the standard's.
+    /// Text of an error code: the maker's own, or the standard's.
     pub fn error(&self, code: u16) -> &'static str {
         let own = self.errors.iter().find(|(own, _)| *own == code).map(|(_, text)| *text);
         own.unwrap_or_else(|| crate::canopen::service::error_meaning(code))

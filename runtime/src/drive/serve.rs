@@ -1,7 +1,7 @@
-//! The drives and devices of a rig, simulated in real time, on buses that other programs can reach.
+//! Serves the simulated drives and devices of a rig in real time, on buses that other programs can reach.
 //!
-//! In: a rig, the part of its system that lies behind the drives, ways to the outside. Out: frames there, and in words how
-//! the states of the drives change. Knows neither terminals nor files but the links of pseudo-terminals.
+//! In: a rig, the part of its system that the hardware replaces, doors. Out: frames at the doors, and messages about
+//! state changes of the drives. Knows neither terminals nor files, except the links of pseudo-terminals.
 
 use super::attend;
 use crate::can;
@@ -19,25 +19,25 @@ use abi::Instance;
 use abi::rig::{Kind, Rig};
 use std::path::PathBuf;
 
-/// How soon the end is heard of, and changes of state are told, on a silent bus.
+/// Polling interval for the end and for state changes on a silent bus.
 const LOOK_NS: u64 = 20_000_000;
-/// Bit rate of a bus whose rig names none.
+/// Bit rate of a bus if the rig names none.
 const BIT_RATE: u32 = 1_000_000;
 
-/// Ways to the outside, and what shall happen.
+/// Doors, and faults to inject.
 #[derive(Clone, Debug, Default)]
 pub struct Doors {
-    /// Buses elsewhere than the rig says: its name and an address.
+    /// Addresses of buses in place of the rig's: name and address.
     pub buses: Vec<(String, String)>,
-    /// Pseudo-terminals that speak like an slcan adapter: links to them.
+    /// Pseudo-terminals that behave like an slcan adapter: links to them.
     pub pty: Vec<PathBuf>,
-    /// A TCP port that speaks like socketcand, 0 for a free one.
+    /// A TCP port that behaves like socketcand; 0 for a free one.
     pub tcp: Option<u16>,
-    /// What drives say they have besides what their simulation knows.
+    /// Data sheets of drives, for objects that their simulation does not have.
     pub sheets: Vec<Sheet>,
-    /// What fails, as [`fault_injection::read`] takes it.
+    /// Faults, in the syntax of [`fault_injection::read`].
     pub inject: Vec<String>,
-    /// From which all that is random follows.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
@@ -46,25 +46,25 @@ pub struct Doors {
 pub struct Sheet {
     /// The drive's name in the rig.
     pub drive: String,
-    /// Where the text is from, for messages.
+    /// Origin of the text, for messages.
     pub file: String,
     /// The text.
     pub text: String,
 }
 
-/// Why nothing is served.
+/// Reason why nothing is served.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Refused {
-    /// It was asked for wrongly.
+    /// The arguments are wrong.
     Misused(String),
-    /// The world failed: a bus, a port.
+    /// A bus or a port failed.
     Failed(String),
 }
 
 /// Priority under SCHED_FIFO; a rig's loop has 80.
 const PRIORITY: i32 = 79;
 
-/// A simulated bus for each of a rig, joined with ways to the outside, and the drives on them.
+/// A simulated bus for each bus of a rig, connected with the doors, and the drives on them.
 pub struct Served {
     world: Simulation,
     buses: Vec<SimBus>,
@@ -75,10 +75,10 @@ pub struct Served {
 }
 
 impl Served {
-    /// Opens the doors. `plant`: what lies behind the drives, if it is simulated.
+    /// Opens the doors. `plant`: the program of the part that hardware replaces, if it is simulated.
     ///
     /// # Errors
-    /// Why not.
+    /// Wrong arguments, or a bus or port that failed.
     pub fn open(rig: &Rig, plant: Option<Instance>, doors: &Doors) -> Result<Served, Refused> {
         let (misused, failed) = (Refused::Misused, Refused::Failed);
         let mut addresses: Vec<(&str, &str)> =
@@ -110,7 +110,7 @@ impl Served {
                 failed(format!("{file} is no data sheet: {}", first.join("; ")))
             })?;
             let objects = bench.drive(at).expect("it is a drive").objects();
-            // What the drive simulates it knows better.
+            // The simulation takes precedence for its own objects.
             for entry in sheet.entries() {
                 if objects.entry(entry.object).is_none() {
                     objects.add(entry.clone());
@@ -129,7 +129,7 @@ impl Served {
             let mut hub = Hub::new();
             hub.join(name, Box::new(simulated.port("outside")));
             let parsed = address.parse::<Address>().map_err(misused)?;
-            // A door replaces the address of the rig's text, not one that was asked for.
+            // An explicit door replaces the address of the rig's text, but not an address in the arguments.
             let asked = doors.buses.iter().any(|(bus, _)| bus == name);
             let inside = matches!(parsed, Address::Sim(_));
             if !inside && (asked || !opens) {
@@ -157,16 +157,17 @@ impl Served {
         Ok(Served { world, buses, hubs, server, bench, joined })
     }
 
-    /// Which drives there are, and where they are heard, in words.
+    /// Names of the drives and of their doors, as text.
     pub fn describe(&self, rig: &Rig) -> String {
         let names: Vec<&str> = rig.nodes.iter().map(|node| node.name.as_str()).collect();
         format!("simulated: {}; {}", names.join(", "), self.joined.join(", "))
     }
 
-    /// Lets them live for so many s, or until `over`; tells how their states change.
+    /// Runs the drives for this time, s, or until `over`; reports their state changes to `told`.
     pub fn serve(self, rig: &Rig, duration: Option<f64>, over: &dyn Fn() -> bool, told: &mut dyn FnMut(&str)) {
         let Served { world, buses, mut hubs, mut server, bench, .. } = self;
-        // A drive keeps its time however busy a computer is: where it may, this one stands just below a loop beside it.
+        // A drive keeps its timing on a busy computer: if permitted, it runs at a priority just below that of a loop
+        // beside it.
         let _real_time = threads::enter(&Wishes { priority: PRIORITY, core: None, memory: false, awake: false });
         let bench = attend(&world, &buses, rig, bench);
         let until_ns = duration.map_or(u64::MAX, |seconds| world.now_ns().saturating_add((seconds * 1e9) as u64));
@@ -194,7 +195,7 @@ impl Served {
                 let look_ns = until_ns.min(world.now_ns() + LOOK_NS);
                 match hubs.as_mut_slice() {
                     [one] => one.wait(&world, &also, look_ns),
-                    // Several at once: none of them may wait for another.
+                    // With several buses none may wait for another.
                     _ => world.run_to(until_ns.min(world.now_ns() + LOOK_NS / 100)),
                 }
             }

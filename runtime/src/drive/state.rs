@@ -1,21 +1,21 @@
-//! The state machine of CiA 402: the drive's side and the master's, from one table.
+//! The state machine of CiA 402: the drive's side and the master's side.
 //!
 //! In: status words and control words. Out: states, transitions, and the one command that leads a step towards a goal.
 //! Knows no object and no frame. Source: CiA 402-2, section 6.
 
 use std::fmt;
 
-/// Control words. The upper bits, which modes use, are 0.
+/// Control words. The upper bits, which depend on the mode, are 0.
 pub mod control {
-    /// To "ready to switch on".
+    /// Leads to "ready to switch on".
     pub const SHUTDOWN: u16 = 0x06;
-    /// To "switched on".
+    /// Leads to "switched on".
     pub const SWITCH_ON: u16 = 0x07;
-    /// To "operation enabled".
+    /// Leads to "operation enabled".
     pub const ENABLE: u16 = 0x0F;
     /// Stops on the ramp of object 6085.
     pub const QUICK_STOP: u16 = 0x02;
-    /// Takes the torque off.
+    /// Disables the torque.
     pub const DISABLE_VOLTAGE: u16 = 0x00;
     /// Its rising edge resets a fault.
     pub const FAULT_RESET: u16 = 0x80;
@@ -23,11 +23,11 @@ pub mod control {
 
 /// Bits of the status word besides the state.
 pub mod status {
-    /// Voltage is on.
+    /// The voltage is on.
     pub const VOLTAGE: u16 = 1 << 4;
     /// A warning is present.
     pub const WARNING: u16 = 1 << 7;
-    /// The control word is obeyed.
+    /// The control word is processed.
     pub const REMOTE: u16 = 1 << 9;
     /// Target reached.
     pub const TARGET: u16 = 1 << 10;
@@ -53,7 +53,7 @@ pub enum State {
 }
 
 impl State {
-    /// The state that a status word shows; nothing if it is none of the standard's.
+    /// The state in a status word; none if the bits match no state of the standard.
     pub fn of(status: u16) -> Option<State> {
         match (status & 0x6F, status & 0x4F) {
             (0x21, _) => Some(State::Ready),
@@ -68,7 +68,7 @@ impl State {
         }
     }
 
-    /// Its bits in the status word.
+    /// The state's bits in the status word.
     pub fn bits(self) -> u16 {
         match self {
             State::NotReady => 0x00,
@@ -82,7 +82,7 @@ impl State {
         }
     }
 
-    /// Whether the motor may make torque.
+    /// Whether the motor can have torque.
     pub fn powered(self) -> bool {
         matches!(self, State::Enabled | State::QuickStop | State::FaultReaction)
     }
@@ -103,7 +103,7 @@ impl fmt::Display for State {
     }
 }
 
-/// Where a master wants a drive to be.
+/// Target of a master for a drive.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub enum Goal {
     /// Without torque.
@@ -117,8 +117,8 @@ pub enum Goal {
 
 /// The control word that leads from a state one step towards the goal; `reset`: a fault may be reset now.
 ///
-/// The word is to be sent again each cycle until the state has changed; a fault is reset by the rising edge of its bit,
-/// so `reset` must alternate.
+/// The word must be sent in each cycle until the state has changed. The rising edge of its bit resets a fault, so
+/// `reset` must alternate.
 pub fn towards(goal: Goal, state: State, reset: bool) -> u16 {
     match (goal, state) {
         (_, State::Fault) if reset => control::FAULT_RESET,
@@ -126,7 +126,7 @@ pub fn towards(goal: Goal, state: State, reset: bool) -> u16 {
         (Goal::Enabled, State::SwitchOnDisabled) => control::SHUTDOWN,
         (Goal::Enabled, State::Ready) => control::SWITCH_ON,
         (Goal::Enabled, State::SwitchedOn | State::Enabled) => control::ENABLE,
-        // A drive that was stopped must first lose its torque: it never goes on by itself.
+        // A stopped drive must first lose its torque: it never continues by itself.
         (Goal::Enabled, State::QuickStop) => control::DISABLE_VOLTAGE,
         (Goal::Stopped, State::Enabled | State::QuickStop) => control::QUICK_STOP,
         (Goal::Stopped, State::SwitchOnDisabled | State::Ready | State::SwitchedOn) => control::DISABLE_VOLTAGE,
@@ -134,7 +134,7 @@ pub fn towards(goal: Goal, state: State, reset: bool) -> u16 {
     }
 }
 
-/// A command, as the lower bits of a control word say it.
+/// A command, as encoded by the lower bits of a control word.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Command {
     Shutdown,
@@ -156,34 +156,34 @@ impl Command {
     }
 }
 
-/// How long a drive takes for what is not done at once, ns.
+/// Durations of a drive's transitions, ns.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Times {
     /// Power stage on: "ready" to "switched on".
     pub switch_on_ns: u64,
-    /// Magnetisation and brake: "switched on" to "operation enabled".
+    /// Magnetisation and brake release: "switched on" to "operation enabled".
     pub enable_ns: u64,
-    /// Brake falls in: out of "operation enabled" by command.
+    /// Brake engagement: out of "operation enabled" by command.
     pub disable_ns: u64,
-    /// Self-test after power-on and after a fault was reset.
+    /// Self-test after power-on and after a fault reset.
     pub start_ns: u64,
 }
 
-/// The drive's side.
+/// The drive's side of the state machine.
 #[derive(Clone, Debug)]
 pub struct Machine {
     state: State,
     times: Times,
-    /// A transition under way: where to, and when it ends.
+    /// A transition in progress: its target state and the time of its end.
     pending: Option<(State, u64)>,
-    /// The last control word, for rising edges.
+    /// The last control word, for the detection of rising edges.
     word: u16,
-    /// Object 605A: 1 to 3 lead to "switch on disabled", 5 to 8 stay in "quick stop active", 0 takes the torque off.
+    /// Object 605A: 1 to 3 lead to "switch on disabled", 5 to 8 stay in "quick stop active", 0 disables the torque.
     pub quick_stop_option: i16,
 }
 
 impl Machine {
-    /// A machine that leaves "not ready" by itself once its self-test is over.
+    /// A machine that leaves "not ready" by itself after its self-test.
     pub fn new(times: Times, now_ns: u64) -> Machine {
         let pending = Some((State::SwitchOnDisabled, now_ns + times.start_ns));
         Machine { state: State::NotReady, times, pending, word: 0, quick_stop_option: 2 }
@@ -194,12 +194,12 @@ impl Machine {
         self.state
     }
 
-    /// The next moment at which it changes by itself.
+    /// Time of the next transition by itself.
     pub fn due_ns(&self) -> u64 {
         self.pending.map_or(u64::MAX, |(_, due)| due)
     }
 
-    /// Ends transitions whose time has come; says whether the state has changed.
+    /// Completes transitions that are due; returns whether the state has changed.
     pub fn advance(&mut self, now_ns: u64) -> bool {
         match self.pending {
             Some((state, due)) if due <= now_ns => {
@@ -218,7 +218,7 @@ impl Machine {
         }
     }
 
-    /// Takes a control word; says whether it reset a fault. `cleared`: the cause of the fault has gone.
+    /// Processes a control word; returns whether it reset a fault. `cleared`: the cause of the fault has gone.
     pub fn command(&mut self, word: u16, cleared: bool, now_ns: u64) -> bool {
         let edge = word & !self.word & control::FAULT_RESET != 0;
         self.word = word;
@@ -251,7 +251,7 @@ impl Machine {
             }
             (State::Enabled, Command::QuickStop) => self.go(State::QuickStop, 0, now_ns), // 11
             (State::QuickStop, Command::Enable) if self.quick_stop_option >= 5 => self.go(State::Enabled, 0, now_ns), // 16
-            // A command to stay, or one that this state doesn't know, ends a transition that has not ended.
+            // A command to stay, or one without meaning in this state, cancels a transition in progress.
             (State::Ready, Command::Shutdown)
             | (State::SwitchedOn, Command::SwitchOn)
             | (State::Enabled, Command::Enable) => self.pending = None,
@@ -260,14 +260,14 @@ impl Machine {
         false
     }
 
-    /// The quick stop has come to its end: options 1 to 3 take the torque off.
+    /// Notes the end of the quick stop: options 1 to 3 then disable the torque.
     pub fn stopped(&mut self) {
         if self.state == State::QuickStop && self.quick_stop_option < 5 {
             (self.state, self.pending) = (State::SwitchOnDisabled, None); // 12
         }
     }
 
-    /// Stops on the ramp, as 6007 = 3 and the like ask for.
+    /// Stops on the ramp, for example because of 6007 = 3.
     pub fn quick_stop(&mut self) {
         match self.state {
             State::Enabled => (self.state, self.pending) = (State::QuickStop, None),
@@ -276,7 +276,7 @@ impl Machine {
         }
     }
 
-    /// Takes the torque off, as 6007 = 2 asks for.
+    /// Disables the torque, for example because of 6007 = 2.
     pub fn disable(&mut self) {
         match self.state {
             State::Ready | State::SwitchedOn | State::Enabled | State::QuickStop => {
@@ -286,7 +286,7 @@ impl Machine {
         }
     }
 
-    /// A fault: the reaction first, if the motor makes torque.
+    /// Enters the fault state, through the fault reaction if the motor can have torque.
     pub fn fault(&mut self, reaction_ns: u64, now_ns: u64) {
         match self.state {
             State::Fault | State::FaultReaction => {}
@@ -330,7 +330,7 @@ mod tests {
     fn every_transition_is_that_of_the_standard() {
         use State::*;
         use control::*;
-        // Rows: states, in the order of `STATES`; columns: commands.
+        // Rows: states in the order of `STATES`; columns: commands.
         let commands = [SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET];
         let table = [
             [NotReady, NotReady, NotReady, NotReady, NotReady, NotReady],
@@ -357,7 +357,7 @@ mod tests {
                 assert_eq!(State::of(status), Some(state));
             }
         }
-        // Bit 5 doesn't count in the four states without it.
+        // Bit 5 is ignored in the four states without it.
         assert_eq!(State::of(0x28), Some(State::Fault));
         assert_eq!(State::of(0x60), Some(State::SwitchOnDisabled));
         assert_eq!(State::of(0x01), None);

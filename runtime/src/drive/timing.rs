@@ -1,20 +1,20 @@
-//! When a command reaches a drive: what of its `delay` is not the drive's own.
+//! Timing of commands: the share of a drive's `delay` that is not the drive's own.
 //!
-//! In: a rig. Out: times of its cycle, ns. The `delay` of a rig's text counts from the reading of the shaft, at SYNC, to
-//! the first effect of the command that answers it: waiting for answers, computing, the way over the bus and what the
-//! drive itself needs. So `delay`, not a clock, is what a dry run, a prediction and the look ahead go by.
+//! In: a rig. Out: times of its cycle, ns. The `delay` of a rig's text counts from the reading of the shaft, at SYNC,
+//! to the first effect of the command that answers it: waiting for answers, computation, transfer on the bus, and the
+//! drive's own delay. A SIL run, the stability prediction and the predictor therefore use `delay` and no clock.
 
 use abi::rig::{Kind, Rig};
 
-/// Bit rate of a bus where the rig names none.
+/// Bit rate of a bus if the rig names none.
 const BIT_RATE: u64 = 1_000_000;
-/// Longest frame of a control word and a torque, in bits with the gap behind it.
+/// Longest frame with a control word and a torque, in bits with the interframe space.
 const COMMAND_BITS: u64 = 95;
-/// A SYNC frame: the drives read the shaft at its end.
+/// A SYNC frame, in bits: the drives read the shaft at its end.
 const SYNC_BITS: u64 = 47;
 
-/// From the begin of a cycle to its computing: answers are waited for until then. All drives wait for the next SYNC: there
-/// is time. Otherwise the answers of some drives at 1 Mbit/s and 1 kHz.
+/// Time from the begin of a cycle to its computation, in which answers are awaited. If all drives act on the next SYNC,
+/// it is most of the period. Otherwise it suffices for the answers of some drives at 1 Mbit/s and 1 kHz.
 pub fn collect_ns(rig: &Rig) -> u64 {
     let at_sync = rig.nodes.iter().all(|node| match &node.kind {
         Kind::Cia402(drive) => !node.moves || drive.at_sync,
@@ -23,7 +23,8 @@ pub fn collect_ns(rig: &Rig) -> u64 {
     rig.period_ns * if at_sync { 85 } else { 55 } / 100
 }
 
-/// From a reading to the arrival of the command that answers it at a node: drives are told in the order of the text.
+/// Time from a reading to the arrival of the command that answers it at a node: commands are sent in the order of the
+/// text.
 pub fn transit_ns(rig: &Rig, node: usize) -> u64 {
     let bus = rig.nodes[node].bus;
     let speaks = |node: &&abi::rig::Node| node.bus == bus && node.moves && matches!(node.kind, Kind::Cia402(_));

@@ -1,34 +1,34 @@
-//! SI values and the whole numbers that drives speak.
+//! Conversion between SI values and the integers of drives.
 //!
-//! What is measured is rounded to the nearest number; what is commanded towards zero, so that no command on the wire is
-//! greater than the value that was permitted.
+//! Measured values are rounded to nearest, commands towards zero, so that no command on the bus exceeds the permitted
+//! value.
 
 use crate::safety::{Protection, is_present};
 
-/// How a signal is told in whole numbers: one step of it, SI, and its least and greatest number.
+/// Encoding of a signal as an integer: the value of one step, and the range.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Scale {
-    /// SI value of one step; never 0.
+    /// Value of one step, SI; never 0.
     pub step: f64,
-    /// Least number that may be sent.
+    /// Lowest number that may be sent.
     pub low: i64,
-    /// Greatest number that may be sent.
+    /// Highest number that may be sent.
     pub high: i64,
 }
 
 impl Scale {
-    /// Steps in a signed number of so many bits.
+    /// Steps in a signed number of this many bits.
     pub fn signed(step: f64, bits: u32) -> Scale {
         Scale { step, low: -1 << (bits - 1), high: (1 << (bits - 1)) - 1 }
     }
 
-    /// The number nearest to a value. What is no number gives 0, what doesn't fit the nearest that does.
+    /// The number nearest to a value. NaN becomes 0; a value outside the range is clamped.
     pub fn number(&self, value: f64) -> i64 {
         ((value / self.step).round() as i64).clamp(self.low, self.high)
     }
 
-    /// The number for a command: the greatest one, towards zero, whose value is not greater than this. What is no number gives
-    /// 0, what doesn't fit the nearest that does.
+    /// The number for a command: the greatest one in magnitude whose value does not exceed the command. NaN becomes 0;
+    /// a value outside the range is clamped.
     pub fn command(&self, value: f64) -> i64 {
         let number = self.number(value);
         if beyond(self.value(number), value, value) && is_present(Protection::Rounding) {
@@ -43,13 +43,13 @@ impl Scale {
     }
 }
 
-/// Whether a value on the wire is greater than the permitted one, by more than the rounding of a product or sum of numbers of
-/// this size.
+/// Whether a value on the bus exceeds the permitted one by more than the rounding error of a product or sum of numbers
+/// of magnitude `size`.
 pub fn beyond(wire: f64, permitted: f64, size: f64) -> bool {
     wire.abs() > permitted.abs() + 2.0 * f64::EPSILON * size.abs()
 }
 
-/// A position told in 32 bits, continued beyond them.
+/// A 32-bit position, extended beyond its overflow.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Counter {
     last: Option<i32>,
@@ -58,7 +58,7 @@ pub struct Counter {
 }
 
 impl Counter {
-    /// Takes the next reading: between two, less than half of all counts have gone by.
+    /// Takes the next reading: between two readings less than half of all counts pass.
     pub fn read(&mut self, counts: i32) {
         if let Some(last) = self.last {
             self.total += i64::from(counts.wrapping_sub(last));
@@ -76,9 +76,9 @@ impl Counter {
         self.total
     }
 
-    /// The number that stands for so many counts since the origin, for a drive that takes positions. A number that has no
-    /// place in 32 bits is not wrapped, since a drive would turn the other way: then it is the last one on the way there,
-    /// and false.
+    /// The number for a position command of this many counts since the origin. A number beyond 32 bits does not wrap,
+    /// because the drive would turn the other way: the nearest number in the right direction is returned instead, with
+    /// false.
     pub fn number(&self, total: i64) -> (i32, bool) {
         let way = total.saturating_sub(self.total);
         if !is_present(Protection::Wrap) {
@@ -150,7 +150,7 @@ mod tests {
             let step = 10f64.powf(random.between(-9.0, 3.0)) * [1.0, -1.0][random.below(2) as usize];
             let bits = [8, 16, 32][random.below(3) as usize];
             let scale = Scale::signed(step, bits);
-            // Any value, one on a step, and those beside it.
+            // Any value, a value on a step, and the neighbours of that.
             let most = 2f64.powi(bits as i32 - 1) - 1.0;
             let value = match random.below(3) {
                 0 => random.between(-1.0, 1.0) * most * step,
