@@ -1,43 +1,44 @@
-//! The first motion: a small push that shows whether torque, speed and position have the right sign and scale.
+//! Polarity check: a small motion that shows whether torque, speed and position agree in sign and scale.
 //!
-//! In: readings, once a tick. Out: the command wanted, then a verdict. A torque rises slowly until the shaft has
-//! turned a little, then the same torques follow backwards and mirrored, which takes the speed out again.
+//! In: readings, once per tick. Out: the requested command, then a verdict. The torque rises slowly until the shaft has
+//! turned a little; then the same torques follow in reverse order and with the opposite sign, which removes the speed
+//! again.
 
 use crate::drive::faults::Why;
 use abi::rig::Mode;
 
-/// How the test is made.
+/// Kind of the polarity check.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub enum SignTest {
-    /// By a push under tight limits.
+    /// By a push of the drive under tight limits.
     #[default]
     Push,
-    /// Somebody turns the shaft by hand; torque stays zero.
+    /// Somebody turns the shaft by hand; the torque stays zero.
     ByHand,
-    /// Not at all.
+    /// No check.
     Skip,
 }
 
-/// What the test may use and what must come of it, SI.
+/// Limits and scales of the check, SI.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Bounds {
-    /// What the drive follows.
+    /// The quantity that the drive controls.
     pub mode: Mode,
-    /// Greatest torque or speed of the push.
+    /// Highest torque or speed of the push.
     pub command: f64,
     /// Angle that counts as motion.
     pub angle: f64,
-    /// Angle at which the test has gone wrong.
+    /// Angle at which the check fails.
     pub angle_most: f64,
-    /// Speed at which it has gone wrong.
+    /// Speed at which the check fails.
     pub speed_most: f64,
-    /// One step of the speed.
+    /// Quantisation step of the speed.
     pub speed_unit: f64,
-    /// One step of the torque.
+    /// Quantisation step of the torque.
     pub torque_unit: f64,
 }
 
-/// What the drive says.
+/// Readings of the drive.
 #[derive(Clone, Copy, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Sample {
@@ -54,24 +55,24 @@ enum Phase {
     Settle,
 }
 
-/// Time to see how the shaft moves by itself, s.
+/// Time in which the shaft's own motion is observed, s.
 const CALM: f64 = 0.1;
-/// Time in which the greatest command is reached, s.
+/// Time in which the torque rises to its maximum, s.
 const RISE: f64 = 0.5;
-/// Time a shaft is given to turn, s.
+/// Time in which the shaft must turn, s.
 pub const PATIENCE: f64 = 1.5;
-/// Time somebody is given to turn it by hand, s.
+/// Time in which somebody must turn the shaft by hand, s.
 pub const PATIENCE_BY_HAND: f64 = 60.0;
-/// Time for the last motion to end, s.
+/// Time for the remaining motion to end, s.
 const SETTLE: f64 = 0.2;
 /// Time constant with which it is damped, s.
 const DAMPING: f64 = 0.03;
 
-/// One test.
+/// State of one check.
 #[derive(Clone, Debug)]
 pub struct Push {
     bounds: Bounds,
-    /// Something else turns the shaft, within so many s.
+    /// The shaft is turned from outside, within this time, s; none: the drive pushes it.
     turned: Option<f64>,
     phase: Phase,
     /// Time in this phase, s.
@@ -80,29 +81,29 @@ pub struct Push {
     /// Speed of the shaft before the push, rad/s.
     drift: f64,
     last: f64,
-    /// Time the push took, s.
+    /// Duration of the push, s.
     rise: f64,
     turned_by_speed: f64,
-    /// ∫|torque| dt while pushing: told, reported along it.
+    /// ∫torque dt during the push: commanded, reported, N·m·s.
     told: f64,
     reported: f64,
     command: f64,
 }
 
-/// Where a test is.
+/// Result of one tick.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Verdict {
-    /// Goes on: the command wanted, counted from rest.
+    /// The check continues with this command, relative to rest.
     Wants(f64),
-    /// All is right.
+    /// The check has passed.
     Right,
-    /// It isn't.
+    /// The check has failed.
     Wrong(Why),
 }
 
 impl Push {
-    /// A test that has not begun. `turned`: the time in which somebody, or another drive, turns the shaft, s; without one the
-    /// drive pushes it.
+    /// A check before its first tick. `turned`: time in which the shaft is turned by hand or by another drive, s; none:
+    /// the drive pushes it.
     pub fn new(bounds: Bounds, turned: Option<f64>) -> Push {
         Push {
             bounds,
@@ -131,7 +132,7 @@ impl Push {
             }
             return Verdict::Wants(0.0);
         }
-        // Counted from where a shaft without the push would be: that one goes on as it did before.
+        // Relative to the position that the shaft would have without the push, continuing its earlier motion.
         self.start = Some(start + self.drift * dt);
         let turned = sample.position - start - self.drift * dt;
         let speed = sample.speed.map_or((turned - self.last) / dt, |speed| speed - self.drift);
@@ -161,7 +162,7 @@ impl Push {
                 });
             }
             Phase::Push => {}
-            // The motion has ended or turned round: friction has done part of it.
+            // The motion has ended or reversed: friction has contributed.
             Phase::Back if self.t >= self.rise || turned < self.last => {
                 if let Some(why) = self.judge(turned, sample) {
                     return Verdict::Wrong(why);
@@ -179,7 +180,7 @@ impl Push {
             (Phase::Push, Mode::Torque) => (slope * self.t).min(bounds.command),
             (Phase::Back, Mode::Torque) => -(slope * (self.rise - self.t)).clamp(0.0, bounds.command),
             (Phase::Push, Mode::Speed) => bounds.command,
-            // What motion is left is damped, with the inertia that the push has shown.
+            // The remaining motion is damped, with the moment of inertia that the push has shown.
             (Phase::Settle, Mode::Torque) => {
                 let most = 0.1 * bounds.command;
                 (-(speed + self.drift) * self.inertia() / DAMPING).clamp(-most, most)
@@ -191,16 +192,16 @@ impl Push {
         Verdict::Wants(self.command)
     }
 
-    /// Moment of inertia by the impulse and the angle of the push, whose torque rose evenly: x = ∫T dt · t / (3 J).
+    /// Moment of inertia from impulse and angle of the push, whose torque rose linearly: x = ∫T dt · t / (3 J).
     fn inertia(&self) -> f64 {
         self.told * self.rise / (3.0 * self.bounds.angle)
     }
 
-    /// What is wrong with the scales, once the shaft has turned and its speed has been taken out again.
+    /// The scale error, if any, once the shaft has turned and its speed has been removed again.
     fn judge(&self, turned: f64, sample: Sample) -> Option<Why> {
         let bounds = self.bounds;
         let seconds = self.rise + self.t;
-        // A speed in coarse steps may be off by one the whole time.
+        // A coarsely quantised speed may be off by one step all the time.
         let slack = 0.3 * turned.abs().max(bounds.angle) + bounds.speed_unit * seconds;
         if sample.speed.is_some() && (self.turned_by_speed - turned).abs() > slack {
             return Some(Why::Scale(turned, self.turned_by_speed));
@@ -228,7 +229,7 @@ mod tests {
         torque_unit: 4e-3,
     };
 
-    /// A shaft of 0.012 kg·m² under dry friction, with these factors on what it reports.
+    /// Simulates a shaft of 0.012 kg·m² with dry friction, with these factors on its readings.
     fn run(bounds: Bounds, friction: f64, [torque, speed, position]: [f64; 3]) -> (Verdict, f64, f64) {
         let (mut push, mut x, mut w, mut wanted) = (Push::new(bounds, None), 0.0f64, 0.0f64, 0.0);
         for _ in 0..5000 {
@@ -268,7 +269,7 @@ mod tests {
         let (verdict, ..) = run(BOUNDS, 0.1, [4.0, 1.0, 1.0]);
         assert!(matches!(verdict, Verdict::Wrong(Why::Torque(..))), "{verdict:?}");
         assert_eq!(run(BOUNDS, 2.0, [1.0; 3]).0, Verdict::Wrong(Why::Stuck(1.0)));
-        // Somebody else is to turn it, and it does not see that.
+        // The shaft is to be turned from outside, but the drive does not see a motion.
         let mut turned = Push::new(BOUNDS, Some(0.5));
         let still = Sample { position: 1.0, speed: Some(0.0), torque: Some(0.0) };
         let verdicts: Vec<Verdict> = (0..502).map(|_| turned.tick(still, 1e-3)).collect();

@@ -1,36 +1,36 @@
-//! What is read from a drive and written into it before it may move, as a list that an SDO client works through.
+//! Sequences of SDO accesses by which a drive is identified and configured before it may move.
 
 use crate::canopen::sdo::{Client, Failure, Outcome};
 use crate::canopen::{Object, Send, Type};
 use crate::drive::faults::Why;
 
-/// One entry of a list.
+/// One entry of a sequence.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Entry {
-    /// Reads a number and keeps it.
+    /// Reads a number and stores it.
     Read(Object, Type, Keep),
-    /// The same, where the drive has it.
+    /// The same, if the drive has the object.
     ReadIf(Object, Type, Keep),
-    /// Reads a text, where the drive has it; keeps 1 if it is this one, else 0.
+    /// Reads a text, if the drive has the object; stores 1 if it equals this text, otherwise 0.
     TextIf(Object, &'static str, Keep),
-    /// Writes a number of so many bytes.
+    /// Writes a number of this many bytes.
     Write(Object, i64, u8),
-    /// Writes it where the drive takes it; where not, passes over so many entries behind this one.
+    /// The same, if the drive accepts it; otherwise skips this many entries after this one.
     WriteOr(Object, i64, u8, usize),
-    /// Reads; the bits must be those.
+    /// Reads a number and compares it under a mask: expected value, mask.
     Compare(Object, i64, i64),
-    /// Writes node and time of a watched heartbeat; longer times are tried where the drive refuses; last resort: the
-    /// entries behind the next so many.
+    /// Writes node and time of a heartbeat consumer. If the drive refuses, longer times are tried; if it refuses all,
+    /// skips this many entries after this one.
     Watch(Object, u8, usize),
-    /// Reads it back.
+    /// Reads that entry back.
     Watched(Object, u8),
-    /// Asks the owner to judge what has been read so far.
+    /// Lets the owner judge the values read so far.
     Judge(Question),
-    /// Goes on so many entries further.
+    /// Skips this many entries.
     Skip(usize),
 }
 
-/// Where a number that was read is kept.
+/// Place of a number that was read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Keep {
@@ -53,65 +53,65 @@ pub enum Keep {
 /// Number of [`Keep`]s.
 pub const KEPT: usize = Keep::Deadline as usize + 1;
 
-/// What the owner is asked in between.
+/// Questions to the owner during a sequence.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Question {
-    /// Is it the right drive, and what are its limits?
+    /// Whether this is the right drive, and what its limits are.
     Identity,
-    /// Does object 605A end a quick stop without torque?
+    /// Whether object 605A ends a quick stop without torque.
     QuickStop,
-    /// It has a heartbeat consumer or guarding: from now on we must be heard.
+    /// The drive has a heartbeat consumer or node guarding: it must hear us from now on.
     Timeout(Watching),
 }
 
-/// How a drive watches us.
+/// Mechanism by which a drive monitors us.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Watching {
-    /// Our heartbeat; the time is known from the list.
+    /// Our heartbeat; the sequence holds the time.
     Heartbeat,
     /// Guard requests.
     Guarding,
-    /// Nothing does.
+    /// None.
     Nothing,
 }
 
-/// How far a list is.
+/// Progress of a sequence.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Progress {
     /// Waits for an answer.
     Busy,
-    /// The owner must answer, then call again.
+    /// The owner must answer this question, then call again.
     Asks(Question),
-    /// At its end.
+    /// The sequence is complete.
     Done,
-    /// The drive said no.
+    /// The drive refused an entry.
     Refused(Why),
 }
 
-/// How often a drive is asked that does not answer: one may be busy, or an answer be lost on the way.
+/// Attempts if a drive does not answer: it may be busy, or an answer may be lost.
 const TRIES: u32 = 3;
 
-/// A list and the place in it.
+/// A sequence and its current entry.
 #[derive(Clone, Debug)]
 pub struct Script {
     entries: Vec<Entry>,
     at: usize,
     asked: bool,
-    /// Times it was asked in vain.
+    /// Number of attempts without an answer.
     unanswered: u32,
     /// Numbers that were read.
     pub kept: [Option<i64>; KEPT],
-    /// The time-out that a drive has accepted, ms.
+    /// The time-out that the drive has accepted, ms.
     pub timeout_ms: u32,
 }
 
 impl Script {
-    /// At the start of a list.
+    /// A sequence at its first entry.
     pub fn new(entries: Vec<Entry>, timeout_ms: u32) -> Script {
         Script { entries, at: 0, asked: false, unanswered: 0, kept: [None; KEPT], timeout_ms }
     }
 
-    /// To the start again.
+    /// Returns to the first entry.
     pub fn rewind(&mut self) {
         (self.at, self.asked, self.unanswered) = (0, false, 0);
     }
@@ -125,7 +125,7 @@ impl Script {
         (self.at, self.asked, self.unanswered) = (self.at + 1 + further, false, 0);
     }
 
-    /// Asks the next thing, or takes the answer. Called once a tick.
+    /// Sends the next request, or processes its answer. Called once per tick.
     pub fn work(&mut self, client: &mut Client, now_ns: u64, send: Send) -> Progress {
         let Some(&entry) = self.entries.get(self.at) else { return Progress::Done };
         match entry {
@@ -176,7 +176,7 @@ impl Script {
                         if self.timeout_ms >= 1000 {
                             self.next(further);
                         } else {
-                            // As short as the drive takes it.
+                            // The shortest time that the drive accepts.
                             (self.timeout_ms, self.asked) = (self.timeout_ms * 2, false);
                         }
                     }
@@ -196,7 +196,7 @@ impl Script {
                 self.kept[keep as usize] = Some(kind.number(data));
             }
             Entry::TextIf(_, text, keep) => {
-                // Some devices fill their texts up with zeros.
+                // Some devices pad their texts with zeros.
                 let told = data.split(|byte| *byte == 0).next().unwrap_or_default();
                 self.kept[keep as usize] = Some((told == text.as_bytes()).into());
             }
