@@ -1,8 +1,8 @@
-//! A simulated CiA 402 drive: a node with the real dictionary and state machine, a torque loop, an encoder.
+//! A simulated CiA 402 drive: a node with the real object dictionary and state machine, a torque loop, an encoder.
 //!
 //! In: frames, the time, the true angle and speed of its shaft. Out: frames, the torque on the shaft. A command passes
-//! dead time → slope limit (mode 4) → saturation → first-order lag; what is told passes the encoder, a filter and the
-//! drive's units. Its time-outs work. [`Effect`]s make it fail.
+//! dead time → slope limit (mode 4) → saturation → first-order lag; readings pass the encoder, a filter and the drive's
+//! units. Its time-outs work. [`Effect`]s make it fail.
 
 use super::profiles::{self, Life, Path, Profile};
 use super::state::{Machine, State, Times, status};
@@ -14,33 +14,33 @@ use crate::canopen::{Access, Nmt, NmtState, Object, ObjectDictionary, Send, Type
 use crate::drive::fault_injection::Effect;
 use abi::rig::Cia402;
 
-/// Commands on their way to the motor.
+/// Most commands under way to the motor.
 const QUEUE: usize = 256;
-/// Frames that are held back.
+/// Most delayed frames.
 const HELD: usize = 64;
 
-/// How a simulated drive behaves beyond what the rig says of it.
+/// Behaviour of a simulated drive beyond the rig's text.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Behaviour {
-    /// From power-on or reset to the boot-up message, ns.
+    /// Time from power-on or reset to the boot-up message, ns.
     pub boot_ns: u64,
     /// Times of its state machine.
     pub times: Times,
-    /// From a fault to the torque being off, ns.
+    /// Time from a fault until the torque is off, ns.
     pub reaction_ns: u64,
-    /// From SYNC to its answers, ns.
+    /// Time from SYNC to its answers, ns.
     pub answer_ns: u64,
-    /// Torque ripple, share of rated torque.
+    /// Torque ripple as a share of the rated torque.
     pub ripple: f64,
-    /// Periods of the ripple in a turn.
+    /// Periods of the ripple per revolution.
     pub ripples: f64,
-    /// Greatest torque, share of rated torque.
+    /// Highest torque as a share of the rated torque.
     pub overload: f64,
-    /// Greatest speed, rad/s.
+    /// Highest speed, rad/s.
     pub speed: f64,
-    /// Least time of a heartbeat that it can watch, ms.
+    /// Shortest heartbeat time that it can monitor, ms.
     pub least_consumer_ms: u16,
-    /// Modes it offers, as object 6502; none: those of its profile.
+    /// Modes of operation it offers, as object 6502; none: those of its profile.
     pub modes: Option<u32>,
 }
 
@@ -66,7 +66,7 @@ impl Default for Behaviour {
     }
 }
 
-/// What is wrong with it at present.
+/// The faults that act at present.
 #[derive(Clone, Copy, Debug, Default)]
 struct Wrong {
     silent: bool,
@@ -98,7 +98,7 @@ struct Parameters {
     ramp: f64,
 }
 
-/// A drive.
+/// State of a simulated drive.
 #[derive(Clone, Debug)]
 pub struct SimulatedDrive {
     config: Cia402,
@@ -109,11 +109,11 @@ pub struct SimulatedDrive {
     delay_ns: u64,
     lag: f64,
     torque_scale: Scale,
-    /// Gains of the speed loop: N·m per rad/s, N·m per rad.
+    /// Gains of the speed controller: N·m per rad/s, N·m per rad.
     gains: (f64, f64),
-    /// The state that its status word shows.
+    /// The state in its status word.
     told: State,
-    /// The mode it is in.
+    /// Its mode of operation.
     mode: i8,
     /// Targets with the time at which they act: (ns, number).
     queue: [(u64, i64); QUEUE],
@@ -121,24 +121,24 @@ pub struct SimulatedDrive {
     waiting: usize,
     /// The target that acts.
     target: i64,
-    /// Torque behind the slope limit, and on the shaft, N·m.
+    /// Torque after the slope limit, and torque on the shaft, N·m.
     ramped: f64,
     torque: f64,
     limited: bool,
-    /// Speed that a ramp has reached, rad/s; what the speed loop has summed up, N·m.
+    /// Speed set-point after its ramp, rad/s; integral part of the speed controller, N·m.
     speed_wanted: f64,
     sum: f64,
     speed_filtered: f64,
-    /// Number of the position at angle 0, and counts that went astray.
+    /// Number of the position at angle 0, with all lost counts.
     offset: i64,
     position_at_rest: f64,
     shaft: (f64, f64),
     parameters: Parameters,
-    /// Length of a step, s, and how far lag and filter go in it.
+    /// Length of a step, s, and the shares by which lag and filter approach their input in it.
     shares: (f64, f64, f64),
     refreshed_ns: u64,
     held: [(u64, Option<Frame>); HELD],
-    /// Whether anything is held back.
+    /// Whether any frame is delayed.
     holding: bool,
     wrong: Wrong,
 }
@@ -150,7 +150,7 @@ const MODE_SHOWN: Object = Object(0x6061, 0);
 
 /// 1 − e^(−x) for x ≥ 0, the same on every machine.
 fn approach(x: f64) -> f64 {
-    // e^(−x) = (e^(−x/1024))^1024; the series has 1e-16 left at x/1024 < 0.06, and beyond that nothing remains.
+    // e^(−x) = (e^(−x/1024))^1024; for x/1024 < 0.06 the series has an error of 1e-16, and beyond that the result is 1.
     if x > 60.0 {
         return 1.0;
     }
@@ -162,18 +162,18 @@ fn approach(x: f64) -> f64 {
     1.0 - power
 }
 
-/// `x`, or where it tends to once it is as good as there: what is left must not linger as ever smaller numbers.
+/// `x`, or its limit `end` once it is close, so that the difference does not decay through ever smaller numbers.
 fn near(x: f64, end: f64) -> f64 {
     if (x - end).abs() < 1e-12 { end } else { x }
 }
 
-/// A wave between −1 and 1 with period 1.
+/// A triangle wave between −1 and 1 with period 1.
 fn triangle(x: f64) -> f64 {
     4.0 * (x - (x + 0.5).floor()).abs() - 1.0
 }
 
 impl SimulatedDrive {
-    /// A drive that boots at time 0. `inertia`: of its shaft, kg·m², for its own speed loop; `offset`: number of its
+    /// A drive that boots at time 0. `inertia`: of its shaft, kg·m², for its speed controller; `offset`: number of its
     /// position at angle 0.
     pub fn new(
         config: &Cia402,
@@ -247,7 +247,7 @@ impl SimulatedDrive {
         add(0x6075, "motor rated current", U32, ReadWrite, 5000);
         add(0x6076, "motor rated torque", U32, ReadWrite, (config.rated_torque * 1e3).round() as i64);
         add(0x6080, "max motor speed", U32, ReadWrite, (behaviour.speed * rpm).round() as i64);
-        // Rated torque on the inertia of the shaft stops it fast enough for any test: 1000 rad/s².
+        // 1000 rad/s²: with rated torque on the inertia of the shaft that stops it fast enough for any test.
         add(0x6085, "quick stop deceleration", U32, ReadWrite, (1000.0 / config.speed_unit).min(4e9) as i64);
         add(0x6087, "torque slope", U32, ReadWrite, 1000 * profile.full_torque);
         add(0x60B2, "torque offset", I16, ReadWrite, 0);
@@ -293,25 +293,25 @@ impl SimulatedDrive {
         objects
     }
 
-    /// Modes it offers, a bit for each.
+    /// Modes of operation it offers, one bit each.
     fn modes(&self) -> u32 {
         let own = [self.profile.torque, self.profile.speed, self.profile.position];
         let own = own.iter().flatten().flat_map(|path| path.modes).fold(0, |modes, (_, bit)| modes | 1 << bit);
         self.behaviour.modes.unwrap_or(own)
     }
 
-    /// The node it is.
+    /// Its CANopen node.
     pub fn node(&self) -> &Node {
         &self.node
     }
 
-    /// Its objects, for tests that change what it says of itself.
+    /// Its objects, for tests that change them.
     pub fn objects(&mut self) -> &mut ObjectDictionary {
         &mut self.node.objects
     }
 
-    /// Takes its deadlines for set-points away (objects 1400:5 and following), which not every drive has: before it is
-    /// configured.
+    /// Removes its deadlines for set-points (objects 1400:5 and following), which not every drive has. Must be called
+    /// before it is configured.
     pub fn without_deadlines(&mut self) {
         self.node.without_deadlines();
     }
@@ -326,12 +326,12 @@ impl SimulatedDrive {
         self.torque
     }
 
-    /// Speed that it holds where its shaft gives no way, rad/s: what a plant takes that is driven by speed.
+    /// Speed set-point, rad/s, for a plant whose input is the speed.
     pub fn speed(&self) -> f64 {
         self.speed_wanted
     }
 
-    /// The next moment at which [`poll`](SimulatedDrive::poll) has something to do.
+    /// Time at which [`poll`](SimulatedDrive::poll) is next due.
     pub fn due_ns(&self) -> u64 {
         let due = self.node.due_ns().min(self.machine.due_ns());
         if !self.holding {
@@ -341,7 +341,7 @@ impl SimulatedDrive {
         due.min(held.unwrap_or(u64::MAX))
     }
 
-    /// Makes it fail, or ends that. `random` gives numbers from 0 to 1.
+    /// Applies a fault, or ends it.
     pub fn afflict(&mut self, effect: Effect, on: bool, now_ns: u64, send: Send) {
         let factor = |factor: f64| on.then_some(factor);
         match effect {
@@ -358,7 +358,7 @@ impl SimulatedDrive {
             }
             Effect::PreOperational => {
                 let state = if on { NmtState::PreOperational } else { NmtState::Operational };
-                // A node that was reset meanwhile boots.
+                // A node that was reset meanwhile is booting.
                 if on || self.node.state() == NmtState::PreOperational {
                     self.node.go(state);
                 }
@@ -396,7 +396,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Lets the node send through what is wrong with the drive.
+    /// Calls the node, and applies the drive's faults to the frames that it sends.
     fn with_node<T>(&mut self, now_ns: u64, send: Send, work: impl FnOnce(&mut Node, Send) -> T) -> T {
         let (wrong, held, answer_ns) = (self.wrong, &mut self.held, self.behaviour.answer_ns);
         let holding = &mut self.holding;
@@ -421,7 +421,7 @@ impl SimulatedDrive {
         (self.mode, self.waiting, self.target, self.ramped, self.sum) = (0, 0, 0, 0.0, 0.0);
     }
 
-    /// What object 6007 says about a connection that is lost while the drive is in use.
+    /// Reaction of object 6007 to a lost connection while the drive is in use.
     fn abort_connection(&mut self, now_ns: u64) {
         if !matches!(self.machine.state(), State::Ready | State::SwitchedOn | State::Enabled) {
             return;
@@ -434,13 +434,13 @@ impl SimulatedDrive {
         }
     }
 
-    /// Takes a frame of its bus.
+    /// Receives a frame of its bus.
     pub fn receive(&mut self, frame: &Frame, now_ns: u64, send: Send) {
         if self.wrong.silent {
             return;
         }
         if frame.id() == 0x600 + u32::from(self.config.node) {
-            // Whoever asks shall hear what is, not what was told last.
+            // An SDO request must read the present values, not those of the last answer.
             self.tell(now_ns);
         }
         let happening = self.with_node(now_ns, send, |node, send| node.receive(frame, now_ns, send));
@@ -449,7 +449,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Does all that is due.
+    /// Executes everything that is due.
     pub fn poll(&mut self, now_ns: u64, send: Send) {
         if self.holding {
             for (due_ns, frame) in &mut self.held {
@@ -472,7 +472,7 @@ impl SimulatedDrive {
     fn happened(&mut self, happening: Happening, now_ns: u64, send: Send) {
         match happening {
             Happening::Sync => {
-                // Commands of a type that waits for SYNC have just come into the dictionary.
+                // SYNC has just transferred the commands of synchronous PDOs into the dictionary.
                 self.take_commands(now_ns, send);
                 self.tell(now_ns);
                 self.with_node(now_ns, send, |node, send| node.answer_sync(send));
@@ -522,7 +522,7 @@ impl SimulatedDrive {
         self.path().map(|path| path.target.0)
     }
 
-    /// What a step needs, as it is in the dictionary now.
+    /// Reads the parameters of a step from the dictionary.
     fn take_parameters(&mut self) {
         let number = |index| self.node.objects.get(Object(index, 0)).unwrap_or(0);
         let torque = |number| self.torque_scale.value(number);
@@ -536,7 +536,7 @@ impl SimulatedDrive {
         };
     }
 
-    /// The mode as it is in the dictionary now, if it is offered.
+    /// Reads the mode of operation from the dictionary, if the drive offers it.
     fn take_mode(&mut self) {
         let wanted = self.node.objects.get(MODE).unwrap_or(0);
         let paths = [self.profile.torque, self.profile.speed, self.profile.position];
@@ -548,14 +548,14 @@ impl SimulatedDrive {
         }
     }
 
-    /// Control word and target as they are in the dictionary now.
+    /// Reads control word and target from the dictionary.
     fn take_commands(&mut self, now_ns: u64, send: Send) {
         let word = self.node.objects.get(CONTROL).unwrap_or(0) as u16;
         let before = self.machine.state();
         let cleared = !self.wrong.fault && !self.wrong.torque_off;
         let reset = self.machine.command(word, cleared, now_ns);
         let told = self.node.objects.get(Object(0x1001, 0)) != Some(0);
-        // An error whose cause has gone is taken back with the fault, or when the drive is made ready again.
+        // An error whose cause has gone is withdrawn with the fault, or when the drive leaves "switch on disabled".
         if reset || before == State::SwitchOnDisabled && self.machine.state() == State::Ready && told {
             self.with_node(now_ns, send, |node, send| node.emergency(0, 0, send));
         }
@@ -578,7 +578,7 @@ impl SimulatedDrive {
         self.position_at_rest = self.shaft.0;
     }
 
-    /// Writes what is measured into the dictionary.
+    /// Writes the readings into the dictionary.
     fn tell(&mut self, now_ns: u64) {
         let refresh = self.profile.refresh_ns;
         let objects = &mut self.node.objects;
@@ -614,13 +614,13 @@ impl SimulatedDrive {
             && !self.wrong.frozen
         {
             let counts = (self.shaft.0 * self.wrong.position_told.unwrap_or(1.0) / self.config.count).floor();
-            // So many counts that they cannot be told apart: a drive of absurd resolution.
+            // Saturates for a drive of absurd resolution.
             objects.set(path.actual.0, (counts as i64).saturating_add(self.offset));
         }
     }
 
-    /// One step of `h` seconds from `t_ns` on, the shaft at this angle (rad) and speed (rad/s). Afterwards
-    /// [`torque`](SimulatedDrive::torque) is what acts on the shaft.
+    /// One step of `h` seconds from `t_ns` on, with the shaft at this angle (rad) and speed (rad/s). Afterwards
+    /// [`torque`](SimulatedDrive::torque) is the torque on the shaft.
     pub fn step(&mut self, t_ns: u64, h: f64, shaft: (f64, f64)) {
         let before = self.machine.state();
         self.machine.advance(t_ns);
@@ -657,7 +657,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Torque on the shaft with its ripple and what is wrong with it, N·m.
+    /// Torque on the shaft with ripple and faults, N·m.
     pub fn applied(&self) -> f64 {
         let ripple = match self.machine.state().powered() && self.behaviour.ripple > 0.0 {
             true => {
@@ -669,7 +669,7 @@ impl SimulatedDrive {
         self.torque * self.wrong.torque.unwrap_or(1.0) + ripple
     }
 
-    /// The torque that the mode asks for, N·m.
+    /// The torque that the mode of operation requests, N·m.
     fn follow(&mut self, h: f64) -> f64 {
         match self.mode {
             4 => {
@@ -696,14 +696,14 @@ impl SimulatedDrive {
 
     fn speed_loop(&mut self, h: f64) -> f64 {
         let error = self.speed_wanted - self.shaft.1;
-        // What can't act isn't summed up.
+        // Anti-windup: no integration while the torque is limited.
         if !self.limited {
             self.sum += self.gains.1 * error * h;
         }
         self.gains.0 * error + self.sum
     }
 
-    /// The torque that brakes on the ramp of object 6085; at rest a quick stop has ended.
+    /// The torque that brakes on the ramp of object 6085; at standstill the quick stop ends.
     fn brake(&mut self, h: f64) -> f64 {
         if self.machine.state() == State::QuickStop && self.mode != 0 {
             let less = self.parameters.ramp * h;
@@ -718,7 +718,7 @@ impl SimulatedDrive {
         self.ramped
     }
 
-    /// Whether its profile lets it be fed by this kind of life sign.
+    /// Whether its profile has this mechanism to detect that we are gone.
     pub fn lives_by(&self, life: Life) -> bool {
         self.profile.life.contains(&life)
     }

@@ -1,4 +1,4 @@
-//! A master against simulated drives, without a bus between them.
+//! Tests of the master's side with simulated drives, without a bus between them.
 
 use super::simulated::Behaviour;
 use super::state::State;
@@ -58,7 +58,7 @@ fn two_drives_start_up_in_order() {
         let limits = table.fieldbus.limits(node).expect("a drive");
         assert_eq!((limits.torque, limits.speed, limits.power), (2.0, 200.0, 400.0));
     }
-    // The shaft has hardly moved, and rests.
+    // The shaft has hardly moved, and stands still.
     let shaft = table.bench.shaft(LOAD);
     assert!(shaft.position.abs() < 0.1 && shaft.speed.abs() < 0.1, "{shaft:?}");
     assert_eq!(troubles(&mut table), []);
@@ -73,7 +73,7 @@ fn nothing_makes_torque_before_the_first_motion() {
         table.tick();
         assert_eq!((table.bench.shaft(LOAD).torque, table.bench.shaft(SERVO).torque), (0.0, 0.0));
     }
-    // The command word never skips a state.
+    // The control word never skips a state.
     let words: Vec<u8> = table
         .log
         .iter()
@@ -103,7 +103,7 @@ fn armed_the_shaft_follows_the_torque() {
     let turned = table.value(LOAD, What::Position) - table.value(SERVO, What::Position);
     assert!(turned.abs() < 1e-3, "both count from enabling: {turned}");
     assert_eq!((table.value(LOAD, What::Enabled), table.value(LOAD, What::Fault)), (1.0, 0.0));
-    // And stops when told to.
+    // It stops on command.
     table.fieldbus.request(Request::QuickStop);
     table.ticks(100);
     assert!(table.fieldbus.at_rest());
@@ -132,7 +132,7 @@ fn torque_mode_4_has_the_rigs_slope() {
 #[test]
 fn speed_and_position_are_held() {
     let mut speed = rig(Mode::Speed);
-    // The other drive must not work against it: alone on the shaft.
+    // Alone on the shaft, so that the other drive does not work against it.
     speed.nodes.remove(SERVO);
     speed.outputs.truncate(1);
     speed.predict = None;
@@ -165,7 +165,7 @@ fn wrong_drives_are_refused_in_words() {
         })
         .refused()
     };
-    // What a reset of communication restores can't be changed this way; the drive's own objects can.
+    // This way does not change what a reset of communication restores, but it changes the drive's own objects.
     assert_eq!(
         set(0x6076, Type::U32, 40_000),
         "servo (node 4): its rated torque is 40 N·m (object 6076), the rig says 4 N·m: correct `T_rated`, or the node id"
@@ -221,7 +221,7 @@ fn wrong_drives_are_refused_in_words() {
 
 #[test]
 fn a_map_that_reads_back_otherwise_is_refused() {
-    // The bench runs on; the answer to one read-back is bent on its way.
+    // The simulation continues; the answer to one read-back is falsified on the bus.
     let mut table = table(&rig(Mode::Torque));
     table.until(Step::Configure);
     let mut bent = false;
@@ -282,7 +282,7 @@ fn wrong_signs_and_scales_are_refused() {
 fn a_drive_that_ignores_our_silence_is_refused() {
     let mut table = table(&rig(Mode::Torque));
     table.until(Step::AwaitEnable);
-    // Set behind our back: what the read-back can't see, the test does.
+    // Changed after the configuration: the read-back cannot detect it, but the time-out test does.
     table.bench.drive(LOAD).unwrap().objects().set(Object(0x6007, 0), 0);
     assert_eq!(
         table.refused(),
@@ -313,7 +313,8 @@ fn another_master_is_refused_or_told() {
     }
 }
 
-/// Arms, lets something go wrong a tick later, and gives what the supervisor hears, with the ticks it took.
+/// Arms the rig and injects a fault one tick later; returns the troubles that the supervisor receives, and the ticks
+/// until then.
 fn after(text: &str) -> (Vec<(Option<usize>, TroubleKind)>, usize, Table) {
     let rig = rig(Mode::Torque);
     let mut table = table(&rig);
@@ -353,7 +354,7 @@ fn what_goes_wrong_is_heard_in_time() {
     assert_eq!((kinds[0], ticks), ((SERVO, emergency(0x5441, 1)), 1));
     let (kinds, ticks) = heard("servo pre-operational");
     assert!(ticks <= 21 && kinds[0] == (SERVO, TroubleKind::Nmt(NmtState::PreOperational)), "{kinds:?} {ticks}");
-    // Answers that don't come are seen by their age alone.
+    // Missing answers are detected by their age alone.
     let (kinds, _, table) = after("load no answers");
     assert_eq!(kinds, []);
     let reading = table.fieldbus.reading(abi::rig::Signal { node: LOAD, what: What::Torque });
@@ -370,7 +371,7 @@ fn a_master_that_dies_leaves_the_shaft_at_rest() {
     table.ticks(50);
     let died = table.now_ns;
     assert!(table.bench.shaft(SERVO).speed > 1.0);
-    // Nothing comes from us any more.
+    // We send nothing any more.
     let mut states = Vec::new();
     while table.now_ns < died + 100_000_000 {
         table.now_ns += 100_000;
@@ -421,7 +422,7 @@ fn a_device_is_read_and_told() {
     assert!(reading.value == 0.0 && reading.age <= 1, "{reading:?}");
     table.ticks(100);
     assert_eq!(table.fieldbus.reading(enable).value, 1.0);
-    // The lamp: on change, and each 100 ms.
+    // The lamp: sent on change, and every 100 ms.
     table.arm();
     table.log.clear();
     table.commands[PANEL].1 = 1.0;
@@ -462,7 +463,7 @@ fn a_simulated_vlt_has_its_scale_and_refresh() {
     let told = table.log.iter().rev().find(|(_, ours, frame)| *ours && frame.id() == 0x204).unwrap().2;
     assert_eq!(told.data(), [0x0F, 0, 0x00, 0x20], "half of 0x4000");
     assert!((table.value(SERVO, What::Torque) - 2.0).abs() < 0.01);
-    // Its answers change only every other tick.
+    // Its answers change only in every other tick.
     let speeds: Vec<_> = table
         .log
         .iter()
@@ -522,7 +523,7 @@ fn hooks_are_read_or_refused_in_words() {
     }
 }
 
-/// The start-up over a bus with its bit times: what the table does at once takes its time here.
+/// The start-up over a bus with its bit times: here the frames take time.
 #[test]
 fn two_drives_start_up_over_a_bus() {
     use crate::can::sim::Simulation;
