@@ -1,35 +1,35 @@
-//! Eigenvalues of a linear system, as an engineer reads them. The only file besides the solvers that knows nalgebra.
+//! Eigenvalues of a linear system, as natural frequencies and damping ratios (real Schur form, by nalgebra).
 //!
-//! In: a square matrix, row by row. Out: its modes, slowest first.
+//! In: a square matrix, row by row. Out: its modes, the slowest first.
 
 use nalgebra::linalg::Schur;
 use nalgebra::{Complex, DMatrix};
 
-/// One eigenvalue; of a pair of conjugates the one above the real axis.
+/// One eigenvalue; of a conjugate pair the one above the real axis.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Mode {
-    /// Real part in 1/s.
+    /// Real part, 1/s.
     pub real: f64,
-    /// Imaginary part in rad/s, not negative.
+    /// Imaginary part, rad/s, not negative.
     pub imaginary: f64,
 }
 
 impl Mode {
-    /// Natural frequency: its absolute value, in rad/s.
+    /// Natural frequency: the absolute value, rad/s.
     pub fn frequency(self) -> f64 {
-        // Scaled, so that nothing overflows.
+        // Scaled to avoid overflow.
         let (large, small) = (self.real.abs().max(self.imaginary), self.real.abs().min(self.imaginary));
         if large > 0.0 { large * (1.0 + (small / large) * (small / large)).sqrt() } else { 0.0 }
     }
 
-    /// Damping ratio: 1 for what dies away without swinging, below 0 for what grows; none of an integrator.
+    /// Damping ratio: 1 for a decay without oscillation, below 0 for a growing mode; none for an integrator.
     pub fn damping(self) -> Option<f64> {
         let frequency = self.frequency();
         (frequency > 0.0).then(|| -self.real / frequency)
     }
 }
 
-/// The modes of dx/dt = A x; none if the eigenvalues cannot be found, as where an entry is not finite.
+/// The modes of dx/dt = A x; none if the eigenvalues cannot be computed, for example because an entry is not finite.
 pub fn modes(n: usize, a: &[f64]) -> Option<Vec<Mode>> {
     assert_eq!(a.len(), n * n, "a matrix of {n} rows");
     if !a.iter().all(|entry| entry.is_finite()) {
@@ -42,7 +42,7 @@ pub fn modes(n: usize, a: &[f64]) -> Option<Vec<Mode>> {
     balance(n, &mut scaled);
     let size = scaled.iter().fold(0.0f64, |size, entry| size.max(entry.abs()));
     let matrix = DMatrix::from_row_slice(n, n, &scaled);
-    // What is below the rounding of the largest entries is noise of the reduction.
+    // Values below the rounding error of the largest entries are noise of the reduction.
     let schur = Schur::try_new(matrix, f64::EPSILON, 10_000)?;
     let eigenvalues: Vec<Complex<f64>> = schur.complex_eigenvalues().iter().copied().collect();
     let noise = 1e-15 * size;
@@ -56,8 +56,8 @@ pub fn modes(n: usize, a: &[f64]) -> Option<Vec<Mode>> {
     Some(modes)
 }
 
-/// Scales rows and columns by powers of two until they are of one size: a similarity that costs no bit.
-/// Source: Parlett, Reinsch, Numer. Math. 13 (1969).
+/// Balances the matrix: scales rows and columns by powers of two until their norms are similar. This is an exact
+/// similarity transformation. Source: Parlett, Reinsch, Numer. Math. 13 (1969).
 fn balance(n: usize, a: &mut [f64]) {
     for _ in 0..100 {
         let mut done = true;
@@ -102,7 +102,7 @@ mod tests {
 
     #[test]
     fn integrators_and_fast_modes_stand_side_by_side() {
-        // x' = v, v' = −1e8 v: of very different size.
+        // x' = v, v' = −1e8 v: eigenvalues of very different magnitude.
         let found = modes(2, &[0.0, 1.0, 0.0, -1e8]).unwrap();
         assert_eq!(found[0], Mode { real: 0.0, imaginary: 0.0 });
         assert_eq!(found[0].damping(), None);
@@ -111,7 +111,7 @@ mod tests {
 
     #[test]
     fn bad_scales_do_not_blur_small_eigenvalues() {
-        // Similar to diag(−1, −2, −3) by scales of 1e6: the products of a triangular matrix.
+        // Similar to diag(−1, −2, −3), with scales of 1e6: the superdiagonal entries are the ratios of the scales.
         let found = modes(3, &[-1.0, 1e6, 1e12, 0.0, -2.0, 1e6, 0.0, 0.0, -3.0]).unwrap();
         let real: Vec<f64> = found.iter().map(|mode| mode.real).collect();
         assert!(real.iter().zip([-1.0, -2.0, -3.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{real:?}");

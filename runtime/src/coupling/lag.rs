@@ -1,12 +1,13 @@
-//! A command on its way to the shaft: dead time, then a first-order lag, exactly.
+//! Response of a drive to its commands: a dead time, then a first-order lag, integrated exactly.
 //!
-//! In: commands with the instants at which they act. Out: what is applied, and its mean over an interval, so that the
-//! impulse on the shaft is right however long the steps of the shaft are. Allocates when it is made, never later.
+//! In: commands with the times at which they act. Out: the applied torque, and its mean over an interval, so that the
+//! impulse on the shaft is exact for any step of the shaft. Allocates only at construction.
 
-/// Most commands on their way at once; the compiler permits dead times of at most 200 periods.
+/// Most commands under way at once; the compiler permits dead times of at most 200 periods.
 const QUEUE: usize = 256;
 
-/// e^−x for x ≥ 0, by halving the argument and squaring the result: the same bits on every machine, within 1e-15.
+/// e^−x for x ≥ 0, by argument halving and repeated squaring: the same bits on every machine, with an error within
+/// 1e-15.
 pub fn remaining(x: f64) -> f64 {
     let mut halvings = 0;
     let mut small = x;
@@ -14,7 +15,7 @@ pub fn remaining(x: f64) -> f64 {
         small *= 0.5;
         halvings += 1;
     }
-    // 1 − e^−x loses nothing while x is small: (1 − d)² = 1 − (2 d − d²).
+    // Computes 1 − e^−x without cancellation for small x; then (1 − d)² = 1 − (2 d − d²).
     let mut term = small;
     let mut gone = small;
     for k in 2..14 {
@@ -27,23 +28,23 @@ pub fn remaining(x: f64) -> f64 {
     1.0 - gone
 }
 
-/// What a drive applies.
+/// State of a drive's response.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Lag {
     /// Time constant, s; 0 for none.
     constant: f64,
-    /// Commands on their way: instant at which each acts in ns, and its value. A ring.
+    /// Ring buffer of the commands under way: time at which each acts, ns, and its value.
     queue: [(u64, f64); QUEUE],
     first: usize,
     waiting: usize,
     /// The command that acts.
     acting: f64,
-    /// What is applied.
+    /// The applied value.
     applied: f64,
 }
 
 impl Lag {
-    /// At rest; `constant` in s.
+    /// At rest; `constant`: time constant, s.
     pub fn new(constant: f64) -> Lag {
         Lag { constant, queue: [(0, 0.0); QUEUE], first: 0, waiting: 0, acting: 0.0, applied: 0.0 }
     }
@@ -53,17 +54,17 @@ impl Lag {
         self.constant
     }
 
-    /// What is applied now.
+    /// The applied value at present.
     pub fn applied(&self) -> f64 {
         self.applied
     }
 
-    /// At rest again, nothing on its way, with this command acting for long.
+    /// Resets to a steady state: nothing is under way, and this command has acted for long.
     pub fn settle(&mut self, value: f64) {
         (self.first, self.waiting, self.acting, self.applied) = (0, 0, value, value);
     }
 
-    /// All that the future depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Lag::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend([self.acting.to_bits(), self.applied.to_bits(), self.waiting as u64]);
         for k in 0..self.waiting {
@@ -72,7 +73,7 @@ impl Lag {
         }
     }
 
-    /// Takes over what [`Lag::save`] gave. None if the words are not enough.
+    /// Restores the state that [`Lag::save`] wrote. None if there are too few words.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.acting = f64::from_bits(words.next()?);
         self.applied = f64::from_bits(words.next()?);
@@ -83,7 +84,7 @@ impl Lag {
         Some(())
     }
 
-    /// A command that acts from this instant on; later ones must not act before it. When too many are on their way, the
+    /// Adds a command that acts from this time on; later ones must not act before it. If too many are under way, the
     /// oldest acts at once.
     pub fn send(&mut self, acts_ns: u64, value: f64) {
         if self.waiting == QUEUE {
@@ -98,7 +99,7 @@ impl Lag {
         (self.first, self.waiting) = ((self.first + 1) % QUEUE, self.waiting - 1);
     }
 
-    /// Goes on from one instant to a later one; the mean of what was applied between them.
+    /// Advances from one time to a later one; returns the mean of the applied value between them.
     pub fn advance(&mut self, from_ns: u64, to_ns: u64) -> f64 {
         let mut now = from_ns;
         let mut integral = 0.0;
@@ -155,7 +156,7 @@ mod tests {
             let sum: f64 = (0..steps).map(|k| lag.advance(k * step, (k + 1) * step)).sum();
             (sum / steps as f64, lag.applied())
         };
-        // 2 from 0.8 ms, −1 from 1.8 ms, with a lag of 0.6 ms: by hand.
+        // 2 from 0.8 ms on, −1 from 1.8 ms on, with a lag of 0.6 ms, calculated by hand.
         let e = |x: f64| (-x / 0.6).exp();
         let at = 2.0 * (1.0 - e(1.0));
         let end = -1.0 + (at + 1.0) * e(1.2);

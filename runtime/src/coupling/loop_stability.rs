@@ -1,14 +1,15 @@
-//! Whether an emulated contact is stable: the whole loop of shaft, drives and compiled step, as one matrix.
+//! Stability of the loop with an emulated contact: shaft, drives and compiled step as one discrete-time state matrix.
 //!
-//! In: the step of the control program as matrices, the shaft as matrices, and of each drive dead time and lag. Out: the
-//! spectral radius of one period, and how much later the loop may be before it rises above 1. Nothing is approximated but
-//! the linearisation: the shaft and the lags are integrated exactly between the instants at which commands act.
+//! In: the step of the control program as matrices, the shaft as matrices, dead time and lag of each drive. Out: the
+//! spectral radius over one period, and the dead time at which it exceeds 1. The linearisation is the only
+//! approximation: the shaft and the lags are integrated exactly between the times at which commands act (Åström,
+//! Wittenmark, *Computer-Controlled Systems*, 3.2).
 //!
-//! A dead time n T + r is n + 1 set-points that wait; over one period the shaft feels the older one for r, the next for
-//! the rest. Eigenvalues at 1 are positions that turn freely, and what a program keeps constant; they are left out.
+//! A dead time n T + r is a queue of n + 1 set-points; within one period the older of the last two acts for r, the
+//! newer for the rest. Eigenvalues at 1 are free rotations and constants of the program; they are ignored.
 //!
-//! A loop whose command looks ahead ([`Ahead`]) is run instead, observer and all, from a small push: how fast it dies out or
-//! grows is its radius.
+//! A loop with a predictor ([`Ahead`]) is simulated instead, including the observer, from a small deflection: the rate
+//! at which it decays or grows is its radius.
 
 use crate::coupling::predictor::{Lookahead, Torque};
 use nalgebra::DMatrix;
@@ -16,9 +17,9 @@ use std::collections::VecDeque;
 
 /// Eigenvalues this near to 1 are free motion.
 const FREE: f64 = 1e-6;
-/// Dead times are looked at up to so many periods.
+/// Longest dead time that is examined, in periods.
 const PERIODS: f64 = 40.0;
-/// A drive without a lag follows within this time, s.
+/// Time constant assumed for a drive without a lag, s.
 const LEAST_LAG: f64 = 1e-6;
 
 /// s' = A s + B y, u = C s + D y over one period: n states, m signals, p commands; SI, row by row.
@@ -34,7 +35,7 @@ pub struct Step {
     pub d: Vec<f64>,
 }
 
-/// dx/dt = A x + B q, y = C x: n states, p torques as the drives apply them, m signals; SI, row by row.
+/// dx/dt = A x + B q, y = C x: n states, p torques applied by the drives, m signals; SI, row by row.
 #[derive(Clone, PartialEq, Debug)]
 #[allow(missing_docs)]
 pub struct Shaft {
@@ -47,16 +48,16 @@ pub struct Shaft {
 }
 
 impl Shaft {
-    /// One inertia in kg·m² that one drive turns, its speed the only signal.
+    /// One inertia in kg·m² on one drive, with its speed as the only signal.
     pub fn rigid(inertia: f64) -> Shaft {
         Shaft { states: 1, torques: 1, signals: 1, a: vec![0.0], b: vec![1.0 / inertia], c: vec![1.0] }
     }
 }
 
-/// How late a command acts.
+/// Delay of a command.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Late {
-    /// From the reading to the begin of the effect, s.
+    /// Dead time from the reading to the begin of the effect, s.
     pub dead: f64,
     /// Time constant of the effect, s.
     pub lag: f64,
@@ -65,23 +66,23 @@ pub struct Late {
 /// A loop of a control program and a shaft.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Loop {
-    /// s
+    /// Period, s.
     pub period: f64,
     /// The program.
     pub step: Step,
-    /// The shaft; its torques are the commands of the step, in the same order, and so are its signals.
+    /// The shaft; its torques are the commands of the step, in the same order, and its signals are those of the step.
     pub shaft: Shaft,
-    /// Of each command how late it acts.
+    /// Delay of each command.
     pub late: Vec<Late>,
 }
 
 impl Loop {
-    /// Over one period: states of the shaft, applied torques, waiting set-points of each command, the newest first, and
-    /// states of the program, to the same a period later.
+    /// State matrix over one period. The state consists of states of the shaft, applied torques, waiting set-points of
+    /// each command, the newest first, and states of the program.
     pub fn matrix(&self) -> DMatrix<f64> {
         let (n, p) = (self.shaft.states, self.shaft.torques);
         let (step, t) = (&self.step, self.period);
-        // Of each command: whole periods, and the rest.
+        // Dead time of each command: whole periods, and the remainder.
         let dead: Vec<(usize, f64)> = self
             .late
             .iter()
@@ -120,7 +121,7 @@ impl Loop {
             };
             let commands: Vec<f64> = (0..step.commands).map(|i| row(&step.c, &step.d, i)).collect();
             let next: Vec<f64> = (0..step.states).map(|i| row(&step.a, &step.b, i)).collect();
-            // Set-points that wait, the new one first.
+            // Waiting set-points, the new one first.
             let set_points: Vec<Vec<f64>> = (0..p)
                 .map(|j| {
                     let old = &state[queue_at[j]..queue_at[j] + dead[j].0 + 1];
@@ -154,7 +155,7 @@ impl Loop {
         matrix
     }
 
-    /// What h seconds do to states of the shaft, applied torques and acting commands.
+    /// State transition over h seconds of the shaft's states, applied torques and acting commands.
     fn transition(&self, h: f64) -> DMatrix<f64> {
         let (n, p) = (self.shaft.states, self.shaft.torques);
         let mut rates = DMatrix::zeros(n + 2 * p, n + 2 * p);
@@ -174,8 +175,8 @@ impl Loop {
         rates.exp()
     }
 
-    /// The greatest |λ| of one period, free motion left out: below 1 every disturbance dies out. Infinite if a matrix is
-    /// not finite.
+    /// The greatest |λ| over one period, without free motion: below 1 every disturbance decays. Infinite if an entry of
+    /// the matrix is not finite.
     pub fn radius(&self) -> f64 {
         let matrix = self.matrix();
         if matrix.iter().any(|entry| !entry.is_finite()) {
@@ -186,13 +187,13 @@ impl Loop {
         kept.map(|value| (value.re * value.re + value.im * value.im).sqrt()).fold(0.0, f64::max)
     }
 
-    /// Whether every disturbance dies out.
+    /// Whether every disturbance decays.
     pub fn is_stable(&self) -> bool {
         self.radius() < 1.0
     }
 
-    /// The least dead time of a command, s, from which on the loop is unstable; none if it is stable up to 40 periods.
-    /// 0 if it is never stable.
+    /// The smallest dead time of a command, s, from which on the loop is unstable; none if it is stable up to 40
+    /// periods; 0 if it is never stable.
     pub fn limit(&self, command: usize) -> Option<f64> {
         let stable = |dead: f64| {
             let mut other = self.clone();
@@ -203,7 +204,7 @@ impl Loop {
     }
 }
 
-/// The least dead time, s, that is not stable: looked for in strides of so many periods, then by halving so often.
+/// The smallest unstable dead time, s: searched for in strides of `stride` periods, then by `halvings` bisections.
 fn first_unstable(period: f64, stride: f64, halvings: usize, stable: impl Fn(f64) -> bool) -> Option<f64> {
     if !stable(0.0) {
         return Some(0.0);
@@ -226,32 +227,32 @@ fn first_unstable(period: f64, stride: f64, halvings: usize, stable: impl Fn(f64
     Some(0.5 * (low + high))
 }
 
-/// Periods in which the greatest deflection is looked for.
+/// Periods over which the greatest deflection is taken.
 const WINDOW: usize = 64;
-/// Windows that are run at most.
+/// Most windows that are simulated.
 const WINDOWS: usize = 48;
-/// What has died out, or grown, so far is enough; less than that would be rounding.
+/// Factor of decay or growth that suffices; beyond it rounding would dominate.
 const ENOUGH: f64 = 1e9;
 
-/// A loop of one command that looks ahead.
+/// A loop of one command with a predictor.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Ahead {
-    /// The loop without it: one command.
+    /// The loop without the predictor: one command.
     pub plain: Loop,
-    /// The position that the observer sees, from the states of the shaft.
+    /// The observed position, as a row over the states of the shaft.
     pub position: Vec<f64>,
-    /// Of each signal whether the program reads it as it will be.
+    /// For each signal whether the program reads its prediction.
     pub ahead: Vec<bool>,
-    /// As the observer is told, kg·m².
+    /// Moment of inertia that the observer assumes, kg·m².
     pub inertia: f64,
-    /// With which sign the command speeds up what is seen.
+    /// Sign with which the command accelerates the observed position.
     pub sign: f64,
-    /// Dead time and lag as the observer is told.
+    /// Dead time and lag that the observer assumes.
     pub told: Late,
 }
 
 impl Ahead {
-    /// By how much a deflection grows in one period, once the fast motions have died out: below 1 the loop is stable.
+    /// Factor by which a deflection grows in one period, once the fast modes have decayed: below 1 the loop is stable.
     #[allow(clippy::disallowed_methods, reason = "a figure to be shown and compared with 1: decides nothing that runs")]
     pub fn radius(&self) -> f64 {
         let Loop { period, step, shaft, late } = &self.plain;
@@ -263,7 +264,7 @@ impl Ahead {
         let rest = (late.dead - whole * period).max(0.0);
         let [before, after] = [rest, period - rest].map(|h| self.plain.transition(h));
         let mut waiting: VecDeque<f64> = vec![0.0; whole as usize + 1].into();
-        // States of the shaft, then the torque that is applied.
+        // States of the shaft, then the applied torque.
         let mut moving: Vec<f64> = (0..=n).map(|i| if i < n { 1.0 / (1.0 + i as f64) } else { 0.0 }).collect();
         let mut program = vec![0.0; step.states];
         let mut peaks = Vec::new();
@@ -282,7 +283,7 @@ impl Ahead {
             program = (0..step.states).map(|i| row(&step.a, &step.b, i)).collect();
             look.sent(0, self.sign * command);
             waiting.push_front(command);
-            // The oldest acts for the rest of the dead time, then the next one.
+            // The oldest set-point acts for the remainder of the dead time, then the next one.
             for (transition, acting) in [(&before, waiting[waiting.len() - 1]), (&after, waiting[waiting.len() - 2])] {
                 let all = DMatrix::from_iterator(n + 2, 1, moving.iter().copied().chain([acting]));
                 moving.copy_from_slice(&(transition * all).as_slice()[..=n]);
@@ -305,8 +306,8 @@ impl Ahead {
         (peaks[peaks.len() - 1] / peaks[1]).powf(1.0 / spans)
     }
 
-    /// The least dead time, s, known to the observer, from which on the loop is unstable; none if it is stable up to 40
-    /// periods. 0 if it is never stable.
+    /// The smallest dead time, s, known to the observer, from which on the loop is unstable; none if it is stable up to
+    /// 40 periods; 0 if it is never stable.
     pub fn limit(&self) -> Option<f64> {
         let period = self.plain.period;
         let stable = |dead: f64| {
@@ -323,8 +324,8 @@ mod tests {
     use super::*;
     use rayon::prelude::*;
 
-    /// A LuGre bristle at rest, stepped over the coming period with the newest speed: z' = z + T v,
-    /// F = σ0 z' + (σ1 + σ2) v, as the compiled step does it.
+    /// A LuGre bristle at rest, stepped over the coming period with the newest speed: z' = z + T v, F = σ0 z' + (σ1 +
+    /// σ2) v, like the compiled step.
     fn contact(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> Loop {
         let step = Step {
             states: 1,
@@ -369,8 +370,8 @@ mod tests {
         }
     }
 
-    /// The nonlinear loop: a bristle of any size of motion, the drive with dead time and lag, the shaft in fine steps.
-    /// Whether a small push dies out.
+    /// The nonlinear loop: a bristle with any amplitude, the drive with dead time and lag, the shaft in fine steps.
+    /// Returns whether a small deflection decays.
     fn dies_out(inertia: f64, sigma0: f64, damping: f64, period: f64, late: Late) -> bool {
         let period_ns = (period * 1e9).round() as u64;
         let fc = 1.0;
@@ -425,7 +426,7 @@ mod tests {
         Ahead { plain, position: vec![0.0, 1.0], ahead: vec![false], inertia, sign: 1.0, told: late }
     }
 
-    /// Without looking ahead the run must say what the eigenvalues say.
+    /// Without prediction the simulation must agree with the eigenvalues.
     #[test]
     fn the_radius_of_a_run_is_that_of_the_matrix() {
         for (dead, zeta) in [(0.2e-3, 0.5), (0.8e-3, 0.5), (1.6e-3, 0.5), (2.4e-3, 0.5), (0.3e-3, 0.1)] {
@@ -436,7 +437,8 @@ mod tests {
         }
     }
 
-    /// The contact of the textbook: plain it is unstable from 2.4 ms on, looking ahead not before three times that.
+    /// The contact of the textbook: without the predictor it is unstable from 2.4 ms on, with it not before three times
+    /// that.
     #[test]
     fn looking_ahead_makes_a_late_contact_stable() {
         let late = Late { dead: 4.5e-3, lag: lag_of(500.0) };
@@ -450,8 +452,8 @@ mod tests {
         assert!(limit.is_none_or(|limit| limit > 6e-3), "{limit:?}");
     }
 
-    /// The predicted limit is where the nonlinear loop begins to chatter, within 5 % of the total delay, over a grid of J,
-    /// σ0, ζ, lag and period: below it a push dies out, above it does not.
+    /// The predicted limit is the onset of chatter in the nonlinear loop, within 5 % of the total delay, over a grid of
+    /// J, σ0, ζ, lag and period: below it a deflection decays, above it does not.
     #[test]
     fn the_predicted_limit_is_the_observed_onset() {
         let mut grid = Vec::new();
@@ -471,7 +473,7 @@ mod tests {
             let late = |dead: f64| Late { dead, lag };
             let predicted = contact(inertia, sigma0, damping, period, late(0.0)).limit(0).unwrap();
             let total = 0.5 * period + lag + predicted;
-            // None where lag and period alone are too late, or so late that 5 % less would need a negative dead time.
+            // None if lag and period alone are too long, or so long that 5 % less would require a negative dead time.
             let below = predicted - 0.05 * total;
             let stable = (below >= 0.0).then(|| dies_out(inertia, sigma0, damping, period, late(below)));
             let unstable = !dies_out(inertia, sigma0, damping, period, late(predicted + 0.05 * total));

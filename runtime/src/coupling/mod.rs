@@ -1,7 +1,8 @@
-//! The coupling of a contact model to a shaft through drives: lags, predictors, the energy they give back, and whether the loop is
-//! stable; and the same loop without a rig ([`sil`]).
+//! The coupling of a contact model to a shaft through drives: lags, predictor, passivity observer, stability of the
+//! loop; and the same loop without hardware ([`sil`], software in the loop).
 //!
-//! In: a rig's description, readings, torques. Out: predictions, energies, eigenvalues, verdicts. Knows neither buses nor clocks.
+//! In: a rig's description, readings, torques. Out: predictions, energies, eigenvalues, verdicts. Knows neither buses
+//! nor clocks.
 
 pub mod lag;
 pub mod predictor;

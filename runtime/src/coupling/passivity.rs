@@ -1,37 +1,40 @@
-//! Whether an emulated contact gives back more energy than it can hold: the first sign of a loop that is late.
+//! Passivity observer: detects that an emulated contact returns more energy than it can store, the first sign of a
+//! delayed loop. Source: Hannaford, Ryu, "Time-domain passivity control of haptic interfaces", IEEE Trans. Robotics and
+//! Automation 18 (2002).
 //!
-//! In: torque and speed of every cycle, and the largest energy that the model stores. Out: [`Sign`]. Friction may give
-//! back what its bristles hold and no more; a late loop gives more at every reversal. Allocates when it is made.
+//! In: torque and speed of every cycle, and the largest energy that the model stores. Out: [`Sign`]. Friction may
+//! return the energy of its bristles and no more; a delayed loop returns more at every reversal. Allocates only at
+//! construction.
 
 /// Length of the window, s.
 const WINDOW: f64 = 0.1;
-/// Energy given back in the window, in units of the store: a warning, and more for each reversal of the other torque.
+/// Energy returned in the window that causes a warning, in units of the store; reversals of the other torque raise it.
 const WARN: f64 = 0.5;
 /// The same for a trip.
 const TRIP: f64 = 3.0;
-/// What each reversal of the other torque in the window allows besides.
+/// Additional allowance for each reversal of the other torque in the window.
 const REVERSAL: f64 = 1.5;
-/// Fall of the absorbed energy from its maximum that is a trip.
+/// Fall of the absorbed energy from its maximum that causes a trip.
 const FALL: f64 = 1.0;
 
-/// What the monitor says.
+/// Result of the observer.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Sign {
-    /// As friction does.
+    /// Passive, as friction is.
     Healthy,
-    /// More came back than should.
+    /// The contact returned more energy than it should.
     Warning,
     /// The contact drives the shaft.
     Trip,
 }
 
-/// The monitor of one emulated contact.
+/// State of the observer of one emulated contact.
 #[derive(Clone, Debug)]
 pub struct Energy {
     /// Largest energy that the model stores, J.
     store: f64,
     period: f64,
-    /// Energy given back in each cycle of the window, J, and whether the other torque reversed.
+    /// Energy returned in each cycle of the window, J, and whether the other torque reversed.
     window: Vec<(f64, bool)>,
     at: usize,
     absorbed: f64,
@@ -40,7 +43,7 @@ pub struct Energy {
 }
 
 impl Energy {
-    /// `store`: the largest energy the model holds, J; `period` in s.
+    /// `store`: largest energy that the model stores, J; `period` in s.
     ///
     /// # Panics
     /// If either is not positive.
@@ -77,19 +80,19 @@ impl Energy {
         self.store
     }
 
-    /// Forgets what was.
+    /// Discards the history.
     pub fn restart(&mut self) {
         self.window.fill((0.0, false));
         (self.at, self.absorbed, self.highest, self.other) = (0, 0.0, 0.0, 0.0);
     }
 
-    /// All that the future depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Energy::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend([self.at as u64, self.absorbed.to_bits(), self.highest.to_bits(), self.other.to_bits()]);
         words.extend(self.window.iter().flat_map(|(back, reversed)| [back.to_bits(), u64::from(*reversed)]));
     }
 
-    /// Takes over what [`Energy::save`] gave. None if the words do not fit.
+    /// Restores the state that [`Energy::save`] wrote. None if the words do not fit.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.at = usize::try_from(words.next()?).ok().filter(|at| *at < self.window.len())?;
         for number in [&mut self.absorbed, &mut self.highest, &mut self.other] {
@@ -101,12 +104,12 @@ impl Energy {
         Some(())
     }
 
-    /// Energy given back within the window, in units of the store.
+    /// Energy returned within the window, in units of the store.
     pub fn returned(&self) -> f64 {
         self.window.iter().map(|(back, _)| back).sum::<f64>() / self.store
     }
 
-    /// How far the absorbed energy lies below its maximum, in units of the store.
+    /// Distance of the absorbed energy below its maximum, in units of the store.
     pub fn fall(&self) -> f64 {
         (self.highest - self.absorbed) / self.store
     }
@@ -116,8 +119,8 @@ impl Energy {
 mod tests {
     use super::*;
 
-    /// A spring of 260 N·m/rad with a store of 0.34 mJ on a shaft of 0.012 kg·m² that swings, its torque late by so many
-    /// periods: what it gives back grows with the delay.
+    /// A spring of 260 N·m/rad with a store of 0.34 mJ on an oscillating shaft of 0.012 kg·m², its torque delayed by
+    /// `late` periods: the returned energy grows with the delay.
     fn swing(late: usize, amplitude: f64) -> Sign {
         let (stiffness, inertia, period) = (260.0, 0.012, 1e-3);
         let mut energy = Energy::new(0.34e-3, period);

@@ -1,54 +1,58 @@
-//! The coupling that looks ahead: how fast the shaft will turn when the torque acts that is computed now.
+//! Predictor: the speed of the shaft at the time when the torque acts that is computed now (a disturbance observer with
+//! prediction over the dead time, as in a Smith predictor).
 //!
-//! In: the position as measured, what was sent and when it acts, the inertia. Out: speed and position at the instant in
-//! the middle of the coming torque, H = dead time + T/2 + lag ahead. An observer of the shaft knows what has been sent and
-//! has not acted yet, and holds whatever nobody told it (a cable, another torque) as a constant disturbance. Torques are
-//! those that speed the shaft up. Allocates when it is made, never later; one cycle is 64 short steps.
+//! In: measured positions, the commands sent and their times of action, the inertia. Out: speed and position at the
+//! centre of the coming torque, ahead by H = dead time + T/2 + lag. An observer of the shaft knows the commands that
+//! have been sent and do not act yet, and models all unknown torques (a cable, another drive) as a constant
+//! disturbance. A torque is positive if it accelerates the shaft. Allocates only at construction; one cycle takes 64
+//! short steps.
 //!
-//! The observer's poles lie together at θ per period: x̂, ŵ and d̂ are corrected by 1 − θ³, 1.5 (1 − θ)² (1 + θ)/T and
-//! (1 − θ)³ J/T² times the error of the position (Kalata's α-β-γ with equal poles).
+//! All observer poles are at θ per period: x̂, ŵ and d̂ are corrected by 1 − θ³, 1.5 (1 − θ)² (1 + θ)/T and (1 − θ)³
+//! J/T² times the error of the position (Kalata, "The tracking index: a generalized parameter for α-β and α-β-γ target
+//! trackers", IEEE Trans. Aerospace and Electronic Systems, 1984, with equal poles).
 
 use crate::coupling::lag::Lag;
 use abi::Instance;
 use abi::rig::{Kind, Rig, Signal, What};
 
-/// Short steps of the observer in one period, and of the look ahead.
+/// Short steps of the observer per period, and of the prediction.
 const STEPS: u64 = 32;
 
-/// Poles of the observer at a period of 1 ms; others keep the same time constant.
+/// Observer poles at a period of 1 ms; at other periods the time constant is the same.
 const THETA_AT_1_MS: f64 = 0.9;
 
-/// A residual this many times its usual size, in counts or its own running mean, is a sign that the shaft is not as told.
+/// A residual greater than this multiple of its usual size (one count, or its own running mean) indicates a deviation
+/// from the model.
 const UNUSUAL: f64 = 5.0;
-/// For so many cycles in a row.
+/// Number of successive cycles after which the prediction is invalid.
 const CYCLES: u32 = 3;
 
 /// One drive on the shaft.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Torque {
-    /// From a command to its effect, ns.
+    /// Dead time from a command to its effect, ns.
     pub dead_ns: u64,
     lag: Lag,
 }
 
 impl Torque {
-    /// At rest. `dead_ns`: from sending to acting; `lag`: time constant, s.
+    /// At rest. `dead_ns`: from sending to the effect; `lag`: time constant, s.
     pub fn new(dead_ns: u64, lag: f64) -> Torque {
         Torque { dead_ns, lag: Lag::new(lag) }
     }
 }
 
-/// What the shaft looks like from its encoder.
+/// State of the observer.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Lookahead {
     inertia: f64,
     period_ns: u64,
     theta: f64,
-    /// Step of the encoder, rad.
+    /// Quantisation step of the encoder, rad.
     count: f64,
-    /// The drive that emulates first; then those whose commands are known.
+    /// The emulating drive first; then the others whose commands are known.
     torques: Vec<Torque>,
-    /// A copy of it that goes ahead.
+    /// A copy of `torques` for the prediction.
     ahead: Vec<Torque>,
     horizon_ns: u64,
     now_ns: u64,
@@ -61,7 +65,7 @@ pub struct Lookahead {
     unusual_for: u32,
 }
 
-/// Where the shaft will be.
+/// Predicted state of the shaft.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Ahead {
     /// rad/s
@@ -70,27 +74,28 @@ pub struct Ahead {
     pub position: f64,
 }
 
-/// The look ahead of a rig, and how it is wired.
+/// The predictor of a rig, with its signals and outputs.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Wired {
     /// The observer.
     pub lookahead: Lookahead,
-    /// The position it takes.
+    /// The position signal that it observes.
     pub position: Signal,
-    /// Of each of its torques the output of the rig, as an index, the sign with which it speeds the shaft up, and one step
-    /// of the command, N·m.
+    /// For each of its torques: the index of the rig's output, the sign with which the output accelerates the shaft,
+    /// and one quantisation step of the command, N·m.
     pub outputs: Vec<(usize, f64, f64)>,
-    /// The drive that emulates: its speed and position are those ahead.
+    /// The emulating drive, whose speed and position are predicted.
     pub node: usize,
 }
 
 impl Wired {
-    /// The look ahead that `predict` of a rig asks for; none if it asks for none. The crossed-out part says with which
-    /// sign each torque turns what the emulating drive sees. `least_ns`: of each node how long after a reading a command
-    /// reaches it at the earliest; its `delay` counts from the reading and is not shorter.
+    /// The predictor that `predict` of a rig requires; none if it requires none. `plant`, the program of the part that
+    /// hardware replaces, determines the sign with which each torque accelerates the emulating drive. `least_ns`:
+    /// shortest time of each node from a reading to the arrival of its command; the node's `delay` counts from the
+    /// reading and cannot be shorter.
     ///
     /// # Errors
-    /// What is missing for it, in words.
+    /// A message about missing data.
     pub fn of(rig: &Rig, plant: &Instance, least_ns: impl Fn(usize) -> u64) -> Result<Option<Wired>, String> {
         let Some(node) = rig.predict else { return Ok(None) };
         let Some(inertia) = rig.plant.inertia else {
@@ -127,7 +132,8 @@ impl Wired {
         Ok(Some(Wired { lookahead, position: Signal { node, what: What::Position }, outputs, node }))
     }
 
-    /// Tells the observer what was permitted, one value an output of the rig: rounded as the drives hear it.
+    /// Passes the permitted outputs to the observer, one value per output of the rig, rounded as the drives receive
+    /// them.
     pub fn sent(&mut self, permitted: &[f64]) {
         for (torque, (output, sign, step)) in self.outputs.iter().enumerate() {
             let value = permitted[*output];
@@ -136,7 +142,7 @@ impl Wired {
         }
     }
 
-    /// A shaft at rest again, with these values permitted for long.
+    /// Resets to a shaft at rest, with these outputs permitted for long.
     pub fn restart(&mut self, permitted: &[f64]) {
         self.lookahead.restart();
         for (torque, (output, sign, _)) in self.lookahead.torques.iter_mut().zip(&self.outputs) {
@@ -145,7 +151,7 @@ impl Wired {
     }
 }
 
-/// Which way a torque turns what a drive sees: one short step of the part tells.
+/// Sign with which a torque accelerates the shaft at a drive, determined by one short step of the plant.
 pub(crate) fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> f64 {
     let speed = rig.plant.seen.iter().find(|(signal, _)| *signal == Signal { node, what: What::Speed });
     let applied = rig.plant.applied.iter().find(|(signal, _)| *signal == torque);
@@ -162,8 +168,8 @@ pub(crate) fn sign(rig: &Rig, plant: &Instance, torque: Signal, node: usize) -> 
 }
 
 impl Lookahead {
-    /// A shaft at rest. `inertia` in kg·m²; `count`: step of the encoder, rad; `torques`: the drive that emulates first,
-    /// then all others whose commands are known.
+    /// An observer of a shaft at rest. `inertia` in kg·m²; `count`: quantisation step of the encoder, rad; `torques`:
+    /// the emulating drive first, then all others whose commands are known.
     ///
     /// # Panics
     /// Without a torque, or if inertia or period are not positive.
@@ -171,7 +177,8 @@ impl Lookahead {
         assert!(inertia > 0.0 && period_ns > 0 && !torques.is_empty(), "a shaft of {inertia} kg·m², {period_ns} ns");
         let first = &torques[0];
         let horizon_ns = first.dead_ns + period_ns / 2 + (first.lag.constant() * 1e9).round() as u64;
-        // θ = e^(−T/τ) with the time constant that gives 0.9 at 1 ms: a rational form does, and is the same everywhere.
+        // θ = e^(−T/τ) with the time constant that results in 0.9 at 1 ms, by a rational approximation that is the same
+        // on every machine.
         let x = period_ns as f64 / 1e6 * ((1.0 - THETA_AT_1_MS) / (0.5 * (1.0 + THETA_AT_1_MS)));
         let theta = ((1.0 - 0.5 * x) / (1.0 + 0.5 * x)).max(0.0);
         Lookahead {
@@ -193,18 +200,19 @@ impl Lookahead {
         }
     }
 
-    /// How far it looks ahead, ns.
+    /// Prediction horizon, ns.
     pub fn horizon_ns(&self) -> u64 {
         self.horizon_ns
     }
 
-    /// Forgets the shaft: the next position is believed.
+    /// Discards the state: the next position is accepted as it is.
     fn restart(&mut self) {
         (self.started, self.now_ns, self.unusual_for) = (false, 0, 0);
         (self.position, self.speed, self.disturbance, self.residual, self.usual) = (0.0, 0.0, 0.0, 0.0, 0.0);
     }
 
-    /// Takes the position at a tick, rad, as its encoder tells it: whole counts, cut down. The first one is believed.
+    /// Takes the position at a tick, rad, as its encoder reports it: whole counts, rounded down. The first one is
+    /// accepted as it is.
     pub fn observe(&mut self, now_ns: u64, position: f64) {
         let middle = position + 0.5 * self.count;
         if !self.started {
@@ -221,7 +229,7 @@ impl Lookahead {
         self.judge(error);
     }
 
-    /// Goes on to an instant from which no position came.
+    /// Advances to a time for which no position arrived.
     pub fn coast(&mut self, now_ns: u64) {
         if !self.started {
             return;
@@ -244,31 +252,31 @@ impl Lookahead {
         let unusual = size > UNUSUAL * self.usual.max(self.count);
         self.unusual_for = if unusual { self.unusual_for + 1 } else { 0 };
         self.residual = error;
-        // A running mean over a hundred cycles that a burst does not carry away.
+        // A running mean over a hundred cycles that limits the influence of a burst.
         self.usual += 0.01 * (size.min(10.0 * self.usual.max(self.count)) - self.usual);
     }
 
-    /// Error of the last position, rad.
+    /// Error of the last predicted position, rad.
     pub fn residual(&self) -> f64 {
         self.residual
     }
 
-    /// The torque that nobody told, N·m.
+    /// Estimated unknown torque, N·m.
     pub fn disturbance(&self) -> f64 {
         self.disturbance
     }
 
-    /// The speed now, rad/s.
+    /// Estimated speed, rad/s.
     pub fn speed(&self) -> f64 {
         self.speed
     }
 
-    /// Whether what is seen can be explained: else the prediction is worth nothing.
+    /// Whether the model explains the readings; otherwise the prediction must not be used.
     pub fn is_valid(&self) -> bool {
         self.unusual_for < CYCLES
     }
 
-    /// Where the shaft will be when what is computed now acts.
+    /// Predicted state of the shaft at the time when the present computation acts.
     pub fn ahead(&mut self) -> Ahead {
         self.ahead.clone_from_slice(&self.torques);
         let (mut speed, mut position) = (self.speed, self.position);
@@ -284,7 +292,7 @@ impl Lookahead {
         Ahead { speed, position }
     }
 
-    /// All that the future depends on, as words: appended.
+    /// Appends the complete state as words, from which [`Lookahead::restore`] continues.
     pub fn save(&self, words: &mut Vec<u64>) {
         words.extend([self.now_ns, u64::from(self.started), u64::from(self.unusual_for)]);
         let numbers = [self.position, self.speed, self.disturbance, self.residual, self.usual];
@@ -292,7 +300,7 @@ impl Lookahead {
         self.torques.iter().for_each(|torque| torque.lag.save(words));
     }
 
-    /// Takes over what [`Lookahead::save`] gave. None if the words do not fit.
+    /// Restores the state that [`Lookahead::save`] wrote. None if the words do not fit.
     pub fn restore(&mut self, words: &mut impl Iterator<Item = u64>) -> Option<()> {
         self.now_ns = words.next()?;
         self.started = words.next()? != 0;
@@ -304,7 +312,7 @@ impl Lookahead {
         self.torques.iter_mut().try_for_each(|torque| torque.lag.restore(words))
     }
 
-    /// Tells what was sent at this tick to the torque of this number: after every limit, as it left.
+    /// Passes the command sent at this tick to the torque with this index: the value after all limits.
     pub fn sent(&mut self, torque: usize, value: f64) {
         let one = &mut self.torques[torque];
         one.lag.send(self.now_ns + one.dead_ns, value);
@@ -315,7 +323,7 @@ impl Lookahead {
 mod tests {
     use super::*;
 
-    /// LuGre of the textbook on 1 kg, pulled through a spring of 2 N/m at 0.1 m/s, in steps of the rig.
+    /// LuGre model of the textbook on 1 kg, pulled through a spring of 2 N/m at 0.1 m/s, in steps of the rig.
     struct Bristle {
         z: f64,
     }
@@ -344,18 +352,18 @@ mod tests {
     const T_NS: u64 = 1_000_000;
     const LAG: f64 = 1.0 / (2.0 * std::f64::consts::PI * 500.0);
 
-    /// What the rig does with the friction.
+    /// Kind of the coupling.
     #[derive(Clone, Copy, PartialEq)]
     enum Coupling {
-        /// The contact itself.
+        /// The ideal contact.
         Ideal,
-        /// Measured speed in, force out.
+        /// Measured speed as input, force as output.
         Plain,
-        /// As this module does.
+        /// With the predictor of this module.
         Ahead {
-            /// Counts in presliding.
+            /// Encoder counts in the presliding range.
             counts: f64,
-            /// Whether the pulling force is told.
+            /// Whether the predictor knows the pulling force.
             told: bool,
         },
     }
@@ -419,7 +427,7 @@ mod tests {
         100.0 * (sum / course.len() as f64).sqrt()
     }
 
-    /// Friction of the stick-slip test, rms error in % of F_C, over dead times. The figures are those of docs/prediction.md.
+    /// Rms error of the friction in the stick-slip test, in % of F_C, over dead times. Figures of docs/prediction.md.
     #[test]
     fn stick_slip_at_a_dead_time_of_2_ms_is_right_with_the_look_ahead() {
         let (ideal, slips) = pulled(Coupling::Ideal, 0);
@@ -458,7 +466,7 @@ mod tests {
         assert!((look.disturbance() - 0.05).abs() < 5e-3, "{}", look.disturbance());
         assert!((look.speed() - (v - 1e-3 * 0.05 / inertia)).abs() < 5e-3, "{} {v}", look.speed());
         assert!(look.is_valid());
-        // A shaft that jumps cannot be explained.
+        // No model explains a shaft that jumps.
         for k in 0..3 {
             look.observe((400 + k) * T_NS, x + 0.3 * (k + 1) as f64);
         }

@@ -1,8 +1,9 @@
-//! A rig without the rig: its control program, cycle by cycle, against the crossed-out part as a program.
+//! Software in the loop (SIL): the control program of a rig, cycle by cycle, with the program of the plant instead of
+//! hardware.
 //!
-//! In: the control program, a [`Bench`], a plan. Out: what any run gives. The step is the one that runs on the rig; between
-//! two ticks the part takes steps of its own, driven through the same limits, slews, steps of the command, dead times and
-//! lags, and is seen in the steps of encoders.
+//! In: the control program, a [`Bench`], a plan. Out: the results of an ordinary run. The step is the one that runs on
+//! the rig. Between two ticks the plant takes steps of its own; commands pass the same limits, slews, quantisation,
+//! dead times and lags, and readings have the resolution of the encoders.
 
 use crate::coupling::lag::Lag;
 use crate::coupling::predictor::Wired;
@@ -12,37 +13,37 @@ use abi::plan::Experiment;
 use abi::rig::{Bench, Field, Format, Kind, Rig, Signal, What};
 use abi::{Instance, Slot};
 
-/// A command of the control program on its way to the part.
+/// Path of a command from the control program to the plant.
 struct Path {
     from: Slot,
     low: f64,
     high: f64,
     /// Greatest change in one period.
     change: f64,
-    /// One step of the message, SI; 0 where it has none.
+    /// One quantisation step of the message, SI; 0 where it has none.
     step: f64,
-    /// What was permitted last.
+    /// The last permitted value.
     permitted: f64,
     dead_ns: u64,
     lag: Lag,
     signal: Signal,
-    /// Where it acts on the part, if it does.
+    /// Slot of the plant on which it acts, if any.
     to: Option<Slot>,
 }
 
-/// A signal on its way to the control program.
+/// A signal that the control program reads.
 struct Reading {
     to: Slot,
     from: From,
 }
 
-/// Where the value of a signal comes from.
+/// Source of a signal's value.
 enum From {
-    /// A slot of the part, told in steps: rounded, or for an encoder cut down to whole counts.
+    /// A slot of the plant, quantised: rounded, or rounded down to whole counts for an encoder.
     Part(Slot, f64, bool),
-    /// What this command applies, in steps.
+    /// The value that this command applies, quantised.
     Applied(usize, f64),
-    /// Always this.
+    /// A constant.
     Constant(f64),
 }
 
@@ -124,12 +125,12 @@ pub(crate) fn run(
     Ok(())
 }
 
-/// The look ahead of `predict`, if the rig asks for it.
+/// The predictor, if the rig has `predict`.
 struct Ahead {
     wired: Option<Wired>,
-    /// Where the part has the position, and one count.
+    /// Slot of the position in the plant, and the size of one count.
     seen: Option<(Slot, f64)>,
-    /// Inputs of the control program that look ahead.
+    /// Inputs of the control program that receive predictions.
     speed: Option<Slot>,
     position: Option<Slot>,
 }
@@ -164,12 +165,12 @@ fn probe(observer: &mut Observer, control: &Instance, step: f64) {
     }
 }
 
-/// The nearest of values a step apart.
+/// Rounds to the nearest multiple of a step.
 fn in_steps(value: f64, step: f64) -> f64 {
     if step > 0.0 { (value / step).round() * step } else { value }
 }
 
-/// Hands every signal to the control program.
+/// Passes every signal to the control program.
 fn read(control: &mut Instance, plant: &Instance, readings: &[Reading], paths: &[Path]) {
     for reading in readings {
         let value = match &reading.from {
@@ -182,7 +183,7 @@ fn read(control: &mut Instance, plant: &Instance, readings: &[Reading], paths: &
     }
 }
 
-/// One step of a field; 0 for a number with a point.
+/// Quantisation step of a field; 0 for a floating-point number.
 fn step_of(field: &Field) -> f64 {
     match field.format {
         Format::Unsigned | Format::Signed => field.scale.abs(),
@@ -190,7 +191,7 @@ fn step_of(field: &Field) -> f64 {
     }
 }
 
-/// One step in which a signal travels, SI.
+/// Quantisation step of a signal on the bus, SI.
 fn step_of_signal(rig: &Rig, signal: Signal) -> f64 {
     match (&rig.nodes[signal.node].kind, signal.what) {
         (Kind::Cia402(drive), What::Torque) => 1e-3 * drive.rated_torque,

@@ -1,7 +1,8 @@
-//! The other side of a rig's buses: its drives and devices simulated, on one shaft.
+//! The other side of a rig's buses: simulated drives and devices on one shaft.
 //!
-//! In: received frames, the time. Out: frames, and the truth about the shaft. The shaft is the crossed-out part of the
-//! system, compiled from the same text: torques go in, angles and speeds come out, at fine steps between the frames.
+//! In: received frames, the time. Out: frames, and the true state of the shaft. The shaft is the part of the system
+//! that hardware replaces, compiled from the same text: torques are its inputs, angles and speeds its outputs, at fine
+//! steps between the frames.
 
 use super::frames;
 use super::profiles;
@@ -13,35 +14,35 @@ use crate::rng::Chance;
 use abi::Instance;
 use abi::rig::{Kind, Message, Rig, Signal, What};
 
-/// Takes what nodes send: the node (an index into the rig's nodes) and the frame.
+/// Callback for the frames of nodes: the node (an index into the rig's nodes) and the frame.
 pub type Speak<'a> = &'a mut dyn FnMut(usize, Frame);
 
-/// Steps of the shaft in a period of the rig.
+/// Steps of the shaft per period of the rig.
 const STEPS: u64 = 50;
 /// Longest step, ns.
 const STEP_NS: u64 = 20_000;
 
-/// True values of a shaft at a drive.
+/// True values of the shaft at a drive.
 #[derive(Clone, Copy, PartialEq, Debug, Default)]
 pub struct Shaft {
-    /// rad, from its start.
+    /// Position relative to its start, rad.
     pub position: f64,
-    /// rad/s.
+    /// Speed, rad/s.
     pub speed: f64,
-    /// N·m of the drive.
+    /// Torque of the drive, N·m.
     pub torque: f64,
 }
 
-/// A device: what it sends, what it was told.
+/// State of a simulated device.
 #[derive(Clone)]
 struct SimulatedDevice {
     messages: Vec<Message>,
     values: Vec<Vec<f64>>,
-    /// When each message is sent next.
+    /// Time at which each message is sent next.
     due_ns: Vec<u64>,
     period_ns: Vec<u64>,
     lag: f64,
-    /// Message and field of signals that stay as they were made, whatever the plant gives.
+    /// Message and field of signals with a fixed value, which override the plant.
     stuck: Vec<(usize, usize)>,
 }
 
@@ -51,17 +52,17 @@ enum Body {
     Device(SimulatedDevice),
 }
 
-/// A hook with its place in time.
+/// State of an injected fault.
 #[derive(Clone)]
 struct Armed {
     hook: Hook,
-    /// When it began; when it ends.
+    /// Time of its begin; time of its end.
     since_ns: Option<u64>,
     until_ns: Option<u64>,
     over: bool,
 }
 
-/// Where a signal of a node is found.
+/// A signal of a node and its slot in the plant.
 #[derive(Clone)]
 struct Link {
     signal: Signal,
@@ -76,29 +77,30 @@ pub struct Bench {
     shafts: Vec<Shaft>,
     plant: Option<Instance>,
     applied: Vec<Link>,
-    /// For each node: where the plant gives its position and its speed.
+    /// For each node: slots of its position and its speed in the plant.
     seen: Vec<(Option<abi::Slot>, Option<abi::Slot>)>,
-    /// Whether the plant takes the speed or the position of a node.
+    /// Whether the speed or the position of a node is an input of the plant.
     holds: Vec<bool>,
-    /// Signals of devices that the plant gives.
+    /// Signals of devices that are outputs of the plant.
     felt: Vec<Link>,
     /// Angular acceleration of a drive without a plant, rad/s² per N·m.
     compliance: Vec<f64>,
     step_ns: u64,
-    /// Steps done.
+    /// Number of steps done.
     count: u64,
     status: u64,
     hooks: Vec<Armed>,
 }
 
 impl Bench {
-    /// The nodes of a rig. `plant`: the program of its crossed-out part, before its start; without one each drive
-    /// turns a shaft of its own that reaches 1000 rad/s² at rated torque. `seed`: where the encoders start.
+    /// The nodes of a rig. `plant`: the program of the part that hardware replaces, before its start; without one each
+    /// drive turns a shaft of its own that reaches 1000 rad/s² at rated torque. `seed`: for the initial counts of the
+    /// encoders.
     pub fn new(rig: &Rig, plant: Option<Instance>, seed: u64) -> Result<Bench, String> {
         Bench::with(rig, plant, seed, |_| Behaviour::default())
     }
 
-    /// The same, each drive (index into the rig's nodes) behaving as told.
+    /// The same, with a behaviour for each drive (index into the rig's nodes).
     pub fn with(
         rig: &Rig,
         mut plant: Option<Instance>,
@@ -121,7 +123,7 @@ impl Bench {
                     compliance[at] = 1000.0 / config.rated_torque;
                     let inertia = rig.plant.inertia.filter(|_| plant.is_some()).unwrap_or(1.0 / compliance[at]);
                     let offset = chance.number() as i32;
-                    // What a command has waited for before it reaches the drive is part of its delay.
+                    // The wait of a command before it reaches the drive is part of the drive's delay.
                     let passed = if config.at_sync { 0 } else { timing::transit_ns(rig, at) };
                     let lags = ((node.delay - passed as f64 * 1e-9).max(0.0), node.lag);
                     let drive = SimulatedDrive::new(config, profile, behaviour(at), lags, inertia, offset);
@@ -178,7 +180,7 @@ impl Bench {
         Ok(bench)
     }
 
-    /// The same with other steps of the shaft, ns, before any time has passed: coarse ones for very many runs.
+    /// The same with other steps of the shaft, ns, before any time has passed: coarse steps for very many runs.
     #[cfg(test)]
     pub fn in_steps_of(mut self, step_ns: u64) -> Bench {
         assert_eq!(self.count, 0, "the shaft has turned already");
@@ -189,7 +191,7 @@ impl Bench {
         self
     }
 
-    /// Something that shall go wrong.
+    /// Adds a fault.
     pub fn hook(&mut self, hook: Hook) {
         self.hooks.push(Armed { hook, since_ns: None, until_ns: None, over: false });
     }
@@ -199,7 +201,7 @@ impl Bench {
         self.shafts[node]
     }
 
-    /// A simulated drive, to look into it or to change it; nothing for a device.
+    /// A simulated drive, for inspection and changes; none for a device.
     pub fn drive(&mut self, node: usize) -> Option<&mut SimulatedDrive> {
         match &mut self.bodies[node] {
             Body::Drive(drive) => Some(drive),
@@ -207,7 +209,7 @@ impl Bench {
         }
     }
 
-    /// The value of a device's signal: as it sends it, or as it was told.
+    /// The value of a device's signal: as it sends it, or as it last received it.
     pub fn value(&self, node: usize, message: usize, field: usize) -> Option<f64> {
         match &self.bodies[node] {
             Body::Drive(_) => None,
@@ -215,18 +217,18 @@ impl Bench {
         }
     }
 
-    /// What lies behind the drives.
+    /// The program of the plant.
     #[cfg(test)]
     pub fn plant(&self) -> Option<&Instance> {
         self.plant.as_ref()
     }
 
-    /// Status of the plant's last step: 0, or the guard that was hit.
+    /// Status of the plant's last step: 0, or the guard that was violated.
     pub fn status(&self) -> u64 {
         self.status
     }
 
-    /// The next moment at which something is sent without being asked for.
+    /// Time at which a node next sends by itself.
     pub fn due_ns(&self) -> u64 {
         let bodies = self.bodies.iter().map(|body| match body {
             Body::Drive(drive) => drive.due_ns(),
@@ -236,7 +238,7 @@ impl Bench {
             self.hooks.iter().filter(|armed| !armed.over).map(|armed| match (armed.since_ns, armed.hook.start) {
                 (Some(_), _) => armed.until_ns.unwrap_or(u64::MAX),
                 (None, Start::At(at)) => at,
-                // A condition is looked at after each step.
+                // A condition is checked after each step.
                 (None, Start::When { .. }) => (self.count + 1) * self.step_ns,
             });
         bodies.chain(hooks).min().unwrap_or(u64::MAX)
@@ -247,7 +249,7 @@ impl Bench {
         self.buses[node]
     }
 
-    /// Takes a frame of a bus to all nodes on it. `send` gets the bus and the frame of an answer.
+    /// Passes a frame of a bus to all nodes on it. `send` receives the bus and the frame of each answer.
     pub fn receive(&mut self, bus: usize, frame: &Frame, now_ns: u64, send: super::Send) {
         let buses = std::mem::take(&mut self.buses);
         for node in (0..buses.len()).filter(|node| buses[*node] == bus) {
@@ -256,14 +258,14 @@ impl Bench {
         self.buses = buses;
     }
 
-    /// Goes on to a time. `send` gets the bus and the frame of what is due.
+    /// Advances to a time. `send` receives the bus and the frame of each message that is due.
     pub fn advance(&mut self, now_ns: u64, send: super::Send) {
         let buses = std::mem::take(&mut self.buses);
         self.go_on(now_ns, &mut |node, frame| send(buses[node], frame));
         self.buses = buses;
     }
 
-    /// Takes a frame to one node. `send` gets the node and the frame of an answer.
+    /// Passes a frame to one node. `send` receives the node and the frame of each answer.
     pub fn hear(&mut self, node: usize, frame: &Frame, now_ns: u64, send: Speak) {
         self.go_on(now_ns, send);
         match &mut self.bodies[node] {
@@ -272,7 +274,7 @@ impl Bench {
         }
     }
 
-    /// Goes on to a time: the shaft turns, and what is due is sent. `send` gets the node and the frame.
+    /// Advances to a time: steps the shaft, and sends what is due. `send` receives the node and the frame.
     pub fn go_on(&mut self, now_ns: u64, send: Speak) {
         while (self.count + 1) * self.step_ns <= now_ns {
             self.turn();
@@ -286,7 +288,7 @@ impl Bench {
         }
     }
 
-    /// Hooks whose time has come, or has gone.
+    /// Begins and ends faults that are due.
     fn pull(&mut self, now_ns: u64, send: Speak) {
         for at in 0..self.hooks.len() {
             let Armed { hook, since_ns, until_ns, over } = &self.hooks[at];
@@ -369,7 +371,7 @@ impl Bench {
         self.look(h);
     }
 
-    /// What the plant shows at the nodes. `h`: since the last look, s.
+    /// Reads the plant's outputs at the nodes. `h`: time since the last call, s.
     fn look(&mut self, h: f64) {
         let Some(plant) = &self.plant else { return };
         for (node, (shaft, (position, speed))) in self.shafts.iter_mut().zip(&self.seen).enumerate() {
@@ -384,7 +386,8 @@ impl Bench {
                     shaft.speed = speed;
                     shaft.position += (last.speed + speed) / 2.0 * h;
                 }
-                // Nobody reads a drive that holds its shaft: it turns as it is held.
+                // The plant has no output for a drive that controls the shaft: the shaft turns with the drive's
+                // set-point.
                 (None, None) => {
                     if let (Body::Drive(drive), true) = (&self.bodies[node], self.holds[node]) {
                         shaft.speed = drive.speed();
@@ -405,7 +408,7 @@ impl Bench {
 }
 
 impl SimulatedDevice {
-    /// How much of the way to its command it goes in `h` seconds.
+    /// Share by which the device approaches its command in `h` seconds.
     fn share(&self, h: f64) -> f64 {
         if self.lag > 0.0 { (h / self.lag).min(1.0) } else { 1.0 }
     }
