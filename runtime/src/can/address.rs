@@ -1,40 +1,40 @@
-//! Where a bus is, as people write it.
+//! Addresses of buses as text.
 //!
-//! In: `sim:bench`, `socketcan:can0` or plain `can0`, `slcan:/dev/ttyACM0@1000000`, `socketcand:host:29536/can0`,
-//! `replay:file.log`. Out: an [`Address`], or what is wrong with the text.
+//! In: `sim:bench`, `socketcan:can0` or just `can0`, `slcan:/dev/ttyACM0@1000000`, `socketcand:host:29536/can0`,
+//! `replay:file.log`. Out: an [`Address`], or a message about the error in the text.
 
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-/// Where a bus is.
+/// Address of a bus.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Address {
-    /// In the process, by name.
+    /// A simulated bus within the process, by name.
     Sim(String),
-    /// An interface of the kernel.
+    /// A kernel interface.
     SocketCan(String),
-    /// A serial adapter, or a pseudo-terminal that speaks like one.
+    /// A serial adapter, or a pseudo-terminal with the same protocol.
     Slcan {
         /// The terminal.
         path: PathBuf,
-        /// Bits a second on the CAN side; that of the rig if the address says nothing.
+        /// Bit rate on the CAN side, bits per second; none: the rig's.
         bit_rate: Option<u32>,
     },
     /// A TCP gateway.
     Socketcand {
-        /// Name or number.
+        /// Host name or number.
         host: String,
-        /// 29536 by custom.
+        /// Port, 29536 by convention.
         port: u16,
-        /// What the gateway calls the bus.
+        /// Name of the bus at the gateway.
         interface: String,
     },
     /// A log of candump.
     Replay(PathBuf),
 }
 
-/// The port that socketcand listens on.
+/// Default port of socketcand.
 pub const SOCKETCAND_PORT: u16 = 29_536;
 
 /// All kinds with an example, for messages.
@@ -81,7 +81,7 @@ impl FromStr for Address {
     }
 }
 
-/// An interface of the kernel: its names have at most 15 bytes, without `/` and white space.
+/// A kernel interface: its name has at most 15 bytes, without `/` and white space.
 fn interface(text: &str, name: &str) -> Result<Address, String> {
     let fits = !name.is_empty() && name.len() < 16 && !name.contains(|c: char| c == '/' || c.is_whitespace());
     if fits {
@@ -91,7 +91,7 @@ fn interface(text: &str, name: &str) -> Result<Address, String> {
     }
 }
 
-/// The bit rates an slcan adapter can be told, `S0` to `S8`.
+/// Bit rates of the slcan commands `S0` to `S8`.
 pub const SLCAN_BIT_RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000];
 
 fn slcan_bit_rate(text: &str) -> Result<u32, String> {

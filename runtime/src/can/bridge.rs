@@ -1,55 +1,56 @@
-//! Joins buses: what comes from one goes to all others.
+//! Bridge between buses: forwards the frames of each bus to all others.
 //!
-//! In: buses of any kind. Out: their frames on each other, and each one told. Who is slower than the rest loses frames, and
-//! each loss is counted: a hub never waits for anybody.
+//! In: buses of any kind. Out: their frames on each other; each frame is reported. A bus that is slower than the others
+//! loses frames, and each loss is counted: the hub never waits.
 
 use super::sim::Simulation;
 use super::{Bus, Event, Received, Refused, descriptor};
 
-/// Frames taken from one bus before the next one has its turn.
+/// Most frames taken from one bus before the next one has its turn.
 const TURN: usize = 64;
 
-/// Several buses as one.
+/// Several buses connected to one.
 #[derive(Default)]
 pub struct Hub {
     members: Vec<Member>,
     watched: Vec<libc::pollfd>,
 }
 
-/// One of them.
+/// A connected bus.
 pub struct Member {
-    /// How it is called in reports.
+    /// Its name in reports.
     pub name: String,
-    /// Frames that it did not take.
+    /// Frames that it refused.
     pub lost: u64,
     bus: Box<dyn Bus>,
-    /// Whether it goes when its other end does.
+    /// Whether it is removed when its other end closes.
     guest: bool,
     gone: bool,
 }
 
 impl Hub {
-    /// Joins nothing yet.
+    /// A hub without buses.
     pub fn new() -> Hub {
         Hub::default()
     }
 
-    /// Adds a bus that stays, whatever becomes of it.
+    /// Adds a bus that stays connected in any case.
     pub fn join(&mut self, name: &str, bus: Box<dyn Bus>) {
         self.members.push(Member { name: name.into(), lost: 0, bus, guest: false, gone: false });
     }
 
-    /// Adds a bus that leaves when it goes down: a client of a door.
+    /// Adds a bus that is removed when it goes down: a client of a door.
     pub fn admit(&mut self, name: &str, bus: Box<dyn Bus>) {
         self.members.push(Member { name: name.into(), lost: 0, bus, guest: true, gone: false });
     }
 
-    /// Who belongs to it.
+    /// The connected buses.
     pub fn members(&self) -> &[Member] {
         &self.members
     }
 
-    /// Passes on what has come, and tells it: from whom, and what. True if there was anything.
+    /// Forwards everything that has arrived, and reports each item with the name of its source. Returns whether there
+    /// was any.
     pub fn pass_on(&mut self, mut told: impl FnMut(&str, &Received)) -> bool {
         let mut any = false;
         for from in 0..self.members.len() {
@@ -60,7 +61,7 @@ impl Hub {
                 match received {
                     Received::Frame(frame, _) => {
                         for (to, member) in self.members.iter_mut().enumerate() {
-                            // What it can't carry by its kind is no loss of traffic that it could.
+                            // A frame that the bus cannot carry by its kind does not count as lost.
                             let lost =
                                 to != from && matches!(member.bus.send(frame), Err(Refused::Full | Refused::Down));
                             member.lost += u64::from(lost);
@@ -75,8 +76,8 @@ impl Hub {
         any
     }
 
-    /// Waits until something comes from any of them or `also`, or until a time. Simulated buses among them belong to
-    /// `world`.
+    /// Waits until something arrives at any of them or at `also`, or until a time. Simulated buses among them must
+    /// belong to `world`.
     pub fn wait(&mut self, world: &Simulation, also: &[i32], until_ns: u64) {
         self.watched.clear();
         let open = self.members.iter().filter(|member| !member.gone);

@@ -1,11 +1,11 @@
-//! What frames mean to CANopen, in a few words: for people who watch traffic.
+//! Meaning of frames in CANopen, as short texts for people who watch traffic.
 //!
-//! In: a frame. Out: `TPDO1 of node 1`, `SDO of node 5: read 6041:00`, or nothing for what CANopen does not define.
-//! Knows no object dictionary and no state of any node. Source: CiA 301.
+//! In: a frame. Out: `TPDO1 of node 1`, `SDO of node 5: read 6041:00`, or nothing for frames that CANopen does not
+//! define. Knows no object dictionary and no state of any node. Source: CiA 301.
 
 use super::Frame;
 
-/// What a frame means, if CANopen says so.
+/// Meaning of a frame in CANopen, if there is one.
 pub fn canopen(frame: &Frame) -> Option<String> {
     if frame.is_extended() {
         return None;

@@ -1,20 +1,20 @@
-//! File descriptors that never make a loop wait but where it asks to.
+//! Non-blocking I/O on file descriptors.
 //!
-//! In: an open descriptor and bytes. Out: bytes, nothing yet, or that the other end is gone. The calls of the kernel that
-//! the buses share are here, and nothing of any protocol.
+//! In: an open descriptor and bytes. Out: bytes, nothing yet, or that the other end is gone. Contains the system calls
+//! that the buses share, and no protocol.
 
 use crate::realtime::clock::{Clock, Monotonic};
 use std::io;
 use std::os::fd::RawFd;
 
-/// What became of a read or a write.
+/// Result of a read or a write.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Moved {
-    /// So many bytes.
+    /// This many bytes were transferred.
     Bytes(usize),
-    /// None for now.
+    /// None at present.
     Later,
-    /// The other end is gone, or the descriptor is.
+    /// The other end or the descriptor is closed.
     Gone,
 }
 
@@ -29,7 +29,7 @@ fn moved(result: isize) -> Moved {
     }
 }
 
-/// Reads what is there.
+/// Reads the available bytes.
 pub(super) fn read(fd: RawFd, into: &mut [u8]) -> Moved {
     if into.is_empty() {
         return Moved::Later;
@@ -38,7 +38,7 @@ pub(super) fn read(fd: RawFd, into: &mut [u8]) -> Moved {
     moved(unsafe { libc::read(fd, into.as_mut_ptr().cast(), into.len()) })
 }
 
-/// Writes what fits.
+/// Writes as many bytes as the descriptor accepts.
 pub(super) fn write(fd: RawFd, bytes: &[u8]) -> Moved {
     if bytes.is_empty() {
         return Moved::Bytes(0);
@@ -47,7 +47,7 @@ pub(super) fn write(fd: RawFd, bytes: &[u8]) -> Moved {
     moved(unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) })
 }
 
-/// Lets reads and writes return at once.
+/// Makes a descriptor non-blocking.
 pub(super) fn unblock(fd: RawFd) -> io::Result<()> {
     // SAFETY: takes no pointers.
     let flags = unsafe { libc::fcntl(fd, libc::F_GETFL) };
@@ -56,12 +56,12 @@ pub(super) fn unblock(fd: RawFd) -> io::Result<()> {
     if flags < 0 || set(flags | libc::O_NONBLOCK) < 0 { Err(io::Error::last_os_error()) } else { Ok(()) }
 }
 
-/// An entry of [`wait`] for something to read.
+/// An entry of [`wait`] for reading.
 pub fn readable(fd: RawFd) -> libc::pollfd {
     libc::pollfd { fd, events: libc::POLLIN, revents: 0 }
 }
 
-/// Waits until one of the descriptors has something, or the clock shows `until_ns`; says whether one has.
+/// Waits until one of the descriptors is ready or the clock reaches `until_ns`; returns whether one is.
 pub fn wait(descriptors: &mut [libc::pollfd], clock: &Monotonic, until_ns: u64) -> bool {
     loop {
         let left_ns = until_ns.saturating_sub(clock.now_ns());
@@ -71,14 +71,14 @@ pub fn wait(descriptors: &mut [libc::pollfd], clock: &Monotonic, until_ns: u64) 
         let found = unsafe {
             libc::ppoll(descriptors.as_mut_ptr(), descriptors.len() as libc::nfds_t, &left, std::ptr::null())
         };
-        // A signal interrupts: what is left is waited for again.
+        // After an interruption by a signal it waits for the remaining time.
         if found >= 0 || left_ns == 0 {
             return found > 0;
         }
     }
 }
 
-/// Bytes on their way out, as many as fit.
+/// Buffer of bytes to send.
 pub(super) struct Outgoing {
     bytes: Box<[u8]>,
     length: usize,
@@ -89,7 +89,7 @@ impl Outgoing {
         Outgoing { bytes: vec![0; capacity].into(), length: 0 }
     }
 
-    /// Takes all of a message or, if it does not fit, nothing.
+    /// Appends a whole message, or nothing if it does not fit.
     pub fn push(&mut self, message: &[u8]) -> bool {
         let end = self.length + message.len();
         let fits = end <= self.bytes.len();
@@ -100,7 +100,7 @@ impl Outgoing {
         fits
     }
 
-    /// Writes what the descriptor takes; says whether it is still there.
+    /// Writes as many bytes as the descriptor accepts; returns false if it is closed.
     pub fn flush(&mut self, fd: RawFd) -> bool {
         while self.length > 0 {
             match write(fd, &self.bytes[..self.length]) {
@@ -123,7 +123,7 @@ impl Outgoing {
     }
 }
 
-/// Bytes that came, cut into messages.
+/// Buffer of received bytes, which is split into messages.
 pub(super) struct Incoming {
     bytes: Box<[u8]>,
     begin: usize,
@@ -135,7 +135,7 @@ impl Incoming {
         Incoming { bytes: vec![0; capacity].into(), begin: 0, end: 0 }
     }
 
-    /// Reads what fits.
+    /// Reads as many bytes as fit.
     pub fn fill(&mut self, fd: RawFd) -> Moved {
         if self.begin > 0 && self.end > self.bytes.len() / 2 {
             self.bytes.copy_within(self.begin..self.end, 0);
@@ -148,7 +148,7 @@ impl Incoming {
         moved
     }
 
-    /// The bytes up to and without the next end mark, which is taken too.
+    /// The bytes before the next end mark; consumes the mark too.
     pub fn message(&mut self, end: impl Fn(u8) -> bool) -> Option<&[u8]> {
         let at = self.bytes[self.begin..self.end].iter().position(|&byte| end(byte))?;
         let message = self.begin..self.begin + at;
@@ -156,24 +156,24 @@ impl Incoming {
         Some(&self.bytes[message])
     }
 
-    /// Whether there is a whole message.
+    /// Whether there is a complete message.
     pub fn has_message(&self, end: impl Fn(u8) -> bool) -> bool {
         self.bytes[self.begin..self.end].iter().any(|&byte| end(byte))
     }
 
-    /// Bytes without an end mark yet.
+    /// Number of bytes without an end mark.
     pub fn unfinished(&self) -> usize {
         self.end - self.begin
     }
 
-    /// Throws away what is there.
+    /// Discards all bytes.
     pub fn discard(&mut self) {
         (self.begin, self.end) = (0, 0);
     }
 }
 
-/// Waits on a stream for something to read, or until the clock shows `until_ns`, and writes meanwhile what the other end
-/// takes; says whether something can be read.
+/// Waits until a stream is readable or the clock reaches `until_ns`, and meanwhile writes as many bytes as the other
+/// end accepts; returns whether the stream is readable.
 pub(super) fn wait_stream(fd: RawFd, outgoing: &mut Outgoing, clock: &Monotonic, until_ns: u64) -> bool {
     loop {
         let mut entry = readable(fd);

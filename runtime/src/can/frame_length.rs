@@ -1,19 +1,20 @@
-//! How many bits a frame takes on the wire, by building them.
+//! Length of a frame on the bus in bits, by constructing its bits.
 //!
-//! In: a frame. Out: bits, stuff bits and the space behind it included. Source: ISO 11898-1:2015, 10.4 and 10.5.
+//! In: a frame. Out: its length in bits, including stuff bits and interframe space. Source: ISO 11898-1:2015, 10.4 and
+//! 10.5.
 
 use super::Frame;
 
-/// Bits behind the stuffed region: CRC delimiter, acknowledge slot and delimiter, end of frame, space between frames.
+/// Bits after the stuffed region: CRC delimiter, acknowledge slot and delimiter, end of frame, interframe space.
 const TAIL: u32 = 1 + 2 + 7 + SPACE;
 
-/// Recessive bits that keep frames apart.
+/// Interframe space: recessive bits between frames.
 pub const SPACE: u32 = 3;
 
 /// CRC-15 of CAN: x¹⁵ + x¹⁴ + x¹⁰ + x⁸ + x⁷ + x⁴ + x³ + 1.
 const POLYNOMIAL: u16 = 0x4599;
 
-/// Bits that a frame takes, the space to the next one included.
+/// Length of a frame in bits, including the interframe space.
 pub fn bits(frame: &Frame) -> u32 {
     let mut string = Bits::of(frame);
     let crc = string.crc();
@@ -21,31 +22,32 @@ pub fn bits(frame: &Frame) -> u32 {
     string.length + string.stuffing() + TAIL
 }
 
-/// Bits of the longest frame with this many data bytes: a stuff bit after the first five and then after every four.
+/// Length of the longest frame with this many data bytes: a stuff bit after the first five and then after every four
+/// bits.
 pub fn bits_at_most(extended: bool, bytes: u8) -> u32 {
     let region = if extended { 54 } else { 34 } + 8 * u32::from(bytes);
     region + (region - 1) / 4 + TAIL
 }
 
-/// What decides between frames that start together: the dominant bit, 0, wins, so the least key does.
+/// Arbitration key of frames that start together: the dominant bit is 0, so the lowest key wins.
 pub fn arbitration(frame: &Frame) -> u32 {
     let remote = u32::from(frame.is_remote());
     match frame.is_extended() {
         // Base identifier, RTR, IDE.
         false => frame.id() << 21 | remote << 20,
-        // Base identifier, SRR, IDE, the rest of the identifier, RTR.
+        // Base identifier, SRR, IDE, identifier extension, RTR.
         true => (frame.id() >> 18) << 21 | 0b11 << 19 | (frame.id() & 0x3FFFF) << 1 | remote,
     }
 }
 
-/// A string of up to 128 bits, the first one highest. The longest stuffed region has 54 + 64.
+/// A string of up to 128 bits, the first one highest. The longest stuffed region has 54 + 64 bits.
 struct Bits {
     bits: u128,
     length: u32,
 }
 
 impl Bits {
-    /// From the start of the frame to the end of its data.
+    /// The bits from the start of the frame to the end of its data.
     fn of(frame: &Frame) -> Bits {
         let mut string = Bits { bits: 0, length: 0 };
         let remote = u64::from(frame.is_remote());
@@ -85,7 +87,8 @@ impl Bits {
         })
     }
 
-    /// After five equal bits an opposite one is sent, which counts as the first of the next five.
+    /// Number of stuff bits: after five equal bits an opposite one is inserted, which counts as the first of the next
+    /// five.
     fn stuffing(&self) -> u32 {
         let (mut stuffed, mut run, mut last) = (0, 0, 2);
         for bit in self.each() {
@@ -105,14 +108,14 @@ mod tests {
 
     #[test]
     fn a_frame_is_47_bits_8_a_byte_and_its_stuffing() {
-        // 0x555 alternates: nothing to stuff but the run of reserved bits and length.
+        // 0x555 alternates, so only the run of reserved bits and length needs stuffing.
         let plain = |frame: &Frame| 47 + 8 * u32::from(frame.length()) + if frame.is_extended() { 20 } else { 0 };
         for frame in [Frame::new(0x555, &[]), Frame::new(0x2AA, &[0x55; 8]), Frame::extended(0x15555555, &[0xAA; 3])] {
             let extra = bits(&frame) - plain(&frame);
             assert!(extra <= 4, "{frame}: {extra} stuff bits");
         }
-        // SOF and eleven dominant identifier bits, RTR, IDE, r0, length 0, CRC 0: 34 equal bits. The first stuff bit
-        // comes after five, then one after every five more, since each stuff bit breaks the run.
+        // SOF and eleven dominant identifier bits, RTR, IDE, r0, length 0, CRC 0: 34 equal bits. The first stuff bit is
+        // inserted after five bits, then one after every five more, since each stuff bit breaks the run.
         assert_eq!(bits(&Frame::new(0, &[])), 47 + 34 / 5);
     }
 
@@ -140,7 +143,7 @@ mod tests {
 
     #[test]
     fn the_crc_is_that_of_can() {
-        // Check value of CRC-15/CAN: the remainder of the digits 1 to 9 as text.
+        // Check value of CRC-15/CAN: the CRC of the text "123456789".
         let mut string = Bits { bits: 0, length: 0 };
         b"123456789".iter().for_each(|&digit| string.push(digit.into(), 8));
         assert_eq!(string.crc(), 0x059E);

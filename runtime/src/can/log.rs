@@ -1,6 +1,6 @@
-//! Traffic as text, the way `candump -L` writes it: `(1436509052.249713) can0 181#AABB`.
+//! Traffic as text in the format of `candump -L`: `(1436509052.249713) can0 181#AABB`.
 //!
-//! In: frames and times, or lines. Out: lines, or frames and times, or what is wrong with a line.
+//! In: frames and times, or lines. Out: lines, or frames and times, or a message about the error in a line.
 
 use super::Frame;
 use std::fmt;
@@ -8,11 +8,11 @@ use std::fmt;
 /// A frame of a log.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Entry {
-    /// Nanoseconds since 1970, or since whatever the log counts from.
+    /// Time in ns since 1970, or since the origin of the log.
     pub time_ns: u64,
-    /// The interface it came from.
+    /// The interface that received it.
     pub interface: String,
-    /// What it was.
+    /// The frame.
     pub frame: Frame,
 }
 
@@ -23,13 +23,13 @@ impl fmt::Display for Entry {
     }
 }
 
-/// Reads a line. None: an empty line, a comment, or an error frame, which is no traffic. Error: what is wrong.
+/// Parses a line. None: an empty line, a comment, or an error frame, which is no traffic. Error: the message.
 pub fn entry(line: &str) -> Result<Option<Entry>, String> {
     let line = line.trim();
     if line.is_empty() || line.starts_with('#') {
         return Ok(None);
     }
-    // What follows the frame is its direction, or nothing.
+    // Only the direction may follow the frame.
     let mut words = line.split_ascii_whitespace();
     let (Some(time), Some(interface), Some(frame)) = (words.next(), words.next(), words.next()) else {
         return Err(
@@ -44,7 +44,7 @@ pub fn entry(line: &str) -> Result<Option<Entry>, String> {
     Ok(parse_frame(frame)?.map(|frame| Entry { time_ns, interface: interface.into(), frame }))
 }
 
-/// Decimal seconds, kept whole: a float has no nanoseconds left after 1970.
+/// Parses decimal seconds without floating point, which has no resolution of nanoseconds for times since 1970.
 fn nanoseconds(text: &str) -> Option<u64> {
     let (seconds, fraction) = text.split_once('.').unwrap_or((text, "0"));
     let digits = fraction.len();
@@ -56,10 +56,10 @@ fn nanoseconds(text: &str) -> Option<u64> {
     seconds.checked_mul(1_000_000_000)?.checked_add(fraction * 10u64.pow(9 - digits as u32))
 }
 
-/// Marks an error frame in an identifier of eight digits.
+/// Flag of an error frame in an identifier of eight digits.
 const ERROR_FRAME: u32 = 0x2000_0000;
 
-/// Reads a frame as `cansend` takes it: `181#AABB`, `00000181#`, `701#R1`. None: an error frame.
+/// Parses a frame in the format of `cansend`: `181#AABB`, `00000181#`, `701#R1`. None: an error frame.
 pub fn parse_frame(text: &str) -> Result<Option<Frame>, String> {
     let wrong = |what: &str| format!("`{text}` is no frame: {what}");
     let (id, data) = text.split_once('#').ok_or_else(|| wrong("write 181#AABB"))?;

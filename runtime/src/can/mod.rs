@@ -1,6 +1,6 @@
-//! Frames and the one way they travel: a [`Bus`], whatever is behind it.
+//! CAN frames, and the [`Bus`] trait for all kinds of buses.
 //!
-//! In: addresses and frames. Out: frames, stamps and events of the bus. Knows no drive and no model.
+//! In: addresses and frames. Out: frames, timestamps and events of the bus. Knows no drive and no model.
 
 pub mod cob_ids;
 pub mod frame_length;
@@ -38,7 +38,7 @@ impl Frame {
     /// A data frame with an 11-bit identifier.
     ///
     /// # Panics
-    /// If the identifier or the data is too long: a mistake of the caller.
+    /// If the identifier or the data is too long: an error of the caller.
     pub fn new(id: u32, data: &[u8]) -> Frame {
         assert!(id < 0x800, "identifier {id:#x} has more than 11 bits");
         Frame::any(id, false, data)
@@ -47,25 +47,25 @@ impl Frame {
     /// A data frame with a 29-bit identifier.
     ///
     /// # Panics
-    /// If the identifier or the data is too long: a mistake of the caller.
+    /// If the identifier or the data is too long: an error of the caller.
     pub fn extended(id: u32, data: &[u8]) -> Frame {
         assert!(id < 1 << 29, "identifier {id:#x} has more than 29 bits");
         Frame::any(id, true, data)
     }
 
-    /// A remote frame with an 11-bit identifier that asks for `length` bytes.
+    /// A remote frame with an 11-bit identifier that requests `length` bytes.
     ///
     /// # Panics
-    /// If the identifier or the length is too long: a mistake of the caller.
+    /// If the identifier or the length is too long: an error of the caller.
     pub fn remote(id: u32, length: u8) -> Frame {
         assert!(id < 0x800 && length <= 8, "identifier {id:#x} or length {length} is too long");
         Frame { id, extended: false, remote: true, length, data: [0; 8] }
     }
 
-    /// A remote frame with a 29-bit identifier that asks for `length` bytes.
+    /// A remote frame with a 29-bit identifier that requests `length` bytes.
     ///
     /// # Panics
-    /// If the identifier or the length is too long: a mistake of the caller.
+    /// If the identifier or the length is too long: an error of the caller.
     pub fn remote_extended(id: u32, length: u8) -> Frame {
         assert!(id < 1 << 29 && length <= 8, "identifier {id:#x} or length {length} is too long");
         Frame { id, extended: true, remote: true, length, data: [0; 8] }
@@ -88,23 +88,23 @@ impl Frame {
         self.extended
     }
 
-    /// Whether it asks for data instead of carrying them.
+    /// Whether it requests data instead of carrying data.
     pub fn is_remote(&self) -> bool {
         self.remote
     }
 
-    /// Number of data bytes, or of bytes asked for.
+    /// Number of data bytes, or of requested bytes.
     pub fn length(&self) -> u8 {
         self.length
     }
 
-    /// The data; nothing in a remote frame.
+    /// The data; empty in a remote frame.
     pub fn data(&self) -> &[u8] {
         if self.remote { &[] } else { &self.data[..self.length as usize] }
     }
 }
 
-/// As `candump` and `cansend` write it: `181#AABB`, `080#`, `701#R1`.
+/// In the format of `candump` and `cansend`: `181#AABB`, `080#`, `701#R1`.
 impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self.extended {
@@ -124,21 +124,21 @@ impl fmt::Debug for Frame {
     }
 }
 
-/// Which frames come in.
+/// Acceptance filter for received frames.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub enum Filter {
-    /// All of them.
+    /// All frames.
     #[default]
     All,
-    /// Those with exactly these identifiers, 29-bit ones with [`Filter::EXTENDED`] added.
+    /// Frames with exactly these identifiers; [`Filter::EXTENDED`] is added to those of 29 bits.
     Only(Vec<u32>),
 }
 
 impl Filter {
-    /// Marks an identifier of 29 bits.
+    /// Flag of an identifier of 29 bits.
     pub const EXTENDED: u32 = 1 << 31;
 
-    /// Whether a frame comes in.
+    /// Whether a frame passes the filter.
     pub fn accepts(&self, frame: &Frame) -> bool {
         let extended = if frame.is_extended() { Filter::EXTENDED } else { 0 };
         match self {
@@ -148,59 +148,59 @@ impl Filter {
     }
 }
 
-/// What came from a bus.
+/// A frame or event received from a bus.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Received {
-    /// A frame, and when it came.
+    /// A frame, and the time of its arrival.
     Frame(Frame, u64),
-    /// The bus has something to say of itself.
+    /// An event of the bus itself, and its time.
     Event(Event, u64),
 }
 
-/// What a bus says of itself. Error frames are events, never frames.
+/// Event of a bus. Error frames are events, never frames.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Event {
-    /// More than 96 errors of one kind counted.
+    /// An error counter exceeds 96.
     Warning,
-    /// Error counters above 127: nobody hears our error flags any more.
+    /// An error counter exceeds 127: error passive, other nodes no longer see our error flags.
     Passive,
-    /// Counter above 255: we no longer take part.
+    /// The transmit error counter exceeds 255: bus-off, we no longer take part.
     BusOff,
     /// Active again after [`Event::BusOff`].
     Restarted,
-    /// Nobody acknowledged a frame of ours.
+    /// No node acknowledged our frame.
     NotAcknowledged,
-    /// This many frames were lost before we read them.
+    /// This many frames were lost before they were read.
     Lost(u32),
     /// Any other error frame.
     Error,
-    /// The interface went down or the other end closed.
+    /// The interface went down, or the other end closed the connection.
     Down,
 }
 
-/// Why a frame was not taken.
+/// Reason why a bus refused a frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Refused {
-    /// The queue towards the bus is full: a fault of the bus, never a reason to wait.
+    /// The transmit queue is full: a fault of the bus, never a reason to wait.
     Full,
-    /// Bus-off, interface down, other end gone.
+    /// Bus-off, interface down, or the other end is gone.
     Down,
-    /// Nothing that this bus carries: a remote frame over socketcand, anything over one that only listens.
+    /// This bus cannot send it: a remote frame over socketcand, any frame over a listen-only bus.
     Unable,
 }
 
-/// How a bus is.
+/// Health of a bus.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Health {
-    /// As the controller tells it.
+    /// State of the controller, as it reports it.
     pub state: State,
     /// Transmit error counter.
     pub transmit_errors: u16,
     /// Receive error counter.
     pub receive_errors: u16,
-    /// Frames lost on their way to us.
+    /// Received frames that were lost.
     pub lost: u64,
-    /// Frames of ours that were refused.
+    /// Frames to send that were refused.
     pub refused: u64,
 }
 
@@ -215,35 +215,36 @@ pub enum State {
     Down,
 }
 
-/// A bus. None of its calls allocates, and only [`wait`](Bus::wait) waits.
+/// A bus. None of its methods allocates, and only [`wait`](Bus::wait) blocks.
 pub trait Bus {
-    /// Hands over a frame; does not wait for it to be sent. Own frames don't come back.
+    /// Queues a frame without waiting for its transmission. Our own frames are not received back.
     fn send(&mut self, frame: Frame) -> Result<(), Refused>;
 
-    /// The next thing that came, if any.
+    /// The next received frame or event, if any.
     fn receive(&mut self) -> Option<Received>;
 
-    /// Waits until something can be received or the clock shows `until_ns`; says whether something came. On a line of text that
-    /// may be an answer, or a part of a frame, of which [`receive`](Bus::receive) makes nothing yet.
+    /// Waits until something can be received or the clock reaches `until_ns`; returns whether something arrived. On a
+    /// text protocol that may be an answer or a part of a frame, from which [`receive`](Bus::receive) returns nothing
+    /// yet.
     fn wait(&mut self, until_ns: u64) -> bool;
 
-    /// How it is.
+    /// Its health.
     fn health(&self) -> Health;
 
-    /// What becomes readable when something came; none where no kernel is involved.
+    /// A descriptor that becomes readable when something has arrived; none where no kernel is involved.
     fn descriptor(&self) -> Option<RawFd> {
         None
     }
 
-    /// A frame made ready to be sent by another thread or by a signal handler, whatever this bus is in the middle of. None
-    /// where no kernel is involved.
+    /// Encodes a frame so that another thread or a signal handler can send it at any time, whatever this bus is doing.
+    /// None where no kernel is involved.
     fn prepare(&self, frame: Frame) -> Option<Prepared> {
         let _ = frame;
         None
     }
 }
 
-/// A frame as the bytes that one write(2) sends. Valid as long as the bus that made it.
+/// A frame as bytes for one write(2). Valid as long as the bus that made it.
 #[derive(Clone, Copy, Debug)]
 pub struct Prepared {
     fd: RawFd,
@@ -258,37 +259,37 @@ impl Prepared {
         Prepared { fd, bytes, length: from.len() as u8 }
     }
 
-    /// Sends it: one system call that is allowed in a signal handler, no allocation, no lock. False if it was not taken.
+    /// Sends the frame: one async-signal-safe system call, no allocation, no lock. False if it was refused.
     pub fn send(&self) -> bool {
         let bytes = &self.bytes[..usize::from(self.length)];
         descriptor::write(self.fd, bytes) == descriptor::Moved::Bytes(bytes.len())
     }
 }
 
-/// How a bus is opened.
+/// Options for opening a bus.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Options {
-    /// Bits a second: what a simulated bus gets and an adapter is told. An interface of the kernel is compared with it
-    /// and never set.
+    /// Bit rate, bits per second: set for a simulated bus and an adapter. That of a kernel interface is checked against
+    /// it and never set.
     pub bit_rate: Option<u32>,
-    /// What is received.
+    /// Acceptance filter.
     pub filter: Filter,
-    /// Never to send.
+    /// Never send.
     pub listen_only: bool,
 }
 
-/// Why a bus can't be opened.
+/// Reason why a bus cannot be opened.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct CannotOpen {
-    /// Which one.
+    /// The address of the bus.
     pub address: String,
-    /// What is wrong.
+    /// The problem.
     pub reason: String,
-    /// What to do about it.
+    /// Its remedy.
     pub remedy: Option<String>,
 }
 
-/// The first line says what is wrong, the second what mends it.
+/// The first line names the problem, the second one its remedy.
 impl fmt::Display for CannotOpen {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{}: {}", self.address, self.reason)?;
@@ -296,12 +297,13 @@ impl fmt::Display for CannotOpen {
     }
 }
 
-/// Bits a second of a simulated bus that nobody gave any.
+/// Default bit rate of a simulated bus, bits per second.
 const BIT_RATE: u32 = 1_000_000;
 
-/// Opens a bus, whatever its kind. `name` is how the node is called on a simulated one.
+/// Opens a bus of any kind. `name`: name of our node on a simulated bus.
 ///
-/// Real buses stamp with the clock of the world, which therefore must be real: a simulated time can't wait for them.
+/// Real buses use the clock of `world` for timestamps, which must therefore be a real clock: a simulated one cannot
+/// wait for them.
 pub fn open(address: &Address, options: &Options, world: &Simulation, name: &str) -> Result<Box<dyn Bus>, CannotOpen> {
     let clock = || {
         world.monotonic().ok_or_else(|| CannotOpen {

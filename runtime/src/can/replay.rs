@@ -1,7 +1,8 @@
-//! A log of candump as a bus: what was recorded comes again at its recorded times.
+//! A log of candump as a bus: replays the recorded frames at their recorded times.
 //!
-//! In: a log. Out: its frames, the first one when the bus is opened. A frame that is sent stands for the recorded one of
-//! its identifier: from then on those no longer come in, and each one sent is compared with the next one recorded.
+//! In: a log. Out: its frames, the first one when the bus is opened. A frame that we send takes the place of the
+//! recorded frames with its identifier: these are no longer received, and each sent frame is compared with the next
+//! recorded one.
 
 use super::log::{self, Entry};
 use super::sim::Simulation;
@@ -12,14 +13,14 @@ use std::path::Path;
 /// A log as a bus.
 pub struct Replay {
     world: Simulation,
-    /// When the first frame is due.
+    /// Time at which the first frame is due.
     origin_ns: u64,
     entries: Vec<Recorded>,
-    /// All before have come, or were ours.
+    /// Index of the next frame: all frames before have been received, or were ours.
     next: usize,
     filter: Filter,
     listen_only: bool,
-    /// Sent frames that differ from the log, and are not told yet.
+    /// Number of sent frames that differ from the log and have not been reported yet.
     differences: u32,
     health: Health,
 }
@@ -27,13 +28,13 @@ pub struct Replay {
 struct Recorded {
     after_ns: u64,
     frame: Frame,
-    /// Sent by us: it doesn't come in, and is compared.
+    /// We send it: it is not received, and is compared.
     ours: bool,
     compared: bool,
 }
 
 impl Replay {
-    /// Reads a log; it begins now.
+    /// Opens a log; its replay begins now.
     pub fn open(path: &Path, options: &Options, world: Simulation) -> Result<Replay, CannotOpen> {
         let cannot = |reason: String| CannotOpen {
             address: format!("replay:{}", path.display()),
@@ -69,7 +70,7 @@ impl Replay {
         })
     }
 
-    /// When the next frame that is not ours is due.
+    /// Time at which the next frame is due that is not ours.
     fn due_ns(&mut self) -> Option<u64> {
         while self.entries.get(self.next).is_some_and(|entry| entry.ours || !self.filter.accepts(&entry.frame)) {
             self.next += 1;
@@ -79,7 +80,7 @@ impl Replay {
 }
 
 impl Bus for Replay {
-    /// Frames of an identifier that the log does not have are taken and forgotten.
+    /// A frame with an identifier that the log does not contain is accepted and ignored.
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
         if self.listen_only {
             return Err(Refused::Unable);

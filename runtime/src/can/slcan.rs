@@ -1,11 +1,13 @@
-//! Frames as lines of text on a terminal: serial adapters, and pseudo-terminals that speak like one.
+//! The slcan protocol: frames as lines of text on a terminal, for serial adapters and pseudo-terminals with the same
+//! protocol.
 //!
-//! In: frames. Out: frames, stamped when they were read. Both ends are here: [`Slcan::open`] speaks to an adapter,
-//! [`Slcan::door`] is one. A terminal tells nothing of errors on the bus behind it.
+//! In: frames. Out: frames, with the time at which they were read. Both ends are here: [`Slcan::open`] connects to an
+//! adapter, [`Slcan::door`] is one. The protocol does not report bus errors.
 //!
 //! A line ends in CR. `t1232AABB` is a frame with 11-bit identifier 123 and two bytes, `T` has 8 digits of identifier,
-//! `r` and `R` are remote. Commands: `S0`…`S8` bit rate, `O` open, `L` listen, `C` close, `V` version, `N` serial number,
-//! `F` flags, `Z1` time stamps. An adapter answers `z` or `Z` to frames, an empty line to commands, BEL to what it refuses.
+//! `r` and `R` are remote. Commands: `S0`…`S8` bit rate, `O` open, `L` listen, `C` close, `V` version, `N` serial
+//! number, `F` flags, `Z1` timestamps. An adapter answers frames by `z` or `Z`, commands by an empty line, and refuses
+//! by BEL.
 
 use super::address::SLCAN_BIT_RATES;
 use super::descriptor::{self, Incoming, Moved, Outgoing};
@@ -17,13 +19,13 @@ use std::os::fd::{AsRawFd, FromRawFd, OwnedFd, RawFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-/// Bytes on their way out, some 150 frames: more is a terminal that takes nothing.
+/// Capacity for bytes to send, some 150 frames: a full buffer means that the terminal accepts nothing.
 const OUTGOING: usize = 4096;
 
-/// Bytes read and not yet understood: a burst of 2,000 frames fits.
+/// Capacity for received bytes: a burst of 2,000 frames fits.
 const INCOMING: usize = 128 * 1024;
 
-/// The longest line: `T`, identifier, length, data, time stamp, CR.
+/// Length of the longest line: `T`, identifier, length, data, timestamp, CR.
 const LINE: usize = 1 + 8 + 1 + 16 + 4 + 1;
 
 const CR: u8 = b'\r';
@@ -57,9 +59,9 @@ struct Adapter {
     open: bool,
     listen_only: bool,
     stamps: bool,
-    /// Our own handle of the computer's end: without it the terminal would be gone whenever nobody has it open.
+    /// Our own handle of the computer's end: without it the terminal would hang up whenever no program has it open.
     _end: File,
-    /// Where the computer's end is, and the link to it with a name that stays.
+    /// Path of the computer's end, and a link to it with a constant name.
     path: PathBuf,
     link: Option<PathBuf>,
 }
@@ -98,14 +100,15 @@ impl Slcan {
         })?;
         let side = Side::Computer { listen_only: options.listen_only };
         let mut bus = Slcan::new(file.into(), clock, side, options.filter.clone());
-        // An empty line ends whatever was half said before; closing first, because an open bus refuses a bit rate.
+        // An empty line terminates any partial line; the bus is closed first, because an open bus refuses a bit rate.
         let open = if options.listen_only { 'L' } else { 'O' };
         bus.outgoing.push(format!("\r\rC\rS{code}\r{open}\r").as_bytes());
         bus.outgoing.flush(bus.fd.as_raw_fd());
         Ok(bus)
     }
 
-    /// Makes a pseudo-terminal that speaks like an adapter; `link` becomes a symbolic link to it, until this is dropped.
+    /// Creates a pseudo-terminal that behaves like an adapter; `link` becomes a symbolic link to it, until this is
+    /// dropped.
     pub fn door(link: Option<&Path>, clock: Monotonic) -> Result<Slcan, CannotOpen> {
         let cannot = |error: io::Error| CannotOpen {
             address: link.map_or("a pseudo-terminal".into(), |link| link.display().to_string()),
@@ -113,13 +116,13 @@ impl Slcan {
             remedy: Some("name a path that does not exist yet, in a folder that can be written".into()),
         };
         let (fd, path) = pseudo_terminal().map_err(cannot)?;
-        // Both ends raw: a terminal would make LF of CR and echo what it hears.
+        // Both ends raw: otherwise the terminal would convert CR to LF and echo its input.
         let ends = make_raw(fd.as_raw_fd())
             .and_then(|()| OpenOptions::new().read(true).write(true).custom_flags(libc::O_NOCTTY).open(&path));
         let end = ends.and_then(|end| make_raw(end.as_raw_fd()).map(|()| end)).map_err(cannot)?;
         descriptor::unblock(fd.as_raw_fd()).map_err(cannot)?;
         if let Some(link) = link {
-            // What is left of a door that was killed leads nowhere, and may go.
+            // The link of a killed process is dangling, and may be removed.
             if link.is_symlink() && !link.exists() {
                 std::fs::remove_file(link).map_err(cannot)?;
             }
@@ -135,7 +138,7 @@ impl Slcan {
         Slcan { fd, clock, side, filter, incoming, outgoing, health: Health::default(), down_told: false }
     }
 
-    /// Where the computer's end of a door is.
+    /// Path of the computer's end of a door.
     pub fn path(&self) -> Option<&Path> {
         match &self.side {
             Side::Computer { .. } => None,
@@ -149,12 +152,12 @@ impl Slcan {
         (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
     }
 
-    /// The next line that is a frame, or BEL where an adapter refused one.
+    /// The next frame among the received lines; an adapter executes and answers commands on the way.
     fn next(&mut self) -> Option<Received> {
         loop {
             let now_ns = self.clock.now_ns();
             let line = self.incoming.message(is_end)?;
-            // Answers to frames stand before what follows them.
+            // Answers to frames precede the next frame without a separator.
             let line = line.trim_ascii_start();
             let frame = decode(line);
             match &mut self.side {
@@ -175,7 +178,7 @@ impl Slcan {
                         (Some(_), _) => &[BEL],
                         (None, line) => adapter.command(line),
                     };
-                    // An answer that does not fit is one to a computer that reads nothing.
+                    // An answer that does not fit is for a computer that reads nothing.
                     self.outgoing.push(answer);
                 }
             }
@@ -184,7 +187,7 @@ impl Slcan {
 }
 
 impl Adapter {
-    /// Does what a command says; the answer.
+    /// Executes a command and returns the answer.
     fn command(&mut self, line: &[u8]) -> &'static [u8] {
         match line {
             [] => b"",
@@ -201,7 +204,7 @@ impl Adapter {
                 b"\r"
             }
             [b'S', b'0'..=b'8'] => b"\r",
-            // Bit timing registers, acceptance code and mask: there is nothing here to set.
+            // Bit timing registers, acceptance code and mask have no meaning here.
             [b's', ..] | [b'M', ..] | [b'm', ..] => b"\r",
             [b'Z', on @ (b'0' | b'1')] => {
                 self.stamps = *on == b'1';
@@ -218,7 +221,7 @@ impl Adapter {
 impl Bus for Slcan {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
         let stamp = match &self.side {
-            // Nobody has opened the bus: nobody is meant.
+            // Nobody has opened the bus, so the frame has no recipient.
             Side::Adapter(adapter) if !adapter.open => return Ok(()),
             Side::Adapter(adapter) => adapter.stamps.then(|| (self.clock.now_ns() / 1_000_000 % 60_000) as u16),
             Side::Computer { listen_only: true } => return Err(Refused::Unable),
@@ -244,7 +247,7 @@ impl Bus for Slcan {
         let received = self.next().or_else(|| match self.incoming.fill(self.fd.as_raw_fd()) {
             Moved::Bytes(_) => {
                 let received = self.next();
-                // A line without an end is no line.
+                // A line of excessive length without an end is discarded.
                 if received.is_none() && self.incoming.unfinished() > 4 * LINE {
                     self.incoming.discard();
                     self.health.lost += 1;
@@ -278,7 +281,7 @@ impl Bus for Slcan {
         Some(self.fd.as_raw_fd())
     }
 
-    /// It begins with an empty line: what was half written before can't swallow it.
+    /// Begins with an empty line, which terminates a partially written line.
     fn prepare(&self, frame: Frame) -> Option<Prepared> {
         let mut line = [CR; 1 + LINE];
         let mut text = [0; LINE];
@@ -296,7 +299,7 @@ impl Drop for Slcan {
                 self.outgoing.flush(self.fd.as_raw_fd());
             }
             Side::Adapter(Adapter { link: Some(link), path, .. }) => {
-                // Somebody may have put another one there.
+                // Another process may have replaced the link.
                 if std::fs::read_link(link).is_ok_and(|target| target == *path) {
                     let _ = std::fs::remove_file(link);
                 }
@@ -306,7 +309,7 @@ impl Drop for Slcan {
     }
 }
 
-/// Writes a frame as a line; its length.
+/// Encodes a frame as a line; returns its length.
 fn encode(frame: &Frame, stamp: Option<u16>, line: &mut [u8; LINE]) -> usize {
     let mut at = 0;
     let mut put = |value: u32, digits: u32| {
@@ -315,7 +318,7 @@ fn encode(frame: &Frame, stamp: Option<u16>, line: &mut [u8; LINE]) -> usize {
             at += 1;
         }
     };
-    // The letter is put last, over the leading zero.
+    // The letter is written last, over the leading zero.
     put(0, 1);
     put(frame.id(), if frame.is_extended() { 8 } else { 3 });
     put(frame.length().into(), 1);
@@ -333,7 +336,7 @@ fn encode(frame: &Frame, stamp: Option<u16>, line: &mut [u8; LINE]) -> usize {
     at + 1
 }
 
-/// The frame that a line says; a time stamp behind it is not read.
+/// Decodes the frame of a line; ignores a timestamp after it.
 fn decode(line: &[u8]) -> Option<Frame> {
     let (&letter, rest) = line.split_first()?;
     let (extended, remote) = match letter {
@@ -363,12 +366,12 @@ fn decode(line: &[u8]) -> Option<Frame> {
     Some(if extended { Frame::extended(id, &data[..length]) } else { Frame::new(id, &data[..length]) })
 }
 
-/// A hexadecimal number.
+/// Parses a hexadecimal number.
 fn number(digits: &[u8]) -> Option<u32> {
     digits.iter().try_fold(0, |number, &digit| Some(number << 4 | char::from(digit).to_digit(16)?))
 }
 
-/// Lets a terminal carry bytes as they are.
+/// Sets a terminal to raw mode.
 fn make_raw(fd: RawFd) -> io::Result<()> {
     // SAFETY: all bytes 0 is a valid termios.
     let mut settings: libc::termios = unsafe { std::mem::zeroed() };
@@ -376,8 +379,8 @@ fn make_raw(fd: RawFd) -> io::Result<()> {
     if unsafe { libc::tcgetattr(fd, &mut settings) } != 0 {
         return Err(io::Error::last_os_error());
     }
-    // SAFETY: both work on valid settings. The speed concerns only a real serial line; it is written where Linux keeps it,
-    // since the function that does so has no name that a static program could be linked with.
+    // SAFETY: both calls get valid settings. The speed concerns only a real serial line. It is set in the fields
+    // directly, because the symbol of the function for it is not available to a static program.
     let set = unsafe {
         libc::cfmakeraw(&mut settings);
         settings.c_cflag = (settings.c_cflag & !libc::CBAUD) | libc::B115200 | libc::CLOCAL | libc::CREAD;
@@ -387,7 +390,7 @@ fn make_raw(fd: RawFd) -> io::Result<()> {
     if set == 0 { Ok(()) } else { Err(io::Error::last_os_error()) }
 }
 
-/// A pseudo-terminal: the adapter's end, and where the computer's end is.
+/// A pseudo-terminal: the descriptor of the adapter's end, and the path of the computer's end.
 fn pseudo_terminal() -> io::Result<(OwnedFd, PathBuf)> {
     // SAFETY: takes no pointers.
     let fd = unsafe { libc::posix_openpt(libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC) };
@@ -449,7 +452,7 @@ mod tests {
         use std::io::{Read, Write};
         descriptor::unblock(computer.as_raw_fd()).expect("a descriptor");
         let clock = Monotonic::new();
-        // The kernel hands bytes from end to end when it comes to it: what is there may be a part of them.
+        // The kernel transfers bytes between the ends asynchronously: the available bytes may be only a part.
         let mut says = |text: &str, frames: usize, answer: &str| {
             computer.write_all(text.as_bytes()).expect("written");
             let until_ns = clock.now_ns() + 10_000_000_000;
@@ -462,12 +465,12 @@ mod tests {
             }
             assert_eq!((got, answered.as_str()), (frames, answer), "{text:?}");
         };
-        // As python-can does: closed twice, an empty line, opened twice.
+        // The sequence of python-can: closed twice, an empty line, opened twice.
         says("C\rS8\r\rO\rO\r", 0, "\r\r\r\r");
         says("V\rN\rF\r", 0, "V1013\rN0001\rF00\r");
         says("t0800\rT000000010\r", 2, "z\rZ\r");
         says("quatsch\r", 0, "\u{7}");
-        // Nothing is sent on a closed bus, nor by who only listens.
+        // Nothing is sent on a closed bus, nor on a listen-only one.
         says("C\rt0800\r", 0, "\r\u{7}");
         says("L\rt0800\r", 0, "\r\u{7}");
     }

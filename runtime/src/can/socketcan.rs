@@ -1,7 +1,8 @@
-//! An interface of the kernel: raw sockets of Linux.
+//! SocketCAN: raw sockets of Linux on a kernel interface.
 //!
-//! In: frames. Out: frames with the kernel's own time stamps, error frames as events, and every loss counted. Only this
-//! file knows the crate of that name; it sets nothing of an interface, it looks at it and says what would mend it.
+//! In: frames. Out: frames with the kernel's timestamps, error frames as events, and counts of all losses. Only this
+//! file uses the crate `socketcan`. It does not configure an interface to open it, but inspects it and reports how to
+//! fix it.
 
 use super::descriptor;
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
@@ -10,7 +11,7 @@ use ::socketcan::{CanFilter, CanInterface, CanSocket, Socket, SocketOptions, nl}
 use std::io;
 use std::os::fd::{AsRawFd, RawFd};
 
-/// Bytes of the receive buffer: some 10,000 frames, each with the kernel's own notes of it.
+/// Size of the receive buffer, bytes: some 10,000 frames with the kernel's metadata.
 const BUFFER: libc::c_int = 8 << 20;
 
 /// A raw socket on an interface.
@@ -18,33 +19,33 @@ pub struct SocketCan {
     socket: CanSocket,
     clock: Monotonic,
     health: Health,
-    /// Frames the socket has dropped since it was opened, as the kernel counts them.
+    /// Number of frames that the socket has dropped since it was opened, as counted by the kernel.
     dropped: u32,
-    /// Came behind a loss that is told first.
+    /// A frame received after a loss; the loss is reported first.
     held: Option<Received>,
     listen_only: bool,
-    /// Whether it was told already that the interface is down.
+    /// Whether the loss of the interface has been reported.
     down_told: bool,
 }
 
-/// What the kernel says of an interface.
+/// The kernel's information about an interface.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Interface {
     /// Whether it is up.
     pub up: bool,
-    /// Bits a second; a virtual one has none.
+    /// Bit rate, bits per second; none for a virtual interface.
     pub bit_rate: Option<u32>,
-    /// State of its controller; a virtual one has none.
+    /// State of its controller; none for a virtual interface.
     pub state: Option<State>,
-    /// Milliseconds after which it comes back from bus-off by itself; 0 is never, and right for a rig.
+    /// Time after which it restarts automatically from bus-off, ms; 0: never, which is right for a rig.
     pub restart_ms: Option<u32>,
     /// Transmit and receive error counter.
     pub errors: Option<(u16, u16)>,
-    /// Frames the kernel queues towards it. 10 is right: a long queue hides a bus that takes nothing.
+    /// Length of the kernel's transmit queue, frames. 10 is right: a long queue hides a bus that accepts nothing.
     pub queue: Option<u32>,
 }
 
-/// Looks at an interface. Error: there is none of that name, or the kernel has no CAN, or doesn't say.
+/// Inspects an interface. Error: it does not exist, or the kernel has no CAN support or gives no information.
 pub fn inspect(name: &str) -> Result<Interface, String> {
     let class = std::path::Path::new("/sys/class/net").join(name);
     if !class.exists() {
@@ -69,7 +70,7 @@ pub fn inspect(name: &str) -> Result<Interface, String> {
     })
 }
 
-/// Makes a virtual interface and takes it up: needs CAP_NET_ADMIN, for tests and gateways.
+/// Creates a virtual interface and takes it up: needs CAP_NET_ADMIN, for tests and gateways.
 pub fn make_virtual(name: &str) -> Result<(), String> {
     let made = CanInterface::create_vcan(name, None).and_then(|interface| interface.bring_up());
     made.map_err(|error| format!("cannot make {name}: {error}"))
@@ -94,7 +95,7 @@ pub fn take_down(name: &str) -> Result<(), String> {
 }
 
 impl SocketCan {
-    /// Opens an interface that is up, with the bit rate that is asked for.
+    /// Opens an interface, which must be up and have the requested bit rate.
     pub fn open(name: &str, options: &Options, clock: Monotonic) -> Result<SocketCan, CannotOpen> {
         let cannot = |reason: String, remedy: String| CannotOpen {
             address: format!("socketcan:{name}"),
@@ -125,7 +126,7 @@ impl SocketCan {
         socket.set_nonblocking(true)?;
         match &options.filter {
             Filter::All => socket.set_filter_accept_all()?,
-            // An empty list means nothing at all, which is what was asked for.
+            // An empty list of filters means no frame at all, as requested.
             Filter::Only(ids) => {
                 let exactly = |&id: &u32| match id & Filter::EXTENDED {
                     0 => CanFilter::new(id, libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG),
@@ -134,11 +135,11 @@ impl SocketCan {
                 socket.set_filters(&ids.iter().map(exactly).collect::<Vec<_>>())?;
             }
         }
-        // Off unless asked for: without it a bus that is off looks like one that is quiet.
+        // Error frames are off by default, and a bus that is off would then look like a silent one.
         socket.set_error_filter_accept_all()?;
         socket.set_recv_timestamp(true)?;
         socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RXQ_OVFL, 1)?;
-        // Beyond the limit for everybody only with CAP_NET_ADMIN.
+        // Exceeding the system's limit requires CAP_NET_ADMIN.
         if socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUFFORCE, BUFFER).is_err() {
             socket.set_socket_option_int(libc::SOL_SOCKET, libc::SO_RCVBUF, BUFFER)?;
         }
@@ -154,12 +155,12 @@ impl SocketCan {
         })
     }
 
-    /// One message from the kernel: a frame, when it came, and how many were dropped until then.
+    /// One message from the kernel: a frame, its timestamp, and the number of frames dropped so far.
     fn message(&mut self) -> io::Result<(libc::can_frame, u64, u32)> {
         // SAFETY: all bytes 0 is a valid frame.
         let mut frame: libc::can_frame = unsafe { std::mem::zeroed() };
         let mut part = libc::iovec { iov_base: (&raw mut frame).cast(), iov_len: size_of::<libc::can_frame>() };
-        // Eight bytes each keep the headers in it aligned.
+        // Elements of eight bytes, so that the headers in it are aligned.
         let mut control = [0u64; 16];
         // SAFETY: all bytes 0 is a valid header: no name, no parts.
         let mut header: libc::msghdr = unsafe { std::mem::zeroed() };
@@ -173,37 +174,38 @@ impl SocketCan {
             return Err(io::Error::last_os_error());
         }
         let (mut stamp, mut dropped) = (None, self.dropped);
-        // SAFETY: the kernel has filled the header; the macros walk within its control buffer.
+        // SAFETY: the kernel has filled the header; the macros stay within its control buffer.
         let mut note = unsafe { libc::CMSG_FIRSTHDR(&header) };
         while !note.is_null() {
-            // SAFETY: a note that the macros give is whole and lies within the buffer.
+            // SAFETY: a control message returned by the macros is complete and lies within the buffer.
             let (kind, data) = unsafe { ((*note).cmsg_type, libc::CMSG_DATA(note)) };
             match kind {
-                // SAFETY: a note of this kind carries a timespec; it need not be aligned for one.
+                // SAFETY: a control message of this kind contains a timespec, possibly unaligned.
                 libc::SCM_TIMESTAMPNS => stamp = Some(unsafe { data.cast::<libc::timespec>().read_unaligned() }),
-                // SAFETY: a note of this kind carries 32 bits; they need not be aligned.
+                // SAFETY: a control message of this kind contains 32 bits, possibly unaligned.
                 libc::SO_RXQ_OVFL => dropped = unsafe { data.cast::<u32>().read_unaligned() },
                 _ => {}
             }
-            // SAFETY: as above; null behind the last one.
+            // SAFETY: as above; null after the last one.
             note = unsafe { libc::CMSG_NXTHDR(&header, note) };
         }
         Ok((frame, stamp.map_or_else(|| self.clock.now_ns(), |stamp| self.stamp_ns(stamp)), dropped))
     }
 
-    /// The kernel stamps with the time of day; what was since then is the same on every clock.
+    /// Converts a timestamp of the kernel, which is wall-clock time, by its age, which is the same on every clock.
     fn stamp_ns(&self, stamp: libc::timespec) -> u64 {
         let mut day = libc::timespec { tv_sec: 0, tv_nsec: 0 };
         // SAFETY: the time is written by the call and outlives it.
         unsafe { libc::clock_gettime(libc::CLOCK_REALTIME, &mut day) };
         let now_ns = self.clock.now_ns();
         let ns = |time: libc::timespec| i128::from(time.tv_sec) * 1_000_000_000 + i128::from(time.tv_nsec);
-        // A clock of day that was set meanwhile must not bring a frame from the future.
+        // If the wall clock was set meanwhile, the frame must not come from the future.
         let age_ns = u64::try_from(ns(day) - ns(stamp)).unwrap_or(0);
         now_ns.saturating_sub(age_ns)
     }
 
-    /// What the socket dropped since the last frame: notes travel with frames, and the tail of a burst has none behind it.
+    /// Frames dropped since the last received frame: the counter arrives with frames, so the end of a burst needs a
+    /// query of its own.
     fn dropped_behind(&mut self) -> Option<Received> {
         let mut memory = [0u32; MEMINFO];
         let mut length = size_of_val(&memory) as libc::socklen_t;
@@ -217,7 +219,7 @@ impl SocketCan {
         (lost > 0).then(|| Received::Event(Event::Lost(lost), self.clock.now_ns()))
     }
 
-    /// How many more the kernel has dropped than it had; they are counted.
+    /// Number of frames dropped since the last call; adds it to the health.
     fn lost(&mut self, dropped: u32) -> u32 {
         let lost = dropped.wrapping_sub(self.dropped);
         self.dropped = dropped;
@@ -231,7 +233,7 @@ impl SocketCan {
         (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
     }
 
-    /// What an error frame says, and what follows for the health. None: nothing worth telling.
+    /// The event of an error frame; updates the health. None: not worth reporting.
     fn event(&mut self, frame: &libc::can_frame) -> Option<Event> {
         let class = frame.can_id & libc::CAN_ERR_MASK;
         let controller = libc::c_int::from(frame.data[1]);
@@ -252,7 +254,7 @@ impl SocketCan {
             return Some(Event::Passive);
         }
         if is(libc::CAN_ERR_CRTL_RX_OVERFLOW) {
-            // The controller doesn't say how many.
+            // The controller does not report how many.
             self.health.lost += 1;
             return Some(Event::Lost(1));
         }
@@ -272,10 +274,10 @@ impl SocketCan {
     }
 }
 
-/// Values that SO_MEMINFO tells; the last one is of drops.
+/// Number of values of SO_MEMINFO; the last one counts dropped frames.
 const MEMINFO: usize = libc::SK_MEMINFO_DROPS as usize + 1;
 
-/// Error counters are in the last two bytes. Newer than the crate libc.
+/// Flag: the last two bytes hold error counters. Newer than the libc crate.
 const CAN_ERR_CNT: u32 = 0x200;
 
 impl Bus for SocketCan {
@@ -288,12 +290,13 @@ impl Bus for SocketCan {
         // SAFETY: the bytes are valid for their length and outlive the call.
         let write = || unsafe { libc::write(fd, bytes.as_ptr().cast(), bytes.len()) } == bytes.len() as isize;
         let full = |error: &io::Error| matches!(error.raw_os_error(), Some(libc::ENOBUFS | libc::EAGAIN | libc::EINTR));
-        // A socket keeps the news that its interface was down, and a write gets it even when that is over.
+        // A socket stores the error that its interface was down, and a write returns it even after the interface is up
+        // again.
         if write() || !full(&io::Error::last_os_error()) && write() {
             return Ok(());
         }
         self.health.refused += 1;
-        // The queue towards the interface, or the socket's own.
+        // The queue of the interface, or the socket's own.
         if full(&io::Error::last_os_error()) {
             return Err(Refused::Full);
         }
@@ -351,7 +354,7 @@ impl Bus for SocketCan {
     }
 }
 
-/// A frame as the kernel takes it: `struct can_frame`.
+/// Encodes a frame as the kernel's `struct can_frame`.
 fn encode(frame: &Frame) -> [u8; size_of::<libc::can_frame>()] {
     let mut bytes = [0; size_of::<libc::can_frame>()];
     let extended = if frame.is_extended() { libc::CAN_EFF_FLAG } else { 0 };

@@ -1,10 +1,10 @@
-//! Frames as messages of text over TCP, as socketcand speaks them.
+//! The socketcand protocol: frames as text messages over TCP.
 //!
-//! In: frames. Out: frames, stamped when they were read. Both ends are here: [`Client`] speaks to a gateway, [`Server`] is
-//! one. The protocol knows no remote frames and tells nothing of errors on the bus behind it.
+//! In: frames. Out: frames, with the time at which they were read. Both ends are here: [`Client`] connects to a
+//! gateway, [`Server`] is one. The protocol has no remote frames and does not report bus errors.
 //!
-//! The server greets `< hi >`; the client says `< open can0 >` and `< rawmode >`, each answered `< ok >`; then frames go as
-//! `< send 123 2 aa b >` and come as `< frame 123 1700000000.123456 AABB >`.
+//! The server sends `< hi >`; the client sends `< open can0 >` and `< rawmode >`, each answered by `< ok >`. Then the
+//! client sends frames as `< send 123 2 aa b >` and receives them as `< frame 123 1700000000.123456 AABB >`.
 
 use super::descriptor::{self, Incoming, Moved, Outgoing};
 use super::{Bus, CannotOpen, Event, Filter, Frame, Health, Options, Prepared, Received, Refused, State};
@@ -14,26 +14,26 @@ use std::net::{TcpListener, TcpStream, ToSocketAddrs};
 use std::os::fd::{AsRawFd, RawFd};
 use std::time::{Duration, SystemTime};
 
-/// Bytes on their way out: beyond what the kernel takes, a few hundred frames.
+/// Capacity for bytes to send, in addition to the kernel's buffer: a few hundred frames.
 const OUTGOING: usize = 16 * 1024;
 
-/// Bytes read and not yet understood: a burst of 2,000 frames fits.
+/// Capacity for received bytes: a burst of 2,000 frames fits.
 const INCOMING: usize = 256 * 1024;
 
-/// An unfinished message of this length is thrown away, as socketcand does.
+/// An incomplete message of this length is discarded, as by socketcand.
 const UNFINISHED: usize = 200;
 
-/// The longest message is that of a frame with 8 bytes.
+/// Length of the longest message, a frame with 8 bytes.
 const MESSAGE: usize = 80;
 
-/// How long a gateway may take to answer.
+/// Longest time for a gateway to answer.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// How long after rawmode a client may still be busy reading the answer: some take each answer with one read and compare
-/// it whole, so that a frame behind it breaks the handshake.
+/// Time after rawmode in which a client may still read the answer: some clients read each answer by one call and
+/// compare it as a whole, so that a frame right after it would break the handshake.
 const PAUSE_NS: u64 = 20_000_000;
 
-/// A stream, with what both ends need.
+/// A TCP stream with the state that both ends need.
 struct Stream {
     tcp: TcpStream,
     clock: Monotonic,
@@ -53,11 +53,11 @@ impl Stream {
         Ok(stream)
     }
 
-    /// The other end may hold its next message back until this one is acknowledged, and the kernel takes its time for that
-    /// unless told again after every read: 44 ms become 0.3.
+    /// Requests an immediate TCP acknowledgement, because the other end may hold back its next message until then. The
+    /// kernel delays acknowledgements unless this is requested after every read: 44 ms become 0.3.
     fn acknowledge_at_once(&self) {
         let on: libc::c_int = 1;
-        // SAFETY: the option is valid for its length and outlives the call. A refusal costs time only.
+        // SAFETY: the option is valid for its length and outlives the call. A refusal only costs time.
         unsafe {
             libc::setsockopt(
                 self.tcp.as_raw_fd(),
@@ -69,7 +69,7 @@ impl Stream {
         };
     }
 
-    /// Reads more; what a read cannot have is told as an event.
+    /// Reads more bytes; the loss of the connection is returned as an event.
     fn fill(&mut self) -> Result<bool, Option<Received>> {
         match self.incoming.fill(self.tcp.as_raw_fd()) {
             Moved::Bytes(_) => {
@@ -81,7 +81,7 @@ impl Stream {
         }
     }
 
-    /// Throws away what can't become a message any more.
+    /// Discards bytes that cannot become a message any more.
     fn tidy(&mut self) -> Option<Received> {
         (self.incoming.unfinished() > UNFINISHED).then(|| {
             self.incoming.discard();
@@ -96,7 +96,7 @@ impl Stream {
         (!told).then(|| Received::Event(Event::Down, self.clock.now_ns()))
     }
 
-    /// Sends all of a message or nothing of it.
+    /// Sends a whole message or nothing.
     fn say(&mut self, message: &[u8]) -> Result<(), Refused> {
         let fd = self.tcp.as_raw_fd();
         let there = self.outgoing.flush(fd);
@@ -128,7 +128,7 @@ pub struct Client {
     stream: Stream,
     filter: Filter,
     listen_only: bool,
-    /// A second connection, on which nothing else is ever half said.
+    /// A second connection for emergency frames, on which no message can be incomplete.
     emergency: TcpStream,
 }
 
@@ -160,7 +160,7 @@ impl Client {
     }
 }
 
-/// Connects and goes through the greetings.
+/// Connects and performs the handshake.
 fn greeted(host: &str, port: u16, interface: &str, raw: bool) -> Result<TcpStream, String> {
     let addresses = (host, port).to_socket_addrs().map_err(|error| error.to_string())?;
     let mut tried = Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
@@ -176,7 +176,7 @@ fn greeted(host: &str, port: u16, interface: &str, raw: bool) -> Result<TcpStrea
         tcp.write_all(say.as_bytes()).map_err(|error| error.to_string())?;
         let mut heard = Vec::new();
         let mut byte = [0];
-        // One byte at a time: what comes behind the answer is not ours to read yet.
+        // One byte at a time, because the bytes after the answer must not be read yet.
         while !heard.ends_with(b">") && heard.len() < UNFINISHED {
             match tcp.read(&mut byte) {
                 Ok(0) => return Err("it closed the connection".to_string()),
@@ -242,7 +242,7 @@ impl Bus for Client {
     }
 }
 
-/// A gateway that waits for clients.
+/// A gateway that accepts clients.
 pub struct Server {
     listener: TcpListener,
     clock: Monotonic,
@@ -269,12 +269,12 @@ impl Server {
         self.listener.local_addr().map_or(0, |address| address.port())
     }
 
-    /// Readable when a client comes.
+    /// A descriptor that is readable when a client connects.
     pub fn descriptor(&self) -> RawFd {
         self.listener.as_raw_fd()
     }
 
-    /// The next client, if one has come.
+    /// The next client, if one has connected.
     pub fn accept(&mut self) -> Option<Connection> {
         let (tcp, _) = self.listener.accept().ok()?;
         let mut stream = Stream::new(tcp, self.clock).ok()?;
@@ -283,24 +283,24 @@ impl Server {
     }
 }
 
-/// A client of ours.
+/// A connected client.
 pub struct Connection {
     stream: Stream,
     stage: Stage,
 }
 
-/// How far the greetings have come.
+/// Progress of the handshake.
 #[derive(Clone, Copy, PartialEq)]
 enum Stage {
     Greeted,
-    /// It may send, and hears nothing.
+    /// The client may send, and receives nothing.
     Opened,
-    /// It hears all frames from this time on.
+    /// The client receives all frames from this time on.
     Raw(u64),
 }
 
 impl Connection {
-    /// Does what a message says; gives its frame.
+    /// Executes a message; returns its frame, if it has one.
     fn heard(&mut self) -> Option<Option<Frame>> {
         let now_ns = self.stream.clock.now_ns();
         let message = self.stream.incoming.message(|byte| byte == b'>')?;
@@ -318,7 +318,7 @@ impl Connection {
             (Some("echo"), _) => b"< echo >",
             (Some("send"), Stage::Opened | Stage::Raw(_)) => match decode_send(words) {
                 Some(frame) => {
-                    // Who sends has read the greetings: what answers it may come at once.
+                    // A client that sends has read the answers: frames may follow immediately.
                     if let Stage::Raw(from_ns) = &mut self.stage {
                         *from_ns = 0;
                     }
@@ -328,7 +328,7 @@ impl Connection {
             },
             _ => b"< error unknown command >",
         };
-        // An answer that does not fit is one to a client that reads nothing.
+        // An answer that does not fit is for a client that reads nothing.
         let _ = self.stream.say(answer);
         Some(None)
     }
@@ -338,7 +338,7 @@ impl Bus for Connection {
     fn send(&mut self, frame: Frame) -> Result<(), Refused> {
         match self.stage {
             Stage::Raw(from_ns) if self.stream.clock.now_ns() >= from_ns => {}
-            // It does not listen yet.
+            // The client does not receive yet.
             Stage::Greeted | Stage::Opened | Stage::Raw(_) => return Ok(()),
         }
         if frame.is_remote() {
@@ -383,7 +383,7 @@ impl Bus for Connection {
     }
 }
 
-/// `< send 123 2 aa b >`, bytes without leading zeros; the length of it.
+/// Encodes `< send 123 2 aa b >`, bytes without leading zeros; returns its length.
 fn encode_send(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
     let mut text = Cursor::new(&mut message[..]);
     let id = frame.id();
@@ -401,7 +401,8 @@ fn encode_send(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
     text.position() as usize
 }
 
-/// `< frame 123 1700000000.123456 AABB >`; without data the field is empty, two spaces. The length of it.
+/// Encodes `< frame 123 1700000000.123456 AABB >`; without data the field is empty, with two spaces. Returns its
+/// length.
 fn encode_frame(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
     let mut text = Cursor::new(&mut message[..]);
     let id = frame.id();
@@ -420,7 +421,7 @@ fn encode_frame(frame: &Frame, message: &mut [u8; MESSAGE]) -> usize {
     text.position() as usize
 }
 
-/// The frame of `123 2 aa b`.
+/// Decodes the frame of `123 2 aa b`.
 fn decode_send<'t>(mut words: impl Iterator<Item = &'t str>) -> Option<Frame> {
     let id = words.next()?;
     let length: usize = words.next()?.parse().ok().filter(|&length| length <= 8)?;
@@ -434,7 +435,7 @@ fn decode_send<'t>(mut words: impl Iterator<Item = &'t str>) -> Option<Frame> {
     identified(id, &data[..length])
 }
 
-/// The frame of `< frame 123 1700000000.123456 AABB `.
+/// Decodes the frame of `< frame 123 1700000000.123456 AABB `.
 fn decode_frame(message: &[u8]) -> Option<Frame> {
     let text = std::str::from_utf8(message).ok()?.trim_start_matches(['<', ' ', '\n', '\r']);
     let mut words = text.split_ascii_whitespace();
@@ -498,7 +499,7 @@ mod tests {
         }
     }
 
-    /// What answers the first frame of a client may come before the pause behind its greetings is over.
+    /// The answer to a client's first frame may arrive before the pause after the handshake has ended.
     #[test]
     fn who_sends_at_once_hears_the_answer() {
         let clock = Monotonic::new();
