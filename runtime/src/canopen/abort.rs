@@ -1,4 +1,4 @@
-//! Why an SDO transfer was broken off: the code in the frame and its meaning.
+//! Abort codes of SDO transfers and their meanings.
 
 use std::fmt;
 
@@ -12,10 +12,10 @@ macro_rules! codes {
         impl Abort {
             $(#[doc = $text] pub const $name: Abort = Abort($code);)*
 
-            /// Every code of the standard.
+            /// All codes of the standard.
             pub const ALL: &[Abort] = &[$(Abort::$name),*];
 
-            /// What the standard says it means; nothing for a code of a maker.
+            /// The meaning according to the standard; none for a manufacturer-specific code.
             pub fn meaning(self) -> Option<&'static str> {
                 match self.0 {
                     $($code => Some($text),)*

@@ -1,19 +1,18 @@
-//! Electronic data sheets: the text that says which objects a device has (EDS), or what they are set to (DCF).
+//! Electronic data sheets: the objects of a device (EDS) or their configured values (DCF).
 //!
-//! In: the text. Out: an [`ObjectDictionary`], or the lines that can't be understood. Source: CiA 306-1. Read are the
-//! objects with type, access, default, limits and mapping; compact sub-objects, comments and file information are
-//! passed over.
+//! In: the text. Out: an [`ObjectDictionary`], or the lines with errors. Source: CiA 306-1. Objects are read with type,
+//! access, default, limits and mapping; compact sub-objects, comments and file information are ignored.
 
 use super::object::Entry;
 use super::{Access, Object, ObjectDictionary, Type};
 use std::fmt;
 
-/// What is wrong with a data sheet.
+/// An error in a data sheet.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Mistake {
     /// Line, from 1.
     pub line: usize,
-    /// What.
+    /// The message.
     pub text: String,
 }
 
@@ -23,7 +22,7 @@ impl fmt::Display for Mistake {
     }
 }
 
-/// One section under its name, each value with its line.
+/// One section, each value with its line.
 struct Section<'t> {
     line: usize,
     name: &'t str,
@@ -37,7 +36,7 @@ impl<'t> Section<'t> {
     }
 }
 
-/// Reads a data sheet for a device that has the id `node`, which stands for `$NODEID`.
+/// Parses a data sheet for a device with the node id `node`, which replaces `$NODEID`.
 pub fn read(text: &str, node: u8) -> Result<ObjectDictionary, Vec<Mistake>> {
     let mut mistakes = Vec::new();
     let mut objects = ObjectDictionary::new();
@@ -68,7 +67,7 @@ fn sections<'t>(text: &'t str, mistakes: &mut Vec<Mistake>) -> Vec<Section<'t>> 
                 None => mistakes.push(Mistake { line: at, text: format!("`{line}` lacks its `]`") }),
             }
         } else if let Some((key, value)) = line.split_once('=') {
-            // What stands before the first section belongs to none.
+            // Lines before the first section are ignored.
             if let Some(section) = sections.last_mut() {
                 section.values.push((at, key.trim(), value.trim()));
             }
@@ -89,7 +88,7 @@ fn object(name: &str) -> Option<Object> {
     Some(Object(u16::from_str_radix(index, 16).ok()?, u8::from_str_radix(sub, 16).ok()?))
 }
 
-/// The entry a section describes; none where it only announces sub-objects.
+/// The entry that a section describes; none if it only announces sub-objects.
 fn entry(object: Object, section: &Section, node: u8) -> Result<Option<Entry>, Mistake> {
     let mistake = |line: usize, text: String| Mistake { line, text };
     let number_of = |key: &str, kind: Type| match section.get(key) {
@@ -98,7 +97,7 @@ fn entry(object: Object, section: &Section, node: u8) -> Result<Option<Entry>, M
             .map(Some)
             .ok_or_else(|| mistake(line, format!("`{text}` is no number for {key} of object {object}"))),
     };
-    // 7: variable. 8 and 9, arrays and records, only say how many sub-objects follow.
+    // 7: variable. 8 and 9, arrays and records, only contain the number of their sub-objects.
     if number_of("ObjectType", Type::I64)?.unwrap_or(7) != 7 {
         return Ok(None);
     }
@@ -149,7 +148,7 @@ fn entry(object: Object, section: &Section, node: u8) -> Result<Option<Entry>, M
     Ok(Some(entry))
 }
 
-/// `12`, `0x1F`, `-3`, `$NODEID+0x180`, `0x180+$NODEID`, `1.5`. A hexadecimal number is the bits of its type.
+/// `12`, `0x1F`, `-3`, `$NODEID+0x180`, `0x180+$NODEID`, `1.5`. A hexadecimal number is the bit pattern of its type.
 fn number(text: &str, node: u8, kind: Type) -> Option<i64> {
     let upper = text.to_ascii_uppercase();
     if upper.contains("$NODEID") {

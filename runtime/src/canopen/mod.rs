@@ -1,7 +1,7 @@
-//! CANopen, as far as a rig needs it: what a master says to a node and what a node answers.
+//! CANopen services that a rig needs, on both the master's and the node's side.
 //!
-//! In: frames, and the time as an argument. Out: frames. Nothing here waits, owns a bus or, once set up, allocates; the
-//! same [`ObjectDictionary`] stands behind a simulated drive and behind what the master knows of a real one. Knows
+//! In: frames, and the time as an argument. Out: frames. Nothing here blocks, owns a bus or, once set up, allocates;
+//! the same [`ObjectDictionary`] is used for a simulated drive and for the master's knowledge of a real one. Knows
 //! nothing of motors. Source: CiA 301, version 4.2.
 
 pub mod abort;
@@ -16,5 +16,5 @@ pub use abort::Abort;
 pub use object::{Access, Object, ObjectDictionary, Type};
 pub use service::{Nmt, NmtState, Service};
 
-/// Takes the frames that go out.
+/// Callback that sends a frame.
 pub type Send<'a> = &'a mut dyn FnMut(crate::can::Frame);

@@ -1,8 +1,8 @@
-//! A CANopen node: the side that is commanded.
+//! A CANopen node: the commanded side.
 //!
-//! In: frames and the time. Out: frames, and [`Happening`]s for the device that it belongs to. It keeps the object
-//! dictionary, follows network management, answers SDO requests, sends and takes PDOs, produces and watches
-//! heartbeats, answers node guarding. What the objects mean is the device's business.
+//! In: frames and the time. Out: frames, and [`Happening`]s for its device. It holds the object dictionary, follows NMT
+//! commands, answers SDO requests, sends and receives PDOs, produces and monitors heartbeats, answers node guarding.
+//! The device interprets the objects.
 
 use super::object::Entry;
 use super::pdo::{self, Direction, Mapped};
@@ -11,31 +11,31 @@ use super::service::{Emergency, NmtState, Service};
 use super::{Abort, Access, Nmt, Object, ObjectDictionary, Send, Type};
 use crate::can::Frame;
 
-/// PDOs of a direction.
+/// PDOs per direction.
 const PDOS: usize = 4;
-/// Nodes whose heartbeat can be watched.
+/// Most nodes whose heartbeat can be monitored.
 const CONSUMERS: usize = 4;
 /// Emergencies kept in object 1003.
 const HISTORY: u8 = 8;
 
-/// What a device learns from its node.
+/// Event that a node reports to its device.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Happening {
-    /// SYNC came: sample, then call [`Node::answer_sync`].
+    /// SYNC has arrived: sample, then call [`Node::answer_sync`].
     Sync,
-    /// Process data came into the dictionary; number from 1.
+    /// An RPDO has changed the dictionary; its number from 1.
     Rpdo(u8),
-    /// An object was written through SDO.
+    /// An object was written by SDO.
     Written(Object),
-    /// Network management moved the node.
+    /// NMT changed the node's state.
     State(NmtState),
-    /// It was told to reset; its dictionary is as after power-on (only objects below 2000 for a reset of communication).
+    /// The node was reset; its dictionary is as after power-on (only objects below 2000 for a reset of communication).
     Reset(Nmt),
-    /// Something that was watched is missing.
+    /// A monitored message is missing.
     Lost(Loss),
 }
 
-/// What is missing.
+/// The missing message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Loss {
     /// The heartbeat of this node.
@@ -46,22 +46,22 @@ pub enum Loss {
     Rpdo(u8),
 }
 
-/// One PDO as the dictionary describes it.
+/// One PDO as configured in the dictionary.
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     id: Option<u32>,
     kind: u8,
     map: [Mapped; pdo::MOST],
     count: usize,
-    /// Bytes of the map.
+    /// Length of the data, bytes.
     length: usize,
     /// Event timer, ns; 0: none.
     timer_ns: u64,
-    /// When the timer ends, if it runs.
+    /// Time at which the timer expires, if it runs.
     due_ns: Option<u64>,
-    /// SYNCs since it was sent.
+    /// SYNCs since the last transmission.
     syncs: u8,
-    /// Received and waiting for SYNC, or sent last.
+    /// Data received and waiting for SYNC, or data sent last.
     data: [u8; 8],
     waiting: bool,
 }
@@ -93,23 +93,23 @@ pub struct Node {
     pub objects: ObjectDictionary,
     factory: ObjectDictionary,
     state: NmtState,
-    /// From a reset to the boot-up message.
+    /// Time from a reset to the boot-up message, ns.
     boot_ns: u64,
     boots_at_ns: Option<u64>,
     server: Server,
     receive: [Slot; PDOS],
     transmit: [Slot; PDOS],
     heartbeat_due_ns: Option<u64>,
-    /// Deadline of each watched heartbeat, once one has come.
+    /// Deadline of each monitored heartbeat, once the first one has arrived.
     consumers: [Option<u64>; CONSUMERS],
-    /// Least time of a watched heartbeat that the device accepts, ms.
+    /// Shortest heartbeat consumer time that the device accepts, ms.
     least_consumer_ms: u16,
     guard_toggle: bool,
     guard_deadline_ns: Option<u64>,
 }
 
 impl Node {
-    /// A node that boots at time 0. `objects`: the device's own; those of communication are added where they lack.
+    /// A node that boots at time 0. `objects`: the device's own; missing communication objects are added.
     pub fn new(id: u8, objects: ObjectDictionary, boot_ns: u64, least_consumer_ms: u16) -> Node {
         let mut all = communication(id);
         for entry in objects.entries() {
@@ -135,7 +135,7 @@ impl Node {
         node
     }
 
-    /// The same without event timers of RPDOs (objects 1400:5 and following), which not every device has.
+    /// Removes the event timers of RPDOs (objects 1400:5 and following), which not every device has.
     pub fn without_deadlines(&mut self) {
         for i in 0..PDOS as u16 {
             self.objects.remove(Object(0x1400 + i, 5));
@@ -143,17 +143,17 @@ impl Node {
         }
     }
 
-    /// Its number.
+    /// Its node id.
     pub fn id(&self) -> u8 {
         self.id
     }
 
-    /// Its state.
+    /// Its NMT state.
     pub fn state(&self) -> NmtState {
         self.state
     }
 
-    /// Moves to a state by itself, as after an error of communication.
+    /// Changes the state without a command, for example after a communication error.
     pub fn go(&mut self, state: NmtState) {
         self.state = state;
         for slot in self.receive.iter_mut().chain(&mut self.transmit) {
@@ -161,7 +161,7 @@ impl Node {
         }
     }
 
-    /// Resets: all objects for [`Nmt::ResetNode`], those below 2000 for a reset of communication.
+    /// Resets all objects for [`Nmt::ResetNode`], or those below 2000 for a reset of communication.
     pub fn reset(&mut self, command: Nmt, now_ns: u64) {
         for entry in self.factory.entries() {
             if command == Nmt::ResetNode || entry.object.0 < 0x2000 {
@@ -176,7 +176,7 @@ impl Node {
         self.boots_at_ns = Some(now_ns + self.boot_ns);
     }
 
-    /// Says that something went wrong: error register, history, object 603F where there is one, EMCY.
+    /// Signals an error: error register, history, object 603F where it exists, EMCY message.
     pub fn emergency(&mut self, code: u16, register: u8, send: Send) {
         self.objects.set(Object(0x1001, 0), register.into());
         if code != 0 {
@@ -196,14 +196,14 @@ impl Node {
         }
     }
 
-    /// The next moment at which [`poll`](Node::poll) has something to do.
+    /// Time at which [`poll`](Node::poll) is next due.
     pub fn due_ns(&self) -> u64 {
         let timers = self.receive.iter().chain(&self.transmit).filter_map(|slot| slot.due_ns);
         let others = [self.boots_at_ns, self.heartbeat_due_ns, self.guard_deadline_ns];
         timers.chain(others.into_iter().flatten()).chain(self.consumers.into_iter().flatten()).min().unwrap_or(u64::MAX)
     }
 
-    /// Takes a frame of its bus.
+    /// Receives a frame of its bus.
     pub fn receive(&mut self, frame: &Frame, now_ns: u64, send: Send) -> Option<Happening> {
         if self.state == NmtState::BootUp {
             return None;
@@ -305,14 +305,14 @@ impl Node {
         Some(Happening::Rpdo(at as u8 + 1))
     }
 
-    /// Sends what is due with the SYNC that just came.
+    /// Sends the PDOs that are due with the SYNC that has just arrived.
     pub fn answer_sync(&mut self, send: Send) {
         for slot in &mut self.transmit {
             let (Some(id), 0..=240) = (slot.id, slot.kind) else { continue };
             let mut data = [0; 8];
             let length = pdo::pack(&slot.map[..slot.count], &self.objects, &mut data);
             slot.syncs = slot.syncs.saturating_add(1);
-            // Type 0: with a SYNC, but only if something has changed.
+            // Type 0: with a SYNC, but only after a change.
             let due = if slot.kind == 0 { data != slot.data } else { slot.syncs >= slot.kind };
             if due {
                 (slot.syncs, slot.data) = (0, data);
@@ -321,7 +321,7 @@ impl Node {
         }
     }
 
-    /// Does one thing that is due; call it until it says no more.
+    /// Executes one thing that is due; must be called until it returns none.
     pub fn poll(&mut self, now_ns: u64, send: Send) -> Option<Happening> {
         let over = |due: Option<u64>| due.is_some_and(|due| due <= now_ns);
         if over(self.boots_at_ns) {
@@ -359,7 +359,7 @@ impl Node {
         None
     }
 
-    /// PDOs of type 254 and 255: when something has changed or their timer ends.
+    /// PDOs of type 254 and 255: sent on change or when their timer expires.
     fn send_events(&mut self, now_ns: u64, send: Send) {
         for slot in &mut self.transmit {
             let (Some(id), 254..) = (slot.id, slot.kind) else { continue };
@@ -379,7 +379,7 @@ impl Node {
         (period > 0).then(|| from_ns + period * 1_000_000)
     }
 
-    /// After an object of communication was written: timers and PDOs follow.
+    /// Updates timers and PDOs after a communication object was written.
     fn take_over(&mut self, object: Object, heartbeat_before: u64, now_ns: u64) {
         match object.0 {
             0x1017 if self.heartbeat_ms() != heartbeat_before => self.heartbeat_due_ns = self.next_heartbeat(now_ns),
@@ -413,7 +413,7 @@ impl Node {
     }
 }
 
-/// What SDO sees: the dictionary with the rules of communication.
+/// The dictionary for SDO access, with the rules for communication objects.
 struct Served<'a> {
     objects: &'a mut ObjectDictionary,
     operational: bool,
@@ -445,7 +445,7 @@ impl Objects for Served<'_> {
                 if value & pdo::OFF == 0 && value & 0x2000_0000 != 0 {
                     return Err(Abort::VALUE);
                 }
-                // An identifier may change only while the PDO is off.
+                // An identifier may change only while the PDO is disabled.
                 if before & pdo::OFF == 0 && value & pdo::OFF == 0 && (before ^ value) & 0x1FFF_FFFF != 0 {
                     return Err(Abort::VALUE);
                 }
@@ -460,7 +460,7 @@ impl Objects for Served<'_> {
 }
 
 impl Served<'_> {
-    /// The rules of CiA 301, 7.5.2.36: only while the PDO is off; entries only while their number is 0.
+    /// The rules of CiA 301, 7.5.2.36: only while the PDO is disabled; entries only while their number is 0.
     fn may_map(&self, index: u16, sub: u8, value: u32) -> Result<(), Abort> {
         let cob_id = self.objects.get(Object(index - 0x200, 1)).unwrap_or(0) as u32;
         if cob_id & pdo::OFF == 0 {
@@ -494,7 +494,7 @@ impl Served<'_> {
     }
 }
 
-/// The objects every node has.
+/// The objects of every node.
 fn communication(id: u8) -> ObjectDictionary {
     use Access::{Constant, ReadOnly, ReadWrite};
     use Type::{U8, U16, U32};
@@ -657,7 +657,7 @@ mod tests {
         assert_eq!(write(&mut node, Object(0x1600, 0), 0, 1), refused(Abort::STATE));
         assert_eq!(write(&mut node, Object(0x1016, 1), 0x7F_0004, 4), refused(Abort::TOO_LOW));
         assert_eq!(write(&mut node, Object(0x1003, 0), 1, 1), refused(Abort::VALUE));
-        // A reset of communication forgets it all.
+        // A reset of communication restores all of it.
         let reset = node.receive(&Nmt::ResetCommunication.frame(3), 0, &mut |_| {});
         assert_eq!(reset, Some(Happening::Reset(Nmt::ResetCommunication)));
         assert_eq!(node.objects.get(Object(0x1600, 0)), Some(0));
@@ -672,7 +672,7 @@ mod tests {
         assert_eq!(node.poll(19 * MS, &mut |frame| sent.push(frame)), None);
         assert_eq!(node.poll(20 * MS, &mut |frame| sent.push(frame)), None);
         assert_eq!(sent, [Frame::new(0x703, &[0x7F])]);
-        // Watching begins with the first heartbeat.
+        // Monitoring begins with the first heartbeat.
         node.receive(&NmtState::Operational.heartbeat(0x7F), 21 * MS, &mut |_| {});
         assert_eq!(node.due_ns(), 26 * MS);
         assert_eq!(node.poll(26 * MS - 1, &mut |_| {}), None);

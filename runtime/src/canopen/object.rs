@@ -1,20 +1,20 @@
-//! Objects: where a device keeps what can be read, written and put into PDOs.
+//! Objects: values of a device that can be read, written and mapped into PDOs.
 
 use super::Abort;
 use std::fmt;
 
-/// Where an object lies: index and sub-index.
+/// Index and sub-index of an object.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Object(pub u16, pub u8);
 
-/// As in `6040:00`.
+/// In the format `6040:00`.
 impl fmt::Display for Object {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         write!(f, "{:04X}:{:02X}", self.0, self.1)
     }
 }
 
-/// How the bytes of an object are read.
+/// Data type of an object.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Type {
@@ -34,7 +34,7 @@ pub enum Type {
 }
 
 impl Type {
-    /// Number of bytes; none if it has any length.
+    /// Number of bytes; none if the length is variable.
     pub fn size(self) -> Option<usize> {
         match self {
             Type::Boolean | Type::I8 | Type::U8 => Some(1),
@@ -61,7 +61,7 @@ impl Type {
     }
 }
 
-/// Who may do what through SDO.
+/// Access rights through SDO.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Access {
@@ -74,17 +74,17 @@ pub enum Access {
 /// One object with its value.
 #[derive(Clone, PartialEq, Debug)]
 pub struct Entry {
-    /// Where it lies.
+    /// Its index and sub-index.
     pub object: Object,
     /// Its name, for people.
     pub name: String,
-    /// How its bytes are read.
+    /// Its data type.
     pub kind: Type,
-    /// Who may do what.
+    /// Its access rights.
     pub access: Access,
-    /// Whether it may be put into a PDO.
+    /// Whether it may be mapped into a PDO.
     pub mappable: bool,
-    /// Least and greatest number that may be written.
+    /// Lowest and highest number that may be written.
     pub range: (i64, i64),
     bytes: Vec<u8>,
     capacity: usize,
@@ -106,7 +106,7 @@ impl Entry {
         }
     }
 
-    /// A text that may grow to `capacity` bytes.
+    /// A text of up to `capacity` bytes.
     pub fn text(object: Object, name: &str, access: Access, value: &str, capacity: usize) -> Entry {
         let capacity = capacity.max(value.len());
         let mut bytes = Vec::with_capacity(capacity);
@@ -123,13 +123,13 @@ impl Entry {
         }
     }
 
-    /// The same, and it may be put into a PDO.
+    /// The same object, mappable into a PDO.
     pub fn mapped(mut self) -> Entry {
         self.mappable = true;
         self
     }
 
-    /// The same, and only numbers from `low` to `high` may be written.
+    /// The same object, restricted to numbers from `low` to `high`.
     pub fn within(mut self, low: i64, high: i64) -> Entry {
         self.range = (low, high);
         self
@@ -145,7 +145,7 @@ impl Entry {
         self.kind.number(&self.bytes)
     }
 
-    /// Whether these bytes may be written, the right to write apart.
+    /// Whether length and range permit these bytes; access rights are not checked.
     fn admits(&self, bytes: &[u8]) -> Result<(), Abort> {
         match self.kind.size() {
             Some(size) if bytes.len() > size => Err(Abort::TOO_LONG),
@@ -161,19 +161,19 @@ impl Entry {
     }
 }
 
-/// Objects in the order of their indices. Adding allocates; reading and writing don't.
+/// Object dictionary, in the order of the indices. Adding allocates; reading and writing does not.
 #[derive(Clone, PartialEq, Debug, Default)]
 pub struct ObjectDictionary {
     entries: Vec<Entry>,
 }
 
 impl ObjectDictionary {
-    /// None.
+    /// An empty dictionary.
     pub fn new() -> ObjectDictionary {
         ObjectDictionary::default()
     }
 
-    /// Adds an object, or puts it in the place of the one that lies there.
+    /// Adds an object, or replaces the one with the same index.
     pub fn add(&mut self, entry: Entry) {
         match self.place(entry.object) {
             Ok(at) => self.entries[at] = entry,
@@ -181,7 +181,7 @@ impl ObjectDictionary {
         }
     }
 
-    /// Takes an object away.
+    /// Removes an object.
     pub fn remove(&mut self, object: Object) {
         if let Ok(at) = self.place(object) {
             self.entries.remove(at);
@@ -192,12 +192,12 @@ impl ObjectDictionary {
         self.entries.binary_search_by_key(&object, |entry| entry.object)
     }
 
-    /// All of them, in order.
+    /// All objects, in order.
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The one that lies there.
+    /// The object with this index.
     pub fn entry(&self, object: Object) -> Option<&Entry> {
         self.place(object).ok().map(|at| &self.entries[at])
     }
@@ -209,7 +209,7 @@ impl ObjectDictionary {
         })
     }
 
-    /// The bytes of an object, as an SDO client reads them.
+    /// The bytes of an object, as read by an SDO client.
     pub fn read(&self, object: Object) -> Result<&[u8], Abort> {
         let entry = &self.entries[self.find(object)?];
         match entry.access {
@@ -227,7 +227,7 @@ impl ObjectDictionary {
         }
     }
 
-    /// Writes as an SDO client does: access, length and range are checked first.
+    /// Writes as an SDO client: access, length and range are checked first.
     pub fn write(&mut self, object: Object, bytes: &[u8]) -> Result<(), Abort> {
         self.may_write(object, bytes)?;
         let at = self.find(object)?;
@@ -237,15 +237,15 @@ impl ObjectDictionary {
         Ok(())
     }
 
-    /// The number of an object, whoever may read it; nothing where there is none.
+    /// The number of an object, regardless of access rights; none if there is no such number.
     pub fn get(&self, object: Object) -> Option<i64> {
         self.entry(object).filter(|entry| entry.kind != Type::Bytes).map(Entry::value)
     }
 
-    /// Sets the number of an object, whoever may write it; the upper bytes of a number that doesn't fit are cut.
+    /// Sets the number of an object, regardless of access rights; a number that does not fit loses its upper bytes.
     ///
     /// # Panics
-    /// If there is no such number: a mistake of the caller.
+    /// If there is no such number: an error of the caller.
     pub fn set(&mut self, object: Object, number: i64) {
         let at = self.place(object).unwrap_or_else(|_| panic!("no object {object}"));
         let entry = &mut self.entries[at];

@@ -1,36 +1,36 @@
-//! Process data: which objects travel in which frame, and how a drive is told so.
+//! Process data objects (PDO): their mapping, and how it is configured in a drive.
 
 use super::{Object, ObjectDictionary};
 
-/// Bit 31 of a PDO's identifier: it is off.
+/// Bit 31 of a PDO's COB-ID: disabled.
 pub const OFF: u32 = 0x8000_0000;
 /// Bit 30: no remote request.
 pub const NO_REMOTE: u32 = 0x4000_0000;
-/// Most objects in a PDO of whole bytes.
+/// Most objects in a PDO, of whole bytes.
 pub const MOST: usize = 8;
 
 /// One object in a PDO.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Mapped {
-    /// Which.
+    /// The object.
     pub object: Object,
     /// Its length in bits: whole bytes.
     pub bits: u8,
 }
 
 impl Mapped {
-    /// As objects 1600 and 1A00 hold it.
+    /// The entry in objects 1600 and 1A00.
     pub fn word(self) -> u32 {
         u32::from(self.object.0) << 16 | u32::from(self.object.1) << 8 | u32::from(self.bits)
     }
 
-    /// From what objects 1600 and 1A00 hold.
+    /// Decodes an entry of objects 1600 and 1A00.
     pub fn of(word: u32) -> Mapped {
         Mapped { object: Object((word >> 16) as u16, (word >> 8) as u8), bits: word as u8 }
     }
 }
 
-/// From us to the device or from the device to us, as the device sees it.
+/// Direction from the device's point of view.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Direction {
@@ -38,26 +38,26 @@ pub enum Direction {
     Transmit,
 }
 
-/// One PDO as it shall be.
+/// Configuration of one PDO.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Pdo {
-    /// Which way.
+    /// Direction.
     pub direction: Direction,
     /// Number from 1.
     pub number: u8,
-    /// Identifier; [`OFF`] set: not used.
+    /// COB-ID; with [`OFF`] set: disabled.
     pub cob_id: u32,
-    /// Transmission type: 1 to 240 with each n-th SYNC, 255 at once.
+    /// Transmission type: 1 to 240 with each n-th SYNC, 255 immediately.
     pub kind: u8,
     map: [Mapped; MOST],
     count: u8,
 }
 
 impl Pdo {
-    /// A PDO that carries these objects, its identifier by the predefined connection set.
+    /// A PDO with these objects, its COB-ID from the predefined connection set.
     ///
     /// # Panics
-    /// If they take more than 8 bytes: a mistake of the caller.
+    /// If they need more than 8 bytes: an error of the caller.
     pub fn new(direction: Direction, number: u8, node: u8, kind: u8, objects: &[Mapped]) -> Pdo {
         assert!((1..=4).contains(&number), "PDO {number} has no predefined identifier");
         let bits: u32 = objects.iter().map(|mapped| u32::from(mapped.bits)).sum();
@@ -72,28 +72,28 @@ impl Pdo {
         Pdo { direction, number, cob_id, kind, map, count: objects.len() as u8 }
     }
 
-    /// What it carries.
+    /// The mapped objects.
     pub fn map(&self) -> &[Mapped] {
         &self.map[..self.count.into()]
     }
 
-    /// Number of bytes.
+    /// Length of the data, bytes.
     pub fn length(&self) -> usize {
         self.map().iter().map(|mapped| usize::from(mapped.bits / 8)).sum()
     }
 
-    /// Byte at which an object lies.
+    /// First byte of an object.
     pub fn place(&self, object: Object) -> Option<usize> {
         let before = self.map().iter().position(|mapped| mapped.object == object)?;
         Some(self.map[..before].iter().map(|mapped| usize::from(mapped.bits / 8)).sum())
     }
 
-    /// Where its identifier and type lie: 1400 or 1800 and following.
+    /// Index of the communication parameters: 1400 or 1800 and following.
     pub fn communication(&self) -> u16 {
         self.base(0x1400)
     }
 
-    /// Where its map lies: 1600 or 1A00 and following.
+    /// Index of the mapping parameters: 1600 or 1A00 and following.
     pub fn mapping(&self) -> u16 {
         self.base(0x1600)
     }
@@ -103,7 +103,7 @@ impl Pdo {
         first + transmit + u16::from(self.number - 1)
     }
 
-    /// Objects to write, in the order that the standard asks for: off, unmapped, mapped, type, on.
+    /// Objects to write, in the order that the standard requires: disable, unmap, map, type, enable.
     pub fn configuration(&self) -> Vec<(Object, u32, u8)> {
         let (communication, mapping) = (self.communication(), self.mapping());
         let mut writes = vec![(Object(communication, 1), self.cob_id | OFF, 4), (Object(mapping, 0), 0, 1)];
@@ -116,7 +116,7 @@ impl Pdo {
         writes
     }
 
-    /// Objects to read back, with what they must hold and the bits that count.
+    /// Objects to read back, with their expected values and masks.
     pub fn read_back(&self) -> Vec<(Object, u32, u32)> {
         let (communication, mapping) = (self.communication(), self.mapping());
         let mut reads = vec![
@@ -131,7 +131,7 @@ impl Pdo {
     }
 }
 
-/// Puts mapped objects into a frame's data; returns their number of bytes.
+/// Packs mapped objects into the data of a frame; returns their number of bytes.
 pub fn pack(map: &[Mapped], objects: &ObjectDictionary, data: &mut [u8; 8]) -> usize {
     let mut at = 0;
     for mapped in map {
@@ -143,13 +143,13 @@ pub fn pack(map: &[Mapped], objects: &ObjectDictionary, data: &mut [u8; 8]) -> u
     at
 }
 
-/// Takes mapped objects out of a frame's data. Values outside an object's range are not taken.
+/// Unpacks mapped objects from the data of a frame. Values outside an object's range are ignored.
 pub fn unpack(map: &[Mapped], objects: &mut ObjectDictionary, data: &[u8]) {
     let mut at = 0;
     for mapped in map {
         let size = usize::from(mapped.bits / 8);
         if let Some(bytes) = data.get(at..at + size) {
-            // Refused values stay what they were: a PDO has no answer.
+            // Refused values have no effect: a PDO has no answer.
             let _ = objects.write(mapped.object, bytes);
         }
         at += size;

@@ -1,15 +1,17 @@
-//! Service data: one object read or written at a time, up to 4 bytes in one frame, longer ones in segments of 7.
+//! Service data objects (SDO): one object is read or written at a time, up to 4 bytes in one frame (expedited), longer
+//! ones in segments of 7.
 //!
-//! A [`Client`] asks, a [`Server`] answers. Block transfer is not offered; a server refuses it as the standard says.
+//! A [`Client`] sends requests, a [`Server`] answers them. Block transfer is not supported; a server refuses it as the
+//! standard requires.
 
 use super::{Abort, Object, ObjectDictionary, Send};
 use crate::can::Frame;
 use std::fmt;
 
-/// Longest object that can be transferred, bytes.
+/// Length of the longest object that can be transferred, bytes.
 pub const LONGEST: usize = 256;
 
-/// What a server reads from and writes to.
+/// Storage that a server reads and writes.
 pub trait Objects {
     /// The bytes of an object.
     fn read(&mut self, object: Object) -> Result<&[u8], Abort>;
@@ -27,10 +29,10 @@ impl Objects for ObjectDictionary {
     }
 }
 
-/// Why a transfer failed.
+/// Reason for the failure of a transfer.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Failure {
-    /// The server, or we, broke it off.
+    /// The server or the client aborted it.
     Aborted(Abort),
     /// No answer in time.
     Silence,
@@ -45,14 +47,14 @@ impl fmt::Display for Failure {
     }
 }
 
-/// What has become of a request.
+/// State of a request.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Outcome {
-    /// Nothing is asked.
+    /// There is no request.
     Idle,
-    /// No end yet.
+    /// The transfer is in progress.
     Busy,
-    /// It succeeded; [`Client::data`] holds what was read.
+    /// It succeeded; [`Client::data`] holds the bytes read.
     Done,
     /// It failed.
     Failed(Failure),
@@ -61,13 +63,13 @@ pub enum Outcome {
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Stage {
     Rest,
-    /// Waits for the answer to a request to read.
+    /// Waits for the answer to a read request.
     Read,
-    /// Waits for the answer to a request to write.
+    /// Waits for the answer to a write request.
     Write,
-    /// Waits for a segment; its toggle bit.
+    /// Waits for a segment with this toggle bit.
     ReadSegment(bool),
-    /// Waits for the answer to a segment; its toggle bit.
+    /// Waits for the answer to a segment with this toggle bit.
     WriteSegment(bool),
 }
 
@@ -84,7 +86,7 @@ fn object(data: &[u8; 8]) -> Object {
     Object(u16::from_le_bytes([data[1], data[2]]), data[3])
 }
 
-/// A segment of up to 7 bytes behind its command; `last` if no more follow.
+/// A segment of up to 7 bytes after its command byte; `last` if no more follow.
 fn segment(id: u32, toggle: bool, bytes: &[u8], last: bool) -> Frame {
     let mut data = [0; 8];
     data[0] = u8::from(toggle) << 4 | (7 - bytes.len() as u8) << 1 | u8::from(last);
@@ -92,7 +94,7 @@ fn segment(id: u32, toggle: bool, bytes: &[u8], last: bool) -> Frame {
     Frame::new(id, &data)
 }
 
-/// Asks the server of one node.
+/// SDO client for one node.
 #[derive(Clone, Debug)]
 pub struct Client {
     node: u8,
@@ -102,13 +104,13 @@ pub struct Client {
     object: Object,
     buffer: [u8; LONGEST],
     length: usize,
-    /// Bytes of the buffer that have been sent or received.
+    /// Number of bytes of the buffer that have been sent or received.
     moved: usize,
     deadline_ns: u64,
 }
 
 impl Client {
-    /// Asks `node`, and waits for each answer at most `timeout_ns`.
+    /// A client of `node` that waits for each answer at most `timeout_ns`.
     pub fn new(node: u8, timeout_ns: u64) -> Client {
         Client {
             node,
@@ -127,16 +129,16 @@ impl Client {
         0x600 + u32::from(self.node)
     }
 
-    /// Asks for the bytes of an object. A request that has not ended is forgotten.
+    /// Requests the bytes of an object. An unfinished request is discarded.
     pub fn read(&mut self, object: Object, now_ns: u64, send: Send) {
         self.begin(Stage::Read, object, now_ns);
         send(frame(self.request(), 0x40, object, 0));
     }
 
-    /// Asks to write these bytes.
+    /// Requests to write these bytes.
     ///
     /// # Panics
-    /// If there are none or more than [`LONGEST`]: a mistake of the caller.
+    /// If there are none or more than [`LONGEST`]: an error of the caller.
     pub fn write(&mut self, object: Object, bytes: &[u8], now_ns: u64, send: Send) {
         assert!((1..=LONGEST).contains(&bytes.len()), "{} bytes to {object}", bytes.len());
         self.begin(Stage::Write, object, now_ns);
@@ -157,17 +159,17 @@ impl Client {
         (self.length, self.moved, self.deadline_ns) = (0, 0, now_ns + self.timeout_ns);
     }
 
-    /// What has become of the last request.
+    /// State of the last request.
     pub fn outcome(&self) -> Outcome {
         self.outcome
     }
 
-    /// What the last request asked for.
+    /// The object of the last request.
     pub fn object(&self) -> Object {
         self.object
     }
 
-    /// What was read.
+    /// The bytes read.
     pub fn data(&self) -> &[u8] {
         &self.buffer[..self.length]
     }
@@ -181,7 +183,7 @@ impl Client {
         self.end(Outcome::Failed(Failure::Aborted(abort)));
     }
 
-    /// Looks at the time: an answer that is overdue fails the request.
+    /// Checks the time-out: an overdue answer fails the request.
     pub fn poll(&mut self, now_ns: u64, send: Send) {
         if self.stage != Stage::Rest && now_ns >= self.deadline_ns {
             self.abort(Abort::TIMED_OUT, send);
@@ -189,7 +191,7 @@ impl Client {
         }
     }
 
-    /// Takes an answer of the server. Answers that nobody asked for are passed over.
+    /// Receives an answer of the server. Unexpected answers are ignored.
     pub fn receive(&mut self, answer: &Frame, now_ns: u64, send: Send) {
         let Ok(data) = <&[u8; 8]>::try_from(answer.data()) else { return };
         if answer.id() != 0x580 + u32::from(self.node) || self.stage == Stage::Rest {
@@ -262,7 +264,7 @@ impl Client {
     }
 }
 
-/// Answers for one node.
+/// SDO server of one node.
 #[derive(Clone, Debug)]
 pub struct Server {
     node: u8,
@@ -274,7 +276,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Answers for `node`.
+    /// A server of `node`.
     pub fn new(node: u8) -> Server {
         Server { node, stage: Stage::Rest, object: Object(0, 0), buffer: [0; LONGEST], length: 0, moved: 0 }
     }
@@ -283,7 +285,7 @@ impl Server {
         0x580 + u32::from(self.node)
     }
 
-    /// Forgets a transfer that has begun: the node was reset.
+    /// Discards a transfer in progress, because the node was reset.
     pub fn reset(&mut self) {
         self.stage = Stage::Rest;
     }
@@ -293,7 +295,7 @@ impl Server {
         send(frame(self.answer(), 0x80, object, abort.0));
     }
 
-    /// Takes a request and answers it.
+    /// Receives a request and answers it.
     pub fn receive(&mut self, request: &Frame, objects: &mut dyn Objects, send: Send) {
         let Ok(data) = <&[u8; 8]>::try_from(request.data()) else { return };
         if request.id() != 0x600 + u32::from(self.node) {
@@ -349,7 +351,7 @@ impl Server {
         let object = object(data);
         let (expedited, sized) = (data[0] & 2 != 0, data[0] & 1 != 0);
         if expedited {
-            // A client that doesn't say how many bytes it means gets as many as the object has.
+            // If the client does not give the number of bytes, the object's length applies.
             let length = match sized {
                 true => 4 - usize::from(data[0] >> 2 & 3),
                 false => objects.read(object).map_or(4, <[u8]>::len).min(4),
@@ -412,7 +414,7 @@ mod tests {
         objects
     }
 
-    /// A client and a server on a wire; `bend` may change or drop what goes over it.
+    /// A client and a server on a simulated connection; `bend` may change or drop frames.
     struct Wire {
         client: Client,
         server: Server,
@@ -498,7 +500,7 @@ mod tests {
         assert_eq!(wire.write(Object(0x6060, 0), &[11]), failed(Abort::TOO_HIGH));
         assert_eq!(wire.read(Object(0x6061, 0)), failed(Abort::NO_OBJECT));
         assert_eq!(wire.read(Object(0x6060, 1)), failed(Abort::NO_SUB));
-        // Whatever a server answers with is told as it is.
+        // Every abort code of a server is reported unchanged.
         for &abort in Abort::ALL {
             let mut client = Client::new(5, 1);
             client.read(Object(0x1008, 0), 0, &mut |_| {});
@@ -509,7 +511,7 @@ mod tests {
 
     #[test]
     fn a_lost_or_bent_frame_ends_the_transfer() {
-        // Each frame of a segmented read and of a segmented write lost: silence, and the next request works.
+        // Loss of each frame of a segmented read and write: the request times out, and the next one works.
         for writes in [false, true] {
             for lost in 0..8 {
                 let mut wire = Wire::new();
@@ -543,10 +545,10 @@ mod tests {
         wire.server.receive(&open[0], &mut wire.objects, &mut |frame| answers.push(frame));
         wire.client.receive(&answers[0], 0, &mut |frame| open.push(frame));
         wire.server.receive(&open[1], &mut wire.objects, &mut |frame| answers.push(frame));
-        // The request for the first segment once more.
+        // The request for the first segment is repeated.
         wire.server.receive(&open[1], &mut wire.objects, &mut |frame| answers.push(frame));
         assert_eq!(answers[2], frame(0x585, 0x80, Object(0x1008, 0), Abort::TOGGLE.0));
-        // The same on the other side.
+        // The same on the client's side.
         wire.client.receive(&answers[1], 0, &mut |_| {});
         wire.client.receive(&answers[1], 0, &mut |frame| open.push(frame));
         assert_eq!(wire.client.outcome(), Outcome::Failed(Failure::Aborted(Abort::TOGGLE)));
@@ -570,7 +572,7 @@ mod tests {
         answer([0x21, 0x08, 0x10, 0, 10, 0, 0, 0]);
         let short = answer([0x09, 1, 2, 3, 0, 0, 0, 0]);
         assert_eq!(short, [frame(0x585, 0x80, Object(0x1008, 0), Abort::LENGTH.0)]);
-        // A client that doesn't give the number of bytes.
+        // A client that does not give the number of bytes.
         assert_eq!(answer([0x22, 0x40, 0x60, 0, 6, 0, 0, 0]), [frame(0x585, 0x60, Object(0x6040, 0), 0)]);
         assert_eq!(wire.objects.get(Object(0x6040, 0)), Some(6));
     }

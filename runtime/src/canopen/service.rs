@@ -1,9 +1,9 @@
-//! The small services: network management, SYNC, heartbeat, node guarding, emergency; and which frame is which.
+//! The other services: NMT, SYNC, heartbeat, node guarding, emergency; and the classification of frames.
 
 use crate::can::Frame;
 use std::fmt;
 
-/// A command of network management.
+/// An NMT command.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[allow(missing_docs)]
 pub enum Nmt {
@@ -15,7 +15,7 @@ pub enum Nmt {
 }
 
 impl Nmt {
-    /// The frame that says it to a node; node 0 means all.
+    /// The frame of the command for a node; node 0 addresses all.
     pub fn frame(self, node: u8) -> Frame {
         Frame::new(0x000, &[self as u8, node])
     }
@@ -27,7 +27,7 @@ impl Nmt {
     }
 }
 
-/// State of a node, as its heartbeat tells it.
+/// NMT state of a node, as in its heartbeat.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 #[allow(missing_docs)]
 pub enum NmtState {
@@ -39,7 +39,7 @@ pub enum NmtState {
 }
 
 impl NmtState {
-    /// The state of a heartbeat's or guard answer's byte, toggle bit apart.
+    /// The state in the byte of a heartbeat or guard answer, without the toggle bit.
     pub fn of(byte: u8) -> Option<NmtState> {
         [NmtState::BootUp, NmtState::Stopped, NmtState::Operational, NmtState::PreOperational]
             .into_iter()
@@ -71,19 +71,19 @@ pub fn sync(counter: Option<u8>) -> Frame {
     }
 }
 
-/// Asks a node for its state: node guarding.
+/// Requests the state of a node: node guarding.
 pub fn guard_request(node: u8) -> Frame {
     Frame::remote(0x700 + u32::from(node), 1)
 }
 
-/// An emergency: what a device says when something went wrong, or right again (code 0).
+/// Emergency message: a device reports an error, or its end (code 0).
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Emergency {
-    /// What.
+    /// Error code.
     pub code: u16,
     /// Error register, object 1001.
     pub register: u8,
-    /// The maker's own five bytes.
+    /// Five manufacturer-specific bytes.
     pub vendor: [u8; 5],
 }
 
@@ -95,13 +95,13 @@ impl Emergency {
         Frame::new(0x080 + u32::from(node), &[low, high, self.register, a, b, c, d, e])
     }
 
-    /// What the code means.
+    /// Meaning of the code.
     pub fn meaning(&self) -> &'static str {
         error_meaning(self.code)
     }
 }
 
-/// What an error code of an emergency or of object 603F means: CiA 301 table 26, CiA 402-2 table 20.
+/// Meaning of an error code of an emergency or of object 603F: CiA 301 table 26, CiA 402-2 table 20.
 pub fn error_meaning(code: u16) -> &'static str {
     match code {
         0x0000 => "no error",
@@ -146,10 +146,10 @@ pub fn error_meaning(code: u16) -> &'static str {
     }
 }
 
-/// What a frame is, by the predefined connection set.
+/// Kind of a frame in the predefined connection set.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Service {
-    /// Network management: command, node (0: all).
+    /// NMT: command, node (0: all).
     Nmt(Option<Nmt>, u8),
     /// SYNC, with its counter if it has one.
     Sync(Option<u8>),
@@ -167,12 +167,12 @@ pub enum Service {
     Heartbeat(u8, Option<NmtState>, bool),
     /// Request for the state of a node.
     GuardRequest(u8),
-    /// Time stamp, and whatever else has no place in the set.
+    /// Timestamp, and all other frames outside of the set.
     Other,
 }
 
 impl Service {
-    /// What it is.
+    /// Classifies a frame.
     pub fn of(frame: &Frame) -> Service {
         if frame.is_extended() {
             return Service::Other;

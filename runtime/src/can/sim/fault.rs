@@ -1,34 +1,35 @@
-//! What can go wrong with a node of a simulated bus, on purpose.
+//! Faults of a node on a simulated bus.
 //!
-//! In: a seed and what was planted. Out: what becomes of each frame. Knows nothing of the line.
+//! In: a seed and the planted faults. Out: the fate of each frame. Knows nothing of the line.
 
 use super::super::Frame;
 use crate::rng::Chance;
 
-/// What goes wrong.
+/// Kind of a fault.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Kind {
-    /// A frame that the node hands over never reaches the line.
+    /// A frame of the node never reaches the line.
     Drop,
-    /// One bit of the data is wrong, and the checksum agrees with it: nobody on the bus notices.
+    /// One data bit is wrong, under a valid checksum: no node on the bus notices.
     Corrupt,
-    /// Disturbed on the line: an error frame, both counters, and the frame again.
+    /// The frame is disturbed on the line: an error frame, error counters on both sides, and a retransmission.
     Disturb,
-    /// On its way for this many nanoseconds longer; frames behind it may pass.
+    /// The frame is delayed by this time, ns; later frames may overtake it.
     Delay(u64),
-    /// Sent twice.
+    /// The frame is sent twice.
     Duplicate,
-    /// Sent after the next frame of the node.
+    /// The frame is sent after the next frame of the node.
     Reorder,
-    /// Sent with the data of the first frame that was struck: its producer has frozen. For a fault of one identifier.
+    /// The frame is sent with the data of the first frame hit by the fault, as by a frozen producer. For a fault of one
+    /// identifier.
     Stale,
-    /// The node finds its queue full.
+    /// The queue of the node is full.
     Full,
-    /// The node doesn't get a frame of the others, and counts it as lost.
+    /// The node does not receive a frame of another node, and counts it as lost.
     Overrun,
 }
 
-/// A fault of one node: which frames, how often, and when.
+/// A fault of one node: its kind, the affected frames, their number, and the time.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Fault {
     kind: Kind,
@@ -37,42 +38,42 @@ pub struct Fault {
     from_ns: u64,
     until_ns: u64,
     times: u32,
-    /// The first frame that a [`Kind::Stale`] has struck.
+    /// The first frame that a [`Kind::Stale`] has hit.
     frozen: Option<Frame>,
 }
 
 impl Fault {
-    /// It happens to every frame, always.
+    /// A fault that affects every frame, at any time.
     pub fn new(kind: Kind) -> Fault {
         Fault { kind, id: None, chance: 1.0, from_ns: 0, until_ns: u64::MAX, times: u32::MAX, frozen: None }
     }
 
-    /// Only to frames with this identifier.
+    /// Restricts it to frames with this identifier.
     pub fn id(self, id: u32) -> Fault {
         Fault { id: Some(id), ..self }
     }
 
-    /// Only to this fraction of them, 0 to 1.
+    /// Restricts it to this fraction of the frames, 0 to 1, at random.
     pub fn chance(self, chance: f64) -> Fault {
         Fault { chance, ..self }
     }
 
-    /// Not before this time.
+    /// Begins it at this time.
     pub fn from(self, from_ns: u64) -> Fault {
         Fault { from_ns, ..self }
     }
 
-    /// No longer from this time on.
+    /// Ends it at this time.
     pub fn until(self, until_ns: u64) -> Fault {
         Fault { until_ns, ..self }
     }
 
-    /// At most so often.
+    /// Limits the number of affected frames.
     pub fn times(self, times: u32) -> Fault {
         Fault { times, ..self }
     }
 
-    /// Whether it strikes this frame now; it is then counted.
+    /// Whether it affects this frame now; if so, it is counted.
     fn strikes(&mut self, frame: &Frame, now_ns: u64, chance: &mut Chance) -> bool {
         let due = self.times > 0
             && (self.from_ns..self.until_ns).contains(&now_ns)
@@ -94,7 +95,7 @@ impl Faults {
         self.0.push(fault);
     }
 
-    /// The frame that leaves in place of this one: that of a producer that has frozen, or itself.
+    /// The frame to send instead of this one: the stale one of a frozen producer, or the frame itself.
     pub fn frozen(&mut self, frame: Frame, now_ns: u64, chance: &mut Chance) -> Frame {
         let mut strikes = |fault: &mut Fault| fault.kind == Kind::Stale && fault.strikes(&frame, now_ns, chance);
         match self.0.iter_mut().find_map(|fault| strikes(fault).then_some(fault)) {
@@ -103,7 +104,7 @@ impl Faults {
         }
     }
 
-    /// Whether one of a kind strikes this frame now; it is then counted.
+    /// The fault of a matching kind that affects this frame now, if any; it is counted.
     pub fn strike(
         &mut self,
         frame: &Frame,
@@ -118,7 +119,7 @@ impl Faults {
     }
 }
 
-/// The frame with one bit of its data turned over.
+/// The frame with one data bit inverted.
 pub(super) fn corrupted(chance: &mut Chance, frame: Frame) -> Frame {
     if frame.data().is_empty() {
         return frame;

@@ -1,7 +1,8 @@
-//! The line itself: who may send, how long it takes, who hears it, and what errors do to the counters.
+//! The simulated line: arbitration, duration of frames, reception, and error counters.
 //!
-//! In: frames with their times. Out: deliveries, events and error counters of each node. Bits are real ones, times whole
-//! nanoseconds; nothing here waits, and nothing allocates after a node has joined. Source: ISO 11898-1:2015, 10.8, 12.
+//! In: frames with their times. Out: deliveries, events and error counters of each node. Frame lengths are exact in
+//! bits, times in whole nanoseconds; nothing blocks here, and nothing is allocated after a node has joined. Source: ISO
+//! 11898-1:2015, 10.8, 12.
 
 use super::super::{Event, Filter, Frame, Health, Received, Refused, State};
 use super::fault::{Fault, Faults, Kind, corrupted};
@@ -9,38 +10,38 @@ use crate::can::frame_length;
 use crate::rng::Chance;
 use std::collections::VecDeque;
 
-/// Frames a node may have waiting for the line.
+/// Capacity of a node's transmit queue, frames.
 pub(super) const QUEUE: usize = 64;
 
-/// Frames and events a node may have waiting to be read.
+/// Capacity of a node's receive queue, frames and events.
 pub(super) const BUFFER: usize = 4096;
 
-/// Bits of an error delimiter.
+/// Length of an error delimiter, bits.
 const DELIMITER: u32 = 8;
 
-/// Bits that a node which failed too often waits longer than the others.
+/// Suspend transmission time of an error-passive node, bits.
 const SUSPEND: u32 = 8;
 
-/// Recessive bits after which a node that was bus-off may come back.
+/// Number of recessive bits before a node may recover from bus-off.
 const RECOVERY: u32 = 128 * 11;
 
 pub(super) struct Line {
     bit_rate: u32,
     chance: Chance,
     nodes: Vec<Node>,
-    /// From when on a frame may start.
+    /// Time from which on a frame may start.
     free_ns: u64,
     underway: Option<Underway>,
-    /// The wires touch each other in this time.
+    /// Interval of a short circuit between the wires.
     short: (u64, u64),
     busy_ns: u64,
 }
 
-/// An attempt to send.
+/// A transmission in progress.
 struct Underway {
     node: usize,
     frame: Frame,
-    /// Position in the queue of the node; none of it if it babbles.
+    /// Index in the queue of the node; none for a babbling node.
     place: Option<usize>,
     ends_ns: u64,
     free_ns: u64,
@@ -64,9 +65,9 @@ struct Node {
     read: VecDeque<Received>,
     unreported: u32,
     health: Health,
-    /// Whether it was told of the frame that nobody acknowledges.
+    /// Whether the node has been notified of its frame without acknowledge.
     complained: bool,
-    /// From when on it may start a frame: later than others where it failed too often.
+    /// Time from which on it may start a frame: later than for others if it is error passive.
     not_before_ns: u64,
     restart_ns: Option<u64>,
     joined: bool,
@@ -83,13 +84,13 @@ struct Babble {
 }
 
 impl Node {
-    /// Whether it drives the line and hears it.
+    /// Whether it drives the line and receives from it.
     fn takes_part(&self, now_ns: u64) -> bool {
         let unplugged = (self.unplugged.0..self.unplugged.1).contains(&now_ns);
         self.joined && !unplugged && !matches!(self.health.state, State::BusOff | State::Down)
     }
 
-    /// When it has a frame to start, at the earliest.
+    /// Earliest time at which it has a frame to start.
     fn wants_ns(&self) -> Option<u64> {
         let waiting = self.waiting.iter().map(|&(_, ready_ns)| ready_ns);
         let babble =
@@ -97,7 +98,7 @@ impl Node {
         waiting.chain(babble).min().map(|ready_ns| ready_ns.max(self.not_before_ns))
     }
 
-    /// The frame it would start now, and its place in the queue.
+    /// The frame that it would start now, and its index in the queue.
     fn offers(&self, now_ns: u64) -> Option<(Frame, Option<usize>)> {
         if now_ns < self.not_before_ns {
             return None;
@@ -118,7 +119,7 @@ impl Node {
         }
     }
 
-    /// Follows the counters with the state.
+    /// Updates the state according to the error counters, and reports its change.
     fn judge(&mut self, now_ns: u64, before: Health) {
         let worst = |health: &Health| health.transmit_errors.max(health.receive_errors);
         let (was, is) = (worst(&before), worst(&self.health));
@@ -145,7 +146,7 @@ impl Node {
         let before = self.health;
         let Health { transmit_errors, receive_errors, .. } = &mut self.health;
         let counter = if transmitted { transmit_errors } else { receive_errors };
-        // A receiver that was passive comes back at once to just below the bound.
+        // The receive counter of an error-passive node returns at once to the bound.
         *counter = if !transmitted && *counter > 127 { 127 } else { counter.saturating_sub(1) };
         self.judge(now_ns, before);
     }
@@ -300,7 +301,7 @@ impl Line {
         self.nodes[at].health
     }
 
-    /// When the line changes next: a frame or an error ends, one could start, a node comes back.
+    /// Time of the next change: a frame or an error ends, a frame can start, a node restarts.
     pub fn next_ns(&self) -> u64 {
         let restart = self.nodes.iter().filter_map(|node| node.restart_ns).min().unwrap_or(u64::MAX);
         restart.min(match &self.underway {
@@ -315,8 +316,8 @@ impl Line {
         (wants < u64::MAX).then(|| wants.max(self.free_ns))
     }
 
-    /// Catches up with the time. What starts just now starts only with `settled`: until then somebody may still want to
-    /// start at the same instant.
+    /// Advances the line to a time. A frame that starts exactly at that time is started only if `settled`: until then
+    /// another node may still request to start at the same time.
     pub fn run_to(&mut self, now_ns: u64, settled: bool) {
         loop {
             self.come_back(now_ns);
@@ -345,7 +346,7 @@ impl Line {
         }
     }
 
-    /// The nodes that want to start together arbitrate, and the frame of the winner begins.
+    /// Performs the arbitration between the nodes that want to start, and starts the winner's frame.
     fn start(&mut self, start_ns: u64) {
         let offers = |(at, node): (usize, &Node)| node.offers(start_ns).map(|(frame, place)| (at, frame, place));
         let plugged = |&(at, ..): &(usize, Frame, Option<usize>)| self.nodes[at].takes_part(start_ns);
@@ -363,7 +364,7 @@ impl Line {
             .any(|(other, theirs, _)| other != at && frame_length::arbitration(&theirs) == key && theirs != frame);
         let rate = self.nodes[at].bit_rate;
         let others = || self.nodes.iter().enumerate().filter(|&(other, node)| other != at && node.takes_part(start_ns));
-        // A node with another bit rate sees nonsense and says so, as long as its error flags are dominant.
+        // A node with another bit rate misreads the frame and destroys it, as long as its error flags are dominant.
         let misread =
             others().any(|(_, node)| node.bit_rate != rate && node.health.state == State::Active && !node.listen_only);
         let acknowledged = others().any(|(_, node)| node.bit_rate == rate && !node.listen_only);
@@ -374,23 +375,24 @@ impl Line {
         let (end, error_at) = if shorted || misread {
             (Ending::Disturbed, Some(6))
         } else if collides || disturbed {
-            // Somewhere behind the arbitration and before the end.
+            // At a random position after the arbitration and before the end.
             (Ending::Disturbed, Some(20 + self.chance.below(u64::from(whole) - 33) as u32))
         } else if !acknowledged {
-            // The acknowledge slot lies behind the CRC delimiter.
+            // The acknowledge slot follows the CRC delimiter.
             (Ending::NotAcknowledged, Some(whole - 11))
         } else {
             (Ending::Received, None)
         };
         let echoes = if end == Ending::Disturbed { self.chance.below(7) as u32 } else { 0 };
-        // Error flag, the flags of those that noticed it by it, delimiter.
+        // Error flag, echoed error flags of the nodes that detect it, delimiter.
         let ends = error_at.map_or(whole - frame_length::SPACE, |at| at + 6 + echoes + DELIMITER);
         let (ends_ns, free_ns) = (start_ns + ns(ends, rate), start_ns + ns(ends + frame_length::SPACE, rate));
         self.busy_ns += free_ns - start_ns;
         self.underway = Some(Underway { node: at, frame, place, ends_ns, free_ns, end });
     }
 
-    /// Who is unplugged hears no acknowledge: it goes passive and tries again, alone on its piece of cable.
+    /// An unplugged node receives no acknowledge: it becomes error passive and keeps trying, alone on its piece of
+    /// cable.
     fn send_into_nothing(&mut self, start_ns: u64) {
         for node in self.nodes.iter_mut().filter(|node| node.joined) {
             if let Some((frame, _)) = node.offers(start_ns) {
@@ -427,7 +429,7 @@ impl Line {
                 if !std::mem::replace(&mut sender.complained, true) {
                     sender.deliver(Received::Event(Event::NotAcknowledged, ends_ns));
                 }
-                // Once passive, a missing acknowledge no longer counts: a node alone never goes bus-off.
+                // Once error passive, a missing acknowledge no longer counts: a node alone never becomes bus-off.
                 if sender.health.state == State::Active {
                     sender.error(8, true, ends_ns);
                 }
@@ -465,7 +467,7 @@ impl Line {
     }
 }
 
-/// Time that bits take, in whole nanoseconds.
+/// Duration of bits, in whole nanoseconds.
 fn ns(bits: u32, bit_rate: u32) -> u64 {
     u64::from(bits) * 1_000_000_000 / u64::from(bit_rate)
 }

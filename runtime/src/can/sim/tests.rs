@@ -1,4 +1,4 @@
-//! A line by its times, its losers and its counters.
+//! Tests of the simulated line: times, arbitration and error counters.
 
 use super::*;
 use crate::can::{Event, State, frame_length};
@@ -40,7 +40,7 @@ fn a_frame_takes_its_bits() {
     assert!(b.wait(1_000_000) && simulation.now_ns() == whole_ns - 3000, "at {} ns", simulation.now_ns());
     assert_eq!(frames(&mut b), [(frame, whole_ns - 3000)]);
     assert_eq!(frames(&mut a), []);
-    // The next one follows after three bits.
+    // The next frame follows after three bits.
     simulation.run_to(whole_ns - 1000);
     a.send(frame).expect("the queue is empty");
     simulation.run_to(1_000_000);
@@ -54,7 +54,7 @@ fn the_least_identifier_wins_and_the_loser_follows_at_once() {
     let mut c = bus.port("c");
     let (first, second, third) =
         (Frame::new(0x080, &[]), Frame::new(0x181, &[0; 8]), Frame::extended(0x181 << 18, &[1]));
-    // In another order than they will win, all at the same instant.
+    // Not in the order of their priorities, all at the same time.
     c.send(third).expect("sent");
     b.send(second).expect("sent");
     a.send(first).expect("sent");
@@ -77,7 +77,7 @@ fn a_node_alone_goes_passive_and_no_further() {
     let health = a.health();
     assert_eq!((health.state, health.transmit_errors), (State::Passive, 128));
     assert_eq!(events(&mut a), [Event::NotAcknowledged, Event::Warning, Event::Passive]);
-    // Somebody comes: the frame gets through at last.
+    // Another node joins: the frame is finally acknowledged.
     let mut b = bus.port("b");
     simulation.run_to(101_000_000);
     assert_eq!(frames(&mut b).len(), 1);
@@ -207,7 +207,7 @@ fn a_filter_lets_in_what_it_names() {
     assert_eq!(frames(&mut only).iter().map(|(frame, _)| *frame).collect::<Vec<_>>(), [sent[0], sent[2]]);
 }
 
-/// Answers each SYNC after a time.
+/// Answers each SYNC after a delay.
 struct Answers {
     port: Port,
     after_ns: u64,
