@@ -146,7 +146,7 @@ impl Node {
         let before = self.health;
         let Health { transmit_errors, receive_errors, .. } = &mut self.health;
         let counter = if transmitted { transmit_errors } else { receive_errors };
-        // The receive counter of an error-passive node returns at once to the bound.
+        // The receive counter of an error-passive node returns at once to just below the bound.
         *counter = if !transmitted && *counter > 127 { 127 } else { counter.saturating_sub(1) };
         self.judge(now_ns, before);
     }

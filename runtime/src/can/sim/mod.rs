@@ -1,15 +1,15 @@
-//! Buses in the process, with the times, losses and errors of a real one.
+//! Buses simulated within the process, with the times, losses and errors of real ones (discrete-event simulation).
 //!
-//! In: frames and a time that somebody moves. Out: what each node of a bus would have seen, always the same for the same
-//! seed. Knows no drive: whoever answers on a bus is an [`Actor`].
+//! In: frames, and a time that callers advance. Out: everything that each node of a bus would receive, reproducible for
+//! the same seed. Knows no drive: a participant is an [`Actor`].
 //!
 //! ```text
 //! let simulation = Simulation::new();               // or Simulation::real_time(): the same, paced by the machine's clock
-//! let bus = simulation.bus("bench", 1_000_000);     // made at the first call, found at the next
+//! let bus = simulation.bus("bench", 1_000_000);     // created at the first call, found at the next
 //! let mut master = bus.port("master");              // a `Bus`
 //! simulation.attend(Box::new(Drive::new(bus.port("load"))));
 //! master.send(Frame::new(0x080, &[]))?;
-//! master.wait(simulation.now_ns() + 450_000);       // moves the time on; the drive answers meanwhile
+//! master.wait(simulation.now_ns() + 450_000);       // advances the time; the drive answers meanwhile
 //! ```
 
 mod fault;
@@ -22,7 +22,7 @@ use line::Line;
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 
-/// A world of its own: one time, its buses, and whoever acts in it. Copies are handles of the same one.
+/// An independent simulation: one clock, its buses and its actors. Clones are handles of the same simulation.
 #[derive(Clone)]
 pub struct Simulation(Rc<World>);
 
@@ -34,28 +34,28 @@ struct World {
 }
 
 enum Time {
-    /// Stands until somebody waits.
+    /// Advances only while a caller waits.
     Simulated(Simulated),
-    /// Goes by itself.
+    /// Advances by itself.
     Real(Monotonic),
 }
 
-/// Somebody in a simulation: a drive, a disturbance, a watchdog.
+/// A participant of a simulation: a drive, a disturbance, a watchdog.
 pub trait Actor {
-    /// Does what is due: reads its ports, sends, moves its model to `now_ns`. Called when its time has come, and after
-    /// anything has happened on any bus. It must not wait.
+    /// Executes everything that is due: reads its ports, sends, advances its model to `now_ns`. Called when its time
+    /// has come, and after every event on any bus. Must not wait.
     ///
-    /// Returns when it wants to be called again at the latest: after `now_ns`, `u64::MAX` for only when something happens.
+    /// Returns the latest time of the next call: after `now_ns`; `u64::MAX` if only events matter.
     fn act(&mut self, now_ns: u64) -> u64;
 }
 
 impl Simulation {
-    /// A simulation whose time stands at 0 until somebody waits.
+    /// A simulation whose time stays at 0 until a caller waits.
     pub fn new() -> Simulation {
         Simulation::with(Time::Simulated(Simulated::new()))
     }
 
-    /// A simulation whose time is the machine's, from 0 now.
+    /// A simulation with the machine's clock, which is 0 now.
     pub fn real_time() -> Simulation {
         Simulation::with(Time::Real(Monotonic::new()))
     }
@@ -65,13 +65,13 @@ impl Simulation {
         Simulation(Rc::new(World { time, seed: Cell::new(1), buses, actors }))
     }
 
-    /// From which all that is random follows, for buses made later.
+    /// Sets the seed of all random numbers, for buses created later.
     pub fn seeded(self, seed: u64) -> Simulation {
         self.0.seed.set(seed);
         self
     }
 
-    /// The bus of this name; made with this bit rate if there is none.
+    /// The bus of this name; created with this bit rate if it does not exist.
     ///
     /// # Panics
     /// If the bit rate is 0.
@@ -87,12 +87,12 @@ impl Simulation {
         buses[buses.len() - 1].clone()
     }
 
-    /// Lets somebody act in it from now on.
+    /// Adds an actor.
     pub fn attend(&self, actor: Box<dyn Actor>) {
         self.0.actors.borrow_mut().push(actor);
     }
 
-    /// The machine's clock, where that is its time.
+    /// The machine's clock, if the simulation uses it.
     pub fn monotonic(&self) -> Option<Monotonic> {
         match &self.0.time {
             Time::Simulated(_) => None,
@@ -100,13 +100,13 @@ impl Simulation {
         }
     }
 
-    /// Does what is due, then waits for what comes next: on a bus, by an actor, at one of the descriptors, or the time
-    /// `until_ns`. Simulated time does not wait for descriptors.
+    /// Executes everything that is due, then waits for the next event: on a bus, of an actor, at one of the
+    /// descriptors, or the time `until_ns`. Simulated time does not wait for descriptors.
     pub fn step(&self, until_ns: u64, watched: &mut [libc::pollfd]) {
         self.0.step(until_ns, watched, || false);
     }
 
-    /// Moves on to a time, or goes until then.
+    /// Advances to a time, or waits until then.
     pub fn run_to(&self, until_ns: u64) {
         self.0.run(until_ns, || false);
     }
@@ -136,14 +136,15 @@ impl World {
         }
     }
 
-    /// From event to event until the time has come or `enough` says so; gives what that said last.
+    /// Advances from event to event until the time is reached or `enough` returns true; returns the last result of
+    /// `enough`.
     fn run(&self, until_ns: u64, enough: impl Fn() -> bool) -> bool {
         while !self.step(until_ns, &mut [], &enough) {}
         enough()
     }
 
-    /// Lets everybody act at this instant. Then, unless that is `enough` or the time has come, goes on to the next one.
-    /// Says whether it stayed.
+    /// Lets all actors act at the present time. Then advances to the next event, unless `enough` returns true or the
+    /// time is reached. Returns true if it did not advance.
     fn step(&self, until_ns: u64, watched: &mut [libc::pollfd], enough: impl Fn() -> bool) -> bool {
         let now_ns = self.now_ns();
         let buses = self.buses.borrow();
@@ -155,7 +156,7 @@ impl World {
         if enough() || now_ns >= until_ns {
             return true;
         }
-        // Whoever wanted to send at this instant has done so.
+        // All actors have queued their frames for this time.
         let settle = |bus: &SimBus| {
             let mut line = bus.line.borrow_mut();
             line.run_to(now_ns, true);
@@ -172,33 +173,33 @@ impl World {
     }
 }
 
-/// A simulated bus. Copies are handles of the same one.
+/// A simulated bus. Clones are handles of the same bus.
 #[derive(Clone)]
 pub struct SimBus {
     name: Rc<str>,
     line: Rc<RefCell<Line>>,
-    // A simulation owns its buses and its actors own ports: only a weak way back lets them go.
+    // A simulation owns its buses, and its actors own ports: a strong reference would be a cycle.
     time: std::rc::Weak<World>,
 }
 
-/// How a node joins a bus.
+/// Options of a node that joins a bus.
 #[derive(Clone, Default, Debug)]
 pub struct Join {
-    /// Its own bit rate, where it is not that of the bus: errors on both sides.
+    /// Its own bit rate, if it differs from that of the bus: errors on both sides.
     pub bit_rate: Option<u32>,
-    /// What it reads.
+    /// Its acceptance filter.
     pub filter: Filter,
     /// It neither sends nor acknowledges.
     pub listen_only: bool,
 }
 
 impl SimBus {
-    /// Joins a node; several may bear one name. It leaves when the port is dropped.
+    /// Joins a node; several nodes may have the same name. It leaves when the port is dropped.
     pub fn port(&self, name: &str) -> Port {
         self.join(name, Join::default())
     }
 
-    /// Joins a node that is special.
+    /// Joins a node with options.
     pub fn join(&self, name: &str, join: Join) -> Port {
         let Join { bit_rate, filter, listen_only } = join;
         let world = self.world();
@@ -208,12 +209,12 @@ impl SimBus {
         Port { bus: self.clone(), node }
     }
 
-    /// Its bit rate.
+    /// Its bit rate, bits per second.
     pub fn bit_rate(&self) -> u32 {
         self.line.borrow().bit_rate()
     }
 
-    /// How long the line was busy until now.
+    /// Total time in which the line was busy, ns.
     pub fn busy_ns(&self) -> u64 {
         self.caught_up().busy_ns()
     }
@@ -226,17 +227,17 @@ impl SimBus {
         self.caught_up().plant(node, fault);
     }
 
-    /// Lets a node send a frame again and again, at least this far apart: 0 is without a pause.
+    /// Makes a node send a frame again and again, at least this interval apart; 0: without a pause.
     pub fn babble(&self, node: &str, frame: Frame, period_ns: u64, from_ns: u64, until_ns: u64) {
         self.caught_up().babble(node, frame, period_ns, from_ns, until_ns);
     }
 
-    /// Pulls the plug of a node for a time: it hears nobody, nobody hears it.
+    /// Unplugs a node for an interval: it receives nothing, and its frames reach no node.
     pub fn unplug(&self, node: &str, from_ns: u64, until_ns: u64) {
         self.caught_up().unplug(node, from_ns, until_ns);
     }
 
-    /// Lets the two wires touch for a time: no frame gets through, and whoever tries counts an error.
+    /// Short-circuits the two wires for an interval: no frame is transmitted, and each attempt counts an error.
     pub fn short(&self, from_ns: u64, until_ns: u64) {
         self.caught_up().short(from_ns, until_ns);
     }
@@ -247,7 +248,7 @@ impl SimBus {
         self.caught_up().take_down(node, now_ns);
     }
 
-    /// Asks a node that is bus-off or down to come back: after 128 times 11 quiet bits.
+    /// Restarts a node that is bus-off or down: after 128 times 11 recessive bits.
     pub fn restart(&self, node: &str) {
         let now_ns = self.world().now_ns();
         self.caught_up().restart(node, now_ns);
@@ -264,7 +265,7 @@ impl SimBus {
     }
 }
 
-/// A node's place on a simulated bus.
+/// The connection of a node to a simulated bus.
 pub struct Port {
     bus: SimBus,
     node: usize,
